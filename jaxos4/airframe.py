@@ -1,0 +1,215 @@
+"""The physical constants of a quadrotor, published presets, TOML files, and inertia <-> alpha."""
+
+import math
+import tomllib
+from os import PathLike
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ._custom_types import Numeric, Scalar, as_constant
+from .errors import InputError
+
+ALTERNATING_SPINS = (1.0, -1.0, 1.0, -1.0)
+
+
+class Airframe(eqx.Module):
+    """A rigid quadrotor, in a frame with x forward, y left and z up.
+
+    **Arguments:**
+
+    - `mass`: [kg].
+    - `inertia`: principal moments Ix, Iy, Iz [kg m^2].
+    - `rotor_positions`: x and y of each rotor [m].
+    - `rotor_spins`: +1 for counter-clockwise seen from above, -1 for clockwise.
+    - `thrust_coefficient`: b, thrust = b omega^2 [N s^2/rad^2].
+    - `drag_coefficient`: d, yaw torque = -spin d omega^2 [N m s^2/rad^2].
+    - `rotor_inertia`: J_R [kg m^2].
+    - `gravity`: g [m/s^2].
+    - `max_rotor_speed`: full-scale rotor speed [rad/s]; infinite where it is not known.
+
+    Any layout of four rotors fits: plus, X, or asymmetric. `plus_layout` gives the paper's.
+    """
+
+    mass: Float[Numeric, ""] = eqx.field(converter=as_constant)
+    inertia: Float[Numeric, "3"] = eqx.field(converter=as_constant)
+    rotor_positions: Float[Numeric, "4 2"] = eqx.field(converter=as_constant)
+    rotor_spins: Float[Numeric, "4"] = eqx.field(converter=as_constant)
+    thrust_coefficient: Float[Numeric, ""] = eqx.field(converter=as_constant)
+    drag_coefficient: Float[Numeric, ""] = eqx.field(converter=as_constant)
+    rotor_inertia: Float[Numeric, ""] = eqx.field(converter=as_constant)
+    gravity: Float[Numeric, ""] = eqx.field(converter=as_constant, default=9.81)
+    max_rotor_speed: Float[Numeric, ""] = eqx.field(converter=as_constant, default=math.inf)
+
+    @property
+    def mixer(self) -> Float[Array, "4 4"]:
+        """Rows that turn squared rotor speeds into roll, pitch and yaw torque [N m] and thrust [N].
+
+        Reference: Eqs. (10)-(13), written for any layout:
+        d_roll = sum y_i b w_i^2, d_pitch = -sum x_i b w_i^2, d_yaw = -d sum s_i w_i^2, U_c = sum b w_i^2.
+        """
+        x, y = jnp.asarray(self.rotor_positions).T
+        b, d = self.thrust_coefficient, self.drag_coefficient
+        return jnp.stack([b * y, -b * x, -d * jnp.asarray(self.rotor_spins), b * jnp.ones(4)])
+
+    @property
+    def hover_speed(self) -> Scalar:
+        """The rotor speed [rad/s] at which four equal rotors carry the weight."""
+        return jnp.sqrt(jnp.asarray(self.mass * self.gravity / (4 * self.thrust_coefficient)))
+
+
+def plus_layout(arm: float) -> list[tuple[float, float]]:
+    """Rotor positions of the paper's cross: 1 front, 2 right, 3 rear, 4 left, each `arm` [m] from the centre."""
+    return [(arm, 0.0), (0.0, -arm), (-arm, 0.0), (0.0, arm)]
+
+
+# The paper's own Table 1 is not available to us; these numbers are from public literature and code.
+OS4 = Airframe(  # the values of the OS4 thesis
+    mass=0.650,
+    inertia=(7.5e-3, 7.5e-3, 1.3e-2),
+    rotor_positions=plus_layout(0.23),
+    rotor_spins=ALTERNATING_SPINS,
+    thrust_coefficient=3.13e-5,
+    drag_coefficient=7.5e-7,
+    rotor_inertia=6e-5,
+)
+OS4_SIMULATOR = Airframe(  # the values of the OS4 simulator that its authors published
+    mass=0.53,
+    inertia=(6.228e-3, 6.228e-3, 1.121e-2),
+    rotor_positions=plus_layout(0.232),
+    rotor_spins=ALTERNATING_SPINS,
+    thrust_coefficient=3.13e-5,
+    drag_coefficient=7.5e-7,
+    rotor_inertia=6.01e-5,
+    gravity=9.806,
+)
+VOOS = Airframe(  # the quadrotor of H. Voos
+    mass=0.5,
+    inertia=(4.85e-3, 4.85e-3, 8.81e-3),
+    rotor_positions=plus_layout(0.2),
+    rotor_spins=ALTERNATING_SPINS,
+    thrust_coefficient=2.92e-6,
+    drag_coefficient=1.12e-7,
+    rotor_inertia=3.36e-5,
+)
+PRESETS = {"os4": OS4, "os4-simulator": OS4_SIMULATOR, "voos": VOOS}
+
+
+def alpha_from_inertia(inertia: Float[ArrayLike, "3"], gyroscopic: Float[ArrayLike, ""]) -> Float[Array, "8"]:
+    """alpha_1..8 of a rigid body.
+
+    **Arguments:**
+
+    - `inertia`: Ix, Iy, Iz [kg m^2].
+    - `gyroscopic`: what stands over Ix and Iy in alpha2 and alpha5: J_R d as the paper prints it, J_R in physics.
+
+    Reference: the definitions below Eq. (13).
+    """
+    ix, iy, iz = jnp.asarray(inertia)
+    return jnp.stack(
+        [(iy - iz) / ix, gyroscopic / ix, 1 / ix, (iz - ix) / iy, gyroscopic / iy, 1 / iy, (ix - iy) / iz, 1 / iz]
+    )
+
+
+def inertia_from_alpha(alpha: Float[ArrayLike, "8"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Ix, Iy, Iz [kg m^2] and the gyroscopic constant that `alpha` implies: the inverse of `alpha_from_inertia`.
+
+    The inertias are the reciprocals of alpha3, 6, 8, which a flight tells best; the constant is the mean of the two
+    that alpha2 and alpha5 imply. alpha1, 4 and 7 are not used: where they disagree, the alphas are no rigid body's.
+    """
+    a = jnp.asarray(alpha)
+    inertia = 1 / a[jnp.array([2, 5, 7])]
+    return inertia, (a[1] * inertia[0] + a[4] * inertia[1]) / 2
+
+
+def load_airframe(source: str | PathLike[str]) -> Airframe:
+    """An airframe from a preset's name (`os4`, `os4-simulator`, `voos`) or from a TOML file.
+
+    The file holds `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, `drag_coefficient`, `rotor_inertia`, either
+    `arm` (plus layout) or `rotor_positions = [[x1, y1], ...]`, and optionally `rotor_spins`, `gravity` and
+    `max_rotor_speed`, in SI units.
+
+    **Raises:** `InputError` with one line that says what is wrong in which key; `OSError` where it cannot be read.
+    """
+    if source in PRESETS:
+        return PRESETS[str(source)]
+    try:
+        with open(source, "rb") as file:
+            table = tomllib.load(file)
+    except FileNotFoundError:
+        raise InputError(
+            f"{source}: neither a file nor one of the presets {', '.join(PRESETS)}; give one of them."
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{source}: not a TOML file ({error}); correct it there.") from None
+    try:
+        return _from_table(table)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
+
+
+def _from_table(table: dict[str, Any]) -> Airframe:
+    table = dict(table)
+    if "arm" in table:
+        if "rotor_positions" in table:
+            raise InputError("`arm` and `rotor_positions` exclude each other; keep one of them.")
+        arm = _numbers("arm", table.pop("arm"), ()).item()
+        if arm <= 0:
+            raise InputError(f"`arm` must be positive, got {arm}.")
+        table["rotor_positions"] = plus_layout(arm)
+    table.setdefault("rotor_spins", ALTERNATING_SPINS)
+    missing = [name for name in _SHAPES if name not in table and name not in _OPTIONAL]
+    if missing:
+        raise InputError(
+            f"lacks `{missing[0]}`; an airframe needs {', '.join(s for s in _SHAPES if s not in _OPTIONAL)}."
+        )
+    unknown = [name for name in table if name not in _SHAPES]
+    if unknown:
+        raise InputError(f"knows no key `{unknown[0]}`; the keys are arm, {', '.join(_SHAPES)}.")
+    constants = {name: _numbers(name, value, _SHAPES[name]) for name, value in table.items()}
+    for name in _POSITIVE & constants.keys():
+        if not np.all(constants[name] > 0):
+            raise InputError(f"`{name}` must be positive, got {table[name]}.")
+    if constants["rotor_inertia"] < 0:
+        raise InputError(f"`rotor_inertia` must not be negative, got {table['rotor_inertia']}.")
+    if np.any(np.abs(constants["rotor_spins"]) != 1):
+        raise InputError(f"`rotor_spins` must be 1 (counter-clockwise) or -1, got {table['rotor_spins']}.")
+    inertia = constants["inertia"]
+    if 2 * inertia.max() > inertia.sum():
+        raise InputError(f"`inertia` {inertia.tolist()} breaks the triangle inequality: no rigid body has it.")
+    airframe = Airframe(**constants)
+    mixer = np.asarray(airframe.mixer)
+    scale = np.abs(mixer).max(axis=1, keepdims=True)
+    if np.linalg.matrix_rank(mixer / np.where(scale > 0, scale, 1)) < 4:
+        raise InputError("`rotor_positions` and `rotor_spins` cannot make roll, pitch, yaw and thrust independently.")
+    return airframe
+
+
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "mass": (),
+    "inertia": (3,),
+    "rotor_positions": (4, 2),
+    "rotor_spins": (4,),
+    "thrust_coefficient": (),
+    "drag_coefficient": (),
+    "rotor_inertia": (),
+    "gravity": (),
+    "max_rotor_speed": (),
+}
+_OPTIONAL = {"gravity", "max_rotor_speed"}
+_POSITIVE = set(_SHAPES) - {"rotor_positions", "rotor_spins", "rotor_inertia"}
+
+
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        array = np.asarray(None)
+    usable = array.dtype.kind in "iuf" and array.shape == shape
+    if not usable or np.isnan(array).any() or (name != "max_rotor_speed" and np.isinf(array).any()):
+        wanted = "one finite number" if shape == () else f"finite numbers of shape {list(shape)}"
+        raise InputError(f"`{name}` must be {wanted}, got {value!r}.")
+    return array.astype(float)

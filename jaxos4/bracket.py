@@ -1,0 +1,48 @@
+"""Where the parameters are looked for: an interval for each."""
+
+import equinox as eqx
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ._custom_types import Parameters, Scalar, as_float
+from .dynamics import AbstractModel
+
+
+class Bracket(eqx.Module):
+    """An interval for each parameter, in the parameter's unit."""
+
+    lower: Parameters = eqx.field(converter=as_float)
+    upper: Parameters = eqx.field(converter=as_float)
+
+    def __check_init__(self):
+        if self.lower.shape != self.upper.shape or self.lower.ndim != 1:
+            raise ValueError(
+                "`lower` and `upper` must be one-dimensional and of one shape, "
+                f"got {self.lower.shape} and {self.upper.shape}."
+            )
+
+    @classmethod
+    def around(cls, center: Float[ArrayLike, " parameters"], half_width: Float[ArrayLike, " parameters"]) -> "Bracket":
+        """The bracket from `center - half_width` to `center + half_width`."""
+        center, half_width = as_float(center), as_float(half_width)
+        return cls(center - half_width, center + half_width)
+
+    @classmethod
+    def default(cls, model: AbstractModel) -> "Bracket":
+        """The model's own half-widths around the parameters that its airframe implies."""
+        return cls.around(model.alpha, model.half_width)
+
+    @property
+    def center(self) -> Parameters:
+        """The middle of each interval."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def half_width(self) -> Parameters:
+        """Half the length of each interval."""
+        return (self.upper - self.lower) / 2
+
+    @property
+    def valid(self) -> Bool[Array, ""]:
+        """Whether every interval is finite and has its lower end below its upper one."""
+        width: Scalar = (self.upper - self.lower).min()
+        return (width > 0) & (width < float("inf"))

@@ -1,0 +1,38 @@
+"""The application: precision, and exit codes."""
+
+import sys
+
+import jax
+import typer
+
+from ..errors import InputError
+from .estimate import estimate
+from .simulate import simulate
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Identify the parameters of a quadrotor from its flights.",
+)
+app.command()(simulate)
+app.command()(estimate)
+
+
+def main() -> None:
+    """Runs the command line. Exit code 0: done, 1: the computation failed, 2: unusable arguments or input."""
+    jax.config.update("jax_enable_x64", True)
+    try:
+        app()
+    except (InputError, OSError) as error:
+        if isinstance(error, BrokenPipeError):  # whoever read our output has gone: not worth a word
+            sys.stderr.close()
+            raise SystemExit(1) from None
+        typer.echo(f"jaxos4: {_one_line(error)}", err=True)
+        raise SystemExit(2) from None
+
+
+def _one_line(error: InputError | OSError) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}; give a path that can be used."
+    return " ".join(str(error).split())

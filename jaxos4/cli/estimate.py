@@ -1,0 +1,244 @@
+"""`jaxos4 estimate`: the parameters that a flight tells, with their intervals."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import rich.box
+import typer
+from jaxtyping import Array, Float
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from .._files import check_writable, write_atomically
+from ..airframe import load_airframe
+from ..bracket import Bracket
+from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
+from ..errors import InputError
+from ..estimators import IBSS, AbstractEstimator, Estimate
+from ..flight import STATE_NAMES, STATE_UNITS, Flight
+from ..information import cramer_rao_bound
+from ..logs import read_flight_and_notes
+from ..noise import SENSOR_SIGMA
+from ..results import RESULTS, result_names
+from ..shooting import ShootingProblem
+from ._bracket_file import load_bracket
+from ._choices import Channels, Estimator, InitialState, Model
+
+ESTIMATORS: dict[str, AbstractEstimator] = {"ibss": IBSS()}
+# The noise levels are not known: they are estimated from the residuals, and where one turns out to be off by more than
+# this share, the fit is repeated with them. Weights within it cost less than one percent of the efficiency.
+OFF = 0.2
+PASSES = 4
+# Residuals whose neighbours correlate by more than this are not noise.
+COLOURED = 0.3
+# Residuals below this share of a channel's largest value are rounding, whatever their correlation.
+ROUNDING = 1e-9
+NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid")
+
+
+def estimate(
+    flight: Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")],
+    estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
+    model: Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")] = Model["published"],
+    airframe: Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")] = "os4",
+    bracket: Annotated[Path | None, typer.Option(help="TOML file: alpha1 = [lower, upper], ...")] = None,
+    channels: Annotated[
+        Channels | None, typer.Option(help="What to compare; all that was measured by default.")
+    ] = None,
+    initial_state: Annotated[
+        InitialState, typer.Option(help="free: estimated too; known: the first sample is exact.")
+    ] = InitialState["free"],
+    out: Annotated[Path | None, typer.Option(help="A JSON file to write.")] = None,
+) -> None:
+    """Estimate alpha_1..8 of a flight, with 95 % intervals."""
+    console = Console()
+    vehicle = MODELS[model](load_airframe(airframe))
+    where = Bracket.default(vehicle) if bracket is None else load_bracket(bracket, vehicle)
+    if out is not None:
+        check_writable(out)
+    recorded, notes = read_flight_and_notes(flight, vehicle.airframe)
+    for note in notes:
+        console.print(f"note: {note}", markup=False, highlight=False)
+    problem = _problem(flight, vehicle, recorded, channels, known=initial_state == "known")
+
+    begin = time.perf_counter()
+    problem, found, rollouts = _fit(ESTIMATORS[estimator], problem, where)
+    seconds = time.perf_counter() - begin
+
+    name = str(result_names(found.result))
+    report = {
+        "estimator": estimator.value,
+        "model": model.value,
+        "result": name,
+        "rollouts": rollouts,
+        "cost": _number(found.cost),
+        "seconds": seconds,
+        "parameters": _parameters(vehicle, where, found),
+        "fit": {} if name in NO_ANSWER else _fit_quality(problem, found),
+        "provenance": {
+            "flight": str(flight),
+            "airframe": airframe,
+            "channels": problem.channels,
+            "initial_state": initial_state.value,
+            "samples": int(recorded.time.shape[0]),
+            "sample_time": float(recorded.dt),
+            "notes": list(notes),
+            **_provenance(),
+        },
+    }
+    if out is not None:
+        with write_atomically(out) as beside:
+            beside.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    if name in NO_ANSWER:
+        console.print(
+            "No estimate: wherever the search went, the model's trajectory left this flight before its end. The "
+            "vehicle may do what the model lacks, or the airframe's constants or the units are far off.",
+            highlight=False,
+        )
+    else:
+        _print(console, report)
+    if name != "successful":
+        typer.echo(f"jaxos4: {name}: {RESULTS[found.result]}", err=True)
+        raise typer.Exit(1)
+
+
+def _problem(
+    path: Path, model: AbstractModel, flight: Flight, channels: Channels | None, *, known: bool
+) -> ShootingProblem:
+    measured = ~np.isnan(np.asarray(flight.states))
+    beyond = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
+    present = {name: measured[:, CASCADE_ORDER[part]].any() for name, part in beyond.items()}
+    chosen = channels.value if channels else [name for name, there in present.items() if there][-1]
+    if not present[chosen]:
+        missing = ", ".join(STATE_NAMES[i] for i in CASCADE_ORDER[beyond[chosen]])
+        raise InputError(f"{path}: --channels {chosen}: none of {missing} was measured; leave --channels out.")
+    start = None
+    if known:
+        needed = CASCADE_ORDER[: CHANNELS[chosen]]
+        missing = [STATE_NAMES[i] for i in needed if not measured[0, i]]
+        if missing:
+            raise InputError(
+                f"{path}: row 2: --initial-state known needs {', '.join(missing)} there; use --initial-state free."
+            )
+        start = jnp.nan_to_num(flight.states[0])
+    return ShootingProblem(model, flight, sigma=SENSOR_SIGMA, initial_state=start, channels=chosen)
+
+
+def _fit(
+    estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket
+) -> tuple[ShootingProblem, Estimate, int]:
+    """The estimate, and the problem with the noise levels that it found."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("compiling and fitting", total=PASSES)
+        found = jax.block_until_ready(estimator(problem, bracket))
+        rollouts = int(found.rollouts)
+        for number in range(1, PASSES + 1):
+            if str(result_names(found.result)) in NO_ANSWER:
+                return problem, found, rollouts
+            used, problem = problem, problem.reweighted(problem.residuals(found.parameters, found.initial_state))
+            if number == PASSES or bool(jnp.all(jnp.abs(problem.sigma / used.sigma - 1) < OFF)):
+                break
+            progress.update(task, completed=number, description=f"fitting with the noise found in pass {number}")
+            found = jax.block_until_ready(estimator(problem, bracket))
+            rollouts += int(found.rollouts)
+        bound = cramer_rao_bound(problem, found.parameters, found.initial_state)
+    return problem, eqx.tree_at(lambda e: e.covariance, found, bound), rollouts
+
+
+def _parameters(model: AbstractModel, bracket: Bracket, found: Estimate) -> dict[str, dict[str, Any]]:
+    table = {}
+    for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True)):
+        value, std = float(found.parameters[i]), float(found.std[i])
+        lower, upper = float(bracket.lower[i]), float(bracket.upper[i])
+        known = np.isfinite(std)
+        table[name] = {
+            "estimate": value if known else None,
+            "std": _number(std),
+            "ci95": [value - 1.96 * std, value + 1.96 * std] if known else None,
+            "unit": unit,
+            "note": _note(value, std, lower, upper) if known else "no estimate",
+        }
+    return table
+
+
+def _note(value: float, std: float, lower: float, upper: float) -> str:
+    if std > (upper - lower) / 2:
+        return "not told by this flight"
+    notes = []
+    if abs(value) < 1.96 * std:
+        notes.append("below noise floor")
+    if not lower <= value <= upper:
+        notes.append("outside its bracket")
+    return "; ".join(notes)
+
+
+def _fit_quality(problem: ShootingProblem, found: Estimate) -> dict[str, dict[str, Any]]:
+    """For each channel: noise level [unit], share of the motion explained, correlation of neighbouring residuals."""
+    columns = CASCADE_ORDER[: problem.size]
+    measured = np.asarray(problem.flight.states)[:, columns]
+    error = measured - np.asarray(problem.predict(found.parameters, found.initial_state))
+    quality = {}
+    for i, column in enumerate(columns):
+        there = ~np.isnan(measured[:, i])
+        e, y = error[there, i], measured[there, i]
+        if len(e) < 3:
+            continue
+        quality[STATE_NAMES[column]] = {
+            "rms": _number(np.sqrt(np.mean(e**2))),
+            "unit": STATE_UNITS[column],
+            "percent": _number(100 * (1 - np.linalg.norm(e) / max(np.linalg.norm(y - y.mean()), 1e-300))),
+            "correlation": _number((e[1:] @ e[:-1]) / (e @ e)) if np.abs(e).max() > ROUNDING * np.abs(y).max() else 0.0,
+        }
+    return quality
+
+
+def _print(console: Console, report: dict[str, Any]) -> None:
+    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in ("parameter", "unit", "estimate", "95 % interval", "bound", "note"):
+        right = heading in ("estimate", "bound")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "note")
+    for name, row in report["parameters"].items():
+        low, high = row["ci95"]
+        interval = f"[{low:.5g}, {high:.5g}]"
+        table.add_row(name, row["unit"], f"{row['estimate']:.5g}", interval, f"{row['std']:.2g}", row["note"])
+    console.print(table, markup=False)
+    fit = report["fit"]
+    shares = ", ".join(f"{name} {row['percent']:.1f}" for name, row in fit.items() if row["percent"] is not None)
+    console.print("bound: Cramer-Rao, the least standard deviation that the noise found allows.", highlight=False)
+    console.print(f"fit [%], 100 is a perfect prediction: {shares}.", highlight=False, markup=False)
+    coloured = [name for name, row in fit.items() if (row["correlation"] or 0) > COLOURED]
+    if coloured:
+        console.print(
+            f"The residuals of {', '.join(coloured)} are not noise: the model does not explain this flight fully, and "
+            "the intervals are too narrow.",
+            highlight=False,
+        )
+    console.print(
+        f"{report['estimator']}, {report['model']} model, {report['provenance']['channels']} channels: "
+        f"{report['result']}, {report['rollouts']} rollouts, {report['seconds']:.1f} s",
+        highlight=False,
+    )
+
+
+def _provenance() -> dict[str, str]:
+    from .. import __version__
+
+    return {
+        "version": __version__,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "precision": "float64",
+    }
+
+
+def _number(x: Float[Array | np.ndarray, ""] | float | np.floating) -> float | None:
+    return float(x) if np.isfinite(x) else None

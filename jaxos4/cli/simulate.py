@@ -1,0 +1,52 @@
+"""`jaxos4 simulate`: a flight to try things on."""
+
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import typer
+
+from ..airframe import load_airframe
+from ..dynamics import MODELS
+from ..errors import InputError
+from ..excitation import EXCITATIONS
+from ..logs import write_flight
+from ..noise import SENSOR_SIGMA, WhiteNoise
+from ..results import RESULTS, result_names
+from ..simulate import simulate as fly
+from ._choices import Excitation, Method, Model
+
+MOST_SAMPLES = 5_000_000  # more no longer fit an ordinary machine's memory
+
+
+def simulate(
+    out: Annotated[Path, typer.Option(help="The flight file to write (CSV).")],
+    model: Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")] = Model["published"],
+    airframe: Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")] = "os4",
+    excitation: Annotated[Excitation, typer.Option(help="The shape of the inputs.")] = Excitation["multisine"],
+    duration: Annotated[float, typer.Option(help="Length [s].")] = 5.0,
+    dt: Annotated[float, typer.Option(help="Sample time [s].")] = 0.01,
+    method: Annotated[Method, typer.Option(help="The integrator.")] = Method["euler"],
+    noise: Annotated[float, typer.Option(help="White sensor noise, as a multiple of the standard one.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+) -> None:
+    """Simulate a flight and write it as CSV."""
+    vehicle = MODELS[model](load_airframe(airframe))
+    if not (np.isfinite(noise) and noise >= 0):
+        raise InputError(f"--noise: must be 0 or more, got {noise}.")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
+    if dt > 0 and duration / dt > MOST_SAMPLES:
+        raise InputError(f"--duration {duration:g}: more than {MOST_SAMPLES} samples of {dt:g} s; ask for fewer.")
+    try:
+        omega = EXCITATIONS[excitation](vehicle.airframe, duration=duration, dt=dt)
+    except ValueError as error:
+        raise InputError(f"--excitation {excitation.value}: {error}") from None
+    flight = fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)
+    if flight.result != RESULTS.successful:
+        typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
+        raise typer.Exit(1)
+    flight = WhiteNoise(noise * SENSOR_SIGMA)(flight, key=jax.random.key(seed))
+    write_flight(flight, out)
+    typer.echo(f"{out}: {omega.shape[0]} samples of {dt:g} s, {model.value} model, {method.value}, noise {noise:g}")

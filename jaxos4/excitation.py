@@ -1,0 +1,271 @@
+"""Predefined inputs: rotor speeds that turn a hovering quadrotor about its axes, sized so that it can fly them.
+
+Each function designs angular accelerations about roll, pitch and yaw, asks for torque = inertia x acceleration and
+thrust = weight, and solves Eqs. (10)-(13) for the rotor speeds. They set a flight up and are not for tracing: they
+compute in NumPy's double precision and refuse what the airframe cannot fly. They are open loop: the rates follow the
+design up to the gyroscopic coupling. The paper does not state its inputs; these are ours.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from ._custom_types import Numeric, RotorSpeeds, as_float
+from .airframe import Airframe
+
+AXES = ("roll", "pitch", "yaw")
+STANDARD_TONES = ((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), (0.5, 0.9, 1.7))
+DOUBLET = (1.0, -1.0)
+STEP_3211 = (0.8, 0.8, 0.8, -1.2, -1.2, 1.1, -1.1)
+TAPER = 0.2
+
+Amplitude = float | Sequence[float] | Float[Numeric, "3"]
+
+
+def multisine(
+    airframe: Airframe,
+    *,
+    duration: float = 5.0,
+    dt: float = 0.01,
+    amplitude: Amplitude = 1.0,
+    tones: Sequence[Sequence[float]] = STANDARD_TONES,
+) -> RotorSpeeds:
+    """All axes at once, each with its own tones: the input that shows every parameter, and the default.
+
+    The rate of an axis with n tones is amplitude/n sum sin(2 pi f t), which starts at rest. Distinct tones make the
+    axes uncorrelated over a common period (10 s for the default tones).
+
+    **Arguments:**
+
+    - `airframe`: what flies.
+    - `duration`, `dt`: length and sample time [s]; there are round(duration / dt) + 1 rows.
+    - `amplitude`: the designed rates stay within it [rad/s]; one number, or one for roll, pitch and yaw each. 0: still.
+    - `tones`: frequencies [Hz] of roll, pitch and yaw, below half the sample rate; an empty list keeps an axis still.
+
+    **Returns:** rotor speeds [rad/s].
+
+    **Raises:** `ValueError` for arguments out of range, or for what the airframe cannot fly.
+    """
+    intervals, peak = _intervals(duration, dt), _peak_rates(amplitude)
+    if len(tones) != 3:
+        raise ValueError(f"`tones` must hold three lists (roll, pitch, yaw), got {len(tones)}.")
+    time = dt * np.arange(intervals + 1)
+    acceleration = np.zeros((intervals + 1, 3))
+    for axis, axis_tones in enumerate(tones):
+        for tone in axis_tones:
+            _check_frequency("tones", tone, dt)
+            angular = 2 * math.pi * tone
+            acceleration[:, axis] += peak[axis] * angular * np.cos(angular * time) / len(axis_tones)
+    return _rotor_speeds(airframe, acceleration, dt)
+
+
+def doublet(
+    airframe: Airframe,
+    *,
+    duration: float = 5.0,
+    dt: float = 0.01,
+    amplitude: Amplitude = 1.0,
+    width: float = 0.3,
+    axes: Sequence[str] = AXES,
+) -> RotorSpeeds:
+    """A doublet of torque about one axis after the other.
+
+    Torque turns a quadrotor as a double integrator: the pulses + - stop the rate but leave an angle of amplitude x
+    width. So the mirror image - + follows, which brings the angle back, and a rest of one width. An axis takes five
+    widths; the sequence repeats as often as it fits, then the quadrotor hovers. With one axis at a time the products
+    of rates in Eqs. (1)-(3) are zero: such a flight does not show alpha1, alpha4 and alpha7.
+
+    **Arguments:**
+
+    - `airframe`, `duration`, `dt`: as in `multisine`.
+    - `amplitude`: the largest rate [rad/s]; one number, or one for roll, pitch and yaw each.
+    - `width`: of one pulse [s], rounded to samples.
+    - `axes`: which of `"roll"`, `"pitch"`, `"yaw"`, in this order.
+
+    **Returns:** rotor speeds [rad/s].
+
+    **Raises:** `ValueError` for arguments out of range, a duration too short, or for what the airframe cannot fly.
+    """
+    return _pulses(airframe, DOUBLET, duration, dt, amplitude, width, axes)
+
+
+def step3211(
+    airframe: Airframe,
+    *,
+    duration: float = 5.0,
+    dt: float = 0.01,
+    amplitude: Amplitude = 1.0,
+    width: float = 0.1,
+    axes: Sequence[str] = AXES,
+) -> RotorSpeeds:
+    """Pulses of 3, 2, 1 and 1 widths and alternating sign about one axis after the other.
+
+    Equal heights would leave a rate; 0.8, 1.2, 1.1 and 1.1 stop it (3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 = 0). They leave an
+    angle of 2.96 amplitude x width, which the mirror image that follows brings back. With its rest of one width an
+    axis takes fifteen. Arguments, repetition, what the flight does not show, and errors are those of `doublet`.
+    """
+    return _pulses(airframe, STEP_3211, duration, dt, amplitude, width, axes)
+
+
+def chirp(
+    airframe: Airframe,
+    *,
+    duration: float = 5.0,
+    dt: float = 0.01,
+    amplitude: Amplitude = (1.0, 1.0, 0.5),
+    frequencies: tuple[float, float] = (0.6, 3.0),
+    axes: Sequence[str] = AXES,
+) -> RotorSpeeds:
+    """A linear frequency sweep about one axis after the other, which share the duration equally.
+
+    The angle swept is sin(phase) / (2 pi f), faded in and out over a fifth of the sweep each, so rate and angle return
+    to zero. The angle stays within about amplitude / (2 pi x the lowest frequency). As in `doublet`, alpha1, alpha4
+    and alpha7 are not shown.
+
+    **Arguments:**
+
+    - `airframe`, `duration`, `dt`: as in `multisine`.
+    - `amplitude`: the largest rate [rad/s]; one number, or one for roll, pitch and yaw each. The yaw torque of rotors
+      is weak: the default asks for half the rate there.
+    - `frequencies`: first and last [Hz], below half the sample rate.
+    - `axes`: which of `"roll"`, `"pitch"`, `"yaw"`, in this order.
+
+    **Returns:** rotor speeds [rad/s].
+
+    **Raises:** `ValueError` for arguments out of range, a duration that leaves an axis less than one cycle, or for
+    what the airframe cannot fly.
+    """
+    intervals, order = _intervals(duration, dt), _axis_indices(axes)
+    for frequency in frequencies:
+        _check_frequency("frequencies", frequency, dt)
+    first, last = frequencies
+    samples = intervals // len(order)
+    span = (samples - 1) * dt
+    if span * (first + last) / 2 < 1:
+        shortest = len(order) * (2 / (first + last) + 2 * dt)
+        raise ValueError(
+            f"`duration` must be at least {shortest:.3g} s for one cycle on each axis, got {duration:g} s."
+        )
+    share = np.linspace(0, 1, samples)
+    phase = 2 * math.pi * span * (first * share + (last - first) * share**2 / 2)
+    fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / TAPER, 0, 1)) ** 2
+    angle = np.pad(fade * np.sin(phase) / (2 * math.pi * (first + (last - first) * share)), 1)
+    rate = np.diff(angle) / dt
+    shape = np.diff(rate) / dt / np.abs(rate).max()
+    return _rotor_speeds(airframe, _in_turn(shape, intervals, order, _peak_rates(amplitude)), dt)
+
+
+EXCITATIONS: dict[str, Callable[..., RotorSpeeds]] = {
+    "multisine": multisine,
+    "doublet": doublet,
+    "3211": step3211,
+    "chirp": chirp,
+}
+
+
+def _pulses(
+    airframe: Airframe,
+    heights: Sequence[float],
+    duration: float,
+    dt: float,
+    amplitude: Amplitude,
+    width: float,
+    axes: Sequence[str],
+) -> RotorSpeeds:
+    intervals, order = _intervals(duration, dt), _axis_indices(axes)
+    if not math.isfinite(width) or round(width / dt) < 1:
+        raise ValueError(f"`width` must be at least one sample of {dt:g} s, got {width}.")
+    samples = round(width / dt)
+    once = np.repeat(heights, samples)
+    shape = np.concatenate([once, -once, np.zeros(samples)])
+    shape = shape / (np.abs(np.cumsum(shape)).max() * dt)
+    if len(order) * len(shape) > intervals:
+        raise ValueError(
+            f"`duration` must be at least {len(order) * len(shape) * dt:.6g} s for pulses of `width` {width:g} s on "
+            f"{len(order)} axes, got {duration:g} s."
+        )
+    return _rotor_speeds(airframe, _in_turn(shape, intervals, order, _peak_rates(amplitude)), dt)
+
+
+def _in_turn(shape: np.ndarray, intervals: int, order: list[int], peak: np.ndarray) -> np.ndarray:
+    """`shape` (unit peak rate) about each axis in turn, again and again as long as a whole sequence fits."""
+    acceleration = np.zeros((intervals + 1, 3))
+    slots = intervals // (len(order) * len(shape)) * order
+    for slot, axis in enumerate(slots):
+        acceleration[slot * len(shape) : (slot + 1) * len(shape), axis] = peak[axis] * shape
+    return acceleration
+
+
+def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> RotorSpeeds:
+    """Rotor speeds [rad/s] for angular accelerations [rad/s^2] at a thrust that equals the weight."""
+    mixer = np.asarray(airframe.mixer, dtype=np.float64)
+    torque = np.asarray(airframe.inertia, dtype=np.float64) * acceleration
+    weight = float(airframe.mass) * float(airframe.gravity)
+    hover = np.linalg.solve(mixer, np.array([0.0, 0.0, 0.0, weight]))
+    change = np.linalg.solve(mixer, np.pad(torque, ((0, 0), (0, 1))).T).T
+    _check_flyable(hover, change, float(airframe.max_rotor_speed), dt)
+    return as_float(np.sqrt(hover + change))
+
+
+def _check_flyable(hover: np.ndarray, change: np.ndarray, fastest: float, dt: float) -> None:
+    """Refuse squared rotor speeds `hover + change` outside 0..fastest^2, and say how much of `change` would do."""
+    if (hover < 0).any() or (hover > fastest**2).any():
+        raise ValueError(
+            f"`airframe` cannot hover: that takes squared rotor speeds of {np.round(hover).tolist()} rad^2/s^2, and "
+            f"its `max_rotor_speed` is {fastest:g} rad/s."
+        )
+    room = np.where(change > 0, fastest**2 - hover, hover)
+    share = np.divide(room, np.abs(change), out=np.full_like(change, np.inf), where=change != 0)
+    row, rotor = np.unravel_index(np.argmin(share), share.shape)
+    largest = share[row, rotor]
+    if largest >= 1:
+        return
+    squared = hover[rotor] + change[row, rotor]
+    if squared < 0:
+        problem = f"the squared speed of rotor {rotor + 1} would be {squared:.4g} rad^2/s^2, below zero,"
+    else:
+        excess = math.sqrt(squared) - fastest
+        problem = f"rotor {rotor + 1} would exceed the `max_rotor_speed` of {fastest:g} rad/s by {excess:.4g} rad/s"
+    raise ValueError(
+        f"`amplitude` is too large to fly: {problem} at t = {row * dt:.4g} s; "
+        f"multiply it by {_floor(largest):.3g} or less."
+    )
+
+
+def _floor(x: float) -> float:
+    """`x` rounded down to three significant digits."""
+    if x <= 0:
+        return 0.0
+    unit = 10.0 ** (math.floor(math.log10(x)) - 2)
+    return math.floor(x / unit) * unit
+
+
+def _intervals(duration: float, dt: float) -> int:
+    for name, value in (("duration", duration), ("dt", dt)):
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"`{name}` must be positive and finite [s], got {value}.")
+    if round(duration / dt) < 1:
+        raise ValueError(f"`duration` must be at least one `dt` of {dt:g} s, got {duration:g} s.")
+    return round(duration / dt)
+
+
+def _peak_rates(amplitude: Amplitude) -> np.ndarray:
+    peak = np.asarray(amplitude, dtype=np.float64)
+    if peak.shape not in ((), (3,)) or not np.isfinite(peak).all():
+        raise ValueError(f"`amplitude` must be one finite rate or three (roll, pitch, yaw) [rad/s], got {amplitude}.")
+    return np.broadcast_to(peak, (3,))
+
+
+def _axis_indices(axes: Sequence[str]) -> list[int]:
+    if isinstance(axes, str) or not axes or any(axis not in AXES for axis in axes):
+        raise ValueError(f"`axes` must be a list of some of {', '.join(AXES)}, got {axes!r}.")
+    return [AXES.index(axis) for axis in axes]
+
+
+def _check_frequency(name: str, frequency: float, dt: float) -> None:
+    if not 0 < frequency < 0.5 / dt:
+        raise ValueError(
+            f"`{name}` must lie between 0 and half the sample rate, {0.5 / dt:g} Hz, got {frequency:g} Hz."
+        )

@@ -1,0 +1,197 @@
+"""Whether numbers can be in the units that the format asks for.
+
+A limit is no model of a quadrotor: it lies where no quadrotor flies and a wrong unit does. What it lets through may
+still be wrong, so that where an angle and its rate were both measured, the one is compared with the other's integral.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ._table import Table
+
+DEGREES = 180 / math.pi
+
+
+class Limit(NamedTuple):
+    """The largest magnitude that is taken for what it says, its unit, and what a larger one probably is."""
+
+    largest: float
+    unit: str
+    advice: str
+
+
+_TIME = Limit(1e11, "s", "t is in seconds: if these are milli-, micro- or nanoseconds, divide")
+_SPEED = Limit(1e5, "rad/s", "rotor speeds are in rad/s: if these are rpm, divide by 9.549")
+_POSITION = Limit(1e6, "m", "positions are in metres from a place near the flight")
+_VELOCITY = Limit(1e3, "m/s", "velocities are in m/s: if these are mm/s, divide by 1000")
+_RATE = Limit(60.0, "rad/s", "it looks like deg/s: divide by 57.3")
+_ROLL = Limit(2 * math.pi, "rad", "it looks like degrees: divide by 57.3")
+_PITCH = Limit(math.nextafter(math.pi / 2, 0), "rad", "pitch lies within +-pi/2: if this is in degrees, divide by 57.3")
+_YAW = Limit(1e4, "rad", "it looks like degrees: divide by 57.3")
+_FORCE = Limit(1e3, "m/s^2", "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665")
+
+LIMITS = {
+    "t": _TIME,
+    **dict.fromkeys(("omega1", "omega2", "omega3", "omega4"), _SPEED),
+    **dict.fromkeys(("x", "y", "z"), _POSITION),
+    **dict.fromkeys(("vx", "vy", "vz"), _VELOCITY),
+    **dict.fromkeys(("p", "q", "r"), _RATE),
+    "phi": _ROLL,
+    "theta": _PITCH,
+    "psi": _YAW,
+    **dict.fromkeys(("ax", "ay", "az"), _FORCE),
+}
+SHORTEST_STEP, LONGEST_STEP = 1e-6, 2.0  # [s] of the median time between rows
+_ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
+_WINDOW = 0.2  # [s] over which an angle's increment is compared with its rate's integral
+_FEWEST = 8  # windows, fewer of which tell nothing
+_SIMILARITY = 0.7  # cosine between the two, below which they tell nothing
+_SPREAD = 1.6  # a ratio within this factor of 57.3 is taken for it
+
+
+def check_units(table: Table) -> None:
+    """Refuse magnitudes beyond `LIMITS`, rotor speeds and commands out of range, and angles at odds with rates.
+
+    Roll may pass 2 pi where the roll rate says that it did: a flip is no degree.
+
+    **Raises:** `InputError`.
+    """
+    columns = table.columns
+    ratios = {
+        name: scale_ratio(*(columns[c] for c in ("t", name, rate)))
+        for name, rate in _ANGLES
+        if rate in columns and name in columns
+    }
+    for name, rate in _ANGLES:
+        ratio = ratios.get(name)
+        if ratio is not None and 1 / _SPREAD < ratio / DEGREES < _SPREAD:
+            table.refuse(
+                f"changes {ratio:.3g} times as fast as {rate} says: it looks like degrees, divide by 57.3", column=name
+            )
+        if ratio is not None and 1 / _SPREAD < ratio * DEGREES < _SPREAD:
+            table.refuse(f"is {1 / ratio:.3g} times what {name} does: it looks like deg/s, divide by 57.3", column=rate)
+    flips = ratios.get("phi") is not None and 1 / 3 < (ratios["phi"] or 0) < 3
+    for name, values in columns.items():
+        limit = LIMITS.get(name)
+        if limit is None:
+            _check_command(table, name)
+            continue
+        largest = _YAW.largest if name == "phi" and flips else limit.largest
+        index = _first(np.abs(values) > largest)
+        if index is not None:
+            what = f"is {values[index]:g} {limit.unit}, beyond {largest:.4g} {limit.unit}; {limit.advice}"
+            table.refuse(what, index=index, column=name)
+        if limit is _SPEED and (index := _first(values < 0)) is not None:
+            what = f"is {values[index]:g} rad/s; rotor speeds are magnitudes: drop the sign, rotor_spins hold the sense"
+            table.refuse(what, index=index, column=name)
+    if "psi" in columns:
+        _check_yaw_steps(table)
+
+
+def check_time(table: Table) -> float:
+    """The median time between rows [s], of time that is there, increases, and can be seconds.
+
+    **Raises:** `InputError`.
+    """
+    t = table.columns["t"]
+    index = _first(np.isnan(t))
+    if index is not None:
+        table.refuse("is empty; each row needs its time", index=index, column="t")
+    index = _first(np.abs(t) > _TIME.largest)
+    if index is not None:
+        table.refuse(f"is {t[index]:g} s; {_TIME.advice}", index=index, column="t")
+    step = np.diff(t)
+    index = _first(step <= 0)
+    if index is not None:
+        if step[index] == 0:
+            what = f"repeats {t[index]:.9g} s of row {index + 2}; time must increase: delete one of the two rows"
+        else:
+            what = f"runs backward, from {t[index]:.9g} s to {t[index + 1]:.9g} s; sort or cut the rows"
+        table.refuse(what, index=index + 1, column="t")
+    dt = float(np.median(step))
+    if dt < SHORTEST_STEP:
+        table.refuse(f"has rows {dt:.3g} s apart; t is in seconds, and no closer than a microsecond", column="t")
+    if dt > LONGEST_STEP:
+        table.refuse(
+            f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide",
+            column="t",
+        )
+    return dt
+
+
+def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | None:
+    """How much faster an angle changes than its rate says, or None where the flight does not tell.
+
+    Increments over 0.2 s against the rate's integral, so that the noise of differences does not matter. Euler-angle
+    kinematics couple the axes in a steep attitude: there the two grow unlike, and the answer is None rather than wrong.
+
+    **Arguments:**
+
+    - `t`: [s], increasing.
+    - `angle`, `rate`: in units that are in question; NaN where not measured.
+    """
+    with_angle, with_rate = np.isfinite(angle), np.isfinite(rate)
+    if np.count_nonzero(with_rate) < 2:
+        return None
+    times, rates = t[with_rate], rate[with_rate]
+    integral = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
+    with_angle &= (t >= times[0]) & (t <= times[-1])
+    instants = t[with_angle]
+    if instants.size <= _FEWEST:
+        return None
+    windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
+    knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
+    knots = knots[knots < instants.size]
+    if knots.size <= _FEWEST:
+        return None
+    steps = np.diff(angle[with_angle])
+    turn = 360.0 if np.abs(steps).max() > 3 * math.pi else 2 * math.pi
+    unwrapped = np.concatenate([[0.0], np.cumsum(steps - turn * np.rint(steps / turn))])
+    turned = np.diff(unwrapped[knots])
+    told = np.diff(np.interp(instants[knots], times, integral))
+    sizes = float(np.linalg.norm(turned)), float(np.linalg.norm(told))
+    if min(sizes) == 0 or turned @ told < _SIMILARITY * sizes[0] * sizes[1]:
+        return None
+    return sizes[0] / sizes[1]
+
+
+def force_note(force: np.ndarray) -> str | None:
+    """A note where specific force [m/s^2], shape (samples, 3), looks like multiples of g."""
+    size = np.sqrt((force**2).sum(axis=1))
+    size = size[np.isfinite(size)]
+    if size.size == 0 or not 0.5 < np.median(size) < 2:
+        return None
+    return f"ax, ay, az have a median magnitude of {np.median(size):.2g} m/s^2: if they are in g, multiply by 9.80665"
+
+
+def thrust_note(ratio: float) -> str | None:
+    """A note where the rotors carry `ratio` times the weight, and rpm or rev/s would explain it."""
+    if 1 / 25 < ratio < 25 or ratio == 0:
+        return None
+    unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
+    return (
+        f"the rotor speeds carry {ratio:.2g} times the airframe's weight (median): check the airframe, "
+        f"and if they are in {unit}"
+    )
+
+
+def _check_command(table: Table, name: str) -> None:
+    values = table.columns[name]
+    index = _first((values < 0) | (values > 1))
+    if index is not None:
+        what = f"is {values[index]:g}; commands are 0..1 of full-scale rotor speed: divide by full scale (100, 65535)"
+        table.refuse(what, index=index, column=name)
+
+
+def _check_yaw_steps(table: Table) -> None:
+    measured = np.flatnonzero(np.isfinite(table.columns["psi"]))
+    index = _first(np.abs(np.abs(np.diff(table.columns["psi"][measured])) - 360) < 20)
+    if index is not None:
+        what = "jumps by about 360: it looks like degrees, divide by 57.3"
+        table.refuse(what, index=int(measured[index + 1]), column="psi")
+
+
+def _first(condition: np.ndarray) -> int | None:
+    return int(np.argmax(condition)) if condition.any() else None

@@ -1,0 +1,176 @@
+"""Sensor noise: what turns a simulated flight into a measured one.
+
+Every noise changes `Flight.states` and nothing else: time, rotor speeds and specific force are kept. States that were
+not measured (NaN) stay so. A noise is unbatched and `vmap`s over keys, over flights and over its own numbers.
+"""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from ._custom_types import Key, States, as_float
+from .flight import STATE_NAMES, STATE_UNITS, Flight
+
+PerChannel = Float[Array, "12"]
+
+_SIGMA_OF_UNIT = {"m": 0.005, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01}
+SENSOR_SIGMA = np.array([_SIGMA_OF_UNIT[unit] for unit in STATE_UNITS])
+"""Standard deviations of the standard flight's sensors in the order and units of `STATE_NAMES`, `STATE_UNITS`."""
+SENSOR_SIGMA.flags.writeable = False
+
+
+def _per_channel(
+    name: str, low: float, high: float = np.inf, *, open_below: bool = False
+) -> Callable[[ArrayLike], Array]:
+    """A field's converter: one number or one for each of the 12 states, in range as far as its values are known."""
+
+    def convert(value: ArrayLike) -> Array:
+        array = as_float(value)
+        if array.shape not in ((), (12,)):
+            raise ValueError(f"`{name}` must be one number or 12, one for each state, got shape {array.shape}.")
+        if not isinstance(array, Tracer):
+            numbers = np.asarray(array)
+            if not np.all((numbers > low if open_below else numbers >= low) & (numbers <= high)):
+                ends = f"{'(' if open_below else '['}{low:g}, {high:g}]"
+                raise ValueError(f"`{name}` must lie in {ends}, got {numbers.tolist()}.")
+        return jnp.broadcast_to(array, (len(STATE_NAMES),))
+
+    return convert
+
+
+def _with_states(flight: Flight, states: States) -> Flight:
+    return eqx.tree_at(lambda f: f.states, flight, states)
+
+
+class AbstractNoise(eqx.Module):
+    """How measured states differ from true ones."""
+
+    @abc.abstractmethod
+    def __call__(self, flight: Flight, *, key: Key) -> Flight:
+        """The flight as measured.
+
+        **Arguments:**
+
+        - `flight`: the true states, or what an earlier noise made of them.
+        - `key`: of the random numbers; the same key gives the same flight.
+        """
+
+
+class WhiteNoise(AbstractNoise):
+    """Independent Gaussian errors of every sample.
+
+    **Arguments:**
+
+    - `sigma`: standard deviation of each state, in the units of `STATE_UNITS`; one number or 12. 0: exact.
+    """
+
+    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0))
+
+    def __call__(self, flight: Flight, *, key: Key) -> Flight:
+        """See `AbstractNoise`."""
+        return _with_states(flight, flight.states + self.sigma * _normal(key, flight.states))
+
+
+class ConstantBias(AbstractNoise):
+    """An offset of each state that lasts the whole flight, drawn anew for every key.
+
+    **Arguments:**
+
+    - `sigma`: standard deviation of the offset from flight to flight, in the units of `STATE_UNITS`; one number or 12.
+    - `mean`: its mean. `ConstantBias(0, mean=offset)` is a known offset.
+    """
+
+    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0))
+    mean: PerChannel = eqx.field(converter=_per_channel("mean", -np.inf), default=0.0)
+
+    def __call__(self, flight: Flight, *, key: Key) -> Flight:
+        """See `AbstractNoise`."""
+        return _with_states(flight, flight.states + self.mean + self.sigma * _normal(key, flight.states[0]))
+
+
+class GaussMarkov(AbstractNoise):
+    """Coloured errors: a stationary first-order process with autocorrelation sigma^2 exp(-|tau| / T).
+
+    Sampled exactly: e_{k+1} = a e_k + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T), w_k standard normal and e_0 drawn
+    with variance sigma^2.
+
+    **Arguments:**
+
+    - `sigma`: standard deviation of each state, in the units of `STATE_UNITS`; one number or 12.
+    - `correlation_time`: T [s], positive; one number or 12. Infinite: a constant bias.
+    """
+
+    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0))
+    correlation_time: PerChannel = eqx.field(converter=_per_channel("correlation_time", 0, open_below=True))
+
+    def __call__(self, flight: Flight, *, key: Key) -> Flight:
+        """See `AbstractNoise`."""
+        steps = flight.dt / self.correlation_time
+        decay, fresh = jnp.exp(-steps), jnp.sqrt(-jnp.expm1(-2 * steps))
+        normal = _normal(key, flight.states)
+
+        def step(error: PerChannel, draw: PerChannel) -> tuple[PerChannel, PerChannel]:
+            error = decay * error + fresh * draw
+            return error, error
+
+        _, later = jax.lax.scan(step, normal[0], normal[1:])
+        return _with_states(flight, flight.states + self.sigma * jnp.concatenate([normal[:1], later]))
+
+
+class Quantisation(AbstractNoise):
+    """Rounding to the nearest multiple of a step. Nothing in it is random: the key is not used.
+
+    **Arguments:**
+
+    - `step`: of each state, in the units of `STATE_UNITS`; one number or 12. 0: not rounded.
+    """
+
+    step: PerChannel = eqx.field(converter=_per_channel("step", 0))
+
+    def __call__(self, flight: Flight, *, key: Key) -> Flight:
+        """See `AbstractNoise`."""
+        step = jnp.where(self.step > 0, self.step, 1)
+        return _with_states(flight, jnp.where(self.step > 0, step * jnp.round(flight.states / step), flight.states))
+
+
+class Dropouts(AbstractNoise):
+    """Samples that are lost, each state's by itself: they become NaN, not measured.
+
+    **Arguments:**
+
+    - `probability`: that a sample is lost; one number or 12.
+    """
+
+    probability: PerChannel = eqx.field(converter=_per_channel("probability", 0, 1))
+
+    def __call__(self, flight: Flight, *, key: Key) -> Flight:
+        """See `AbstractNoise`."""
+        lost = jax.random.bernoulli(key, self.probability, flight.states.shape)
+        return _with_states(flight, jnp.where(lost, jnp.nan, flight.states))
+
+
+class Chain(AbstractNoise):
+    """Noises one after the other; noise i draws from `fold_in(key, i)`.
+
+    **Arguments:**
+
+    - `noises`: in the order in which they happen: `Chain((WhiteNoise(sigma), Quantisation(step), Dropouts(0.01)))`.
+    """
+
+    noises: tuple[AbstractNoise, ...] = eqx.field(converter=tuple)
+
+    def __call__(self, flight: Flight, *, key: Key) -> Flight:
+        """See `AbstractNoise`."""
+        for i, noise in enumerate(self.noises):
+            flight = noise(flight, key=jax.random.fold_in(key, i))
+        return flight
+
+
+def _normal(key: Key, like: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
+    return jax.random.normal(key, like.shape, like.dtype)

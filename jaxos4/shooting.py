@@ -1,0 +1,255 @@
+"""The mismatch between a flight and what a model makes of its rotor speeds: cost, residuals, slope, curvature.
+
+Every quantity is one scan over the flight that carries the state and a sum, so that memory does not grow with the
+flight; derivatives are forward-mode. Rows are never stacked inside the scan: see `dynamics`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ._custom_types import Parameters, Scalar, StateVector, as_float
+from .dynamics import CASCADE_ORDER, CHANNELS, AbstractModel, Forcing, State, stack, unstack
+from .flight import Flight
+from .simulate import STEPPERS
+
+# A body rate [rad/s] that no quadrotor reaches, and no gyro measures: beyond it a trial trajectory has diverged.
+FASTEST = 1e3
+
+# How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
+_UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
+
+
+class Rows(NamedTuple):
+    """A flight as the scan reads it: one leaf a channel. `measured` is NaN where it says nothing."""
+
+    forcing: Forcing
+    measured: tuple[Float[Array, "*rows"], ...]
+
+
+class Shot(NamedTuple):
+    """One simulated flight: the cost of its sound part, and whether that is all of it.
+
+    A trajectory that passes theta = +-90 degrees or turns faster than anything flies is compared up to there: its
+    slope still says which way to go, while its cost means nothing.
+    """
+
+    cost: Scalar
+    sound: Bool[Array, ""]
+
+
+class Curvature(NamedTuple):
+    """A shot with its first two derivatives in (parameters, initial state), in the Gauss-Newton approximation."""
+
+    shot: Shot
+    gradient: Float[Array, " unknowns"]
+    information: Float[Array, "unknowns unknowns"]
+
+
+class ShootingProblem(eqx.Module):
+    """A model, a flight, and weights: how badly parameters explain the flight.
+
+    **Arguments:**
+
+    - `model`, `flight`: what is fitted to what; NaN in `flight.states` means not measured.
+    - `sigma`: standard deviation of each channel's noise, in the order of `STATE_NAMES`; its reciprocal is the weight.
+    - `initial_state`: X at the first sample. `None`: free, estimated with the parameters.
+    - `channels`: `"rates"`, `"attitude"` (with the rates), or `"all"`: what is compared, and how much is simulated.
+    - `method`: the stepper, `"euler"` or `"rk4"`.
+
+    An *initial state* below is the part of X at the first sample that the channels need, in cascade order: p, q, r,
+    then phi, theta, psi, then x, vx, y, vy, z, vz.
+    """
+
+    model: AbstractModel
+    flight: Flight
+    sigma: StateVector = eqx.field(converter=as_float)
+    initial_state: StateVector | None = None
+    channels: str = eqx.field(static=True, default="all")
+    method: str = eqx.field(static=True, default="euler")
+
+    def __init__(
+        self,
+        model: AbstractModel,
+        flight: Flight,
+        *,
+        sigma: Float[Array | np.ndarray, "12"],
+        initial_state: Float[Array | np.ndarray, "12"] | None = None,
+        channels: str = "all",
+        method: str = "euler",
+    ):
+        if channels not in CHANNELS:
+            raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
+        if method not in STEPPERS:
+            raise ValueError(f"`method` must be one of {', '.join(STEPPERS)}, got {method!r}.")
+        if np.shape(sigma) != (12,):
+            raise ValueError(f"`sigma` must hold one value for each of the 12 states, got shape {np.shape(sigma)}.")
+        if initial_state is not None and np.shape(initial_state) != (12,):
+            raise ValueError(f"`initial_state` must be `None` or of shape (12,), got {np.shape(initial_state)}.")
+        self.model, self.flight, self.sigma = model, flight, as_float(sigma)
+        self.initial_state = None if initial_state is None else as_float(initial_state)
+        self.channels, self.method = channels, method
+
+    @property
+    def size(self) -> int:
+        """How many states the channels need: 3, 6 or 12."""
+        return CHANNELS[self.channels]
+
+    @property
+    def free_size(self) -> int:
+        """How many unknowns the initial state adds to the parameters: `size`, or 0 where it is known."""
+        return 0 if self.initial_state is not None else self.size
+
+    def restrict(self, channels: str) -> "ShootingProblem":
+        """The same problem on fewer channels."""
+        return ShootingProblem(
+            self.model,
+            self.flight,
+            sigma=self.sigma,
+            initial_state=self.initial_state,
+            channels=channels,
+            method=self.method,
+        )
+
+    def rows(self, samples: int | None = None) -> Rows:
+        """The first `samples` of the flight, or all, as the scan reads them.
+
+        Where the initial state is known, the first sample is no data.
+        """
+        measured = self.flight.states[:samples, CASCADE_ORDER[: self.size]]
+        if self.initial_state is not None:
+            measured = measured.at[0].set(jnp.nan)
+        return Rows(self.model.forcing(self.flight.omega[:samples]), tuple(measured.T))
+
+    def first_state(self) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
+        """The initial state where the search starts, and how far off it may be.
+
+        It is the known state, or each channel's first measurement (0 where there is none).
+        """
+        order = CASCADE_ORDER[: self.size]
+        if self.initial_state is not None:
+            return self.initial_state[order], jnp.zeros(self.size, dtype=float)
+        states, sigma = self.flight.states[:, order], self.sigma[order]
+        first = jnp.argmin(jnp.isnan(states), axis=0)
+        value = jnp.take_along_axis(states, first[None], axis=0)[0]
+        off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
+        return jnp.where(jnp.isnan(value), 0.0, value), off
+
+    def cost(self, parameters: Parameters, initial_state: Float[Array, " size"] | None = None) -> Scalar:
+        """1/2 |W (y - x)|^2 over the measured samples, after the first where the initial state is known.
+
+        Infinite where the trajectory diverges or passes theta = +-90 degrees. `initial_state` defaults to
+        `first_state`.
+        """
+        start = self.first_state()[0] if initial_state is None else initial_state
+        cost, sound = self.shot(self.rows(), parameters, start)
+        return jnp.where(sound, cost, jnp.inf)
+
+    def residuals(
+        self, parameters: Parameters, initial_state: Float[Array, " size"] | None = None
+    ) -> Float[Array, " residuals"]:
+        """W (y - x), sample by sample with the channels in cascade order; 0 where nothing was measured."""
+        start = self.first_state()[0] if initial_state is None else initial_state
+        rows = self.rows()
+        predicted = self.predict(parameters, start)
+        measured = jnp.stack(rows.measured, axis=-1)
+        weight = 1 / self.sigma[CASCADE_ORDER[: self.size]]
+        return jnp.where(jnp.isnan(measured), 0.0, weight * (measured - predicted)).ravel()
+
+    def predict(self, parameters: Parameters, initial_state: Float[Array, " size"]) -> Float[Array, "samples size"]:
+        """The trajectory of the simulated channels, in cascade order."""
+
+        def step(state: State, forcing: Forcing) -> tuple[State, State]:
+            return self._step(state, forcing, tuple(parameters)), state
+
+        _, states = jax.lax.scan(step, unstack(initial_state), self.rows().forcing)
+        return stack(states)
+
+    def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
+        """The cost, of rows prepared once by `rows`: what a shooting method calls in its inner loop."""
+        scalars, weights = tuple(parameters), self._weights()
+
+        def step(carry: tuple[State, Shot], row: Rows) -> tuple[tuple[State, Shot], None]:
+            state, shot = carry
+            sound = shot.sound & _sound(state)
+            shot = Shot(shot.cost + _half_square(_errors(row, state, weights, sound)), sound)
+            return (self._step(state, row.forcing, scalars), shot), None
+
+        return jax.lax.scan(step, (unstack(initial_state), _unfired()), rows)[0][1]
+
+    def curvature(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Curvature:
+        """Cost, gradient and Fisher information J^T W^2 J in the parameters and, where it is free, the initial state.
+
+        Forward mode: one tangent for each unknown travels with the state, and their products are summed on the way.
+        """
+        count = parameters.shape[0]
+        unknowns = count + self.free_size
+        identity = jnp.eye(unknowns, dtype=float)
+        scalars, weights = tuple(parameters), self._weights()
+        parameter_tangents = tuple(identity[:, :count].T)
+        start_tangents = jnp.zeros((unknowns, self.size), dtype=float).at[:, : self.free_size].set(identity[:, count:])
+
+        def step(carry: tuple[State, State, Curvature], row: Rows):
+            state, tangent, total = carry
+            sound = total.shot.sound & _sound(state)
+            errors = _errors(row, state, weights, sound)
+            slopes = [
+                jnp.where(jnp.isnan(y) | ~sound, 0.0, -w * dx)
+                for y, w, dx in zip(row.measured, weights, jax.tree.leaves(tangent), strict=True)
+            ]
+            total = Curvature(
+                Shot(total.shot.cost + _half_square(errors), sound),
+                total.gradient + sum(e * s for e, s in zip(errors, slopes, strict=True)),
+                total.information + sum(s[:, None] * s[None, :] for s in slopes),
+            )
+            following, push = jax.linearize(lambda x, a: self._step(x, row.forcing, a), state, scalars)
+            return (following, jax.vmap(push)(tangent, parameter_tangents), total), None
+
+        zero = Curvature(_unfired(), jnp.zeros(unknowns, dtype=float), 0 * identity)
+        tangents = jax.vmap(unstack)(start_tangents)
+        return jax.lax.scan(step, (unstack(initial_state), tangents, zero), rows)[0][2]
+
+    def reweighted(self, residuals: Float[Array, " residuals"]) -> "ShootingProblem":
+        """The problem with each channel's sigma set to what its weighted `residuals` at a fit say it is.
+
+        Alternating this with the fit is maximum likelihood with unknown noise levels. A channel with fewer than two
+        measurements keeps its sigma, and none falls below a millionth of it: residuals can be rounding alone.
+        """
+        order = CASCADE_ORDER[: self.size]
+        squares = jnp.square(residuals.reshape(-1, self.size)).sum(axis=0)
+        count = (~jnp.isnan(jnp.stack(self.rows().measured))).sum(axis=1)
+        ratio = jnp.maximum(jnp.sqrt(squares / jnp.maximum(count, 1)), 1e-6)
+        ratio = jnp.where((count > 1) & jnp.isfinite(ratio), ratio, 1.0)
+        return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[order].multiply(ratio))
+
+    def _step(self, state: State, forcing: Forcing, parameters) -> State:
+        return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
+
+    def _weights(self) -> tuple[Scalar, ...]:
+        return tuple(1 / self.sigma[CASCADE_ORDER[: self.size]])
+
+
+def _unfired() -> Shot:
+    return Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
+
+
+def _sound(state: State) -> Bool[Array, ""]:
+    p, q, r = state.rates
+    sound = (jnp.abs(p) < FASTEST) & (jnp.abs(q) < FASTEST) & (jnp.abs(r) < FASTEST)
+    return sound if state.attitude is None else sound & (jnp.abs(state.attitude.theta) < jnp.pi / 2)
+
+
+def _errors(row: Rows, state: State, weights: tuple[Scalar, ...], sound: Bool[Array, ""]) -> list[Scalar]:
+    return [
+        jnp.where(jnp.isnan(y) | ~sound, 0.0, w * (y - x))
+        for y, w, x in zip(row.measured, weights, jax.tree.leaves(state), strict=True)
+    ]
+
+
+def _half_square(errors: list[Scalar]) -> Scalar:
+    return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2

@@ -1,0 +1,109 @@
+"""From rotor speeds to a flight: forward Euler, Runge-Kutta 4, or diffrax's adaptive Tsit5."""
+
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float
+from .dynamics import CASCADE_ORDER, AbstractModel, Forcing, State, stack, unstack
+from .flight import STATE_NAMES, Flight
+from .results import RESULTS
+
+Stepper = Callable[[AbstractModel, State, Forcing, Parameters | tuple[Scalar, ...], Scalar], State]
+
+
+def euler_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
+    """x_{k+1} = x_k + T f(x_k, u_k): the paper-style discrete model, of order 1."""
+    return _advance(state, model.cascade(state, forcing, parameters), dt)
+
+
+def rk4_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
+    """The classical Runge-Kutta step, of order 4; the forcing is held over the step."""
+    k1 = model.cascade(state, forcing, parameters)
+    k2 = model.cascade(_advance(state, k1, dt / 2), forcing, parameters)
+    k3 = model.cascade(_advance(state, k2, dt / 2), forcing, parameters)
+    k4 = model.cascade(_advance(state, k3, dt), forcing, parameters)
+    mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+    return _advance(state, mean, dt)
+
+
+def _advance(state: State, derivative: State, dt: Scalar) -> State:
+    return jax.tree.map(lambda x, dx: x + dt * dx, state, derivative)
+
+
+def _diffrax_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
+    # One solve per sample holds the input exactly: a solver that looked it up by time would read the next sample at
+    # the right end of its step.
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: model.cascade(y, *args)),
+        diffrax.Tsit5(),
+        t0=0.0,
+        t1=dt,
+        dt0=dt,
+        y0=state,
+        args=(forcing, parameters),
+        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-12),
+        adjoint=diffrax.DirectAdjoint(),
+        max_steps=256,
+        throw=False,
+    )
+    failed = solution.result != diffrax.RESULTS.successful
+    return jax.tree.map(lambda y: jnp.where(failed, jnp.nan, y[0]), solution.ys)
+
+
+STEPPERS: dict[str, Stepper] = {"euler": euler_step, "rk4": rk4_step}
+METHODS: dict[str, Stepper] = {**STEPPERS, "diffrax": _diffrax_step}
+
+
+@eqx.filter_jit
+def simulate(
+    model: AbstractModel,
+    parameters: Parameters,
+    omega: RotorSpeeds,
+    *,
+    dt: Float[ArrayLike, ""],
+    initial_state: StateVector | None = None,
+    method: str = "euler",
+) -> Flight:
+    """Flies `model` with `parameters` through rotor speeds `omega` [rad/s] held over samples of `dt` [s].
+
+    **Arguments:**
+
+    - `initial_state`: X at the first sample, in the order of `STATE_NAMES`; rest at the origin by default.
+    - `method`: `"euler"` (the discrete model), `"rk4"`, or `"diffrax"` (continuous time: adaptive, slow, a reference).
+
+    **Returns:** a `Flight` whose `result` is `successful`, or says why its states end: `attitude_singularity` where
+    the pitch angle reached +-90 degrees, `nonfinite_trajectory` where a number overflowed. From there on they are NaN.
+
+    **Raises:** `ValueError` for a method that does not exist.
+    """
+    if method not in METHODS:
+        raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
+    dt = as_float(dt)
+    start = jnp.zeros(12, dtype=float) if initial_state is None else as_float(initial_state)
+    omega, scalars = as_float(omega), tuple(as_float(parameters))
+
+    def step(state: State, forcing: Forcing) -> tuple[State, State]:
+        following = METHODS[method](model, state, forcing, scalars, dt)
+        return following, following
+
+    first = unstack(start[CASCADE_ORDER])
+    _, rest = jax.lax.scan(step, first, model.forcing(omega[:-1]))
+    trajectory = jnp.concatenate([stack(first)[None], stack(rest)])
+    states, result = _until_failure(trajectory[:, CASCADE_ORDER.argsort()])
+    return Flight(time=dt * jnp.arange(omega.shape[0]), omega=omega, states=states, result=result)
+
+
+def _until_failure(states: States) -> tuple[States, RESULTS]:
+    theta = states[:, STATE_NAMES.index("theta")]
+    level = jnp.abs(theta) < jnp.pi / 2
+    finite = jnp.isfinite(states).all(axis=1)
+    sound: Array = jnp.cumsum(~(level & finite)) == 0
+    first_failure = jnp.argmin(sound)
+    result = RESULTS.where(finite[first_failure], RESULTS.attitude_singularity, RESULTS.nonfinite_trajectory)
+    result = RESULTS.where(sound.all(), RESULTS.successful, result)
+    return jnp.where(sound[:, None], states, jnp.nan), result

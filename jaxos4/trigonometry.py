@@ -1,0 +1,51 @@
+"""Sine and cosine together, in arithmetic that vectorises over a batch of lanes.
+
+A library call per element is what a simulation step would otherwise spend its time on: with this the full-state Euler
+scan runs about six times faster on a CPU (`experiments/speed`).
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# pi/2 in parts short enough that k * part is exact for |k| < 2**20 (2**13 in single precision); Cody and Waite.
+_HALF_PI_DOUBLE = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+_HALF_PI_SINGLE = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
+# Taylor coefficients in r^2: on |r| <= pi/4 their truncation is below half an ulp of double precision.
+_SIN = tuple((-1) ** i / math.factorial(2 * i + 1) for i in range(8))
+_COS = tuple((-1) ** i / math.factorial(2 * i) for i in range(9))
+
+
+@jax.custom_jvp
+def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """`(sin(x), cos(x))` to about one ulp, for an angle x [rad] of less than a million turns.
+
+    Not-a-number and infinity give not-a-number, as in the library's own functions.
+    """
+    quarter = jnp.round(x * (2 / math.pi))
+    r = x
+    for part in _HALF_PI_SINGLE if x.dtype == jnp.float32 else _HALF_PI_DOUBLE:
+        r = r - quarter * part
+    squared = r * r
+    sin = r * _horner(_SIN, squared)
+    cos = _horner(_COS, squared)
+    quadrant = quarter - 4 * jnp.floor(quarter / 4)
+    odd = (quadrant == 1) | (quadrant == 3)
+    sin, cos = jnp.where(odd, cos, sin), jnp.where(odd, sin, cos)
+    return jnp.where(quadrant >= 2, -sin, sin), jnp.where((quadrant == 1) | (quadrant == 2), -cos, cos)
+
+
+@sincos.defjvp
+def _sincos_jvp(primals, tangents):
+    sin, cos = sincos(*primals)
+    (dx,) = tangents
+    return (sin, cos), (cos * dx, -sin * dx)
+
+
+def _horner(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total = total * x + coefficient
+    return total

@@ -1,0 +1,28 @@
+"""What every test shares: precision, platform, runtime shape checks, property-test settings, real flights."""
+
+import os
+import pathlib
+
+import hypothesis
+import jax
+import jaxtyping
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS") or "cpu")
+
+# Before the first import of jaxos4: every annotated function and module in it is checked from here on.
+jaxtyping.install_import_hook("jaxos4", "typechecker.check")
+
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("ci")
+
+
+@pytest.fixture(scope="session")
+def shared_flights() -> pathlib.Path:
+    """The folder of real flight logs: `$JAXOS4_FLIGHTS`, or `../shared/flights` beside the checkout."""
+    beside = pathlib.Path(__file__).resolve().parents[2] / "shared" / "flights"
+    folder = pathlib.Path(os.environ.get("JAXOS4_FLIGHTS") or beside)
+    if not folder.is_dir():
+        pytest.skip(f"no real flights at {folder}: set JAXOS4_FLIGHTS to the folder that holds them")
+    return folder

@@ -1,0 +1,223 @@
+import re
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from jaxos4.airframe import OS4, OS4_SIMULATOR, VOOS
+from jaxos4.excitation import EXCITATIONS, chirp, doublet, multisine, step3211
+
+X_LAYOUT = eqx.tree_at(
+    lambda a: a.rotor_positions, OS4, np.array([[0.16, -0.16], [-0.16, -0.16], [-0.16, 0.16], [0.16, 0.16]])
+)
+AIRFRAMES = {"os4": OS4, "simulator": OS4_SIMULATOR, "voos": VOOS, "x": X_LAYOUT}
+IN_TURN = {"doublet": doublet, "3211": step3211, "chirp": chirp}
+every_excitation = pytest.mark.parametrize("excite", EXCITATIONS.values(), ids=EXCITATIONS)
+every_in_turn = pytest.mark.parametrize("excite", IN_TURN.values(), ids=IN_TURN)
+
+
+def accelerations(airframe, omega):
+    """Angular accelerations [rad/s^2] that the rotor speeds cause at zero rates."""
+    return np.asarray(omega) ** 2 @ np.asarray(airframe.mixer)[:3].T / np.asarray(airframe.inertia)
+
+
+def rates_and_angles(airframe, omega, dt=0.01):
+    """Forward Euler of each axis by itself, from rest."""
+    rates = np.cumsum(np.pad(accelerations(airframe, omega)[:-1], ((1, 0), (0, 0))), axis=0) * dt
+    return rates, np.cumsum(np.pad(rates[:-1], ((1, 0), (0, 0))), axis=0) * dt
+
+
+def standard_acceleration(time):
+    tones = {"roll": (0.6, 1.1, 1.9), "pitch": (0.7, 1.3, 2.3), "yaw": (0.5, 0.9, 1.7)}
+    return np.stack(
+        [sum(2 * np.pi * f * np.cos(2 * np.pi * f * time) / 3 for f in tones[axis]) for axis in tones], axis=1
+    )
+
+
+def test_multisine_is_the_standard_flight():
+    omega = np.asarray(multisine(OS4, duration=5.0, dt=0.01))
+    assert omega.shape == (501, 4)
+    assert omega.dtype == np.float64
+    assert (int(omega.min()), int(omega.max())) == (134, 289)
+    designed = standard_acceleration(0.01 * np.arange(501))
+    torque = omega**2 @ np.asarray(OS4.mixer)[:3].T
+    np.testing.assert_allclose(torque, np.asarray(OS4.inertia) * designed, rtol=0, atol=1e-12)
+    assert np.abs(torque - np.asarray(OS4.inertia) * designed[:, [1, 0, 2]]).max() > 1e-3  # a reference can be wrong
+
+
+@every_excitation
+@pytest.mark.parametrize("airframe", AIRFRAMES.values(), ids=AIRFRAMES)
+def test_default_flights(airframe, excite):
+    """Thrust carries the weight on every row; rates and angles stay small; every axis moves."""
+    omega = np.asarray(excite(airframe))
+    assert omega.shape == (501, 4)
+    thrust = omega**2 @ np.asarray(airframe.mixer)[3]
+    np.testing.assert_allclose(thrust, airframe.mass * airframe.gravity, rtol=1e-12)
+    rates, angles = rates_and_angles(airframe, omega)
+    assert np.abs(rates).max() < 1.05
+    assert np.abs(angles).max() < 0.7
+    assert np.abs(rates).max(axis=0).min() > 0.45
+
+
+@every_in_turn
+@pytest.mark.parametrize("airframe", AIRFRAMES.values(), ids=AIRFRAMES)
+@pytest.mark.parametrize("duration", [5.0, 11.37])
+def test_one_axis_at_a_time_and_back_to_rest(airframe, excite, duration):
+    rates, angles = rates_and_angles(airframe, excite(airframe, duration=duration))
+    moving = np.abs(rates) > 1e-9
+    assert moving.sum(axis=1).max() == 1
+    np.testing.assert_allclose(rates[-1], 0, atol=1e-10)
+    np.testing.assert_allclose(angles[-1], 0, atol=1e-10)
+    np.testing.assert_allclose(np.abs(rates).max(axis=0), (1, 1, 0.5 if excite is chirp else 1), rtol=1e-9)
+
+
+@every_in_turn
+def test_axes_are_flown_in_the_order_given(excite):
+    rates, _ = rates_and_angles(OS4, excite(OS4, axes=("yaw", "roll"), amplitude=0.5))
+    first = [np.flatnonzero(np.abs(rates[:, axis]) > 1e-9) for axis in range(3)]
+    assert first[2][0] < first[0][0]
+    assert first[1].size == 0
+
+
+def test_pulses_have_their_shapes():
+    """Pulse by pulse: the height of each in units of the first, and how long it lasts."""
+    doublets = accelerations(OS4, doublet(OS4, width=0.3))[:150, 0]
+    np.testing.assert_allclose(doublets[::30], np.array([1, -1, -1, 1, 0]) / 0.3, atol=1e-9)
+    steps = accelerations(OS4, step3211(OS4, width=0.1))[:150, 0]
+    once = np.array([0.8, 0.8, 0.8, -1.2, -1.2, 1.1, -1.1]) / (2.4 * 0.1)
+    np.testing.assert_allclose(steps[::10], np.concatenate([once, -once, [0]]), atol=1e-9)
+    np.testing.assert_allclose(steps.reshape(15, 10), steps[::10, None] * np.ones(10), atol=1e-9)
+
+
+def test_pulses_repeat_as_often_as_they_fit():
+    roll = accelerations(OS4, doublet(OS4, duration=10.0))[:, 0]
+    np.testing.assert_allclose(roll[450:900], roll[:450], atol=1e-9)
+    np.testing.assert_allclose(roll[900:], 0, atol=1e-9)
+
+
+def test_chirp_sweeps_its_frequencies():
+    """Zero crossings of the rate: close to the first half-period at the start and to the last at the end."""
+    rates, _ = rates_and_angles(OS4, chirp(OS4, duration=20.0, axes=("roll",), frequencies=(0.5, 2.5)))
+    sign = np.sign(rates[1:2000, 0])
+    crossings = 0.01 * np.flatnonzero(sign[1:] != sign[:-1])
+    half_periods = np.diff(crossings)
+    middle = (crossings[1:] + crossings[:-1]) / 2
+    np.testing.assert_allclose(0.5 / half_periods[2:-2], 0.5 + 2.0 * middle[2:-2] / 20.0, rtol=0.1)
+    assert len(crossings) == pytest.approx(2 * 1.5 * 20, abs=3)
+
+
+def test_axes_of_the_multisine_are_uncorrelated():
+    """Over the common period of the tones, 10 s."""
+    designed = accelerations(OS4, multisine(OS4, duration=10.0))[:1000]
+    gram = designed.T @ designed
+    off_diagonal = gram - np.diag(np.diag(gram))
+    assert np.abs(off_diagonal).max() < 1e-10 * np.diag(gram).min()
+    assert multisine(OS4, tones=((0.6,), (0.6,), (0.5,))).shape == (501, 4)  # the same tone twice is allowed
+
+
+@every_excitation
+def test_amplitude_scales_every_axis_by_itself(excite):
+    still = accelerations(OS4, excite(OS4, amplitude=0.0))
+    np.testing.assert_allclose(still, 0, atol=1e-9)
+    np.testing.assert_allclose(excite(OS4, amplitude=0.0), OS4.hover_speed, rtol=1e-12)
+    whole, half = (accelerations(OS4, excite(OS4, amplitude=a)) for a in (0.4, 0.2))
+    np.testing.assert_allclose(half, whole / 2, atol=1e-9)
+    no_yaw = accelerations(OS4, excite(OS4, amplitude=(0.4, 0.2, 0.0)))
+    np.testing.assert_allclose(no_yaw, whole * np.array([1, 0.5, 0]), atol=1e-9)
+
+
+def test_an_axis_without_tones_is_still():
+    designed = accelerations(OS4, multisine(OS4, tones=((1.0,), (), (0.5, 1.5))))
+    np.testing.assert_allclose(designed[:, 1], 0, atol=1e-9)
+    np.testing.assert_allclose(designed[:, 0], 2 * np.pi * np.cos(2 * np.pi * 0.01 * np.arange(501)), atol=1e-9)
+
+
+LIMITED = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.array(260.0))
+
+
+@every_excitation
+@pytest.mark.parametrize(
+    ("airframe", "amplitude", "reason"),
+    [(OS4, (0.0, 0.0, 9.0), "below zero"), (OS4, 30.0, "below zero"), (LIMITED, 4.0, "max_rotor_speed")],
+)
+def test_unflyable_amplitudes_name_the_scale_that_flies(airframe, amplitude, reason, excite):
+    with pytest.raises(ValueError, match="`amplitude` is too large to fly") as caught:
+        excite(airframe, amplitude=amplitude)
+    message = str(caught.value)
+    assert reason in message or airframe is LIMITED
+    assert "\n" not in message
+    found = re.search(r"multiply it by (\S+) or less", message)
+    assert found is not None
+    scale = float(found[1])
+    omega = np.asarray(excite(airframe, amplitude=np.multiply(amplitude, scale)))
+    assert np.isfinite(omega).all()
+    assert omega.max() <= airframe.max_rotor_speed
+    with pytest.raises(ValueError, match="too large to fly"):
+        excite(airframe, amplitude=np.multiply(amplitude, 1.02 * scale))
+
+
+def test_exceeding_the_rotor_speed_says_by_how_much():
+    omega = multisine(OS4, amplitude=0.5)
+    limited = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(omega.max() - 2.0))
+    with pytest.raises(ValueError, match=r"rotor \d would exceed the `max_rotor_speed` .* by 2 rad/s at t = "):
+        multisine(limited, amplitude=0.5)
+    assert multisine(eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(omega.max() + 1e-6)), amplitude=0.5).size
+
+
+def test_an_airframe_that_cannot_hover():
+    with pytest.raises(ValueError, match="`airframe` cannot hover"):
+        multisine(eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.array(200.0)), amplitude=0.0)
+
+
+@every_excitation
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"duration": 0.0},
+        {"duration": -1.0},
+        {"duration": float("nan")},
+        {"duration": float("inf")},
+        {"duration": 0.001},
+        {"dt": 0.0},
+        {"dt": float("nan")},
+        {"amplitude": float("nan")},
+        {"amplitude": (1.0, 1.0)},
+    ],
+    ids=str,
+)
+def test_arguments_out_of_range_are_named(excite, bad):
+    with pytest.raises(ValueError, match=f"`{next(iter(bad))}`"):
+        excite(OS4, **bad)
+
+
+@pytest.mark.parametrize(
+    ("excite", "bad"),
+    [
+        (multisine, {"tones": ((1.0,), (1.0,))}),
+        (multisine, {"tones": ((50.0,), (1.0,), (1.0,))}),
+        (multisine, {"tones": ((0.0,), (1.0,), (1.0,))}),
+        (doublet, {"duration": 4.0}),
+        (doublet, {"width": 0.001}),
+        (doublet, {"width": float("nan")}),
+        (doublet, {"axes": ()}),
+        (doublet, {"axes": "roll"}),
+        (step3211, {"duration": 4.0}),
+        (step3211, {"axes": ("roll", "heave")}),
+        (chirp, {"duration": 1.0}),
+        (chirp, {"frequencies": (1.0, 60.0)}),
+        (chirp, {"frequencies": (0.0, 3.0)}),
+    ],
+)
+def test_shapes_that_do_not_fit_are_named(excite, bad):
+    with pytest.raises(ValueError, match=f"`{next(iter(bad))}`"):
+        excite(OS4, **bad)
+
+
+@every_in_turn
+def test_the_shortest_duration_it_names_is_enough(excite):
+    with pytest.raises(ValueError, match="`duration` must be at least") as caught:
+        excite(OS4, duration=1.0)
+    found = re.search(r"at least (\S+) s", str(caught.value))
+    assert found is not None
+    amplitude = 0.2
+    assert np.isfinite(excite(OS4, duration=float(found[1]), amplitude=amplitude)).all()
