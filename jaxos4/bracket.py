@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ._custom_types import Parameters, Scalar, as_float
+from ._custom_types import Parameters, as_float
 from .dynamics import AbstractModel
 
 
@@ -44,5 +44,5 @@ class Bracket(eqx.Module):
     @property
     def valid(self) -> Bool[Array, ""]:
         """Whether every interval is finite and has its lower end below its upper one."""
-        width: Scalar = (self.upper - self.lower).min()
-        return (width > 0) & (width < float("inf"))
+        width = self.upper - self.lower
+        return ((width > 0) & (width < float("inf"))).all()

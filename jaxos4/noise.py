@@ -70,7 +70,7 @@ class WhiteNoise(AbstractNoise):
     - `sigma`: standard deviation of each state, in the units of `STATE_UNITS`; one number or 12. 0: exact.
     """
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0))
+    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -86,7 +86,7 @@ class ConstantBias(AbstractNoise):
     - `mean`: its mean. `ConstantBias(0, mean=offset)` is a known offset.
     """
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0))
+    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
     mean: PerChannel = eqx.field(converter=_per_channel("mean", -np.inf), default=0.0)
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
@@ -106,8 +106,8 @@ class GaussMarkov(AbstractNoise):
     - `correlation_time`: T [s], positive; one number or 12. Infinite: a constant bias.
     """
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0))
-    correlation_time: PerChannel = eqx.field(converter=_per_channel("correlation_time", 0, open_below=True))
+    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
+    correlation_time: PerChannel = eqx.field(converter=_per_channel("correlation_time", 0.0, open_below=True))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -131,7 +131,7 @@ class Quantisation(AbstractNoise):
     - `step`: of each state, in the units of `STATE_UNITS`; one number or 12. 0: not rounded.
     """
 
-    step: PerChannel = eqx.field(converter=_per_channel("step", 0))
+    step: PerChannel = eqx.field(converter=_per_channel("step", 0.0))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -147,7 +147,7 @@ class Dropouts(AbstractNoise):
     - `probability`: that a sample is lost; one number or 12.
     """
 
-    probability: PerChannel = eqx.field(converter=_per_channel("probability", 0, 1))
+    probability: PerChannel = eqx.field(converter=_per_channel("probability", 0.0, 1.0))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""

@@ -116,15 +116,12 @@ class ShootingProblem(eqx.Module):
             method=self.method,
         )
 
-    def rows(self, samples: int | None = None) -> Rows:
-        """The first `samples` of the flight, or all, as the scan reads them.
-
-        Where the initial state is known, the first sample is no data.
-        """
-        measured = self.flight.states[:samples, CASCADE_ORDER[: self.size]]
+    def rows(self) -> Rows:
+        """The flight as the scan reads it. Where the initial state is known, the first sample is no data."""
+        measured = self.flight.states[:, CASCADE_ORDER[: self.size]]
         if self.initial_state is not None:
             measured = measured.at[0].set(jnp.nan)
-        return Rows(self.model.forcing(self.flight.omega[:samples]), tuple(measured.T))
+        return Rows(self.model.forcing(self.flight.omega), tuple(measured.T))
 
     def first_state(self) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
         """The initial state where the search starts, and how far off it may be.

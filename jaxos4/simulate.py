@@ -59,7 +59,6 @@ STEPPERS: dict[str, Stepper] = {"euler": euler_step, "rk4": rk4_step}
 METHODS: dict[str, Stepper] = {**STEPPERS, "diffrax": _diffrax_step}
 
 
-@eqx.filter_jit
 def simulate(
     model: AbstractModel,
     parameters: Parameters,
@@ -83,9 +82,15 @@ def simulate(
     """
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
-    dt = as_float(dt)
     start = jnp.zeros(12, dtype=float) if initial_state is None else as_float(initial_state)
-    omega, scalars = as_float(omega), tuple(as_float(parameters))
+    return _fly(model, as_float(parameters), as_float(omega), as_float(dt), start, method)
+
+
+@eqx.filter_jit
+def _fly(
+    model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
+) -> Flight:
+    scalars = tuple(parameters)
 
     def step(state: State, forcing: Forcing) -> tuple[State, State]:
         following = METHODS[method](model, state, forcing, scalars, dt)

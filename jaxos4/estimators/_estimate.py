@@ -33,8 +33,8 @@ class Estimate(eqx.Module):
     result: RESULTS
 
     @property
-    def std(self) -> Parameters:
-        """Standard deviation of each parameter."""
+    def std(self) -> Float[Array, "*batch parameters"]:
+        """Standard deviation of each parameter, of one estimate or of a batch of them."""
         return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
 
 

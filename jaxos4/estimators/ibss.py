@@ -6,7 +6,6 @@ of the slope tells which half of the bracket holds the minimum. A *sweep* bisect
 are then recentred, shrink with the moves, and grow where a search ended at their end.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Parameters, Scalar, as_float
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS
-from ..information import eliminate, invert
+from ..information import cholesky, eliminate, invert, invert_factor
 from ..results import RESULTS
 from ..shooting import Rows, ShootingProblem
 from ._estimate import AbstractEstimator, Estimate
@@ -44,6 +43,14 @@ class _Search(NamedTuple):
     unknowns: Float[Array, " unknowns"]
     half_width: Float[Array, " unknowns"]
     covariance: Float[Array, "unknowns unknowns"]
+    sweeps: Int[Array, ""]
+    rollouts: Int[Array, ""]
+    done: Bool[Array, ""]
+
+
+class _Progress(NamedTuple):
+    unknowns: Float[Array, " unknowns"]
+    spread: Float[Array, "unknowns unknowns"]
     sweeps: Int[Array, ""]
     rollouts: Int[Array, ""]
     done: Bool[Array, ""]
@@ -102,49 +109,58 @@ class IBSS(AbstractEstimator):
         lower, upper = center - self.reach * half_width, center + self.reach * half_width
         parameters = center if start is None else jnp.clip(as_float(start), lower, upper)
 
-        stages = [(problem.channels, 1.0)]
-        if self.directions == "whitened":
-            stages = [("rates", share) for share in _HORIZONS]
-            stages += [(name, 1.0) for name, size in CHANNELS.items() if size <= problem.size]
         initial_state, off = problem.first_state()
-        free = problem.free_size > 0
-        known = jnp.concatenate([half_width, off]) / 2 if free else half_width / 2
-        spread = jnp.diag(known**2)
-        sweeps = rollouts = jnp.zeros((), dtype=int)
-        done = jnp.zeros((), dtype=bool)
-        for channels, share in stages:
+        free = problem.free_size
+        prior = jnp.concatenate([half_width, off[:free]]) / 2
+        far = jnp.full(free, jnp.inf)
+        limits = (jnp.concatenate([lower, -far]), jnp.concatenate([upper, far]))
+
+        def fit(channels: str, progress: _Progress, share: Scalar) -> _Progress:
             stage = problem.restrict(channels)
-            rows = stage.rows(math.ceil(share * problem.flight.time.shape[0]))
-            unknowns = jnp.concatenate([parameters, initial_state[: stage.free_size]])
-            size = unknowns.size
-            limits = (
-                jnp.concatenate([lower, jnp.full(stage.free_size, -jnp.inf)]),
-                jnp.concatenate([upper, jnp.full(stage.free_size, jnp.inf)]),
-            )
-            tolerance = self.tolerance if (channels, share) == stages[-1] else None
+            rows = _until(share, stage.rows())
+            size = len(names) + stage.free_size
+            last = (channels == problem.channels) & (share == 1)
             search = self._search(
                 stage,
                 rows,
-                unknowns,
+                progress.unknowns[:size],
                 initial_state=initial_state[: stage.size],
-                spread=spread[:size, :size],
-                known=known[:size],
-                limits=limits,
-                tolerance=tolerance,
+                spread=progress.spread[:size, :size],
+                prior=prior[:size],
+                limits=(limits[0][:size], limits[1][:size]),
+                last=last,
             )
-            parameters = search.unknowns[: len(names)]
-            initial_state = initial_state.at[: stage.free_size].set(search.unknowns[len(names) :])
-            spread = spread.at[:size, :size].set(search.covariance)
-            sweeps, done = sweeps + search.sweeps, search.done
-            rollouts = rollouts + search.rollouts
+            return _Progress(
+                progress.unknowns.at[:size].set(search.unknowns),
+                progress.spread.at[:size, :size].set(search.covariance),
+                progress.sweeps + search.sweeps,
+                progress.rollouts + search.rollouts,
+                search.done,
+            )
 
+        none = jnp.zeros((), dtype=int)
+        unknowns = jnp.concatenate([parameters, initial_state[:free]])
+        progress = _Progress(unknowns, jnp.diag(prior**2), none, none, jnp.zeros((), dtype=bool))
+        whole = as_float(1.0)
+        if self.directions == "whitened":
+            shares = jnp.asarray((*_HORIZONS, 1.0), dtype=float)
+            # One scan, so that the search against the rates is compiled once.
+            progress, _ = jax.lax.scan(lambda p, share: (fit("rates", p, share), None), progress, shares)
+            for channels, size in CHANNELS.items():
+                if CHANNELS["rates"] < size <= problem.size:
+                    progress = fit(channels, progress, whole)
+        else:
+            progress = fit(problem.channels, progress, whole)
+
+        parameters = progress.unknowns[: len(names)]
+        if free:
+            initial_state = progress.unknowns[len(names) :]
         (cost, trusted), _, information = problem.curvature(problem.rows(), parameters, initial_state)
-        rollouts = rollouts + len(names) + problem.free_size
         bound = invert(eliminate(information, len(names)))
         std = jnp.sqrt(jnp.diagonal(bound))
         at_bound = jnp.minimum(parameters - lower, upper - parameters) < 1e-3 * half_width
         sound = trusted & jnp.isfinite(cost) & jnp.isfinite(parameters).all() & jnp.isfinite(bound).all()
-        result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
+        result = RESULTS.where(progress.done, RESULTS.successful, RESULTS.max_sweeps)
         result = RESULTS.where(at_bound.any(), RESULTS.at_bound, result)
         result = RESULTS.where((std > half_width).any(), RESULTS.unidentifiable, result)
         result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
@@ -155,8 +171,8 @@ class IBSS(AbstractEstimator):
             covariance=jnp.where(sound, bound, jnp.inf),
             initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
             cost=jnp.where(sound, cost, jnp.inf),
-            rollouts=rollouts,
-            sweeps=sweeps,
+            rollouts=progress.rollouts + prior.size,
+            sweeps=progress.sweeps,
             result=result,
         )
 
@@ -168,9 +184,9 @@ class IBSS(AbstractEstimator):
         *,
         initial_state: Float[Array, " size"],
         spread: Float[Array, "unknowns unknowns"],
-        known: Float[Array, " unknowns"],
+        prior: Float[Array, " unknowns"],
         limits: tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]],
-        tolerance: Scalar | None,
+        last: Bool[Array, ""],
     ) -> _Search:
         """Sweeps until the moves are small.
 
@@ -180,9 +196,9 @@ class IBSS(AbstractEstimator):
         - `unknowns`: where to start: the parameters and, where it is free, the initial state.
         - `initial_state`: taken where it is not free.
         - `spread`: the covariance of `unknowns`, which opens the brackets.
-        - `known`: the standard deviation of each unknown without the flight, from the bracket.
+        - `prior`: the standard deviation of each unknown without the flight, from the bracket.
         - `limits`: of the unknowns.
-        - `tolerance`: the share of a standard deviation at which to stop; `None`: coarsely.
+        - `last`: whether to stop at `tolerance`, or coarsely.
         """
         count = unknowns.size - problem.free_size
 
@@ -211,18 +227,15 @@ class IBSS(AbstractEstimator):
 
         def sweep(search: _Search) -> _Search:
             (cost, _), _, information = problem.curvature(rows, *split(search.unknowns))
-            information = information + jnp.diag(1 / jnp.square(known))
-            factor = self._factor(information, count)
-            basis = jnp.linalg.inv(factor).T
+            information = information + jnp.diag(1 / jnp.square(prior))
+            factor, basis = self._directions(information, count)
             first = _OPENING * jnp.sqrt(jnp.diagonal(factor.T @ spread @ factor))
             half_width = jnp.where(search.sweeps == 0, first, search.half_width)
             moved, (steps, at_end) = jax.lax.scan(along, search.unknowns, (basis.T, half_width))
             move = jnp.abs(steps).max()
             misfit = _misfit(cost, rows)
-            if tolerance is None:
-                enough = _COARSE * jnp.maximum(misfit, 1.0)
-            else:
-                enough = jnp.maximum(tolerance * misfit, finest)
+            coarse = _COARSE * jnp.maximum(misfit, 1.0)
+            enough = jnp.where(last, jnp.maximum(self.tolerance * misfit, finest), coarse)
             sound = jnp.isfinite(cost) & jnp.isfinite(moved).all()
             shrunk = half_width * 2.0 ** (1 - self.halvings) + _SPOILT * move
             return _Search(
@@ -235,20 +248,31 @@ class IBSS(AbstractEstimator):
             )
 
         none = jnp.zeros((), dtype=int)
-        begin = _Search(unknowns, known, spread, none, none, jnp.zeros((), dtype=bool))
+        begin = _Search(unknowns, prior, spread, none, none, jnp.zeros((), dtype=bool))
         return jax.lax.while_loop(lambda s: ~s.done & (s.sweeps < self.max_sweeps), sweep, begin)
 
-    def _factor(self, information: Float[Array, "n n"], count: int) -> Float[Array, "n n"]:
-        """A factor A of the information whose inverse transpose has the search directions as its columns.
+    def _directions(
+        self, information: Float[Array, "n n"], count: int
+    ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+        """A factor A of the information A A^T, and A^-T, whose columns are the search directions.
 
         The initial state comes first in the Cholesky factorisation, so that a step along a parameter takes the initial
         state along to where it fits best.
         """
         if self.directions == "coordinate":
-            return jnp.diag(jnp.sqrt(jnp.diagonal(information)))
+            scale = jnp.sqrt(jnp.diagonal(information))
+            return jnp.diag(scale), jnp.diag(1 / scale)
         order = jnp.roll(jnp.arange(information.shape[0]), -count)
         back = jnp.argsort(order)
-        return jnp.linalg.cholesky(information[jnp.ix_(order, order)])[back]
+        factor = cholesky(information[jnp.ix_(order, order)])
+        return factor[back], invert_factor(factor).T[back]
+
+
+def _until(share: Scalar, rows: Rows) -> Rows:
+    """The rows with nothing measured after a share of the flight."""
+    samples = rows.measured[0].size
+    within = jnp.arange(samples) < jnp.ceil(share * samples)
+    return Rows(rows.forcing, tuple(jnp.where(within, y, jnp.nan) for y in rows.measured))
 
 
 def _finest(problem: ShootingProblem, rows: Rows) -> Scalar:

@@ -1,0 +1,101 @@
+"""How close IBSS comes to the Cramer-Rao bound: RMSE / bound of many noisy standard flights, identified in one call.
+
+The truth is simulated with the model that is fitted (the inverse crime), so that the bound is the right yardstick.
+"""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+import jaxos4
+
+jax.config.update("jax_enable_x64", True)
+
+CASES = {
+    "published, all": (jaxos4.PublishedOS4, "all", True),
+    "published, rates": (jaxos4.PublishedOS4, "rates", True),
+    "published, all, free start": (jaxos4.PublishedOS4, "all", False),
+    "corrected, all": (jaxos4.CorrectedOS4, "all", True),
+    "corrected, rates": (jaxos4.CorrectedOS4, "rates", True),
+}
+
+
+def study(model: jaxos4.AbstractModel, channels: str, flights: int, seed: int, *, scale: float, known: bool) -> dict:
+    """Identifies `flights` noisy standard flights from random starts within 80 % of the default bracket."""
+    flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
+    bracket = jaxos4.Bracket.default(model)
+    sigma = scale * jaxos4.SENSOR_SIGMA
+    noise = jaxos4.WhiteNoise(sigma)
+
+    def problem(data: jaxos4.Flight) -> jaxos4.ShootingProblem:
+        start = flight.states[0] if known else None
+        return jaxos4.ShootingProblem(model, data, sigma=sigma, channels=channels, initial_state=start)
+
+    @eqx.filter_jit
+    @eqx.filter_vmap(in_axes=(None, 0))
+    def identify(key, trial) -> jaxos4.Estimate:
+        noise_key, start_key = jax.random.split(jax.random.fold_in(key, trial))
+        start = bracket.center + 0.8 * bracket.half_width * jax.random.uniform(start_key, (8,), minval=-1, maxval=1)
+        return jaxos4.IBSS()(problem(noise(flight, key=noise_key)), bracket, start=start)
+
+    arguments = jax.random.key(seed), jnp.arange(flights)
+    begin = time.perf_counter()
+    compiled = identify.lower(*arguments).compile()
+    built = time.perf_counter()
+    estimates = jax.block_until_ready(compiled(*arguments))
+    done = time.perf_counter()
+
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(flight), model.alpha)))
+    error = np.asarray(estimates.parameters - model.alpha) / bound
+    names, counts = np.unique(jaxos4.result_names(estimates.result), return_counts=True)
+    return {
+        "efficiency": np.sqrt(np.mean(error**2, axis=0)).tolist(),
+        "bias": error.mean(axis=0).tolist(),
+        "monte_carlo_error": 1 / np.sqrt(2 * flights),
+        "covered": float(np.mean(np.abs(error * bound) < 1.96 * np.asarray(estimates.std))),
+        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "rollouts": float(np.mean(estimates.rollouts)),
+        "compile_seconds": built - begin,
+        "seconds": done - built,
+    }
+
+
+def main(
+    flights: Annotated[int, typer.Option(help="For each case.")] = 512,
+    seed: Annotated[int, typer.Option()] = 0,
+    scale: Annotated[float, typer.Option(help="Of the standard sensor noise.")] = 1.0,
+    cases: Annotated[list[str], typer.Option(help="Which cases.")] = tuple(CASES),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+) -> None:
+    """RMSE / Cramer-Rao bound of IBSS, parameter by parameter."""
+    report = {"flights": flights, "seed": seed, "scale": scale, "version": jaxos4.__version__, "cases": {}}
+    table = Table(
+        title=f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
+    )
+    for heading in ("case", *(f"a{i}" for i in range(1, 9)), "covered", "results", "rollouts", "s"):
+        table.add_column(heading)
+    for case in cases:
+        model, channels, known = CASES[case]
+        row = study(model(jaxos4.OS4), channels, flights, seed, scale=scale, known=known)
+        report["cases"][case] = row
+        results = ", ".join(f"{count} {name}" for name, count in row["results"].items())
+        figures = [f"{x:.2f}" for x in row["efficiency"]]
+        table.add_row(
+            case, *figures, f"{row['covered']:.3f}", results, f"{row['rollouts']:.0f}", f"{row['seconds']:.1f}"
+        )
+    Console(width=150).print(table)
+    if out is not None:
+        out.write_text(json.dumps(report, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)
