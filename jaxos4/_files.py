@@ -1,12 +1,16 @@
-"""Output files that are either whole or as they were before."""
+"""Output files that are either whole or as they were before; TOML files that are tables or an error in one line."""
 
 import contextlib
 import errno
 import os
 import secrets
 import shutil
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+from .errors import InputError
 
 
 @contextlib.contextmanager
@@ -24,7 +28,10 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = check_writable(path)
     if target.exists() and not target.is_file():
-        yield Path(path)
+        try:
+            yield Path(path)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
     beside = target.with_name(f".{target.stem[:40]}.{secrets.token_hex(4)}.part{target.suffix}")
     try:
@@ -34,6 +41,8 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.exists():
             shutil.copymode(target, beside)
         os.replace(beside, target)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from None
     finally:
         beside.unlink(missing_ok=True)
 
@@ -51,3 +60,18 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
     if not os.access(target.parent, os.W_OK):
         raise PermissionError(errno.EACCES, "its folder is not writable", os.fspath(path))
     return target
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The table of a TOML file.
+
+    **Raises:** `InputError` for what is not TOML; `OSError` where it cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except RecursionError:
+        raise InputError(f"{path}: nested too deeply for a TOML file of this kind; flatten it.") from None
+    except ValueError as error:
+        what = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: not a TOML file ({what}); correct it there.") from None

@@ -1,7 +1,6 @@
 """The physical constants of a quadrotor, published presets, TOML files, and inertia <-> alpha."""
 
 import math
-import tomllib
 from os import PathLike
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Numeric, Scalar, as_constant
+from ._files import read_toml
 from .errors import InputError
 
 ALTERNATING_SPINS = (1.0, -1.0, 1.0, -1.0)
@@ -137,14 +137,11 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
     if source in PRESETS:
         return PRESETS[str(source)]
     try:
-        with open(source, "rb") as file:
-            table = tomllib.load(file)
+        table = read_toml(source)
     except FileNotFoundError:
         raise InputError(
             f"{source}: neither a file nor one of the presets {', '.join(PRESETS)}; give one of them."
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{source}: not a TOML file ({error}); correct it there.") from None
     try:
         return _from_table(table)
     except InputError as error:
@@ -171,12 +168,18 @@ def _from_table(table: dict[str, Any]) -> Airframe:
         raise InputError(f"knows no key `{unknown[0]}`; the keys are arm, {', '.join(_SHAPES)}.")
     constants = {name: _numbers(name, value, _SHAPES[name]) for name, value in table.items()}
     for name in _POSITIVE & constants.keys():
-        if not np.all(constants[name] > 0):
-            raise InputError(f"`{name}` must be positive, got {table[name]}.")
+        least, most = (0.0, np.inf) if name == "max_rotor_speed" else (1e-15, 1e6)
+        if not np.all((constants[name] > least) & (constants[name] <= most)):
+            raise InputError(
+                f"`{name}` must be positive and of a quadrotor's size in SI units, got {_short(table[name])}."
+            )
     if constants["rotor_inertia"] < 0:
         raise InputError(f"`rotor_inertia` must not be negative, got {table['rotor_inertia']}.")
+    for name, most in (("rotor_positions", 1e3), ("rotor_inertia", 1e3)):
+        if np.any(np.abs(constants[name]) > most):
+            raise InputError(f"`{name}` must be of a quadrotor's size in SI units, got {_short(table[name])}.")
     if np.any(np.abs(constants["rotor_spins"]) != 1):
-        raise InputError(f"`rotor_spins` must be 1 (counter-clockwise) or -1, got {table['rotor_spins']}.")
+        raise InputError(f"`rotor_spins` must be 1 (counter-clockwise) or -1, got {_short(table['rotor_spins'])}.")
     inertia = constants["inertia"]
     if 2 * inertia.max() > inertia.sum():
         raise InputError(f"`inertia` {inertia.tolist()} breaks the triangle inequality: no rigid body has it.")
@@ -206,10 +209,15 @@ _POSITIVE = set(_SHAPES) - {"rotor_positions", "rotor_spins", "rotor_inertia"}
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.asarray(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         array = np.asarray(None)
     usable = array.dtype.kind in "iuf" and array.shape == shape
     if not usable or np.isnan(array).any() or (name != "max_rotor_speed" and np.isinf(array).any()):
         wanted = "one finite number" if shape == () else f"finite numbers of shape {list(shape)}"
-        raise InputError(f"`{name}` must be {wanted}, got {value!r}.")
+        raise InputError(f"`{name}` must be {wanted}, got {_short(value)}.")
     return array.astype(float)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

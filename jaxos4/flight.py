@@ -42,6 +42,8 @@ class Flight(eqx.Module):
                 "`time`, `omega` and `states` must have shapes (samples,), (samples, 4) and (samples, 12), got "
                 f"{samples}, {self.omega.shape} and {self.states.shape}; a batch of flights is made by `vmap`."
             )
+        if self.specific_force is not None and self.specific_force.shape != (*samples, 3):
+            raise ValueError(f"`specific_force` must have shape {(*samples, 3)}, got {self.specific_force.shape}.")
         if samples[0] < 2:
             raise ValueError(f"A flight needs at least two samples, got {samples[0]}.")
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._custom_types import Parameters
+from ._custom_types import Parameters, as_float
 from .shooting import ShootingProblem
 
 
@@ -18,11 +18,11 @@ def fisher_information(
     Where the initial state is free it is eliminated (a Schur complement): what is left is what the flight tells about
     the parameters without knowing where it began.
     """
-    start = problem.first_state()[0] if initial_state is None else initial_state
-    information = problem.curvature(problem.rows(), parameters, start).information
-    return eliminate(information, parameters.shape[0])
+    factor = marginal_factor(_information(problem, parameters, initial_state), parameters.shape[0])
+    return (factor[:, None, :] * factor[None, :, :]).sum(axis=-1)
 
 
+@eqx.filter_jit
 def cramer_rao_bound(
     problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " size"] | None = None
 ) -> Float[Array, "parameters parameters"]:
@@ -30,15 +30,28 @@ def cramer_rao_bound(
 
     Parameters that the flight does not tell have a variance that is huge, not infinite.
     """
-    return invert(fisher_information(problem, parameters, initial_state))
+    return invert_marginal(_information(problem, parameters, initial_state), parameters.shape[0])
 
 
-def eliminate(information: Float[Array, "n n"], count: int) -> Float[Array, "count count"]:
-    """The information in the first `count` unknowns when the others are unknown too."""
-    if information.shape[0] == count:
-        return information
-    kept, cross, rest = information[:count, :count], information[:count, count:], information[count:, count:]
-    return kept - cross @ invert(rest) @ cross.T
+def _information(problem, parameters, initial_state) -> Float[Array, "unknowns unknowns"]:
+    start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
+    return problem.curvature(problem.rows(), as_float(parameters), start).information
+
+
+def marginal_factor(information: Float[Array, "n n"], count: int) -> Float[Array, "count count"]:
+    """L with L L^T the information in the first `count` unknowns when the others are unknown too.
+
+    The others come first in a Cholesky factorisation of the whole, whose last block is the factor of the Schur
+    complement: nothing is subtracted that single precision would lose.
+    """
+    order = jnp.roll(jnp.arange(information.shape[0]), -count)
+    return cholesky(information[jnp.ix_(order, order)])[-count:, -count:]
+
+
+def invert_marginal(information: Float[Array, "n n"], count: int) -> Float[Array, "count count"]:
+    """The covariance of the first `count` unknowns when the others are unknown too."""
+    inverse_factor = invert_factor(marginal_factor(information, count))
+    return (inverse_factor[:, :, None] * inverse_factor[:, None, :]).sum(axis=0)
 
 
 def invert(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -46,8 +59,7 @@ def invert(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     A direction without information gets a variance that is huge, not negative or infinite.
     """
-    inverse_factor = invert_factor(cholesky(information))
-    return (inverse_factor[:, :, None] * inverse_factor[:, None, :]).sum(axis=0)
+    return invert_marginal(information, information.shape[0])
 
 
 def cholesky(information: Float[Array, "n n"]) -> Float[Array, "n n"]:

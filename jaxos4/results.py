@@ -10,9 +10,9 @@ class RESULTS(eqx.Enumeration):
     successful = ""
     at_bound = "a parameter stopped at the hard limit around its bracket: widen the bracket or fix the model"
     unidentifiable = "the flight tells less about a parameter than its bracket already did"
-    nonfinite_trajectory = "the trajectory at the estimate is not finite, or the input is not"
+    nonfinite_trajectory = "the trajectory does not stay finite to its end, or the input is not finite"
     attitude_singularity = "the pitch angle passed +-90 degrees, where Euler angles end"
-    bracket_invalid = "a bracket's lower end is not below its upper end"
+    bracket_invalid = "a bracket's lower end is not below its upper end, or its width is not finite"
     max_sweeps = "the brackets still moved after the largest number of sweeps"
 
 

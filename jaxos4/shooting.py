@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ._custom_types import Parameters, Scalar, StateVector, as_float
@@ -20,6 +21,9 @@ from .simulate import STEPPERS
 
 # A body rate [rad/s] that no quadrotor reaches, and no gyro measures: beyond it a trial trajectory has diverged.
 FASTEST = 1e3
+
+# Rounding errors add up over a flight: to about this many times the rounding of one measurement.
+ROUNDING = 64.0
 
 # How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
 _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
@@ -89,6 +93,8 @@ class ShootingProblem(eqx.Module):
             raise ValueError(f"`method` must be one of {', '.join(STEPPERS)}, got {method!r}.")
         if np.shape(sigma) != (12,):
             raise ValueError(f"`sigma` must hold one value for each of the 12 states, got shape {np.shape(sigma)}.")
+        if not isinstance(sigma, Tracer) and not np.all((np.asarray(sigma) > 0) & np.isfinite(sigma)):
+            raise ValueError(f"`sigma` must be positive and finite, got {np.asarray(sigma).tolist()}.")
         if initial_state is not None and np.shape(initial_state) != (12,):
             raise ValueError(f"`initial_state` must be `None` or of shape (12,), got {np.shape(initial_state)}.")
         self.model, self.flight, self.sigma = model, flight, as_float(sigma)
@@ -137,16 +143,18 @@ class ShootingProblem(eqx.Module):
         off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
         return jnp.where(jnp.isnan(value), 0.0, value), off
 
+    @eqx.filter_jit
     def cost(self, parameters: Parameters, initial_state: Float[Array, " size"] | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, after the first where the initial state is known.
 
-        Infinite where the trajectory diverges or passes theta = +-90 degrees. `initial_state` defaults to
-        `first_state`.
+        Infinite where the trajectory diverges or passes theta = +-90 degrees, and without a derivative there.
+        `initial_state` defaults to `first_state`.
         """
         start = self.first_state()[0] if initial_state is None else initial_state
         cost, sound = self.shot(self.rows(), parameters, start)
         return jnp.where(sound, cost, jnp.inf)
 
+    @eqx.filter_jit
     def residuals(
         self, parameters: Parameters, initial_state: Float[Array, " size"] | None = None
     ) -> Float[Array, " residuals"]:
@@ -158,6 +166,7 @@ class ShootingProblem(eqx.Module):
         weight = 1 / self.sigma[CASCADE_ORDER[: self.size]]
         return jnp.where(jnp.isnan(measured), 0.0, weight * (measured - predicted)).ravel()
 
+    @eqx.filter_jit
     def predict(self, parameters: Parameters, initial_state: Float[Array, " size"]) -> Float[Array, "samples size"]:
         """The trajectory of the simulated channels, in cascade order."""
 
@@ -214,15 +223,21 @@ class ShootingProblem(eqx.Module):
     def reweighted(self, residuals: Float[Array, " residuals"]) -> "ShootingProblem":
         """The problem with each channel's sigma set to what its weighted `residuals` at a fit say it is.
 
-        Alternating this with the fit is maximum likelihood with unknown noise levels. A channel with fewer than two
-        measurements keeps its sigma, and none falls below a millionth of it: residuals can be rounding alone.
+        Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
+        freedom that the unknowns took. A channel with fewer than two measurements keeps its sigma, and none falls
+        below what rounding adds up to over a flight: residuals can be rounding alone.
         """
         order = CASCADE_ORDER[: self.size]
+        measured = jnp.stack(self.rows().measured)
+        count = (~jnp.isnan(measured)).sum(axis=1)
+        unknowns = len(self.model.parameter_names) + self.free_size
+        left = jnp.maximum(1 - unknowns / jnp.maximum(count.sum(), 1), 1e-3)
         squares = jnp.square(residuals.reshape(-1, self.size)).sum(axis=0)
-        count = (~jnp.isnan(jnp.stack(self.rows().measured))).sum(axis=1)
-        ratio = jnp.maximum(jnp.sqrt(squares / jnp.maximum(count, 1)), 1e-6)
-        ratio = jnp.where((count > 1) & jnp.isfinite(ratio), ratio, 1.0)
-        return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[order].multiply(ratio))
+        sigma = self.sigma[order] * jnp.sqrt(squares / jnp.maximum(count * left, 1))
+        rounding = ROUNDING * jnp.finfo(sigma.dtype).eps * jnp.nan_to_num(jnp.nanmax(jnp.abs(measured), axis=1))
+        sigma = jnp.where((count > 1) & jnp.isfinite(sigma), jnp.maximum(sigma, rounding), self.sigma[order])
+        sigma = jnp.where(sigma > 0, sigma, self.sigma[order])
+        return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[order].set(sigma))
 
     def _step(self, state: State, forcing: Forcing, parameters) -> State:
         return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)

@@ -38,6 +38,7 @@ def _advance(state: State, derivative: State, dt: Scalar) -> State:
 def _diffrax_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
     # One solve per sample holds the input exactly: a solver that looked it up by time would read the next sample at
     # the right end of its step.
+    eps = float(jnp.finfo(dt.dtype).eps)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: model.cascade(y, *args)),
         diffrax.Tsit5(),
@@ -46,7 +47,7 @@ def _diffrax_step(model: AbstractModel, state: State, forcing: Forcing, paramete
         dt0=dt,
         y0=state,
         args=(forcing, parameters),
-        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-12),
+        stepsize_controller=diffrax.PIDController(rtol=max(1e-10, 10 * eps), atol=max(1e-12, eps)),
         adjoint=diffrax.DirectAdjoint(),
         max_steps=256,
         throw=False,
@@ -78,7 +79,7 @@ def simulate(
     **Returns:** a `Flight` whose `result` is `successful`, or says why its states end: `attitude_singularity` where
     the pitch angle reached +-90 degrees, `nonfinite_trajectory` where a number overflowed. From there on they are NaN.
 
-    **Raises:** `ValueError` for a method that does not exist.
+    **Raises:** `ValueError` for a method that does not exist, or an argument of another shape.
     """
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")

@@ -75,7 +75,7 @@ def test_estimate_recovers_the_truth_within_its_intervals(run, tmp_path):
         assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4 * row["std"]
         assert name in out
     for name in ("alpha2", "alpha5"):  # 6e-9, which no flight of this noise can tell
-        assert report["parameters"][name]["note"] == "below noise floor"
+        assert report["parameters"][name]["note"] == "below noise"
     for row in report["fit"].values():
         assert row["percent"] > 85
         assert abs(row["correlation"]) < 0.3
@@ -148,6 +148,13 @@ def test_bad_flights_are_refused_in_one_line(run, tmp_path, text, fragments):
         (["estimate", "flight.csv", "--bracket", "unknown.toml"], ["unknown.toml", "alpha9"]),
         (["estimate", "flight.csv", "--out", "none/e.json"], ["none/e.json"]),
         (["estimate", "flight.csv", "--out", "."], ["."]),
+        (["estimate", "flight.csv", "--out", "flight.csv"], ["flight.csv", "overwrite"]),
+        (["estimate", "flight.csv", "--airframe", "deep.toml"], ["deep.toml"]),
+        (["estimate", "flight.csv", "--airframe", "long.toml"], ["long.toml"]),
+        (["estimate", "flight.csv", "--bracket", "deep.toml"], ["deep.toml"]),
+        (["estimate", "flight.csv", "--bracket", "huge.toml"], ["huge.toml", "alpha1"]),
+        (["estimate", "positions.csv"], ["positions.csv", "rates"]),
+        (["simulate", "--airframe", "tiny.toml", "--out", "new.csv"], ["tiny.toml", "inertia"]),
         (["estimate", "rates.csv", "--channels", "all"], ["rates.csv", "--channels"]),
         (["estimate", "rates.csv", "--channels", "rates", "--initial-state", "known"], ["rates.csv", "row 2", "r"]),
         (["simulate", "--out", "none/flight.csv"], ["none/flight.csv"]),
@@ -166,6 +173,14 @@ def test_bad_arguments_are_refused_in_one_line(run, tmp_path, arguments, fragmen
     (tmp_path / "bad.toml").write_text("mass = = 3\n")
     (tmp_path / "swapped.toml").write_text("alpha3 = [140, 100]\n")
     (tmp_path / "unknown.toml").write_text("alpha9 = [1, 2]\n")
+    (tmp_path / "deep.toml").write_text("x = " + "[" * 5000 + "]" * 5000 + "\n")
+    (tmp_path / "long.toml").write_text("mass = 1" + "0" * 5000 + "\n")
+    (tmp_path / "huge.toml").write_text("alpha1 = [0, 1" + "0" * 400 + "]\n")
+    (tmp_path / "positions.csv").write_text("t,omega1,omega2,omega3,omega4,x\n0,1,1,1,1,0\n0.1,1,1,1,1,0\n")
+    (tmp_path / "tiny.toml").write_text(
+        "mass = 0.65\ninertia = [1e-320, 1e-320, 1e-320]\narm = 0.23\nthrust_coefficient = 3e-5\n"
+        "drag_coefficient = 7e-7\nrotor_inertia = 6e-5\n"
+    )
     before = sorted(path.name for path in tmp_path.iterdir())
     refused(run(*arguments), *fragments)
     assert sorted(path.name for path in tmp_path.iterdir()) == before

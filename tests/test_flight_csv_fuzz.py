@@ -5,8 +5,7 @@ import math
 import equinox as eqx
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 import jaxos4.logs._table as table_module
 from jaxos4.airframe import OS4

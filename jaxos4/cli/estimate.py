@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from .._files import check_writable, write_atomically
+from .._files import write_atomically
 from ..airframe import load_airframe
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
@@ -29,6 +29,7 @@ from ..noise import SENSOR_SIGMA
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem
 from ._bracket_file import load_bracket
+from ._check_output import check_output
 from ._choices import Channels, Estimator, InitialState, Model
 
 ESTIMATORS: dict[str, AbstractEstimator] = {"ibss": IBSS()}
@@ -62,7 +63,7 @@ def estimate(
     vehicle = MODELS[model](load_airframe(airframe))
     where = Bracket.default(vehicle) if bracket is None else load_bracket(bracket, vehicle)
     if out is not None:
-        check_writable(out)
+        check_output(out, flight, Path(airframe), bracket)
     recorded, notes = read_flight_and_notes(flight, vehicle.airframe)
     for note in notes:
         console.print(f"note: {note}", markup=False, highlight=False)
@@ -115,6 +116,8 @@ def _problem(
     measured = ~np.isnan(np.asarray(flight.states))
     beyond = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
     present = {name: measured[:, CASCADE_ORDER[part]].any() for name, part in beyond.items()}
+    if not (present["rates"] or present["attitude"]):
+        raise InputError(f"{path}: neither rates nor attitude were measured; log p, q, r or phi, theta, psi.")
     chosen = channels.value if channels else [name for name, there in present.items() if there][-1]
     if not present[chosen]:
         missing = ", ".join(STATE_NAMES[i] for i in CASCADE_ORDER[beyond[chosen]])
@@ -145,13 +148,15 @@ def _fit(
             if str(result_names(found.result)) in NO_ANSWER:
                 return problem, found, rollouts
             used, problem = problem, problem.reweighted(problem.residuals(found.parameters, found.initial_state))
-            if number == PASSES or bool(jnp.all(jnp.abs(problem.sigma / used.sigma - 1) < OFF)):
+            settled = bool(jnp.all(jnp.abs(problem.sigma / used.sigma - 1) < OFF))
+            if settled or number == PASSES or found.result != RESULTS.successful:
                 break
             progress.update(task, completed=number, description=f"fitting with the noise found in pass {number}")
             found = jax.block_until_ready(estimator(problem, bracket))
             rollouts += int(found.rollouts)
         bound = cramer_rao_bound(problem, found.parameters, found.initial_state)
-    return problem, eqx.tree_at(lambda e: e.covariance, found, bound), rollouts
+        cost = problem.cost(found.parameters, found.initial_state)
+    return problem, eqx.tree_at(lambda e: (e.covariance, e.cost), found, (bound, cost)), rollouts
 
 
 def _parameters(model: AbstractModel, bracket: Bracket, found: Estimate) -> dict[str, dict[str, Any]]:
@@ -159,23 +164,21 @@ def _parameters(model: AbstractModel, bracket: Bracket, found: Estimate) -> dict
     for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True)):
         value, std = float(found.parameters[i]), float(found.std[i])
         lower, upper = float(bracket.lower[i]), float(bracket.upper[i])
-        known = np.isfinite(std)
+        told = np.isfinite(std) and std <= (upper - lower) / 2
         table[name] = {
-            "estimate": value if known else None,
+            "estimate": value if told else None,
             "std": _number(std),
-            "ci95": [value - 1.96 * std, value + 1.96 * std] if known else None,
+            "ci95": [value - 1.96 * std, value + 1.96 * std] if told else None,
             "unit": unit,
-            "note": _note(value, std, lower, upper) if known else "no estimate",
+            "note": _note(value, std, lower, upper) if told else "not told by this flight",
         }
     return table
 
 
 def _note(value: float, std: float, lower: float, upper: float) -> str:
-    if std > (upper - lower) / 2:
-        return "not told by this flight"
     notes = []
     if abs(value) < 1.96 * std:
-        notes.append("below noise floor")
+        notes.append("below noise")
     if not lower <= value <= upper:
         notes.append("outside its bracket")
     return "; ".join(notes)
@@ -207,6 +210,9 @@ def _print(console: Console, report: dict[str, Any]) -> None:
         right = heading in ("estimate", "bound")
         table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "note")
     for name, row in report["parameters"].items():
+        if row["estimate"] is None:
+            table.add_row(name, row["unit"], "-", "-", "-", row["note"])
+            continue
         low, high = row["ci95"]
         interval = f"[{low:.5g}, {high:.5g}]"
         table.add_row(name, row["unit"], f"{row['estimate']:.5g}", interval, f"{row['std']:.2g}", row["note"])

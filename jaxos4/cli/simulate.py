@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
-import numpy as np
 import typer
 
 from ..airframe import load_airframe
@@ -15,6 +14,7 @@ from ..logs import write_flight
 from ..noise import SENSOR_SIGMA, WhiteNoise
 from ..results import RESULTS, result_names
 from ..simulate import simulate as fly
+from ._check_output import check_output
 from ._choices import Excitation, Method, Model
 
 MOST_SAMPLES = 5_000_000  # more no longer fit an ordinary machine's memory
@@ -32,9 +32,10 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
 ) -> None:
     """Simulate a flight and write it as CSV."""
+    check_output(out, Path(airframe))
     vehicle = MODELS[model](load_airframe(airframe))
-    if not (np.isfinite(noise) and noise >= 0):
-        raise InputError(f"--noise: must be 0 or more, got {noise}.")
+    if not 0 <= noise <= 1e6:
+        raise InputError(f"--noise: must lie in 0 to 1e6, got {noise}.")
     if not 0 <= seed < 2**63:
         raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
     if dt > 0 and duration / dt > MOST_SAMPLES:

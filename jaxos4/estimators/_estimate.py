@@ -15,7 +15,7 @@ from ..shooting import ShootingProblem
 class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
-    - `parameters`: the estimate; the bracket's center where `result` says that there is none.
+    - `parameters`: the estimate; where `result` says that there is none, the bracket's center, or 0 without one.
     - `covariance`: of `parameters`, from the Fisher information at the estimate and the problem's `sigma`.
     - `initial_state`: the estimated, or known, state at the first sample, in cascade order.
     - `cost`: 1/2 |W (y - x)|^2 there.

@@ -12,14 +12,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar, as_float
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS
-from ..information import cholesky, eliminate, invert, invert_factor
+from ..information import cholesky, invert, invert_factor, invert_marginal
 from ..results import RESULTS
-from ..shooting import Rows, ShootingProblem
+from ..shooting import ROUNDING, Rows, ShootingProblem
 from ._estimate import AbstractEstimator, Estimate
 
 DIRECTIONS = ("whitened", "coordinate")
@@ -29,8 +30,6 @@ DIRECTIONS = ("whitened", "coordinate")
 _HORIZONS = (0.1, 0.3)
 # A stage that is not the last stops once no direction moves by more than this many standard deviations.
 _COARSE = 0.5
-# Rounding errors add up over a flight: to about this many times the rounding of one measurement.
-_ROUNDING = 64.0
 # A bracket opens this many predicted standard deviations to each side.
 _OPENING = 4.0
 # The next bracket holds this share of the sweep's largest move: what the other directions may have spoilt.
@@ -84,10 +83,14 @@ class IBSS(AbstractEstimator):
     def __check_init__(self):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
-        if self.halvings < 2 or self.max_sweeps < 1:
-            raise ValueError(
-                f"`halvings` must be at least 2 and `max_sweeps` at least 1, got {self.halvings} and {self.max_sweeps}."
-            )
+        for name, least in (("halvings", 2), ("max_sweeps", 1)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
+        for name in ("tolerance", "reach"):
+            value = getattr(self, name)
+            if not isinstance(value, Tracer) and not value > 0:
+                raise ValueError(f"`{name}` must be positive, got {value}.")
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket, *, start: Parameters | None = None) -> Estimate:
@@ -99,11 +102,13 @@ class IBSS(AbstractEstimator):
         - `bracket`: where the parameters are looked for; it may turn out not to hold them.
         - `start`: where in the bracket the search begins; its center by default.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
         """
         names = problem.model.parameter_names
         if bracket.lower.shape != (len(names),):
             raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
+        if start is not None and jnp.shape(start) != (len(names),):
+            raise ValueError(f"`start` must hold {len(names)} parameters, got shape {jnp.shape(start)}.")
         center = jnp.where(bracket.valid, bracket.center, 0.0)
         half_width = jnp.where(bracket.valid, bracket.half_width, 1.0)
         lower, upper = center - self.reach * half_width, center + self.reach * half_width
@@ -156,7 +161,7 @@ class IBSS(AbstractEstimator):
         if free:
             initial_state = progress.unknowns[len(names) :]
         (cost, trusted), _, information = problem.curvature(problem.rows(), parameters, initial_state)
-        bound = invert(eliminate(information, len(names)))
+        bound = invert_marginal(information, len(names))
         std = jnp.sqrt(jnp.diagonal(bound))
         at_bound = jnp.minimum(parameters - lower, upper - parameters) < 1e-3 * half_width
         sound = trusted & jnp.isfinite(cost) & jnp.isfinite(parameters).all() & jnp.isfinite(bound).all()
@@ -280,7 +285,7 @@ def _finest(problem: ShootingProblem, rows: Rows) -> Scalar:
     eps = jnp.finfo(problem.sigma.dtype).eps
     squares = [jnp.nanmean(jnp.square(y)) for y in rows.measured]
     weighted = jnp.sqrt(jnp.nan_to_num(jnp.stack(squares))) / problem.sigma[CASCADE_ORDER[: problem.size]]
-    return jnp.maximum(jnp.sqrt(eps), _ROUNDING * eps * weighted.max())
+    return jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * weighted.max())
 
 
 def _misfit(cost: Scalar, rows: Rows) -> Scalar:

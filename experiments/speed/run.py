@@ -1,0 +1,154 @@
+"""How fast it is: shots and slopes, simulation by each method, identification; growth with flights and steps; memory.
+
+Double precision, on whatever device JAX finds. Every figure is the median of warm, blocked runs.
+"""
+
+import json
+import os
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+import jaxos4
+
+jax.config.update("jax_enable_x64", True)
+
+
+def timed(function: Callable, *arguments, repeats: int) -> tuple[float, float, float, float]:
+    """Compile time, then the median, least and largest time of a run [s]."""
+    begin = time.perf_counter()
+    compiled = eqx.filter_jit(function).lower(*arguments).compile()
+    compile_seconds = time.perf_counter() - begin
+    jax.block_until_ready(compiled(*arguments))
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        jax.block_until_ready(compiled(*arguments))
+        times.append(time.perf_counter() - begin)
+    return compile_seconds, float(np.median(times)), min(times), max(times)
+
+
+def standard_problem(channels: str, steps: int) -> jaxos4.ShootingProblem:
+    """The standard flight, of so many steps of 10 ms, without noise."""
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    omega = jaxos4.multisine(model.airframe, duration=steps * 0.01)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)
+    return jaxos4.ShootingProblem(
+        model, flight, sigma=jaxos4.SENSOR_SIGMA, channels=channels, initial_state=flight.states[0]
+    )
+
+
+def identify(problem: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, keys) -> jaxos4.RESULTS:
+    """Identifies one noisy copy of the problem's flight for each key."""
+
+    def one(key):
+        flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(problem.flight, key=key)
+        return jaxos4.IBSS()(eqx.tree_at(lambda p: p.flight, problem, flight), bracket).parameters
+
+    return jax.vmap(one)(keys)
+
+
+def main(
+    batch: Annotated[int, typer.Option(help="Shots at once.")] = 4096,
+    steps: Annotated[int, typer.Option(help="Steps of a flight.")] = 500,
+    flights: Annotated[list[int], typer.Option(help="Flights identified at once.")] = (64, 256, 1024),
+    repeats: Annotated[int, typer.Option()] = 7,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+) -> None:
+    """Benchmarks; every row is measured afresh."""
+    table = Table(
+        title=f"batch {batch}, {steps} steps, float64, {jax.devices()[0].device_kind}, {os.cpu_count()} cores"
+    )
+    for heading in ("what", "compile [s]", "median [s]", "least", "largest", "rate"):
+        table.add_column(heading)
+    rows = []
+
+    def add(what: str, measured: tuple[float, float, float, float], work: float, unit: str) -> None:
+        compile_seconds, median, least, largest = measured
+        rows.append(
+            {
+                "what": what,
+                "compile_seconds": compile_seconds,
+                "median_seconds": median,
+                "min_seconds": least,
+                "max_seconds": largest,
+                "rate": work / median,
+                "unit": unit,
+                "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            }
+        )
+        scaled = f"{work / median / 1e6:.1f} M{unit}" if unit == "steps/s" else f"{work / median:.1f} {unit}"
+        table.add_row(what, f"{compile_seconds:.2f}", f"{median:.4f}", f"{least:.4f}", f"{largest:.4f}", scaled)
+
+    alpha = jaxos4.PublishedOS4(jaxos4.OS4).alpha
+    trials = alpha * (1 + 0.1 * jax.random.normal(jax.random.key(0), (batch, 8)))
+    for channels in ("all", "rates"):
+        problem = standard_problem(channels, steps)
+        add(
+            f"shot, {channels}",
+            timed(lambda p, a: jax.vmap(p.cost)(a), problem, trials, repeats=repeats),
+            batch * steps,
+            "steps/s",
+        )
+        add(
+            f"slope, {channels}",
+            timed(lambda p, a: jax.vmap(lambda x: jax.jvp(p.cost, (x,), (x,)))(a), problem, trials, repeats=repeats),
+            batch * steps,
+            "steps/s",
+        )
+    for length in (steps // 2, steps, 2 * steps, 4 * steps):
+        problem = standard_problem("all", length)
+        measured = timed(lambda p, a: jax.vmap(p.cost)(a), problem, trials[: batch // 4], repeats=repeats)
+        add(f"shot, {length} steps, batch {batch // 4}", measured, batch // 4 * length, "steps/s")
+    for method in ("euler", "rk4", "diffrax"):
+        count = batch // 64 if method == "diffrax" else batch // 8
+        problem = standard_problem("all", steps)
+
+        def trajectories(p, a, method=method):
+            return jax.vmap(lambda x: jaxos4.simulate(p.model, x, p.flight.omega, dt=0.01, method=method).states)(a)
+
+        measured = timed(trajectories, problem, trials[:count], repeats=repeats)
+        add(f"simulate, {method}, batch {count}", measured, count * steps, "steps/s")
+    for channels in ("rates", "all"):
+        problem = standard_problem(channels, steps)
+        for count in flights:
+            keys = jax.random.split(jax.random.key(1), count)
+            measured = timed(identify, problem, jaxos4.Bracket.default(problem.model), keys, repeats=1)
+            add(f"IBSS, {channels}, {count} flights", measured, count, "flights/s")
+
+    # In chunks, the memory of a study does not depend on how many flights it holds.
+    problem, chunk = standard_problem("rates", steps), min(256, flights[-1])
+    step = eqx.filter_jit(identify)
+    for count in (4 * chunk, 16 * chunk):
+        begin = time.perf_counter()
+        for first in range(0, count, chunk):
+            keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(2), i))(jnp.arange(first, first + chunk))
+            jax.block_until_ready(step(problem, jaxos4.Bracket.default(problem.model), keys))
+        seconds = time.perf_counter() - begin
+        add(f"IBSS, rates, {count} flights by {chunk}", (0.0, seconds, seconds, seconds), count, "flights/s")
+    Console(width=120).print(table)
+    peaks = ", ".join(f"{row['what']}: {row['peak_memory_mib']:.0f} MiB" for row in rows[-2:])
+    Console(width=120).print(f"peak memory of the process after {peaks}")
+    if out is not None:
+        provenance = {
+            "version": jaxos4.__version__,
+            "jax": jax.__version__,
+            "device": jax.devices()[0].device_kind,
+            "cores": os.cpu_count(),
+            "precision": "float64",
+        }
+        out.write_text(json.dumps({"provenance": provenance, "rows": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,118 @@
+"""The standard flight, and the equations of motion a second time: plain NumPy, written from the printed equations."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxos4
+
+# Typed in again, not imported: the constants of the OS4 thesis.
+OS4 = {"m": 0.650, "L": 0.23, "b": 3.13e-5, "d": 7.5e-7, "g": 9.81}
+DT = 0.01
+
+
+@functools.cache
+def standard_flight(model_class=jaxos4.PublishedOS4, duration=5.0):
+    """The exact flight that all figures are about."""
+    model = model_class(jaxos4.OS4)
+    omega = jaxos4.multisine(model.airframe, duration=duration, dt=DT)
+    return jaxos4.simulate(model, model.alpha, omega, dt=DT)
+
+
+def standard_problem(
+    model_class=jaxos4.PublishedOS4,
+    channels="all",
+    *,
+    free=False,
+    states=None,
+    duration=5.0,
+    method="euler",
+):
+    """The standard job: the exact flight, or one of the same input with other `states`."""
+    flight = standard_flight(model_class, duration)
+    start = None if free else flight.states[0]
+    if states is not None:
+        flight = eqx.tree_at(lambda f: f.states, flight, states)
+    return jaxos4.ShootingProblem(
+        model_class(jaxos4.OS4),
+        flight,
+        channels=channels,
+        sigma=jaxos4.SENSOR_SIGMA,
+        initial_state=start,
+        method=method,
+    )
+
+
+def noisy_states(count, model_class=jaxos4.PublishedOS4, *, seed=0, scale=1.0, duration=5.0):
+    """States of `count` standard flights as measured; flight i draws from `fold_in(key, i)`."""
+    flight, noise = standard_flight(model_class, duration), jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
+    keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(seed), i))(jnp.arange(count))
+    return jax.vmap(lambda key: noise(flight, key=key).states)(keys)
+
+
+def random_starts(model, count, *, seed=0, share=0.8):
+    """Where a search begins: uniform within `share` of the default bracket."""
+    around = jaxos4.Bracket.default(model)
+    draws = jax.random.uniform(jax.random.key(seed), (count, 8), minval=-share, maxval=share)
+    return around.center + draws * around.half_width
+
+
+def published_derivative(state, omega, alpha, constants=OS4):
+    """dX/dt by Eqs. (1)-(13), state in the order of Eq. (14); leading axes are a batch."""
+    _, vx, _, vy, _, vz, phi, p, theta, q, psi, r = np.moveaxis(np.asarray(state, dtype=float), -1, 0)
+    w1, w2, w3, w4 = np.moveaxis(np.asarray(omega, dtype=float), -1, 0)
+    a1, a2, a3, a4, a5, a6, a7, a8 = np.moveaxis(np.asarray(alpha, dtype=float), -1, 0)
+    arm, b, d, m, g = (constants[name] for name in ("L", "b", "d", "m", "g"))
+    roll = arm * b * (w4**2 - w2**2)
+    pitch = arm * b * (w3**2 - w1**2)
+    yaw = d * (w4**2 + w2**2 - w3**2 - w1**2)
+    thrust = b * (w4**2 + w2**2 + w3**2 + w1**2)
+    return np.stack(
+        [
+            vx,
+            (np.sin(phi) * np.cos(psi) - np.sin(psi) * np.sin(theta) * np.cos(phi)) * thrust / m,
+            vy,
+            (-np.sin(psi) * np.sin(phi) - np.sin(theta) * np.cos(phi) * np.cos(psi)) * thrust / m,
+            vz,
+            -g + np.cos(theta) * np.cos(phi) * thrust / m,
+            p + np.tan(theta) * (q * np.sin(phi) + r * np.cos(phi)),
+            q * r * a1 - a2 * q + a3 * roll,
+            q * np.cos(phi) - r * np.sin(phi),
+            p * r * a4 + r * a5 + a6 * pitch,
+            (q * np.sin(phi) + r * np.cos(phi)) / np.cos(theta),
+            p * q * a7 + a8 * yaw,
+        ],
+        axis=-1,
+    )
+
+
+def corrected_derivative(state, omega, alpha, constants=OS4):
+    """dX/dt of the rigid body: what the printed equations share with it, and what they do not."""
+    _, _, _, _, _, _, phi, p, theta, q, psi, r = np.moveaxis(np.asarray(state, dtype=float), -1, 0)
+    w1, w2, w3, w4 = np.moveaxis(np.asarray(omega, dtype=float), -1, 0)
+    a1, a2, a3, a4, a5, a6, a7, a8 = np.moveaxis(np.asarray(alpha, dtype=float), -1, 0)
+    arm, b, d, m, g = (constants[name] for name in ("L", "b", "d", "m", "g"))
+    residual_speed = w1 + w3 - w2 - w4
+    thrust = b * (w1**2 + w2**2 + w3**2 + w4**2) / m
+    derivative = published_derivative(state, omega, alpha, constants)
+    derivative[..., 1] = (np.cos(psi) * np.sin(theta) * np.cos(phi) + np.sin(psi) * np.sin(phi)) * thrust
+    derivative[..., 3] = (np.sin(psi) * np.sin(theta) * np.cos(phi) - np.cos(psi) * np.sin(phi)) * thrust
+    derivative[..., 5] = np.cos(theta) * np.cos(phi) * thrust - g
+    derivative[..., 7] = a1 * q * r - a2 * residual_speed * q + a3 * arm * b * (w4**2 - w2**2)
+    derivative[..., 9] = a4 * p * r + a5 * residual_speed * p + a6 * arm * b * (w3**2 - w1**2)
+    derivative[..., 11] = a7 * p * q + a8 * d * (w2**2 + w4**2 - w1**2 - w3**2)
+    return derivative
+
+
+REFERENCES = {jaxos4.PublishedOS4: published_derivative, jaxos4.CorrectedOS4: corrected_derivative}
+
+
+def euler_trajectory(derivative, alpha, omega, *, dt=DT, start=None, constants=OS4):
+    """x_{k+1} = x_k + T f(x_k, u_k), one row a sample."""
+    states = [np.zeros(12) if start is None else np.asarray(start, dtype=float)]
+    for row in np.asarray(omega)[:-1]:
+        states.append(states[-1] + dt * derivative(states[-1], row, alpha, constants))
+    return np.stack(states)

@@ -1,0 +1,204 @@
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxos4.airframe import (
+    ALTERNATING_SPINS,
+    OS4,
+    OS4_SIMULATOR,
+    PRESETS,
+    VOOS,
+    Airframe,
+    alpha_from_inertia,
+    inertia_from_alpha,
+    load_airframe,
+)
+from jaxos4.errors import InputError
+
+GOOD = """
+mass = 0.65
+inertia = [7.5e-3, 7.0e-3, 1.3e-2]
+arm = 0.23
+thrust_coefficient = 3.13e-5
+drag_coefficient = 7.5e-7
+rotor_inertia = 6e-5
+"""
+
+
+@pytest.mark.parametrize(
+    ("airframe", "expected"),
+    [
+        (OS4, (-0.73333, 6.0e-9, 133.33, 0.73333, 6.0e-9, 133.33, 0, 76.923)),
+        (OS4_SIMULATOR, (-0.79994, 7.2375e-9, 160.565, 0.79994, 7.2375e-9, 160.565, 0, 89.206)),
+        (VOOS, (-0.81649, 7.7592e-10, 206.186, 0.81649, 7.7592e-10, 206.186, 0, 113.507)),
+    ],
+)
+def test_published_alpha(airframe, expected):
+    """The figures for OS4 are the published ones; those of the others were worked out by hand from their constants."""
+    alpha = alpha_from_inertia(airframe.inertia, airframe.rotor_inertia * airframe.drag_coefficient)
+    np.testing.assert_allclose(alpha, expected, rtol=2e-4)
+
+
+def test_physical_alpha_and_hover():
+    np.testing.assert_allclose(alpha_from_inertia(OS4.inertia, OS4.rotor_inertia)[jnp.array([1, 4])], 8.0e-3)
+    np.testing.assert_allclose(OS4.hover_speed, 225.7, atol=0.05)
+    np.testing.assert_allclose(4 * OS4.thrust_coefficient * OS4.hover_speed**2, 0.650 * 9.81, rtol=1e-14)
+
+
+@pytest.mark.parametrize("inertia", [(7.5e-3, 7.5e-3, 1.3e-2), (5e-3, 7e-3, 1.1e-2), (0.3, 0.2, 0.25)])
+@pytest.mark.parametrize("gyroscopic", [6e-5, 4.5e-11])
+def test_alpha_and_inertia_are_inverses(inertia, gyroscopic):
+    alpha = alpha_from_inertia(np.array(inertia), np.array(gyroscopic))
+    inertia_back, gyroscopic_back = inertia_from_alpha(alpha)
+    np.testing.assert_allclose(inertia_back, inertia, rtol=1e-14)
+    np.testing.assert_allclose(gyroscopic_back, gyroscopic, rtol=1e-14)
+    np.testing.assert_allclose(alpha_from_inertia(inertia_back, gyroscopic_back), alpha, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(("name", "arm"), [("os4", 0.23), ("os4-simulator", 0.232), ("voos", 0.2)])
+def test_mixer_is_the_printed_one(name, arm):
+    """Eqs. (10)-(13), at random rotor speeds."""
+    airframe = PRESETS[name]
+    b, d = float(airframe.thrust_coefficient), float(airframe.drag_coefficient)
+    omega = np.asarray(jax.random.uniform(jax.random.key(0), (20, 4), minval=100.0, maxval=300.0))
+    w1, w2, w3, w4 = omega.T
+    printed = np.stack(
+        [
+            arm * b * (w4**2 - w2**2),
+            arm * b * (w3**2 - w1**2),
+            d * (w4**2 + w2**2 - w3**2 - w1**2),
+            b * (w1**2 + w2**2 + w3**2 + w4**2),
+        ]
+    )
+    np.testing.assert_allclose(airframe.mixer @ (omega.T**2), printed, rtol=1e-12, atol=1e-15)
+
+
+def test_hover_speed_differentiates_by_mass():
+    def hover(mass):
+        return eqx.tree_at(lambda a: a.mass, OS4, mass).hover_speed
+
+    slope = jax.jit(jax.grad(hover))(jnp.asarray(0.65))
+    np.testing.assert_allclose(slope, OS4.hover_speed / (2 * 0.65), rtol=1e-12)
+
+
+def test_mixer_differentiates_by_arm():
+    def roll_authority(positions):
+        return eqx.tree_at(lambda a: a.rotor_positions, OS4, positions).mixer[0, 3]
+
+    slope = jax.grad(roll_authority)(jnp.asarray(OS4.rotor_positions))
+    np.testing.assert_allclose(slope, np.array([[0, 0], [0, 0], [0, 0], [0, OS4.thrust_coefficient]]))
+
+
+def test_presets_outlive_a_change_of_precision():
+    """A preset is made at import, when JAX still rounds to float32: the user's later choice must not come too late."""
+    script = (
+        "import jax, numpy as np\n"
+        "from jaxos4.airframe import OS4\n"
+        "assert OS4.mixer.dtype == np.float32\n"
+        "jax.config.update('jax_enable_x64', True)\n"
+        "assert OS4.mixer.dtype == np.float64\n"
+        "assert float(OS4.mixer[3, 0]) == 3.13e-5 and float(OS4.inertia[2]) == 1.3e-2\n"
+        "assert abs(float(OS4.hover_speed) / (0.65 * 9.81 / 4 / 3.13e-5) ** 0.5 - 1) < 1e-15\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_equal_shapes_share_a_trace():
+    @eqx.filter_jit
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def hover(airframe):
+        return airframe.hover_speed
+
+    assert hover(OS4) != hover(VOOS)
+
+
+def test_toml_with_an_arm(tmp_path):
+    path = tmp_path / "quad.toml"
+    path.write_text(GOOD)
+    airframe = load_airframe(path)
+    plus = eqx.tree_at(lambda a: a.inertia, OS4, np.array([7.5e-3, 7.0e-3, 1.3e-2]))
+    assert eqx.tree_equal(airframe, plus, typematch=True)
+
+
+def test_toml_with_positions(tmp_path):
+    path = tmp_path / "quad.toml"
+    positions = "[[0.1, -0.1], [-0.1, -0.1], [-0.1, 0.1], [0.1, 0.1]]"
+    rest = "rotor_spins = [-1, 1, -1, 1]\ngravity = 9.8\nmax_rotor_speed = 900"
+    path.write_text(GOOD.replace("arm = 0.23", f"rotor_positions = {positions}\n{rest}"))
+    airframe = load_airframe(str(path))
+    np.testing.assert_array_equal(airframe.rotor_positions, [[0.1, -0.1], [-0.1, -0.1], [-0.1, 0.1], [0.1, 0.1]])
+    np.testing.assert_array_equal(airframe.rotor_spins, [-1, 1, -1, 1])
+    assert airframe.gravity == 9.8
+    assert airframe.max_rotor_speed == 900.0
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_by_name(name):
+    assert load_airframe(name) is PRESETS[name]
+
+
+def _replaced(key, line):
+    return "\n".join(line if row.startswith(f"{key} ") else row for row in GOOD.splitlines())
+
+
+BAD = {
+    "missing": ("mass", _replaced("mass", "")),
+    "no layout": ("rotor_positions", _replaced("arm", "")),
+    "two layouts": ("arm", GOOD + "rotor_positions = [[1, 0], [0, -1], [-1, 0], [0, 1]]"),
+    "unknown": ("colour", GOOD + "colour = 1"),
+    "text": ("mass", _replaced("mass", 'mass = "heavy"')),
+    "boolean": ("mass", _replaced("mass", "mass = true")),
+    "not a number": ("mass", _replaced("mass", "mass = nan")),
+    "infinite": ("mass", _replaced("mass", "mass = inf")),
+    "zero": ("thrust_coefficient", _replaced("thrust_coefficient", "thrust_coefficient = 0")),
+    "negative": ("drag_coefficient", _replaced("drag_coefficient", "drag_coefficient = -1e-7")),
+    "negative rotor inertia": ("rotor_inertia", _replaced("rotor_inertia", "rotor_inertia = -6e-5")),
+    "no arm": ("arm", _replaced("arm", "arm = 0")),
+    "negative arm": ("arm", _replaced("arm", "arm = -0.23")),
+    "infinite arm": ("arm", _replaced("arm", "arm = inf")),
+    "list for an arm": ("arm", _replaced("arm", "arm = [0.2, 0.2]")),
+    "two inertias": ("inertia", _replaced("inertia", "inertia = [1e-3, 1e-3]")),
+    "no rigid body": ("inertia", _replaced("inertia", "inertia = [1e-3, 1e-3, 1e-2]")),
+    "ragged": ("rotor_positions", _replaced("arm", "rotor_positions = [[1, 0], [0], [-1, 0], [0, 1]]")),
+    "one line": ("rotor_positions", _replaced("arm", "rotor_positions = [[1, 0], [2, 0], [-1, 0], [-2, 0]]")),
+    "spins of 2": ("rotor_spins", GOOD + "rotor_spins = [2, -2, 2, -2]"),
+    "no yaw": ("rotor_spins", GOOD + "rotor_spins = [1, 1, 1, 1]"),
+    "negative speed": ("max_rotor_speed", GOOD + "max_rotor_speed = -1"),
+    "no TOML": ("TOML", "mass: 0.65"),
+}
+
+
+@pytest.mark.parametrize(("key", "text"), BAD.values(), ids=BAD)
+def test_unusable_toml_is_told_in_one_line(tmp_path, key, text):
+    path = tmp_path / "quad.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_airframe(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert key in message
+    assert "\n" not in message
+
+
+def test_neither_file_nor_preset(tmp_path):
+    with pytest.raises(InputError, match="os4-simulator") as caught:
+        load_airframe(tmp_path / "none.toml")
+    assert "none.toml" in str(caught.value)
+
+
+def test_any_layout_fits():
+    """A plus layout turned by 45 degrees: the same authority about an axis between the arms."""
+    turn = np.array([[1, -1], [1, 1]]) / np.sqrt(2)
+    x_layout = eqx.tree_at(lambda a: a.rotor_positions, OS4, OS4.rotor_positions @ turn.T)
+    assert isinstance(x_layout, Airframe)
+    np.testing.assert_array_equal(x_layout.rotor_spins, ALTERNATING_SPINS)
+    omega_squared = np.array([2e4, 5e4, 3e4, 6e4])
+    torque, turned = OS4.mixer @ omega_squared, x_layout.mixer @ omega_squared
+    np.testing.assert_allclose(turned[:2], turn @ torque[:2], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(turned[2:], torque[2:], rtol=1e-12)

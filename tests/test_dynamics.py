@@ -1,0 +1,253 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import (
+    DT,
+    OS4,
+    REFERENCES,
+    corrected_derivative,
+    euler_trajectory,
+    published_derivative,
+    standard_flight,
+    standard_problem,
+)
+from hypothesis import given, strategies as st
+from scipy.spatial.transform import Rotation
+
+import jaxos4
+from jaxos4.dynamics import CASCADE_ORDER, CHANNELS, stack, unstack
+
+MODELS = [jaxos4.PublishedOS4, jaxos4.CorrectedOS4]
+every_model = pytest.mark.parametrize("model_class", MODELS)
+
+BODY_RATE, ANGLE, PITCH, LENGTH = 5.0, 4.0, 1.4, 20.0
+LARGEST = np.array([*[LENGTH] * 6, ANGLE, BODY_RATE, PITCH, BODY_RATE, ANGLE, BODY_RATE])
+LARGEST_ALPHA = np.array([2.0, 0.2, 300.0, 2.0, 0.2, 300.0, 1.0, 200.0])
+derivative = eqx.filter_jit(lambda model, *args: model.derivative(*args))
+derivatives = eqx.filter_jit(lambda model, *args: jax.vmap(model.derivative)(*args))
+
+
+def random_points(count, seed=0):
+    """States, rotor speeds and parameters, spread far beyond what flies."""
+    rng = np.random.default_rng(seed)
+    state = rng.uniform(-1, 1, (count, 12)) * LARGEST
+    return state, rng.uniform(0, 400, (count, 4)), rng.uniform(-1, 1, (count, 8)) * LARGEST_ALPHA
+
+
+def assert_same(actual, expected):
+    """To 1e-12 of each state's own derivative, or of its largest term where terms cancel."""
+    scale = np.maximum(np.abs(expected), np.abs(expected).max(axis=0, keepdims=True) if expected.ndim > 1 else 1.0)
+    np.testing.assert_array_less(np.abs(np.asarray(actual) - expected), 1e-12 * scale + 1e-13)
+
+
+def differs(actual, expected):
+    with pytest.raises(AssertionError):
+        assert_same(actual, expected)
+    return True
+
+
+@every_model
+def test_agrees_with_the_equations_written_again(model_class):
+    points = random_points(2000)
+    assert_same(derivatives(model_class(), *points), REFERENCES[model_class](*points))
+
+
+def within(largest):
+    bound = np.abs(largest).tolist()
+    return st.tuples(*(st.floats(-x, x, allow_subnormal=False) for x in bound)).map(np.array)
+
+
+@every_model
+@given(state=within(LARGEST), alpha=within(LARGEST_ALPHA), omega=within([400.0] * 4))
+def test_agrees_with_the_equations_at_any_point(model_class, state, alpha, omega):
+    expected = REFERENCES[model_class](state, omega, alpha)
+    actual = derivative(model_class(), jnp.asarray(state), jnp.asarray(omega), jnp.asarray(alpha))
+    np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-10)
+
+
+@every_model
+@pytest.mark.parametrize("seed", range(3))
+def test_agrees_for_any_constants(model_class, seed):
+    rng = np.random.default_rng(seed)
+    constants = {name: value * rng.uniform(0.3, 3) for name, value in OS4.items()}
+    airframe = jaxos4.Airframe(
+        mass=constants["m"],
+        inertia=(0.01, 0.011, 0.02),
+        rotor_positions=jaxos4.plus_layout(constants["L"]),
+        rotor_spins=(1.0, -1.0, 1.0, -1.0),
+        thrust_coefficient=constants["b"],
+        drag_coefficient=constants["d"],
+        rotor_inertia=6e-5,
+        gravity=constants["g"],
+    )
+    points = random_points(200, seed)
+    assert_same(derivatives(model_class(airframe), *points), REFERENCES[model_class](*points, constants))
+
+
+@every_model
+def test_the_whole_standard_flight_agrees(model_class):
+    model, flight = model_class(), standard_flight(model_class)
+    assert flight.states.shape == (501, 12)
+    expected = euler_trajectory(REFERENCES[model_class], np.asarray(model.alpha), flight.omega)
+    scale = np.abs(expected).max(axis=0)
+    assert (np.abs(flight.states - expected) / scale).max() < 1e-12
+    predicted = standard_problem(model_class).predict(model.alpha, flight.states[0, CASCADE_ORDER])
+    assert (np.abs(predicted - expected[:, CASCADE_ORDER]) / scale[CASCADE_ORDER]).max() < 1e-12
+
+
+def test_the_standard_flight_is_the_one_described():
+    flight = standard_flight()
+    states = dict(zip(jaxos4.STATE_NAMES, np.abs(flight.states).max(axis=0), strict=True))
+    assert int(flight.omega.min()) == 134
+    assert int(flight.omega.max()) == 289
+    assert max(states[name] for name in "pqr") < 1.1
+    assert max(states[name] for name in ("phi", "theta", "psi")) < 0.7
+    assert not flight.states[0].any()
+
+
+# The tests above can fail: each of these is a wrong model that they reject.
+
+
+def test_neither_reference_passes_for_the_other():
+    points = random_points(2000)
+    assert differs(derivatives(jaxos4.CorrectedOS4(), *points), published_derivative(*points))
+    assert differs(derivatives(jaxos4.PublishedOS4(), *points), corrected_derivative(*points))
+    different = np.abs(derivatives(jaxos4.CorrectedOS4(), *points) - published_derivative(*points)).max(axis=0) > 1e-6
+    assert set(np.array(jaxos4.STATE_NAMES)[different]) == {"vx", "vy", "p", "q"}
+
+
+@every_model
+@pytest.mark.parametrize("index", range(8))
+def test_a_parameter_that_is_off_by_a_millionth_is_seen(model_class, index):
+    model = model_class()
+    state, omega, alpha = random_points(2000)
+    off = alpha.copy()
+    off[:, index] *= 1 + 1e-6
+    assert differs(derivatives(model, state, omega, off), REFERENCES[model_class](state, omega, alpha))
+
+    truth = np.asarray(model.alpha)
+    off = truth.copy()
+    off[index] += 1e-6 * max(abs(truth[index]), 1.0)
+    flight = standard_flight(model_class)
+    expected = euler_trajectory(REFERENCES[model_class], off, flight.omega)
+    assert (np.abs(flight.states - expected) / np.abs(expected).max(axis=0)).max() > 1e-12
+
+
+@pytest.mark.parametrize("name", OS4)
+def test_a_constant_that_is_off_by_a_millionth_is_seen(name):
+    points = random_points(2000)
+    constants = {**OS4, name: OS4[name] * (1 + 1e-6)}
+    assert differs(derivatives(jaxos4.PublishedOS4(), *points), published_derivative(*points, constants))
+    assert differs(derivatives(jaxos4.CorrectedOS4(), *points), corrected_derivative(*points, constants))
+
+
+# The corrected model is a rigid body: textbook mechanics, with vectors and matrices.
+
+
+def rotation(phi, theta, psi):
+    """Body to earth: yaw about z, then pitch about y, then roll about x."""
+    cx, sx, cy, sy, cz, sz = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta), np.cos(psi), np.sin(psi)
+    return (
+        np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+        @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+        @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    )
+
+
+ODD_LAYOUT = jaxos4.Airframe(
+    mass=0.7,
+    inertia=(0.0071, 0.0083, 0.0127),
+    rotor_positions=[(0.21, 0.02), (-0.01, -0.25), (-0.19, 0.03), (0.05, 0.22)],
+    rotor_spins=(-1.0, 1.0, -1.0, 1.0),
+    thrust_coefficient=2.7e-5,
+    drag_coefficient=9e-7,
+    rotor_inertia=5e-5,
+    gravity=9.7,
+)
+
+
+@pytest.mark.parametrize("airframe", [jaxos4.OS4, jaxos4.VOOS, ODD_LAYOUT], ids=["os4", "voos", "odd"])
+def test_the_corrected_model_is_a_rigid_body(airframe):
+    model = jaxos4.CorrectedOS4(airframe)
+    states, omegas, _ = random_points(100, seed=1)
+    actual = derivatives(model, states, omegas, np.tile(model.alpha, (100, 1)))
+    inertia, arms = np.diag(airframe.inertia), np.pad(airframe.rotor_positions, ((0, 0), (0, 1)))
+    up, spins = np.array([0.0, 0.0, 1.0]), np.asarray(airframe.rotor_spins)
+    for dx, x, omega in zip(np.asarray(actual), states, omegas, strict=True):
+        angles, rates = x[[6, 8, 10]], x[[7, 9, 11]]
+        body = rotation(*angles)
+        np.testing.assert_allclose(body, Rotation.from_euler("ZYX", angles[::-1]).as_matrix(), atol=1e-14)
+
+        force = airframe.thrust_coefficient * omega[:, None] ** 2 * up
+        drag = -spins[:, None] * airframe.drag_coefficient * omega[:, None] ** 2 * up
+        np.testing.assert_allclose(
+            dx[[1, 3, 5]], body @ force.sum(axis=0) / airframe.mass - airframe.gravity * up, rtol=1e-12, atol=1e-12
+        )
+        # Euler's equations, with the angular momentum of the rotors.
+        momentum = inertia @ rates + airframe.rotor_inertia * (spins @ omega) * up
+        torque = np.cross(arms, force).sum(axis=0) + drag.sum(axis=0)
+        acceleration = np.linalg.solve(inertia, torque - np.cross(rates, momentum))
+        np.testing.assert_allclose(dx[[7, 9, 11]], acceleration, rtol=1e-12, atol=1e-11)
+        # dR/dt = R [rates]x, with R's derivative by a complex step.
+        turning = np.imag(rotation(*(angles + 1e-30j * dx[[6, 8, 10]]))) / 1e-30
+        cross = body.T @ turning
+        np.testing.assert_allclose(
+            cross, [[0, -rates[2], rates[1]], [rates[2], 0, -rates[0]], [-rates[1], rates[0], 0]], atol=1e-12
+        )
+
+
+def test_the_published_model_is_no_rigid_body():
+    model = jaxos4.PublishedOS4()
+    x = jnp.array([0, 0, 0, 0, 0, 0, 0.3, 0.1, 0.2, -0.4, 0.5, 0.6])
+    acceleration = np.asarray(model.derivative(x, jnp.full(4, 230.0), model.alpha))[[1, 3, 5]]
+    thrust = 4 * OS4["b"] * 230.0**2 / OS4["m"]
+    physics = rotation(0.3, 0.2, 0.5) @ [0, 0, thrust] - [0, 0, OS4["g"]]
+    assert acceleration[2] == pytest.approx(physics[2], rel=1e-12)
+    # As printed: east and north of the other convention stand where x and y should.
+    assert np.abs(acceleration[:2] - physics[:2]).min() > 0.1
+
+
+# The cascade.
+
+
+@every_model
+def test_a_shallower_state_gives_the_same_derivative(model_class):
+    model = model_class()
+    state, omega, alpha = (jnp.asarray(x[0]) for x in random_points(1))
+    forcing = jax.tree.map(lambda leaf: leaf[0], model.forcing(omega[None]))
+    full = stack(model.cascade(unstack(state[CASCADE_ORDER]), forcing, alpha))
+    for size in CHANNELS.values():
+        part = stack(model.cascade(unstack(state[CASCADE_ORDER[:size]]), forcing, alpha))
+        np.testing.assert_array_equal(part, full[:size])
+
+
+def test_the_cascade_order_is_a_permutation_that_names_the_states():
+    names = np.array(jaxos4.STATE_NAMES)[CASCADE_ORDER]
+    assert names.tolist() == ["p", "q", "r", "phi", "theta", "psi", "x", "vx", "y", "vy", "z", "vz"]
+
+
+@every_model
+def test_parameters_have_names_units_and_the_thesis_values(model_class):
+    model = model_class()
+    assert model.parameter_names == tuple(f"alpha{i}" for i in range(1, 9))
+    assert len(model.parameter_units) == 8
+    second = 6e-5 / 7.5e-3 * (7.5e-7 if model_class is jaxos4.PublishedOS4 else 1)
+    expected = [-5.5 / 7.5, second, 1 / 7.5e-3, 5.5 / 7.5, second, 1 / 7.5e-3, 0, 1 / 1.3e-2]
+    np.testing.assert_allclose(model.alpha, expected, rtol=1e-14)
+    np.testing.assert_array_equal(model.half_width, jaxos4.DEFAULT_HALF_WIDTH)
+
+
+def test_half_widths_scale_with_another_airframe():
+    half_width = np.asarray(jaxos4.PublishedOS4(jaxos4.VOOS).half_width)
+    np.testing.assert_allclose(half_width[[0, 1, 3, 4, 6]], jaxos4.DEFAULT_HALF_WIDTH[[0, 1, 3, 4, 6]])
+    share = half_width[[2, 5, 7]] * np.asarray(jaxos4.VOOS.inertia)
+    np.testing.assert_allclose(share, jaxos4.DEFAULT_HALF_WIDTH[[2, 5, 7]] * np.asarray(jaxos4.OS4.inertia))
+
+
+def test_hover_stays():
+    model = jaxos4.CorrectedOS4()
+    omega = jnp.full((101, 4), model.airframe.hover_speed)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=DT)
+    np.testing.assert_allclose(flight.states, 0, atol=1e-14)

@@ -1,0 +1,172 @@
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import noisy_states, standard_problem
+
+import jaxos4
+from jaxos4.dynamics import CHANNELS
+from jaxos4.information import invert, invert_marginal, marginal_factor
+
+every_channels = pytest.mark.parametrize("channels", CHANNELS)
+known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
+
+# Standard deviations in % of alpha, for alpha2, 5 and 7 absolute x 100: of the standard flight, known start.
+PRINTED = {
+    "rates": ("0.81", "0.11", "0.11", "0.80", "0.19", "0.11", "0.52", "0.11"),
+    "attitude": ("0.35", "0.040", "0.098", "0.38", "0.092", "0.099", "0.13", "0.090"),
+    "all": ("0.14", "0.014", "0.029", "0.15", "0.033", "0.027", "0.12", "0.089"),
+}
+
+
+def percent(bound):
+    alpha = np.asarray(jaxos4.PublishedOS4().alpha)
+    return 100 * np.sqrt(np.diagonal(bound)) / np.where(np.abs(alpha) > 1e-6, np.abs(alpha), 1)
+
+
+@every_channels
+def test_the_standard_flights_bounds_are_the_known_figures(channels):
+    bound = jaxos4.cramer_rao_bound(standard_problem(channels=channels), jaxos4.PublishedOS4().alpha)
+    figures = percent(bound)
+    rounded = [f"{x:.{len(text) - 2}f}" for x, text in zip(figures, PRINTED[channels], strict=True)]
+    assert rounded == list(PRINTED[channels])
+
+
+def jacobian(problem, parameters, start):
+    """Of the weighted residuals in parameters and start, by central differences."""
+    residuals = eqx.filter_jit(eqx.filter_vmap(problem.residuals))
+    point = np.concatenate([parameters, start])
+    step = np.concatenate([1e-4 * jaxos4.DEFAULT_HALF_WIDTH, np.full(problem.size, 1e-4)])
+    points = np.concatenate([point + np.diag(step), point - np.diag(step)])
+    up, down = np.split(np.asarray(residuals(points[:, :8], points[:, 8:])), 2)
+    return ((up - down) / (2 * step[:, None])).T
+
+
+@pytest.mark.parametrize("model_class", [jaxos4.PublishedOS4, jaxos4.CorrectedOS4])
+@every_channels
+def test_information_is_the_jacobians_square(model_class, channels):
+    """Where the start is free, of what is left of the joint one, whose inverse has the bound in its corner."""
+    alpha = model_class().alpha
+    for free in (False, True):
+        problem = standard_problem(model_class, channels, free=free)
+        start = problem.first_state()[0]
+        if not free:
+            slopes = jacobian(problem, alpha, start)[:, :8]
+            information = slopes.T @ slopes
+        else:
+            slopes = jacobian(problem, alpha, start)
+            joint = slopes.T @ slopes
+            information = np.linalg.inv(np.linalg.inv(joint)[:8, :8])
+        scale = np.sqrt(np.diagonal(information))
+        actual = jaxos4.fisher_information(problem, alpha)
+        np.testing.assert_allclose(actual / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-6)
+        bound = jaxos4.cramer_rao_bound(problem, alpha)
+        np.testing.assert_allclose(np.diagonal(bound), np.diagonal(np.linalg.inv(information)), rtol=1e-4)
+
+
+def least_eigenvalue(matrix, scale):
+    return float(np.linalg.eigvalsh(matrix / np.outer(scale, scale)).min())
+
+
+@pytest.mark.parametrize("model_class", [jaxos4.PublishedOS4, jaxos4.CorrectedOS4])
+def test_more_channels_and_a_known_start_never_cost_information(model_class):
+    alpha = model_class().alpha
+    information = {
+        (channels, free): np.asarray(
+            jaxos4.fisher_information(standard_problem(model_class, channels, free=free), alpha)
+        )
+        for channels in CHANNELS
+        for free in (False, True)
+    }
+    scale = np.sqrt(np.diagonal(information["all", False]))
+    for less, more in [("rates", "attitude"), ("attitude", "all")]:
+        for free in (False, True):
+            assert least_eigenvalue(information[more, free] - information[less, free], scale) > -1e-12
+    for channels in CHANNELS:
+        assert least_eigenvalue(information[channels, False] - information[channels, True], scale) > -1e-12
+        known, free = (percent(invert(jnp.asarray(information[channels, f]))) for f in (False, True))
+        assert (free >= known * (1 - 1e-9)).all()
+        assert np.isfinite(free).all()
+
+
+def test_twice_the_noise_is_twice_the_bound_and_lost_samples_cost():
+    alpha, problem = jaxos4.PublishedOS4().alpha, standard_problem(channels="rates")
+    bound = jaxos4.cramer_rao_bound(problem, alpha)
+    louder = eqx.tree_at(lambda p: p.sigma, problem, 2 * problem.sigma)
+    np.testing.assert_allclose(jaxos4.cramer_rao_bound(louder, alpha), 4 * bound, rtol=1e-9)
+    kept = np.arange(501) % 2 == 0
+    half = eqx.tree_at(lambda p: p.flight.states, problem, jnp.where(kept[:, None], problem.flight.states, jnp.nan))
+    ratio = np.diagonal(jaxos4.cramer_rao_bound(half, alpha)) / np.diagonal(bound)
+    np.testing.assert_allclose(ratio, 2, rtol=0.05)
+
+
+def test_the_information_does_not_depend_on_what_was_measured():
+    alpha = jaxos4.PublishedOS4().alpha
+    exact = jaxos4.fisher_information(standard_problem(channels="rates"), alpha)
+    noisy = jaxos4.fisher_information(standard_problem(channels="rates", states=noisy_states(1)[0]), alpha)
+    np.testing.assert_allclose(exact, noisy, rtol=1e-12)
+
+
+# The inverse.
+
+
+def random_information(size, condition, seed=0):
+    rng = np.random.default_rng(seed)
+    vectors = np.linalg.qr(rng.normal(size=(size, size)))[0]
+    units = 10.0 ** rng.uniform(-6, 6, size)
+    return jnp.asarray((vectors * np.geomspace(1, 1 / condition, size)) @ vectors.T * np.outer(units, units))
+
+
+@pytest.mark.parametrize("condition", [1.0, 1e4, 1e8])
+def test_inverts_whatever_the_units(condition):
+    information = random_information(8, condition)
+    inverse = np.asarray(invert(information))
+    scale = np.sqrt(np.diagonal(information))
+    np.testing.assert_allclose(inverse, inverse.T, rtol=1e-12)
+    unit = (inverse * np.outer(scale, scale)) @ (np.asarray(information) / np.outer(scale, scale))
+    np.testing.assert_allclose(unit, np.eye(8), atol=1e-14 * 8 * condition)
+
+
+@pytest.mark.parametrize("lost", [[3], [0, 7], list(range(8))])
+def test_an_unknown_without_information_gets_a_huge_and_finite_variance(lost):
+    information = np.asarray(random_information(8, 10.0)).copy()
+    expected = np.linalg.inv(np.delete(np.delete(information, lost, 0), lost, 1))
+    information[lost, :] = information[:, lost] = 0
+    inverse = np.asarray(invert(jnp.asarray(information)))
+    assert np.isfinite(inverse).all()
+    assert (np.diagonal(inverse)[lost] > 1e12).all()
+    np.testing.assert_allclose(np.delete(np.delete(inverse, lost, 0), lost, 1), expected, rtol=1e-9)
+
+
+def test_a_combination_without_information_gets_a_huge_and_finite_variance():
+    slopes = np.random.default_rng(0).normal(size=(100, 4))
+    slopes[:, 3] = slopes[:, 0] - slopes[:, 1]
+    inverse = np.asarray(invert(jnp.asarray(slopes.T @ slopes)))
+    variance = np.diagonal(inverse)
+    assert np.isfinite(inverse).all()
+    assert (variance[[0, 1, 3]] > 1e10).all()
+    assert variance[2] == pytest.approx(1 / 100, rel=0.5)
+
+
+def test_a_marginal_is_the_inverses_corner():
+    joint = random_information(11, 1e3)
+    expected = np.linalg.inv(joint)[:8, :8]
+    scale = np.sqrt(np.diagonal(expected))
+    covariance = invert_marginal(joint, 8)
+    np.testing.assert_allclose(covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-10)
+    factor = np.asarray(marginal_factor(joint, 8))
+    np.testing.assert_array_equal(factor, np.tril(factor))
+    np.testing.assert_allclose(
+        (factor @ factor.T) * np.outer(scale, scale) @ (expected / np.outer(scale, scale)), np.eye(8), atol=1e-9
+    )
+
+
+def test_a_flight_that_hovers_tells_nothing():
+    model = jaxos4.PublishedOS4()
+    omega = jaxos4.multisine(model.airframe, amplitude=0.0)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)
+    for start in (flight.states[0], None):
+        problem = jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=start)
+        bound = np.asarray(jaxos4.cramer_rao_bound(problem, model.alpha))
+        assert np.isfinite(bound).all()
+        assert (np.sqrt(np.diagonal(bound)) > jaxos4.DEFAULT_HALF_WIDTH).all()

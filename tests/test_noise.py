@@ -1,0 +1,280 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxos4.flight import STATE_NAMES, Flight
+from jaxos4.noise import (
+    SENSOR_SIGMA,
+    AbstractNoise,
+    Chain,
+    ConstantBias,
+    Dropouts,
+    GaussMarkov,
+    Quantisation,
+    WhiteNoise,
+)
+
+DT = 0.02
+NOISES = {
+    "white": WhiteNoise(SENSOR_SIGMA),
+    "bias": ConstantBias(SENSOR_SIGMA, mean=0.01),
+    "coloured": GaussMarkov(SENSOR_SIGMA, correlation_time=0.5),
+    "quantised": Quantisation(0.05),
+    "dropouts": Dropouts(0.2),
+    "chain": Chain((WhiteNoise(SENSOR_SIGMA), Quantisation(0.001), Dropouts(0.1))),
+}
+every_noise = pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
+
+
+def make_flight(samples=50, *, states=None):
+    if states is None:
+        states = jnp.sin(jnp.arange(samples * 12.0).reshape(samples, 12))
+    return Flight(
+        time=DT * jnp.arange(samples),
+        omega=jnp.full((samples, 4), 200.0),
+        states=states,
+        specific_force=jnp.ones((samples, 3)),
+    )
+
+
+def still(samples):
+    return make_flight(samples, states=jnp.zeros((samples, 12)))
+
+
+def errors(noise, samples, *, trials=None, seed=0):
+    """What `noise` adds: (samples, 12), or (trials, samples, 12) with trial i drawing from `fold_in(key, i)`."""
+    key, flight = jax.random.key(seed), still(samples)
+    if trials is None:
+        return np.asarray(noise(flight, key=key).states)
+    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(trials))
+    return np.asarray(jax.vmap(lambda k: noise(flight, key=k).states)(keys))
+
+
+def assert_within(estimate, truth, standard_error, limit=4.0):
+    """No channel further off than `limit` standard errors (one set of 12 channels in 1300 would be, by chance)."""
+    z = np.abs(np.asarray(estimate) - truth) / standard_error
+    assert z.max() < limit, z
+
+
+def test_sensor_sigma_is_in_the_order_of_the_states():
+    sigma = dict(zip(STATE_NAMES, SENSOR_SIGMA.tolist(), strict=True))
+    assert [sigma[name] for name in ("x", "y", "z")] == [0.005] * 3
+    assert [sigma[name] for name in ("vx", "vy", "vz")] == [0.02] * 3
+    assert [sigma[name] for name in ("phi", "theta", "psi")] == [0.005] * 3
+    assert [sigma[name] for name in ("p", "q", "r")] == [0.01] * 3
+    assert SENSOR_SIGMA.dtype == np.float64
+
+
+# Laws of every noise.
+
+
+@every_noise
+def test_same_key_same_numbers(noise):
+    flight = make_flight()
+    first, again, other = (noise(flight, key=jax.random.key(seed)).states for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert isinstance(noise, Quantisation) == np.array_equal(first, other, equal_nan=True)
+    assert not np.array_equal(first, flight.states)
+
+
+@every_noise
+def test_only_states_change(noise):
+    flight = make_flight()
+    noisy = noise(flight, key=jax.random.key(0))
+    assert eqx.tree_equal(eqx.tree_at(lambda f: f.states, noisy, flight.states), flight, typematch=True)
+    assert noisy.states.dtype == flight.states.dtype
+
+
+@every_noise
+def test_what_was_not_measured_stays_so(noise):
+    flight = make_flight()
+    holes = jnp.isnan(flight.states.at[3:7, 2].set(jnp.nan).at[:, 5].set(jnp.nan))
+    flight = eqx.tree_at(lambda f: f.states, flight, jnp.where(holes, jnp.nan, flight.states))
+    key = jax.random.key(0)
+    noisy, whole = noise(flight, key=key).states, noise(make_flight(), key=key).states
+    assert jnp.isnan(noisy)[holes].all()
+    np.testing.assert_array_equal(noisy[~holes], whole[~holes])
+
+
+@every_noise
+def test_compiled_batch_is_a_loop(noise):
+    flight, keys = make_flight(), jax.random.split(jax.random.key(3), 4)
+    batch = eqx.filter_jit(eqx.filter_vmap(lambda n, f, k: n(f, key=k), in_axes=(None, None, 0)))(noise, flight, keys)
+    assert batch.states.shape == (4, 50, 12)
+    for i in range(4):
+        np.testing.assert_allclose(batch.states[i], noise(flight, key=keys[i]).states, rtol=1e-14, atol=1e-16)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        WhiteNoise,
+        ConstantBias,
+        lambda sigma: GaussMarkov(sigma, correlation_time=0.3),
+        Quantisation,
+        lambda sigma: Dropouts(10 * sigma),
+    ],
+    ids=["white", "bias", "coloured", "quantised", "dropouts"],
+)
+def test_a_channel_without_noise_does_not_change(make):
+    flight = make_flight()
+    noisy = make(SENSOR_SIGMA * (np.arange(12) % 2))(flight, key=jax.random.key(5)).states
+    np.testing.assert_array_equal(noisy[:, ::2], flight.states[:, ::2])
+    assert (np.asarray(noisy[:, 1::2]) != np.asarray(flight.states[:, 1::2])).any(axis=0).all()
+
+
+def test_numbers_of_any_kind_share_a_trace():
+    @eqx.filter_jit
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def apply(noise, flight, key):
+        return noise(flight, key=key)
+
+    flight, key = make_flight(), jax.random.key(0)
+    for sigma in (0.1, 0.2, 1, SENSOR_SIGMA, np.float32(0.5), jnp.ones(12)):
+        apply(WhiteNoise(sigma), flight, key)
+
+
+def test_noise_batches_over_its_numbers():
+    flight, key = make_flight(), jax.random.key(0)
+    scales = jnp.array([0.0, 1.0, 10.0])
+    states = jax.vmap(lambda s: WhiteNoise(s * SENSOR_SIGMA)(flight, key=key).states)(scales)
+    added = states - flight.states
+    np.testing.assert_array_equal(added[0], 0)
+    np.testing.assert_allclose(added[2], 10 * added[1], rtol=1e-9, atol=1e-15)
+
+
+# Statistics.
+
+
+def test_white_noise_is_white():
+    n = 10_000
+    z = errors(WhiteNoise(SENSOR_SIGMA), n) / SENSOR_SIGMA
+    assert_within(z.mean(axis=0), 0, 1 / np.sqrt(n))
+    assert_within((z**2).mean(axis=0), 1, np.sqrt(2 / n))
+    assert_within((z[1:] * z[:-1]).mean(axis=0), 0, 1 / np.sqrt(n - 1))
+    assert_within((z**4).mean(axis=0), 3, np.sqrt(96 / n))
+    cross = z.T @ z / n
+    assert_within(cross[np.triu_indices(12, 1)], 0, 1 / np.sqrt(n), limit=4.5)
+
+
+def test_bias_is_constant_and_drawn_anew():
+    mean, trials = 0.3 * SENSOR_SIGMA, 4000
+    offset = errors(ConstantBias(SENSOR_SIGMA, mean=mean), 5, trials=trials)
+    np.testing.assert_array_equal(offset, offset[:, :1] * np.ones((1, 5, 1)))
+    z = offset[:, 0] / SENSOR_SIGMA
+    assert_within(z.mean(axis=0), 0.3, 1 / np.sqrt(trials))
+    assert_within(z.std(axis=0), 1, np.sqrt(0.5 / trials))
+    known = errors(ConstantBias(0, mean=mean), 5)
+    np.testing.assert_array_equal(known, np.broadcast_to(mean, (5, 12)))
+
+
+CORRELATION_TIME = np.linspace(0.05, 2.0, 12)
+
+
+@pytest.fixture(scope="module")
+def coloured():
+    """2000 flights of coloured noise of unit variance: (trials, samples, 12)."""
+    return errors(GaussMarkov(SENSOR_SIGMA, correlation_time=CORRELATION_TIME), 61, trials=2000) / SENSOR_SIGMA
+
+
+def autocorrelation_errors(z, lag, start):
+    """How many standard errors the autocorrelation at `lag` samples is from exp(-lag dt / T), for each channel."""
+    truth = np.exp(-lag * DT / CORRELATION_TIME)
+    return ((z[:, start] * z[:, start + lag]).mean(axis=0) - truth) / np.sqrt((1 + truth**2) / len(z))
+
+
+def innovation_errors(z, correlation_time):
+    """How many standard errors the one-step innovations of `z` are from unit variance, if T is `correlation_time`."""
+    decay = np.exp(-DT / correlation_time)
+    innovation = (z[:, 1:] - decay * z[:, :-1]) / np.sqrt(1 - decay**2)
+    n = innovation[..., 0].size
+    return ((innovation**2).mean(axis=(0, 1)) - 1) / np.sqrt(2 / n)
+
+
+@pytest.mark.parametrize("start", [0, 30])
+@pytest.mark.parametrize("lag", [0, 1, 5, 30])
+def test_autocorrelation_of_coloured_noise(coloured, lag, start):
+    """Lag 0 is the variance: it is the same at the first sample as later, so the process starts stationary."""
+    assert np.abs(autocorrelation_errors(coloured, lag, start)).max() < 4
+
+
+def test_innovations_of_coloured_noise(coloured):
+    assert np.abs(innovation_errors(coloured, CORRELATION_TIME)).max() < 4
+
+
+def test_the_tests_of_coloured_noise_can_fail(coloured):
+    """White noise, and a correlation time that is wrong by a twentieth, are told from the truth on every channel."""
+    white = errors(WhiteNoise(SENSOR_SIGMA), 61, trials=2000) / SENSOR_SIGMA
+    assert np.abs(autocorrelation_errors(white, 1, 0)).min() > 10
+    assert np.abs(innovation_errors(coloured, 1.05 * CORRELATION_TIME)).min() > 4
+
+
+def test_limits_of_coloured_noise():
+    """An infinite correlation time is a constant; one far below the sample time is white."""
+    constant = errors(GaussMarkov(SENSOR_SIGMA, correlation_time=np.inf), 50)
+    np.testing.assert_array_equal(constant, np.broadcast_to(constant[0], (50, 12)))
+    white = errors(GaussMarkov(SENSOR_SIGMA, correlation_time=1e-6), 50)
+    np.testing.assert_array_equal(white, errors(WhiteNoise(SENSOR_SIGMA), 50))
+
+
+def test_quantised_states_are_the_nearest_multiples():
+    step = np.where(np.arange(12) < 6, 0.05, 0.0)
+    flight = make_flight()
+    rounded = np.asarray(Quantisation(step)(flight, key=jax.random.key(0)).states)
+    multiples = rounded[:, :6] / 0.05
+    np.testing.assert_allclose(multiples, np.round(multiples), atol=1e-12)
+    assert np.abs(rounded - flight.states).max() <= 0.025 + 1e-15
+    np.testing.assert_array_equal(rounded[:, 6:], flight.states[:, 6:])
+
+
+def test_dropouts_come_at_their_rate():
+    n = 10_000
+    probability = np.linspace(0.05, 0.6, 12)
+    flight = make_flight(n)
+    noisy = np.asarray(Dropouts(probability)(flight, key=jax.random.key(0)).states)
+    lost = np.isnan(noisy)
+    assert_within(lost.mean(axis=0), probability, np.sqrt(probability * (1 - probability) / n))
+    both = (lost[:, 0] & lost[:, 11]).mean()
+    together = probability[0] * probability[11]
+    assert_within(both, together, np.sqrt(together * (1 - together) / n))
+    np.testing.assert_array_equal(noisy[~lost], np.asarray(flight.states)[~lost])
+    assert np.isnan(errors(Dropouts(1), 5)).all()
+
+
+def test_chain_is_one_after_the_other():
+    first, second, key = WhiteNoise(0.01), Quantisation(0.005), jax.random.key(7)
+    flight = make_flight()
+    chained = Chain((first, second, first))(flight, key=key)
+    by_hand = flight
+    for i, noise in enumerate((first, second, first)):
+        by_hand = noise(by_hand, key=jax.random.fold_in(key, i))
+    assert eqx.tree_equal(chained, by_hand)
+    assert not np.array_equal(chained.states, Chain((second, first, first))(flight, key=key).states)
+    assert eqx.tree_equal(Chain(())(flight, key=key), flight)
+
+
+# Misuse.
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: WhiteNoise(np.ones(3)), "sigma"),
+        (lambda: WhiteNoise(-0.1), "sigma"),
+        (lambda: WhiteNoise(np.nan), "sigma"),
+        (lambda: ConstantBias(1.0, mean=np.ones((2, 12))), "mean"),
+        (lambda: GaussMarkov(1.0, correlation_time=0.0), "correlation_time"),
+        (lambda: Quantisation(-1.0), "step"),
+        (lambda: Dropouts(1.5), "probability"),
+    ],
+)
+def test_numbers_out_of_range_are_named(make, name):
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        make()
+
+
+def test_the_abstract_noise_is_abstract():
+    with pytest.raises(TypeError, match="abstract"):
+        AbstractNoise()  # pyright: ignore[reportAbstractUsage]

@@ -1,0 +1,319 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import REFERENCES, euler_trajectory, noisy_states, standard_flight, standard_problem
+
+import jaxos4
+from jaxos4.dynamics import CASCADE_ORDER, CHANNELS
+
+every_channels = pytest.mark.parametrize("channels", CHANNELS)
+known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
+DURATION = 1.0
+SIGMA = jaxos4.SENSOR_SIGMA
+THETA = jaxos4.STATE_NAMES.index("theta")
+
+
+# Compiled once for each kind of problem, as `cost` and `residuals` are by themselves.
+slope_of = eqx.filter_jit(lambda problem, *args: jax.jacfwd(problem.cost)(*args))
+curvature_of = eqx.filter_jit(lambda problem, *args: problem.curvature(problem.rows(), *args))
+
+
+def measured(model_class=jaxos4.PublishedOS4):
+    return noisy_states(1, model_class, duration=DURATION)[0]
+
+
+def problem_of(channels="all", *, free=False, states=None, model_class=jaxos4.PublishedOS4, method="euler"):
+    states = measured(model_class) if states is None else states
+    return standard_problem(model_class, channels, free=free, states=states, duration=DURATION, method=method)
+
+
+def off(model_class=jaxos4.PublishedOS4):
+    """Parameters where the cost is neither zero nor stationary."""
+    return model_class().alpha + 0.1 * jnp.asarray(jaxos4.DEFAULT_HALF_WIDTH) * jnp.array(
+        [1, -1, 1, -1, 1, -1, 1, -1.0]
+    )
+
+
+def manual_residuals(problem, parameters, start):
+    """W (y - x) sample by sample, by the NumPy equations; NaN where nothing was measured."""
+    model_class = type(problem.model)
+    states = euler_trajectory(
+        REFERENCES[model_class], np.asarray(parameters), problem.flight.omega, start=start, dt=float(problem.flight.dt)
+    )
+    return ((np.asarray(problem.flight.states) - states) / SIGMA)[:, CASCADE_ORDER[: problem.size]]
+
+
+# The cost.
+
+
+@pytest.mark.parametrize("model_class", REFERENCES)
+@every_channels
+@known_or_free
+def test_cost_and_residuals_are_the_weighted_mismatch(model_class, channels, free):
+    problem = problem_of(channels, free=free, model_class=model_class)
+    start = np.asarray(problem.flight.states[0]) if free else np.zeros(12)
+    expected = manual_residuals(problem, off(model_class), start)
+    if not free:
+        expected[0] = 0  # what is known is no data
+    residuals = problem.residuals(off(model_class))
+    assert residuals.shape == (101 * CHANNELS[channels],)
+    np.testing.assert_allclose(residuals, expected.ravel(), atol=1e-9)
+    cost = float(problem.cost(off(model_class)))
+    assert cost == pytest.approx(0.5 * float(residuals @ residuals), rel=1e-13)
+    assert cost == pytest.approx(0.5 * np.sum(expected**2), rel=1e-11)
+    assert cost > 1
+
+
+@every_channels
+def test_an_exact_flight_costs_nothing_at_the_truth(channels):
+    problem = problem_of(channels, states=standard_flight(duration=DURATION).states)
+    assert float(problem.cost(problem.model.alpha)) < 1e-20
+    assert float(problem.cost(off())) > 1
+
+
+def test_the_first_sample_counts_only_where_the_start_is_free():
+    for free in (False, True):
+        states = measured()
+        problem, moved = (problem_of("rates", free=free, states=s) for s in (states, states.at[0].add(0.01)))
+        start = problem.first_state()[0]
+        same = float(moved.cost(off(), start)) == float(problem.cost(off(), start))
+        assert same is not free
+
+
+def test_an_initial_state_that_is_free_starts_at_the_first_measurements():
+    states = measured()
+    order = np.asarray(CASCADE_ORDER)
+    value, spread = problem_of(free=True, states=states).first_state()
+    np.testing.assert_array_equal(value, states[0, order])
+    np.testing.assert_allclose(spread, 3 * SIGMA[order])
+    # p is measured from the third sample on, x never.
+    p, x = (jaxos4.STATE_NAMES.index(name) for name in ("p", "x"))
+    states = states.at[:2, p].set(jnp.nan).at[:, x].set(jnp.nan)
+    value, spread = problem_of(free=True, states=states).first_state()
+    assert float(value[0]) == float(states[2, p])
+    assert float(value[6]) == 0
+    assert spread[0] > 1
+    assert spread[6] > 2
+    np.testing.assert_array_equal(spread[1:6], 3 * SIGMA[order[1:6]])
+    # Where it is known, it is what was told.
+    value, spread = problem_of().first_state()
+    np.testing.assert_array_equal(value, 0)
+    np.testing.assert_array_equal(spread, 0)
+
+
+@known_or_free
+def test_what_was_not_measured_contributes_nothing(free):
+    states, lost = measured(), np.random.default_rng(0).random((101, 12)) < 0.3
+    lost[0] &= not free
+    lost[40:60, THETA] = True
+    masked = problem_of("attitude", free=free, states=jnp.where(lost, jnp.nan, states))
+    start = np.asarray(states[0]) if free else np.zeros(12)
+    expected = manual_residuals(masked, off(), start)
+    expected[0] *= free
+    residuals = masked.residuals(off())
+    assert residuals.shape == (101 * 6,)
+    np.testing.assert_allclose(residuals, np.nan_to_num(expected.ravel()), atol=1e-9)
+    assert float(masked.cost(off())) == pytest.approx(0.5 * np.nansum(expected**2), rel=1e-11)
+    # Whatever stands in the samples that count, the lost ones are not read.
+    gradient = slope_of(masked, off())
+    curvature = curvature_of(masked, off(), masked.first_state()[0])
+    assert np.isfinite(gradient).all()
+    np.testing.assert_allclose(curvature.gradient[:8], gradient, rtol=1e-9)
+    assert np.isfinite(curvature.information).all()
+
+
+def test_a_flight_without_measurements_costs_nothing():
+    problem = problem_of("attitude", states=jnp.full((101, 12), jnp.nan))
+    assert float(problem.cost(off())) == 0
+    assert not problem.residuals(off()).any()
+    assert not curvature_of(problem, off(), problem.first_state()[0]).information.any()
+
+
+def test_restricting_is_the_same_problem_on_fewer_channels():
+    whole = problem_of()
+    for channels, size in CHANNELS.items():
+        part, made = whole.restrict(channels), problem_of(channels)
+        assert (part.size, part.free_size, part.channels) == (size, 0, channels)
+        assert float(part.cost(off())) == float(made.cost(off()))
+        rows = whole.residuals(off()).reshape(101, 12)[:, :size]
+        np.testing.assert_allclose(part.residuals(off()).reshape(101, size), rows, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+def test_shoots_with_its_own_method(method):
+    model, flight = jaxos4.PublishedOS4(), standard_flight(duration=DURATION)
+    exact = jaxos4.simulate(model, model.alpha, flight.omega, dt=flight.dt, method=method)
+    assert float(problem_of(states=exact.states, method=method).cost(model.alpha)) < 1e-18
+    other = {"euler": "rk4", "rk4": "euler"}[method]
+    assert float(problem_of(states=exact.states, method=other).cost(model.alpha)) > 0.1
+
+
+def test_the_last_row_of_rotor_speeds_is_not_read():
+    problem = problem_of("attitude")
+    broken = eqx.tree_at(lambda p: p.flight.omega, problem, problem.flight.omega.at[-1].set(jnp.nan))
+    assert float(broken.cost(off())) == float(problem.cost(off()))
+    np.testing.assert_array_equal(slope_of(broken, off()), slope_of(problem, off()))
+
+
+# Derivatives.
+
+
+@eqx.filter_jit
+def all_derivatives(problem, parameters, start):
+    def cost(u):
+        return problem.cost(u[:8], u[8:])
+
+    u = jnp.concatenate([parameters, start])
+    return jax.value_and_grad(cost)(u), jax.jacfwd(cost)(u), problem.curvature(problem.rows(), parameters, start)
+
+
+@eqx.filter_jit
+def costs_of(problem, parameters, start):
+    return jax.vmap(problem.cost)(parameters, start)
+
+
+def central_differences(problem, parameters, start, step):
+    """Derivatives by Richardson's extrapolation of central differences over `step` and half of it."""
+    point, moves = np.concatenate([parameters, start]), np.diag(step)
+    points = np.concatenate([point + share * moves for share in (1, -1, 0.5, -0.5)])
+    up, down, half_up, half_down = np.split(np.asarray(costs_of(problem, points[:, :8], points[:, 8:])), 4)
+    return (4 * (half_up - half_down) / step - (up - down) / (2 * step)) / 3
+
+
+CASES = [(jaxos4.PublishedOS4, c, f, "euler") for c in CHANNELS for f in (False, True)] + [
+    (jaxos4.CorrectedOS4, "all", True, "euler"),
+    (jaxos4.CorrectedOS4, "rates", False, "rk4"),
+]
+
+
+@pytest.mark.parametrize(("model_class", "channels", "free", "method"), CASES)
+def test_forward_and_reverse_mode_equal_finite_differences(model_class, channels, free, method):
+    problem = problem_of(channels, free=free, model_class=model_class, method=method)
+    # Where the initial state is known the cost still depends on the one it is given.
+    start = problem.first_state()[0] + 0.01
+    (cost, reverse), forward, curvature = all_derivatives(problem, off(model_class), start)
+    order = CASCADE_ORDER[: problem.size]
+    step = np.concatenate([1e-3 * jaxos4.DEFAULT_HALF_WIDTH, 0.1 * SIGMA[order]])
+    expected = central_differences(problem, off(model_class), start, step)
+    scale = np.abs(expected * step)
+    assert (scale > 0).all()
+    for gradient in (reverse, forward):
+        np.testing.assert_allclose(gradient * step, expected * step, rtol=1e-6, atol=1e-9 * scale.max())
+    np.testing.assert_allclose(forward, reverse, rtol=1e-10, atol=1e-12 * np.abs(reverse).max())
+    assert float(curvature.shot.cost) == pytest.approx(float(cost), rel=1e-13)
+    assert bool(curvature.shot.sound)
+    unknowns = 8 + problem.free_size
+    assert curvature.information.shape == (unknowns, unknowns)
+    np.testing.assert_allclose(curvature.gradient, forward[:unknowns], rtol=1e-10)
+
+
+def test_a_derivative_that_is_off_would_be_seen():
+    problem = problem_of("rates")
+    start = problem.first_state()[0]
+    (_, reverse), _, _ = all_derivatives(problem, off(), start)
+    step = np.concatenate([1e-3 * jaxos4.DEFAULT_HALF_WIDTH, np.full(3, 1e-3)])
+    expected = central_differences(problem, off() * (1 + 1e-5), start, step)
+    assert np.abs(reverse / expected - 1).max() > 1e-6
+
+
+# One lane, many lanes; failures.
+
+
+@every_channels
+def test_loop_and_vmap_agree(channels):
+    problem = problem_of(channels, free=True)
+    alphas = off() * jnp.linspace(0.9, 1.1, 3)[:, None]
+    looped = [float(problem.cost(alpha)) for alpha in alphas]
+    np.testing.assert_allclose(eqx.filter_vmap(problem.cost)(alphas), looped, rtol=1e-12)
+
+
+def test_jitted_and_not_agree():
+    problem = standard_problem(duration=0.03)
+    compiled = problem.cost(off())
+    with jax.disable_jit():
+        np.testing.assert_allclose(problem.cost(off()), compiled, rtol=1e-12)
+
+
+@every_channels
+def test_a_trajectory_that_fails_costs_infinitely_much_and_nobody_else_any(channels):
+    problem = problem_of(channels)
+    divergent = problem.model.alpha.at[2].set(1e7)
+    alphas = jnp.stack([problem.model.alpha, divergent, off(), jnp.full(8, jnp.nan)])
+    start = jnp.zeros((4, problem.size))
+    costs, expected = (np.asarray(costs_of(problem, a, start)) for a in (alphas, alphas[jnp.array([0, 0, 2, 2])]))
+    assert costs[[1, 3]].tolist() == [np.inf, np.inf]
+    np.testing.assert_array_equal(costs[[0, 2]], expected[[0, 2]])
+    assert np.isfinite(costs[[0, 2]]).all()
+
+
+def test_a_shot_over_the_top_is_compared_up_to_there():
+    """Its cost means nothing, but its slope still leads back."""
+    problem = problem_of("attitude")
+    start = jnp.zeros(6).at[4].set(1.4)
+
+    def shot(parameters):
+        return problem.shot(problem.rows(), parameters, start)
+
+    steep = off().at[5].set(1000.0)
+    (cost, sound), (slope, _) = jax.jvp(lambda a: shot(a), (steep,), (jnp.zeros(8).at[5].set(1.0),))
+    assert not bool(sound)
+    assert np.isfinite(cost)
+    assert np.isfinite(slope)
+    assert float(problem.cost(steep, start)) == np.inf
+
+
+# Noise levels, and misuse.
+
+
+def test_reweighting_finds_the_noise_level_of_each_channel():
+    flight, factor = standard_flight(), jnp.linspace(0.3, 3.0, 12)
+    noise = jax.random.normal(jax.random.key(0), (501, 12)) * factor * SIGMA
+    states = (flight.states + noise).at[:, 0].set(jnp.nan)
+    problem = standard_problem(states=states)
+    again = problem.reweighted(problem.residuals(problem.model.alpha))
+    ratio = np.asarray(again.sigma / SIGMA)
+    assert ratio[0] == 1  # never measured
+    np.testing.assert_allclose(ratio[1:] / factor[1:], 1, atol=4 / np.sqrt(2 * 500))
+    # Of the fewer channels of a problem only those are judged.
+    rates = standard_problem(channels="rates", states=states)
+    ratio = np.asarray(rates.reweighted(rates.residuals(problem.model.alpha)).sigma / SIGMA)
+    assert (ratio[[0, 1, 2, 3, 4, 5, 6, 8, 10]] == 1).all()
+    np.testing.assert_allclose(ratio[[7, 9, 11]] / factor[jnp.array([7, 9, 11])], 1, atol=4 / np.sqrt(2 * 500))
+
+
+def test_reweighting_an_exact_fit_leaves_weights_that_are_finite():
+    problem = standard_problem()
+    again = problem.reweighted(problem.residuals(problem.model.alpha))
+    assert (np.asarray(again.sigma) > 0).all()
+    assert (np.asarray(again.sigma) <= 1e-6 * SIGMA).all()
+    assert float(again.cost(problem.model.alpha)) < 12 * 501
+    hover = standard_problem(states=jnp.zeros((501, 12)))  # not a number in it but zero
+    np.testing.assert_array_equal(hover.reweighted(jnp.zeros(501 * 12)).sigma, SIGMA)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"channels": "some"}, r"`channels` must be one of rates, attitude, all, got 'some'"),
+        ({"method": "diffrax"}, r"`method` must be one of euler, rk4, got 'diffrax'"),
+    ],
+)
+def test_misuse_is_named(arguments, message):
+    model, flight = jaxos4.PublishedOS4(), standard_flight()
+    with pytest.raises(ValueError, match=message):
+        jaxos4.ShootingProblem(model, flight, **{"sigma": SIGMA, **arguments})
+
+
+def test_vmaps_over_flights_and_over_noise_levels():
+    states = noisy_states(3, duration=DURATION)
+    sigmas = SIGMA * np.array([[1.0], [2.0], [0.5]])
+    flight = standard_flight(duration=DURATION)
+
+    def cost(states, sigma):
+        data = eqx.tree_at(lambda f: f.states, flight, states)
+        return jaxos4.ShootingProblem(jaxos4.PublishedOS4(), data, sigma=sigma, channels="rates").cost(off())
+
+    batched = jax.vmap(cost)(states, jnp.asarray(sigmas))
+    np.testing.assert_allclose(batched, [cost(*pair) for pair in zip(states, jnp.asarray(sigmas), strict=True)])

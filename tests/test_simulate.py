@@ -1,0 +1,256 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DT, REFERENCES, standard_flight
+from scipy.integrate import solve_ivp
+
+import jaxos4
+from jaxos4.simulate import METHODS
+
+every_model = pytest.mark.parametrize("model_class", REFERENCES)
+every_method = pytest.mark.parametrize("method", METHODS)
+THETA, Q = jaxos4.STATE_NAMES.index("theta"), jaxos4.STATE_NAMES.index("q")
+SUCCESS, SINGULAR, NONFINITE = "successful", "attitude_singularity", "nonfinite_trajectory"
+
+
+SAMPLES = 26  # one length for all, so that each method compiles once
+
+
+def name(flight):
+    return jaxos4.result_names(flight.result).tolist()
+
+
+def hover(model):
+    return jnp.full((SAMPLES, 4), model.airframe.hover_speed)
+
+
+# Orders of convergence.
+
+COARSE, STEPS = 0.04, (1, 2, 4)
+
+
+@pytest.fixture(scope="module", params=REFERENCES, ids=lambda c: c.__name__)
+def refinements(request):
+    """Errors at the coarse samples of each method, as the step shrinks and the input stays the same function."""
+    model = request.param()
+    alpha = model.alpha.at[6].set(0.2)  # yaw would be linear without
+    omega = jaxos4.multisine(model.airframe, duration=1.0, dt=COARSE)
+
+    def fly(method, refinement):
+        held = jnp.concatenate([jnp.repeat(omega[:-1], refinement, axis=0), omega[-1:]])
+        flight = jaxos4.simulate(model, alpha, held, dt=COARSE / refinement, method=method)
+        return np.asarray(flight.states)[::refinement]
+
+    exact = fly("diffrax", 1)
+    errors = {
+        method: np.stack([np.abs(fly(method, n) - exact).max(axis=0) for n in STEPS]) for method in ("euler", "rk4")
+    }
+    return model, np.asarray(alpha), np.asarray(omega), exact, errors
+
+
+@pytest.mark.parametrize(("method", "order"), [("euler", 1), ("rk4", 4)])
+def test_converges_at_its_order(refinements, method, order):
+    model, _, _, exact, errors = refinements
+    slopes = np.log2(errors[method][:-1] / errors[method][1:])
+    np.testing.assert_allclose(slopes[-1], order, atol=0.15)
+    relative = np.linalg.norm(errors[method] / np.abs(exact).max(axis=0), axis=1)
+    np.testing.assert_allclose(np.log2(relative[:-1] / relative[1:]), order, atol=0.04)
+
+
+def test_diffrax_agrees_with_another_library_on_other_equations(refinements):
+    model, alpha, omega, exact, _ = refinements
+    derivative, state, states = REFERENCES[type(model)], np.zeros(12), [np.zeros(12)]
+    for row in omega[:-1]:
+        solution = solve_ivp(
+            lambda _, x, row=row: derivative(x, row, alpha), (0, COARSE), state, "DOP853", rtol=1e-12, atol=1e-14
+        )
+        state = solution.y[:, -1]
+        states.append(state)
+    np.testing.assert_allclose(exact, np.stack(states), rtol=0, atol=2e-9)
+
+
+# Zero-order hold.
+
+
+def square_wave(model):
+    """Rotor speeds that jump at every sample, in no regular pattern."""
+    jumps = np.random.default_rng(0).choice([-1.0, 1.0], (SAMPLES, 4))
+    return jnp.asarray(model.airframe.hover_speed + 40 * jumps)
+
+
+@every_method
+def test_each_row_is_held_until_the_next(method):
+    """Without coupling the rates are sums of torques, and the vertical speed a sum of thrusts, whatever the method."""
+    model = jaxos4.PublishedOS4()
+    omega, dt = square_wave(model), 0.05
+    gains = jnp.array([0.0, 0.0, 120.0, 0.0, 0.0, 110.0, 0.0, 60.0])
+    flight = jaxos4.simulate(model, gains, omega, dt=dt, method=method)
+    assert name(flight) == SUCCESS
+
+    w = np.asarray(omega) ** 2
+    torque = np.stack(
+        [
+            120.0 * 0.23 * 3.13e-5 * (w[:, 3] - w[:, 1]),
+            110.0 * 0.23 * 3.13e-5 * (w[:, 2] - w[:, 0]),
+            60.0 * 7.5e-7 * (w[:, 3] + w[:, 1] - w[:, 2] - w[:, 0]),
+        ],
+        axis=-1,
+    )
+    rates = np.asarray(flight.states)[:, [7, 9, 11]]
+    held = np.concatenate([np.zeros((1, 3)), dt * np.cumsum(torque[:-1], axis=0)])
+    np.testing.assert_allclose(rates, held, atol=1e-12)
+    # Reading the next sample, or the mean of both, would be seen.
+    for wrong in (dt * np.cumsum(torque[1:], axis=0), dt * np.cumsum(torque[1:] + torque[:-1], axis=0) / 2):
+        assert np.abs(rates[1:] - wrong).max() > 0.01
+
+
+@every_method
+def test_a_double_integrator_is_exact(method):
+    """Roll alone: phi'' is constant over a sample. Euler advances phi by the rate at the sample's beginning."""
+    model = jaxos4.PublishedOS4()
+    up = np.random.default_rng(1).choice([-900.0, 900.0], SAMPLES)
+    omega = jnp.asarray(np.sqrt(225.0**2 + np.stack([0 * up, -up, 0 * up, up], axis=-1)))
+    dt, acceleration = 0.02, 0.23 * 3.13e-5 * 2 * up / 7.5e-3
+    states = np.asarray(jaxos4.simulate(model, model.alpha, omega, dt=dt, method=method).states)
+    p = np.concatenate([[0], dt * np.cumsum(acceleration[:-1])])
+    within = 0 if method == "euler" else dt**2 / 2
+    phi = np.concatenate([[0], np.cumsum(dt * p[:-1] + within * acceleration[:-1])])
+    np.testing.assert_allclose(states[:, 7], p, atol=1e-13)
+    np.testing.assert_allclose(states[:, 6], phi, atol=1e-13)
+
+
+@every_method
+def test_the_last_row_drives_nothing(method):
+    model = jaxos4.PublishedOS4()
+    omega = square_wave(model)
+    flights = [jaxos4.simulate(model, model.alpha, o, dt=DT, method=method) for o in (omega, omega.at[-1].set(jnp.nan))]
+    np.testing.assert_array_equal(flights[0].states, flights[1].states)
+    assert name(flights[1]) == SUCCESS
+
+
+# What a flight is.
+
+
+@every_method
+def test_begins_where_it_is_told(method):
+    model = jaxos4.PublishedOS4()
+    start = jnp.linspace(-0.3, 0.4, 12)
+    flight = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=start, method=method)
+    np.testing.assert_array_equal(flight.states[0], start)
+    np.testing.assert_allclose(flight.time, DT * np.arange(SAMPLES))
+    assert float(flight.dt) == pytest.approx(DT)
+    resumed = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=flight.states[5], method=method)
+    np.testing.assert_allclose(resumed.states[:-5], flight.states[5:], rtol=1e-13, atol=1e-14)
+
+
+def test_methods_that_do_not_exist_are_named():
+    model = jaxos4.PublishedOS4()
+    with pytest.raises(ValueError, match=r"`method` must be one of euler, rk4, diffrax, got 'heun'"):
+        jaxos4.simulate(model, model.alpha, hover(model), dt=DT, method="heun")
+
+
+def test_shapes_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match=r"`time`, `omega` and `states`"):
+        jaxos4.Flight(time=jnp.arange(3.0), omega=jnp.ones((3, 4)), states=jnp.ones((4, 12)))
+    with pytest.raises(ValueError, match="at least two samples"):
+        jaxos4.Flight(time=jnp.arange(1.0), omega=jnp.ones((1, 4)), states=jnp.ones((1, 12)))
+
+
+# One lane, many lanes.
+
+
+@every_method
+def test_loop_and_vmap_agree(method):
+    model, omega = jaxos4.PublishedOS4(), standard_flight().omega[:SAMPLES]
+    alphas = model.alpha * jnp.linspace(0.8, 1.2, 3)[:, None]
+
+    def fly(alpha):
+        return jaxos4.simulate(model, alpha, omega, dt=DT, method=method)
+
+    batched = eqx.filter_vmap(fly)(alphas)
+    np.testing.assert_allclose(batched.states, [fly(alpha).states for alpha in alphas], rtol=1e-12, atol=1e-14)
+    assert name(batched) == [SUCCESS] * 3
+
+
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+def test_jitted_and_not_agree(method):
+    model, omega = jaxos4.CorrectedOS4(), standard_flight().omega[:4]
+    compiled = jaxos4.simulate(model, model.alpha, omega, dt=DT, method=method)
+    with jax.disable_jit():
+        interpreted = jaxos4.simulate(model, model.alpha, omega, dt=DT, method=method)
+    np.testing.assert_allclose(interpreted.states, compiled.states, rtol=1e-12, atol=1e-14)
+
+
+def test_vmaps_over_flights_models_and_sample_times():
+    omega = standard_flight().omega[:SAMPLES]
+
+    def fly(mass, dt, scale):
+        model = eqx.tree_at(lambda m: m.airframe.mass, jaxos4.PublishedOS4(), mass)
+        return jaxos4.simulate(model, model.alpha, scale * omega, dt=dt).states
+
+    masses, dts, scales = jnp.array([0.5, 0.7]), jnp.array([0.01, 0.02]), jnp.array([1.0, 0.9])
+    batched = eqx.filter_vmap(fly)(masses, dts, scales)
+    for i in range(2):
+        np.testing.assert_allclose(batched[i], fly(masses[i], dts[i], scales[i]), rtol=1e-12, atol=1e-14)
+
+
+# Failures are values, and stay in their lane.
+
+# Nose up without a trace of roll, so that pitch passes 90 degrees after 0.025 s. With any roll, Euler angles turn
+# sharply just before it instead.
+OVER = np.zeros(12)
+OVER[THETA], OVER[Q] = np.pi / 2 - 0.05, 2.0
+PLANE = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
+
+
+@every_method
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_flight_over_the_top_ends_there(method, side):
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, PLANE, hover(model), dt=DT, initial_state=jnp.asarray(side * OVER), method=method)
+    assert name(flight) == SINGULAR
+    ended = np.isnan(flight.states).all(axis=1)
+    first = int(np.argmax(ended))
+    assert first == 3
+    assert ended[first:].all()
+    assert np.isfinite(flight.states[:first]).all()
+    assert (np.abs(flight.states[:first, THETA]) < np.pi / 2).all()
+
+
+@every_method
+def test_an_overflow_ends_the_flight(method):
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, 1e200 * standard_flight().omega[:SAMPLES], dt=DT, method=method)
+    assert name(flight) == NONFINITE
+    assert np.isfinite(flight.states[0]).all()
+    ended = np.isnan(flight.states).any(axis=1)
+    assert np.isnan(flight.states[np.argmax(ended) :]).all()
+
+
+@every_method
+def test_failing_lanes_leave_their_neighbours_alone(method):
+    model = jaxos4.PublishedOS4()
+    omega = np.tile(hover(model), (3, 1, 1))
+    starts = np.tile(OVER / 2, (3, 1))
+
+    def fly(omega, start):
+        return jaxos4.simulate(model, PLANE, omega, dt=DT, initial_state=start, method=method)
+
+    sound = eqx.filter_vmap(fly)(jnp.asarray(omega), jnp.asarray(starts))
+    omega[0, 4, 2] = np.nan
+    starts[2] = OVER
+    mixed = eqx.filter_vmap(fly)(jnp.asarray(omega), jnp.asarray(starts))
+    assert name(sound) == [SUCCESS] * 3
+    assert name(mixed) == [NONFINITE, SUCCESS, SINGULAR]
+    np.testing.assert_array_equal(mixed.states[1], sound.states[1])
+    assert np.isnan(mixed.states[0, 5:]).all()
+    assert np.isfinite(mixed.states[0, :5]).all()
+
+
+def test_a_start_that_is_no_number_is_said():
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=jnp.full(12, jnp.nan))
+    assert name(flight) == NONFINITE
+    assert np.isnan(flight.states).all()
