@@ -1,0 +1,33 @@
+"""Each experiment runs in a small configuration and writes the figures that it prints."""
+
+import importlib.util
+import json
+import pathlib
+
+import numpy as np
+
+EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
+
+
+def load(name: str):
+    spec = importlib.util.spec_from_file_location(f"experiment_{name}", EXPERIMENTS / name / "run.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_efficiency(tmp_path):
+    load("efficiency").main(flights=48, seed=0, scale=1.0, cases=["published, rates"], out=tmp_path / "out.json")
+    row = json.loads((tmp_path / "out.json").read_text())["cases"]["published, rates"]
+    assert row["results"] == {"successful": 48}
+    # Within four Monte-Carlo standard errors of the bound, on each of the eight parameters.
+    assert np.all(np.abs(np.array(row["efficiency"]) - 1) < 4 * row["monte_carlo_error"])
+    assert np.all(np.abs(row["bias"]) < 4 / np.sqrt(48))
+    assert abs(row["covered"] - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 48)
+
+
+def test_speed(tmp_path):
+    load("speed").main(batch=64, steps=40, flights=[2], repeats=2, out=tmp_path / "out.json")
+    report = json.loads((tmp_path / "out.json").read_text())
+    assert report["provenance"]["precision"] == "float64"
+    assert all(row["rate"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
