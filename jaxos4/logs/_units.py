@@ -168,8 +168,10 @@ def force_note(force: np.ndarray) -> str | None:
 
 def thrust_note(ratio: float) -> str | None:
     """A note where the rotors carry `ratio` times the weight, and rpm or rev/s would explain it."""
-    if 1 / 25 < ratio < 25 or ratio == 0:
+    if 1 / 25 < ratio < 25:
         return None
+    if ratio == 0:
+        return "the rotors stand still for half of the flight or more: keep the part that was flown"
     unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
     return (
         f"the rotor speeds carry {ratio:.2g} times the airframe's weight (median): check the airframe, "
