@@ -6,6 +6,8 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float
@@ -79,12 +81,22 @@ def simulate(
     **Returns:** a `Flight` whose `result` is `successful`, or says why its states end: `attitude_singularity` where
     the pitch angle reached +-90 degrees, `nonfinite_trajectory` where a number overflowed. From there on they are NaN.
 
-    **Raises:** `ValueError` for a method that does not exist, or an argument of another shape.
+    **Raises:** `ValueError` for a method that does not exist, an argument of another shape, a `dt` that is not positive.
     """
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
-    start = jnp.zeros(12, dtype=float) if initial_state is None else as_float(initial_state)
-    return _fly(model, as_float(parameters), as_float(omega), as_float(dt), start, method)
+    start = jnp.zeros(12) if initial_state is None else initial_state
+    for name, value, shape in (
+        ("parameters", parameters, (len(model.parameter_names),)),
+        ("omega", omega, (*jnp.shape(omega)[:1], 4)),
+        ("initial_state", start, (12,)),
+        ("dt", dt, ()),
+    ):
+        if jnp.shape(value) != shape:
+            raise ValueError(f"`{name}` must have shape {shape}, got {jnp.shape(value)}; a batch is made by `vmap`.")
+    if not isinstance(dt, Tracer) and not np.asarray(dt) > 0:
+        raise ValueError(f"`dt` must be positive, got {dt}.")
+    return _fly(model, as_float(parameters), as_float(omega), as_float(dt), as_float(start), method)
 
 
 @eqx.filter_jit

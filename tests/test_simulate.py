@@ -254,3 +254,24 @@ def test_a_start_that_is_no_number_is_said():
     flight = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=jnp.full(12, jnp.nan))
     assert name(flight) == NONFINITE
     assert np.isnan(flight.states).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("parameters", {"parameters": np.zeros(3)}),
+        ("omega", {"omega": np.ones((5, 3))}),
+        ("omega", {"omega": np.ones((1, 5, 4))}),
+        ("initial_state", {"initial_state": np.zeros(6)}),
+        ("dt", {"dt": 0.0}),
+        ("dt", {"dt": float("nan")}),
+        ("dt", {"dt": np.ones(2)}),
+    ],
+)
+def test_misuse_names_the_argument(name, change):
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    good = {"parameters": model.alpha, "omega": jnp.ones((5, 4)), "dt": 0.01, "initial_state": None}
+    arguments = good | {key: jnp.asarray(value) if np.ndim(value) else value for key, value in change.items()}
+    parameters, omega = arguments.pop("parameters"), arguments.pop("omega")
+    with pytest.raises((ValueError, TypeError), match=name):
+        jaxos4.simulate(model, parameters, omega, **arguments)
