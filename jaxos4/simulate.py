@@ -81,7 +81,7 @@ def simulate(
     **Returns:** a `Flight` whose `result` is `successful`, or says why its states end: `attitude_singularity` where
     the pitch angle reached +-90 degrees, `nonfinite_trajectory` where a number overflowed. From there on they are NaN.
 
-    **Raises:** `ValueError` for a method that does not exist, an argument of another shape, a `dt` that is not positive.
+    **Raises:** `ValueError` for a method that does not exist, another shape, a `dt` that is not positive.
     """
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")

@@ -1,0 +1,470 @@
+"""Iterative Bi-Section Shooting: without noise, with it, from brackets that miss, and when things go wrong."""
+
+import functools
+import json
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import noisy_states, random_starts, standard_flight, standard_problem
+
+import jaxos4
+
+PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
+HALF = jaxos4.DEFAULT_HALF_WIDTH
+LANES = 64  # in every batch, so that each case compiles once
+
+# Model, channels, whether the initial state is free.
+CASES = {
+    "published-rates": (PUBLISHED, "rates", False),
+    "published-all": (PUBLISHED, "all", False),
+    "published-all-free": (PUBLISHED, "all", True),
+    "corrected-rates": (CORRECTED, "rates", False),
+    "corrected-all": (CORRECTED, "all", False),
+}
+every_case = pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.xdist_group(case)) for case in CASES]
+)
+SEEDS = {case: seed for seed, case in enumerate(CASES)}
+
+
+@eqx.filter_jit
+def identify(estimator, problem, states, omega, lower, upper, starts):
+    """One estimate for each lane of the last five arguments."""
+
+    @eqx.filter_vmap
+    def lane(states, omega, lower, upper, start):
+        flight = eqx.tree_at(lambda f: (f.states, f.omega), problem.flight, (states, omega))
+        data = eqx.tree_at(lambda p: p.flight, problem, flight)
+        return estimator(data, jaxos4.Bracket(lower, upper), start=start)
+
+    return lane(states, omega, lower, upper, starts)
+
+
+def lanes(case, states, *, offset=None, starts=None):
+    """Arguments of `identify`: brackets around the truth, their centers off by `offset` half-widths."""
+    model_class, channels, free = CASES[case]
+    model, count = model_class(), len(states)
+    center = np.asarray(model.alpha) + (np.zeros((count, 8)) if offset is None else offset) * HALF
+    starts = center if starts is None else starts
+    omega = np.tile(standard_flight(model_class).omega, (count, 1, 1))
+    problem = standard_problem(model_class, channels, free=free)
+    return (
+        problem,
+        states,
+        jnp.asarray(omega),
+        jnp.asarray(center - HALF),
+        jnp.asarray(center + HALF),
+        jnp.asarray(starts),
+    )
+
+
+@functools.cache
+def information(case):
+    model_class, channels, free = CASES[case]
+    return np.asarray(
+        jaxos4.fisher_information(standard_problem(model_class, channels, free=free), model_class().alpha)
+    )
+
+
+def bound(case):
+    """Standard deviations at the Cramer-Rao bound."""
+    return np.sqrt(np.diagonal(np.linalg.inv(information(case))))
+
+
+def errors(case, estimates):
+    return np.asarray(estimates.parameters - CASES[case][0]().alpha)
+
+
+def names(estimates):
+    return jaxos4.result_names(estimates.result)
+
+
+# With the noise of the sensors: a batch of flights, each from its own start in the default bracket.
+
+
+@functools.cache
+def noisy(case):
+    model_class, seed = CASES[case][0], SEEDS[case]
+    return identify(
+        jaxos4.IBSS(),
+        *lanes(
+            case,
+            noisy_states(LANES, model_class, seed=seed),
+            starts=random_starts(model_class(), LANES, seed=100 + seed),
+        ),
+    )
+
+
+@every_case
+def test_every_noisy_flight_succeeds(case):
+    assert names(noisy(case)).tolist() == ["successful"] * LANES
+
+
+@every_case
+def test_errors_are_those_of_the_cramer_rao_bound(case):
+    error = errors(case, noisy(case)) / bound(case)
+    efficiency = np.sqrt(np.mean(error**2, axis=0))
+    standard_error = 1 / np.sqrt(2 * LANES)
+    assert np.abs(efficiency - 1).max() < 3.5 * standard_error, efficiency
+    bias = error.mean(axis=0) * np.sqrt(LANES)
+    assert np.abs(bias).max() < 4, bias
+
+
+@every_case
+def test_errors_of_all_parameters_together_are_efficient(case):
+    """error^T F error is chi-square with 8 degrees of freedom, flight by flight."""
+    error = errors(case, noisy(case))
+    square = np.einsum("ni,ij,nj->n", error, information(case), error) / 8
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES)), square.mean()
+
+
+@every_case
+def test_estimates_know_their_errors_and_their_fit(case):
+    estimates = noisy(case)
+    np.testing.assert_allclose(np.median(estimates.std / bound(case), axis=0), 1, atol=0.05)
+    error = errors(case, estimates)
+    inside = np.mean(np.abs(error) < 1.96 * np.asarray(estimates.std))
+    # Errors of one flight are correlated: count flights, not parameters, for the standard error.
+    assert abs(inside - 0.95) < 4 * np.sqrt(0.95 * 0.05 / LANES)
+    model_class, channels, free = CASES[case]
+    problem = standard_problem(model_class, channels, free=free)
+    degrees = problem.size * (501 if free else 500) - 8 - problem.free_size
+    cost = np.asarray(2 * estimates.cost / degrees)
+    assert abs(cost.mean() - 1) < 4 * np.sqrt(2 / (degrees * LANES))
+    assert estimates.initial_state.shape == (LANES, problem.size)
+    if not free:
+        assert not estimates.initial_state.any()
+
+
+# Without noise: to rounding, from anywhere in the bracket and from brackets that miss.
+
+SIDES = np.array([side * np.eye(8)[i] for i in range(8) for side in (-1, 1)])
+# How far beyond the bracket's edge the truth is, in half-widths; a full width is 2.
+BEYOND, FAR = 0.1, 2.0
+EXACT, MISSED, NOISY_MISSED, BARELY = (slice(16 * i, 16 * (i + 1)) for i in range(4))
+
+
+@functools.cache
+def mixed(case):
+    """16 lanes each: exact from random starts; exact, truth far outside; noisy, far outside; noisy, just outside."""
+    model_class, seed = CASES[case][0], SEEDS[case]
+    model = model_class()
+    exact = np.tile(standard_flight(model_class).states, (32, 1, 1))
+    states = jnp.concatenate([exact, noisy_states(32, model_class, seed=200 + seed)])
+    offset = np.concatenate([np.zeros((16, 8)), (1 + FAR) * SIDES, (1 + FAR) * SIDES, (1 + BEYOND) * SIDES])
+    starts = np.asarray(model.alpha) + offset * HALF
+    starts[EXACT] = random_starts(model, 16, seed=300 + seed)
+    return identify(jaxos4.IBSS(), *lanes(case, states, offset=offset, starts=starts))
+
+
+@every_case
+def test_exact_flights_give_the_truth(case):
+    estimates, alpha = mixed(case), np.asarray(CASES[case][0]().alpha)
+    assert set(names(estimates)[EXACT]) == {"successful"}
+    scale = np.where(alpha == 0, 1, np.abs(alpha))
+    error = (np.abs(errors(case, estimates)) / scale)[EXACT].max(axis=0)
+    tiny = alpha == 6e-9  # alpha2 and alpha5 as printed
+    assert (error[tiny] < 1e-2).all(), error
+    assert (error[~tiny] < 1e-8).all(), error
+
+
+@every_case
+def test_never_succeeds_with_a_wrong_answer(case):
+    """Each parameter in turn outside the bracket, on either side, by a tenth of its half-width or by its full width."""
+    estimates = mixed(case)
+    off = np.abs(errors(case, estimates) / bound(case)).max(axis=1)
+    succeeded = names(estimates) == "successful"
+    assert off[succeeded].max() < 6
+    assert off[MISSED][succeeded[MISSED]].max() < 1e-4  # without noise: the truth itself
+    # Few are given up.
+    assert succeeded[MISSED].sum() >= 14
+    assert succeeded[NOISY_MISSED].sum() >= 14
+    assert succeeded[BARELY].all()
+
+
+@every_case
+def test_a_bracket_that_misses_costs_nothing_but_time(case):
+    """The noisy flights end where they end from a bracket around the truth: at the least cost."""
+    estimates = mixed(case)
+    succeeded = names(estimates) == "successful"
+    for part in (NOISY_MISSED, BARELY):
+        error = errors(case, estimates)[part][succeeded[part]]
+        square = np.einsum("ni,ij,nj->n", error, information(case), error) / 8
+        assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * len(error)))
+
+
+def test_a_truth_beyond_the_hard_limits_is_reported():
+    case = "published-rates"
+    offset = np.concatenate([4.5 * SIDES] * 4)
+    estimates = identify(
+        jaxos4.IBSS(),
+        *lanes(case, noisy_states(LANES, seed=1), offset=offset, starts=PUBLISHED().alpha + offset * HALF),
+    )
+    assert not (names(estimates) == "successful").any()
+    assert np.isfinite(estimates.parameters).all()
+    reached = np.abs(np.asarray(estimates.parameters - PUBLISHED().alpha) / HALF - offset)
+    assert (reached <= 4 * (1 + 1e-9)).all()
+    wider = identify(
+        jaxos4.IBSS(reach=6.0),
+        *lanes(case, noisy_states(LANES, seed=1), offset=offset, starts=PUBLISHED().alpha + offset * HALF),
+    )
+    off = np.abs(errors(case, wider) / bound(case)).max(axis=1)
+    assert off[names(wider) == "successful"].max() < 6
+    assert (names(wider) == "successful").mean() > 0.8
+
+
+# When things go wrong: the others do not notice.
+
+
+def test_failing_lanes_leave_their_neighbours_alone():
+    case = "published-rates"
+    problem, states, omega, lower, upper, starts = (
+        x if isinstance(x, jaxos4.ShootingProblem) else np.array(x)
+        for x in lanes(
+            case,
+            noisy_states(LANES, seed=SEEDS[case]),
+            starts=random_starts(PUBLISHED(), LANES, seed=100 + SEEDS[case]),
+        )
+    )
+    sound = noisy(case)
+    p = jaxos4.STATE_NAMES.index("p")
+    expected = {}
+
+    def break_lane(lane, result):
+        expected[lane] = result
+        return lane
+
+    omega[break_lane(1, "nonfinite_trajectory"), 250, 2] = np.nan
+    omega[break_lane(3, "nonfinite_trajectory"), 30, 0] = np.inf
+    states[break_lane(5, "nonfinite_trajectory"), 100, p] = np.inf
+    starts[break_lane(7, "nonfinite_trajectory"), 2] = np.nan
+    lane = break_lane(9, "bracket_invalid")
+    lower[lane, 0], upper[lane, 0] = upper[lane, 0], lower[lane, 0]
+    lower[break_lane(11, "bracket_invalid"), 2] = np.nan
+    upper[break_lane(13, "bracket_invalid"), 3] = np.inf
+    upper[break_lane(15, "bracket_invalid"), 4] = lower[15, 4]
+    states[break_lane(17, "unidentifiable"), :, p] = np.nan  # roll was not measured
+    lane = break_lane(19, "unidentifiable")  # a hover
+    states[lane] -= standard_flight().states
+    omega[lane] = PUBLISHED().airframe.hover_speed
+    states[break_lane(21, "unidentifiable")] = np.nan  # nothing was measured
+
+    broken = identify(jaxos4.IBSS(), problem, *(jnp.asarray(x) for x in (states, omega, lower, upper, starts)))
+    result = names(broken)
+    assert {lane: str(result[lane]) for lane in expected} == expected
+    others = np.setdiff1d(np.arange(LANES), list(expected))
+    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(sound), strict=True):
+        np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
+    # No lane, however broken, holds a parameter that is not a number; what failed says so in its uncertainty.
+    assert np.isfinite(broken.parameters).all()
+    assert np.isfinite(broken.initial_state).all()
+    for lane, name in expected.items():
+        if name == "unidentifiable":
+            assert (np.asarray(broken.std[lane]) > HALF).any()
+        else:
+            assert np.isinf(broken.std[lane]).all()
+            assert np.isinf(broken.cost[lane])
+    inside = np.array([1, 3, 5, 7])
+    np.testing.assert_allclose(broken.parameters[inside], (lower[inside] + upper[inside]) / 2)
+
+
+def test_too_few_sweeps_are_reported():
+    case = "published-rates"
+    estimates = identify(
+        jaxos4.IBSS(max_sweeps=1), *lanes(case, noisy_states(LANES), starts=random_starts(PUBLISHED(), LANES))
+    )
+    assert set(names(estimates)) == {"max_sweeps"}
+    assert np.isfinite(estimates.parameters).all()
+    assert (np.asarray(estimates.sweeps) == 3).all()  # one for each share of the flight
+
+
+# One lane, many lanes.
+
+
+def test_loop_jit_and_vmap_agree():
+    case = "published-rates"
+    states, starts = noisy_states(LANES, seed=SEEDS[case]), random_starts(PUBLISHED(), LANES, seed=100 + SEEDS[case])
+    batched = noisy(case)
+    problem = standard_problem(channels="rates")
+    for lane in range(3):
+        flight = eqx.tree_at(lambda f: f.states, problem.flight, states[lane])
+        alone = jaxos4.IBSS()(
+            eqx.tree_at(lambda p: p.flight, problem, flight),
+            jaxos4.Bracket.around(PUBLISHED().alpha, HALF),
+            start=starts[lane],
+        )
+        difference = np.abs(alone.parameters - batched.parameters[lane]) / bound(case)
+        assert difference.max() < 1e-6
+        np.testing.assert_allclose(alone.covariance, batched.covariance[lane], rtol=1e-6)
+        assert int(alone.rollouts) == int(batched.rollouts[lane])
+        assert names(alone) == "successful"
+
+
+def test_vmaps_over_brackets_flights_and_both():
+    """A table of flights by brackets, in one call, is the rows and columns of it."""
+    case, model = "published-rates", PUBLISHED()
+    problem = standard_problem(channels="rates", duration=1.0)
+    states = noisy_states(2, duration=1.0)
+    shifts = np.array([[0.0], [0.4], [-0.4]]) * HALF
+    brackets = eqx.filter_vmap(lambda shift: jaxos4.Bracket.around(model.alpha + shift, HALF))(jnp.asarray(shifts))
+    problems = eqx.filter_vmap(lambda s: eqx.tree_at(lambda p: p.flight.states, problem, s))(states)
+    estimator = jaxos4.IBSS(tolerance=1e-4)
+    over_brackets = eqx.filter_vmap(estimator, in_axes=(None, 0))
+    table = eqx.filter_vmap(over_brackets, in_axes=(0, None))(problems, brackets)
+    assert table.parameters.shape == (2, 3, 8)
+    assert table.std.shape == (2, 3, 8)
+    row = over_brackets(eqx.tree_at(lambda p: p.flight.states, problem, states[0]), brackets)
+    sigma = np.asarray(table.std[0, 0])
+    np.testing.assert_allclose(table.parameters[0] / sigma, row.parameters / sigma, atol=1e-6)
+    # Where it began does not matter, and two flights are two estimates.
+    assert np.abs((table.parameters - table.parameters[:, :1]) / sigma).max() < 1e-2
+    assert np.abs((table.parameters[0] - table.parameters[1]) / sigma).max() > 0.1
+    assert set(names(table).ravel()) == {"successful"}
+    assert np.abs(errors(case, table)).max() < 1
+
+
+# Settings.
+
+
+def maximum_likelihood(problem):
+    """By Gauss-Newton steps on a Jacobian of the residuals."""
+    jacobian = eqx.filter_jit(lambda p, a: jax.jacfwd(p.residuals)(a))
+    parameters = problem.model.alpha
+    for _ in range(6):
+        step = np.linalg.lstsq(jacobian(problem, parameters), problem.residuals(parameters), rcond=None)[0]
+        parameters = parameters - step
+    return np.asarray(parameters)
+
+
+def test_both_kinds_of_directions_reach_the_maximum_of_the_likelihood():
+    case, count = "published-rates", 4
+    states = noisy_states(LANES, seed=5)
+    arguments = lanes(case, states, starts=random_starts(PUBLISHED(), LANES, seed=6))
+    flights = [standard_problem(channels="rates", states=s) for s in states[:count]]
+    best = np.stack([maximum_likelihood(problem) for problem in flights])
+    for directions in ("whitened", "coordinate"):
+        estimates = identify(jaxos4.IBSS(directions=directions, tolerance=1e-5), *arguments)
+        assert set(names(estimates)) == {"successful"}
+        assert np.abs((estimates.parameters[:count] - best) / bound(case)).max() < 1e-4
+        # What the default tolerance allows is far below the noise.
+        estimates = identify(jaxos4.IBSS(directions=directions), *arguments)
+        assert np.abs((estimates.parameters[:count] - best) / bound(case)).max() < 0.05
+
+
+def test_rollouts_are_counted_right():
+    """Each simulated step calls back: the count of shots is independent of the estimator's own."""
+    calls = [0]
+
+    def note():
+        calls[0] += 1
+
+    class Counting(PUBLISHED):
+        def angular_acceleration(self, rates, forcing, parameters):
+            jax.debug.callback(note)
+            return super().angular_acceleration(rates, forcing, parameters)
+
+    flight, samples = standard_flight(duration=0.5), 51
+    states = noisy_states(1, duration=0.5)[0]
+    free, slow = None, {"directions": "coordinate", "halvings": 3, "max_sweeps": 5}
+    for start, unknowns, settings in ((flight.states[0], 8, {}), (free, 11, slow)):
+        problem = jaxos4.ShootingProblem(
+            Counting(),
+            eqx.tree_at(lambda f: f.states, flight, states),
+            sigma=jaxos4.SENSOR_SIGMA,
+            channels="rates",
+            initial_state=start,
+        )
+        calls[0] = 0
+        bracket = jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF)
+        estimate = jaxos4.IBSS(**settings)(problem, bracket)
+        jax.effects_barrier()
+        sweeps = int(estimate.sweeps)
+        curvatures = sweeps + 1  # each of them carries one tangent for every unknown
+        shots = calls[0] // samples - curvatures
+        assert calls[0] % samples == 0
+        assert sweeps > 3
+        assert shots == unknowns * settings.get("halvings", 6) * sweeps
+        assert int(estimate.rollouts) == shots + unknowns * curvatures
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"directions": "steepest"}, r"`directions` must be one of whitened, coordinate, got 'steepest'"),
+        ({"halvings": 1}, r"`halvings` must be an integer of at least 2, got 1"),
+        ({"max_sweeps": 0}, r"`max_sweeps` must be an integer of at least 1, got 0"),
+        ({"tolerance": 0.0}, r"`tolerance` must be positive"),
+        ({"reach": -1.0}, r"`reach` must be positive"),
+        ({"tolerance": np.nan}, r"`tolerance` must be positive"),
+    ],
+)
+def test_settings_out_of_range_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        jaxos4.IBSS(**settings)
+
+
+def test_brackets_and_starts_of_another_length_are_named():
+    problem = standard_problem(channels="rates", duration=0.1)
+    with pytest.raises(ValueError, match=r"`bracket` must hold 8 parameters, got 7"):
+        jaxos4.IBSS()(problem, jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)))
+    with pytest.raises(ValueError, match=r"`start` must hold 8 parameters"):
+        jaxos4.IBSS()(problem, jaxos4.Bracket.default(PUBLISHED()), start=jnp.zeros(7))
+
+
+# Other data.
+
+
+def test_dropouts_and_channels_that_were_never_measured_only_cost_precision():
+    case = "published-all"
+    states = noisy_states(LANES, seed=7)
+    lost = jax.random.bernoulli(jax.random.key(8), 0.3, states.shape)
+    lost = lost.at[:32, :, jaxos4.STATE_NAMES.index("x")].set(True)
+    estimates = identify(
+        jaxos4.IBSS(), *lanes(case, jnp.where(lost, jnp.nan, states), starts=random_starts(PUBLISHED(), LANES, seed=9))
+    )
+    assert names(estimates).tolist() == ["successful"] * LANES
+    error = errors(case, estimates)
+    assert (np.asarray(estimates.std) > bound(case)).all()
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimates.covariance), error) / 8
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
+
+
+SINGLE = """
+import equinox as eqx, jax, json, sys
+import jaxos4
+
+model = jaxos4.PublishedOS4(jaxos4.OS4)
+flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
+noise, bracket = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), jaxos4.Bracket.default(model)
+
+def lane(key):
+    noise_key, start_key = jax.random.split(key)
+    problem = jaxos4.ShootingProblem(
+        model, noise(flight, key=noise_key), sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0]
+    )
+    away = jax.random.uniform(start_key, (8,), minval=-0.8, maxval=0.8)
+    return jaxos4.IBSS()(problem, bracket, start=bracket.center + away * bracket.half_width)
+
+estimates = eqx.filter_vmap(lane)(jax.random.split(jax.random.key(0), 8))
+assert estimates.parameters.dtype == flight.states.dtype == "float32"
+result = jaxos4.result_names(estimates.result).tolist()
+json.dump({"result": result, "parameters": estimates.parameters.tolist(), "std": estimates.std.tolist()}, sys.stdout)
+"""
+
+
+def test_single_precision_is_enough_for_noisy_flights():
+    """In a process of its own, with JAX as it comes."""
+    environment = {**os.environ, "JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
+    run = subprocess.run([sys.executable, "-c", SINGLE], env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    estimates = json.loads(run.stdout)
+    assert estimates["result"] == ["successful"] * 8
+    error = (np.array(estimates["parameters"]) - PUBLISHED().alpha) / bound("published-all")
+    assert np.abs(error).max() < 4
+    np.testing.assert_allclose(estimates["std"] / bound("published-all"), np.ones((8, 8)), atol=0.1)

@@ -1,0 +1,120 @@
+"""Other numbers of the same shapes are other data, not another program."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import standard_flight
+
+import jaxos4
+from jaxos4.simulate import METHODS
+
+DURATION = 0.1
+once = eqx.debug.assert_max_traces(max_traces=1)
+
+
+@pytest.fixture
+def counted():
+    """A model that no program knows yet, and the count of how often one was traced: each calls `forcing`."""
+    count = [0]
+
+    class Counted(jaxos4.PublishedOS4):
+        def forcing(self, omega):
+            count[0] += 1
+            return super().forcing(omega)
+
+    return Counted, count
+
+
+def model_of(model_class, trial):
+    """The OS4 with another mass and other inertias."""
+    model = model_class()
+    mass, inertia = model.airframe.mass * (1 + trial), model.airframe.inertia * (1 + trial)
+    return eqx.tree_at(lambda m: (m.airframe.mass, m.airframe.inertia), model, (mass, inertia))
+
+
+def problem_of(model_class, trial):
+    flight = standard_flight(duration=DURATION)
+    return jaxos4.ShootingProblem(
+        model_of(model_class, trial),
+        eqx.tree_at(lambda f: f.states, flight, flight.states + trial),
+        sigma=(1.0 + trial) * jaxos4.SENSOR_SIGMA,
+        initial_state=np.full(12, 0.01 * trial),
+        channels="rates",
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_simulates_another_flight_without_another_trace(counted, method):
+    model_class, count = counted
+    omega = standard_flight(duration=DURATION).omega
+    for trial, dt in enumerate((0.01, 0.02, np.float64(0.03), jnp.asarray(0.04))):
+        model, start = model_of(model_class, trial), jnp.full(12, 0.01 * trial)
+        jaxos4.simulate(model, model.alpha, omega + trial, dt=dt, initial_state=start, method=method)
+    assert count[0] == 1
+
+
+@pytest.mark.parametrize("what", ["cost", "residuals", "predict"])
+def test_shoots_at_another_problem_without_another_trace(counted, what):
+    model_class, count = counted
+    counts = []
+    for trial in range(3):
+        problem = problem_of(model_class, trial)
+        getattr(problem, what)(1.1 * problem.model.alpha, problem.first_state()[0])
+        counts.append(count[0])
+    assert counts[0] == counts[-1]
+
+
+def test_a_callers_own_function_is_traced_once():
+    @eqx.filter_jit
+    @once
+    def slope(problem, parameters):
+        return jax.jacfwd(problem.cost)(parameters)
+
+    for trial in range(3):
+        problem = problem_of(jaxos4.PublishedOS4, trial)
+        slope(problem, problem.model.alpha)
+
+
+def test_identifies_another_flight_with_other_settings_without_another_trace():
+    @eqx.filter_jit
+    @once
+    def identify(estimator, problem, bracket):
+        return estimator(problem, bracket)
+
+    for trial, (tolerance, reach) in enumerate([(0.02, 4.0), (0.05, 3.0), (1, 2)]):
+        problem = problem_of(jaxos4.PublishedOS4, trial)
+        bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
+        identify(jaxos4.IBSS(tolerance=tolerance, reach=reach), problem, bracket)
+
+
+def test_the_estimator_itself_traces_once(counted):
+    model_class, count = counted
+    counts = []
+    for trial in range(3):
+        problem = problem_of(model_class, trial)
+        bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
+        jaxos4.IBSS(tolerance=0.01 * (1 + trial))(problem, bracket)
+        counts.append(count[0])
+    assert counts[0] == counts[-1]
+
+
+def test_noise_with_another_sigma_is_traced_once():
+    flight = standard_flight(duration=DURATION)
+
+    @eqx.filter_jit
+    @once
+    def measure(noise, flight, key):
+        return noise(flight, key=key)
+
+    for sigma in (0.01, 2, jaxos4.SENSOR_SIGMA, jnp.ones(12)):
+        measure(jaxos4.WhiteNoise(sigma), flight, jax.random.key(0))
+
+
+def test_the_count_would_see_a_second_trace(counted):
+    """A sample more is another program."""
+    model_class, count = counted
+    for samples in (5, 6):
+        jaxos4.simulate(model_class(), model_class().alpha, jnp.full((samples, 4), 200.0), dt=0.01)
+    assert count[0] == 2
