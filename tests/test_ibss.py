@@ -372,7 +372,7 @@ def test_rollouts_are_counted_right():
     flight, samples = standard_flight(duration=0.5), 51
     states = noisy_states(1, duration=0.5)[0]
     free, slow = None, {"directions": "coordinate", "halvings": 3, "max_sweeps": 5}
-    for start, unknowns, settings in ((flight.states[0], 8, {}), (free, 11, slow)):
+    for start, unknowns, stages, settings in ((flight.states[0], 8, 3, {}), (free, 11, 1, slow)):
         problem = jaxos4.ShootingProblem(
             Counting(),
             eqx.tree_at(lambda f: f.states, flight, states),
@@ -385,11 +385,11 @@ def test_rollouts_are_counted_right():
         estimate = jaxos4.IBSS(**settings)(problem, bracket)
         jax.effects_barrier()
         sweeps = int(estimate.sweeps)
-        curvatures = sweeps + 1  # each of them carries one tangent for every unknown
+        curvatures = sweeps + stages  # each of them carries one tangent for every unknown
         shots = calls[0] // samples - curvatures
         assert calls[0] % samples == 0
         assert sweeps > 3
-        assert shots == unknowns * settings.get("halvings", 6) * sweeps
+        assert shots == unknowns * settings.get("halvings", 4) * sweeps
         assert int(estimate.rollouts) == shots + unknowns * curvatures
 
 

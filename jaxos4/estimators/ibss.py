@@ -2,8 +2,9 @@
 
 The paper names the method; its steps are not available to us, and those below are our choice. A *shot* simulates the
 flight at trial unknowns and returns the slope of the cost along a direction, by one forward-mode derivative. The sign
-of the slope tells which half of the bracket holds the minimum. A *sweep* bisects along every direction once; brackets
-are then recentred, shrink with the moves, and grow where a search ended at their end.
+of the slope tells which half of the bracket holds the minimum. A *sweep* bisects along every direction once, each in a
+bracket around the point where the cost's quadratic model has its minimum; the bracket is as wide as the last sweep's
+predictions were off, and grows where a search ended at its end.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS
 from ..information import cholesky, invert, invert_factor, invert_marginal
 from ..results import RESULTS
-from ..shooting import ROUNDING, Rows, ShootingProblem
+from ..shooting import ROUNDING, Curvature, Rows, ShootingProblem
 from ._estimate import AbstractEstimator, Estimate
 
 DIRECTIONS = ("whitened", "coordinate")
@@ -28,22 +29,38 @@ DIRECTIONS = ("whitened", "coordinate")
 # Shares of the flight against which the rates are fitted before the whole of it. Errors grow with time, and the cost
 # of a long flight has other minima: CorrectedOS4 falls into one in a fifth of all cases otherwise.
 _HORIZONS = (0.1, 0.3)
-# A stage that is not the last stops once no direction moves by more than this many standard deviations.
+# A stage that is not the last stops once no direction has more than this many standard deviations to go.
 _COARSE = 0.5
-# A bracket opens this many predicted standard deviations to each side.
+# The first sweep goes this many of the start's standard deviations at most, in brackets of this share of them.
 _OPENING = 4.0
-# The next bracket holds this share of the sweep's largest move: what the other directions may have spoilt.
-_SPOILT = 0.25
+_FIRST = 0.05
+# Later brackets are this many times as wide as the prediction is off, of which this share of the way is the least.
+_SAFETY = 2.0
+_LEAST = 0.01
 # A bracket whose search ended at its end grows by this factor.
 _GROWTH = 4.0
+# A seed is missed where the answer is this many of its 99.9 % half-widths away: then the wide bracket is searched too.
+_MISSED = 2.0
+
+
+class _Quadratic(NamedTuple):
+    """The cost around the current unknowns, and what it predicts: `ahead` is the longest step in standard deviations.
+
+    `factor` A with A A^T the information, and A^-T: the columns of `basis` are the search directions.
+    """
+
+    curvature: Curvature
+    factor: Float[Array, "unknowns unknowns"]
+    basis: Float[Array, "unknowns unknowns"]
+    ahead: Scalar
 
 
 class _Search(NamedTuple):
     unknowns: Float[Array, " unknowns"]
-    half_width: Float[Array, " unknowns"]
-    covariance: Float[Array, "unknowns unknowns"]
+    quadratic: _Quadratic
+    off: Scalar
+    growth: Float[Array, " unknowns"]
     sweeps: Int[Array, ""]
-    rollouts: Int[Array, ""]
     done: Bool[Array, ""]
 
 
@@ -67,7 +84,7 @@ class IBSS(AbstractEstimator):
       beyond them.
     - `halvings`: of each bracket in a sweep.
     - `max_sweeps`: in each stage.
-    - `tolerance`: the search ends once no direction moves by more than this share of its standard deviation, judged
+    - `tolerance`: the search ends once no direction has more than this share of its standard deviation to go, judged
       from the actual residuals, so that noise-free data are fitted to rounding.
     - `reach`: hard limits, in half-widths of the bracket around its center.
 
@@ -75,8 +92,8 @@ class IBSS(AbstractEstimator):
     """
 
     directions: str = eqx.field(static=True, default="whitened")
-    halvings: int = eqx.field(static=True, default=6)
-    max_sweeps: int = eqx.field(static=True, default=40)
+    halvings: int = eqx.field(static=True, default=4)
+    max_sweeps: int = eqx.field(static=True, default=60)
     tolerance: Scalar = eqx.field(converter=as_float, default=0.02)
     reach: Scalar = eqx.field(converter=as_float, default=4.0)
 
@@ -93,7 +110,14 @@ class IBSS(AbstractEstimator):
                 raise ValueError(f"`{name}` must be positive, got {value}.")
 
     @eqx.filter_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket, *, start: Parameters | None = None) -> Estimate:
+    def __call__(
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        *,
+        start: Parameters | None = None,
+        seed: Estimate | None = None,
+    ) -> Estimate:
         """Identifies one flight.
 
         **Arguments:**
@@ -101,6 +125,9 @@ class IBSS(AbstractEstimator):
         - `problem`: what is to be explained.
         - `bracket`: where the parameters are looked for; it may turn out not to hold them.
         - `start`: where in the bracket the search begins; its center by default.
+        - `seed`: an earlier estimate of the same flight. The search then begins against all of the problem's channels
+          at once, in brackets around the seed that are sized by its covariance. Where that does not end well, or far
+          from the seed, the bracket is searched as if there were none, and the better answer is returned.
 
         **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
         """
@@ -109,74 +136,112 @@ class IBSS(AbstractEstimator):
             raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
         if start is not None and jnp.shape(start) != (len(names),):
             raise ValueError(f"`start` must hold {len(names)} parameters, got shape {jnp.shape(start)}.")
-        center = jnp.where(bracket.valid, bracket.center, 0.0)
-        half_width = jnp.where(bracket.valid, bracket.half_width, 1.0)
-        lower, upper = center - self.reach * half_width, center + self.reach * half_width
-        parameters = center if start is None else jnp.clip(as_float(start), lower, upper)
+        trusted = Bracket.around(
+            jnp.where(bracket.valid, bracket.center, 0.0), jnp.where(bracket.valid, bracket.half_width, 1.0)
+        )
+        begin = trusted.center if start is None else as_float(start)
+        if seed is None:
+            wide = self._descend(problem, trusted, begin, asleep=jnp.zeros((), dtype=bool))
+            return self._finish(problem, trusted, bracket.valid, *wide)
 
-        initial_state, off = problem.first_state()
-        free = problem.free_size
-        prior = jnp.concatenate([half_width, off[:free]]) / 2
-        far = jnp.full(free, jnp.inf)
-        limits = (jnp.concatenate([lower, -far]), jnp.concatenate([upper, far]))
+        near = self._finish(problem, trusted, bracket.valid, *self._from_seed(problem, trusted, seed))
+        half_width = seed.half_width(0.999)
+        far = jnp.abs(near.parameters - seed.parameters) > _MISSED * half_width
+        hit = (near.result == RESULTS.successful) & ~far.any()
+        wide = self._finish(problem, trusted, bracket.valid, *self._descend(problem, trusted, begin, asleep=hit))
+        better = ~hit & ((near.result != RESULTS.successful) | (wide.cost < near.cost))
+        best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
+        return Estimate(
+            parameters=best.parameters,
+            covariance=best.covariance,
+            initial_state=best.initial_state,
+            cost=best.cost,
+            rollouts=seed.rollouts + near.rollouts + wide.rollouts,
+            sweeps=near.sweeps + wide.sweeps,
+            result=best.result,
+            seed=Bracket.around(seed.parameters, half_width),
+        )
 
-        def fit(channels: str, progress: _Progress, share: Scalar) -> _Progress:
+    def _from_seed(self, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> tuple[_Progress, Curvature]:
+        """Against all channels at once, from a seed; a lane whose seed failed is left where it is."""
+        progress = self._begin(problem, bracket, seed.parameters, asleep=seed.result != RESULTS.successful)
+        count = seed.parameters.shape[0]
+        spread = progress.spread.at[:count, :count].set(
+            jnp.where(progress.done, progress.spread[:count, :count], seed.covariance)
+        )
+        return self._search(problem, problem.rows(), progress._replace(spread=spread), bracket, last=jnp.asarray(True))
+
+    def _descend(
+        self, problem: ShootingProblem, bracket: Bracket, begin: Parameters, *, asleep: Bool[Array, ""]
+    ) -> tuple[_Progress, Curvature]:
+        """Down the cascade, from anywhere in the bracket; a lane that is `asleep` is left where it is."""
+        progress = self._begin(problem, bracket, begin, asleep=asleep)
+
+        def fit(channels: str, progress: _Progress, share: Scalar) -> tuple[_Progress, Curvature]:
             stage = problem.restrict(channels)
-            rows = _until(share, stage.rows())
-            size = len(names) + stage.free_size
             last = (channels == problem.channels) & (share == 1)
-            search = self._search(
-                stage,
-                rows,
-                progress.unknowns[:size],
-                initial_state=initial_state[: stage.size],
-                spread=progress.spread[:size, :size],
-                prior=prior[:size],
-                limits=(limits[0][:size], limits[1][:size]),
-                last=last,
-            )
-            return _Progress(
-                progress.unknowns.at[:size].set(search.unknowns),
-                progress.spread.at[:size, :size].set(search.covariance),
-                progress.sweeps + search.sweeps,
-                progress.rollouts + search.rollouts,
-                search.done,
-            )
+            progress = progress._replace(done=asleep)
+            return self._search(stage, _until(share, stage.rows()), progress, bracket, last=last)
 
-        none = jnp.zeros((), dtype=int)
-        unknowns = jnp.concatenate([parameters, initial_state[:free]])
-        progress = _Progress(unknowns, jnp.diag(prior**2), none, none, jnp.zeros((), dtype=bool))
         whole = as_float(1.0)
-        if self.directions == "whitened":
-            shares = jnp.asarray((*_HORIZONS, 1.0), dtype=float)
-            # One scan, so that the search against the rates is compiled once.
-            progress, _ = jax.lax.scan(lambda p, share: (fit("rates", p, share), None), progress, shares)
-            for channels, size in CHANNELS.items():
-                if CHANNELS["rates"] < size <= problem.size:
-                    progress = fit(channels, progress, whole)
-        else:
-            progress = fit(problem.channels, progress, whole)
+        if self.directions == "coordinate":
+            return fit(problem.channels, progress, whole)
+        shares = jnp.asarray((*_HORIZONS, 1.0), dtype=float)
+        # One scan, so that the search against the rates is compiled once.
+        progress, curvatures = jax.lax.scan(lambda p, share: fit("rates", p, share), progress, shares)
+        curvature = jax.tree.map(lambda c: c[-1], curvatures)
+        for channels, size in CHANNELS.items():
+            if CHANNELS["rates"] < size <= problem.size:
+                progress, curvature = fit(channels, progress, whole)
+        return progress, curvature
 
-        parameters = progress.unknowns[: len(names)]
-        if free:
-            initial_state = progress.unknowns[len(names) :]
-        (cost, trusted), _, information = problem.curvature(problem.rows(), parameters, initial_state)
-        bound = invert_marginal(information, len(names))
+    def _begin(
+        self, problem: ShootingProblem, bracket: Bracket, parameters: Parameters, *, asleep: Bool[Array, ""]
+    ) -> _Progress:
+        lower, upper = self._limits(problem, bracket)
+        unknowns = jnp.concatenate([parameters, problem.first_state()[0][: problem.free_size]])
+        spread = jnp.diag(jnp.square(_prior(problem, bracket)))
+        none = jnp.zeros((), dtype=int)
+        return _Progress(jnp.clip(unknowns, lower, upper), spread, none, none, asleep)
+
+    def _limits(
+        self, problem: ShootingProblem, bracket: Bracket
+    ) -> tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]:
+        """How far the search may go: an initial state that is free has no limits."""
+        reach, far = self.reach * bracket.half_width, jnp.full(problem.free_size, jnp.inf)
+        return jnp.concatenate([bracket.center - reach, -far]), jnp.concatenate([bracket.center + reach, far])
+
+    def _finish(
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        valid: Bool[Array, ""],
+        progress: _Progress,
+        curvature: Curvature,
+    ) -> Estimate:
+        """The estimate, and how it ended."""
+        count = bracket.lower.shape[0]
+        parameters, initial_state = progress.unknowns[:count], problem.first_state()[0]
+        if problem.free_size:
+            initial_state = progress.unknowns[count:]
+        (cost, trusted), _, information = curvature
+        bound = invert_marginal(information, count)
         std = jnp.sqrt(jnp.diagonal(bound))
-        at_bound = jnp.minimum(parameters - lower, upper - parameters) < 1e-3 * half_width
+        lower, upper = (limit[:count] for limit in self._limits(problem, bracket))
+        at_bound = jnp.minimum(parameters - lower, upper - parameters) < 1e-3 * bracket.half_width
         sound = trusted & jnp.isfinite(cost) & jnp.isfinite(parameters).all() & jnp.isfinite(bound).all()
         result = RESULTS.where(progress.done, RESULTS.successful, RESULTS.max_sweeps)
         result = RESULTS.where(at_bound.any(), RESULTS.at_bound, result)
-        result = RESULTS.where((std > half_width).any(), RESULTS.unidentifiable, result)
+        result = RESULTS.where((std > bracket.half_width).any(), RESULTS.unidentifiable, result)
         result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
-        result = RESULTS.where(bracket.valid, result, RESULTS.bracket_invalid)
-        sound = sound & bracket.valid
+        result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
+        sound = sound & valid
         return Estimate(
-            parameters=jnp.where(sound, parameters, center),
+            parameters=jnp.where(sound, parameters, bracket.center),
             covariance=jnp.where(sound, bound, jnp.inf),
             initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
             cost=jnp.where(sound, cost, jnp.inf),
-            rollouts=progress.rollouts + prior.size,
+            rollouts=progress.rollouts,
             sweeps=progress.sweeps,
             result=result,
         )
@@ -185,32 +250,29 @@ class IBSS(AbstractEstimator):
         self,
         problem: ShootingProblem,
         rows: Rows,
-        unknowns: Float[Array, " unknowns"],
+        progress: _Progress,
+        bracket: Bracket,
         *,
-        initial_state: Float[Array, " size"],
-        spread: Float[Array, "unknowns unknowns"],
-        prior: Float[Array, " unknowns"],
-        limits: tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]],
         last: Bool[Array, ""],
-    ) -> _Search:
-        """Sweeps until the moves are small.
+    ) -> tuple[_Progress, Curvature]:
+        """Sweeps until nothing is left to go, over as many of the unknowns as the problem has.
 
         **Arguments:**
 
         - `rows`: the part of the flight that is fitted.
-        - `unknowns`: where to start: the parameters and, where it is free, the initial state.
-        - `initial_state`: taken where it is not free.
-        - `spread`: the covariance of `unknowns`, which opens the brackets.
-        - `prior`: the standard deviation of each unknown without the flight, from the bracket.
-        - `limits`: of the unknowns.
+        - `progress`: where to start, and the covariance of that, which opens the brackets. `done`: stay there.
+        - `bracket`: its half-width over 2 stands for what is known of each parameter without the flight.
         - `last`: whether to stop at `tolerance`, or coarsely.
         """
-        count = unknowns.size - problem.free_size
-
-        finest = _finest(problem, rows)
+        count = bracket.lower.shape[0]
+        size = count + problem.free_size
+        first_state = problem.first_state()[0]
+        limits, finest = self._limits(problem, bracket), _finest(problem, rows)
+        regular = jnp.diag(1 / jnp.square(_prior(problem, bracket)))
+        spread = progress.spread[:size, :size]
 
         def split(u):
-            return u[:count], u[count:] if problem.free_size else initial_state
+            return u[:count], u[count:] if problem.free_size else first_state
 
         def slope(u, direction) -> Callable[[Scalar], Scalar]:
             def at(step: Scalar) -> Scalar:
@@ -222,39 +284,61 @@ class IBSS(AbstractEstimator):
 
             return at
 
-        def along(u, column) -> tuple[Float[Array, " unknowns"], tuple[Scalar, Bool[Array, ""]]]:
-            direction, half_width = column
-            below, above = _room(u, direction, limits)
-            lower, upper = jnp.maximum(-half_width, -below), jnp.minimum(half_width, above)
-            step, at_end = _bisect(slope(u, direction), lower, upper, self.halvings)
-            limited = jnp.where(step < 0, below, above) <= half_width
-            return u + step * direction, (step, at_end & ~limited)
+        def look(u) -> _Quadratic:
+            curvature = problem.curvature(rows, *split(u))
+            factor, basis = self._directions(curvature.information + regular, count)
+            return _Quadratic(curvature, factor, basis, jnp.abs(basis.T @ curvature.gradient).max())
 
         def sweep(search: _Search) -> _Search:
-            (cost, _), _, information = problem.curvature(rows, *split(search.unknowns))
-            information = information + jnp.diag(1 / jnp.square(prior))
-            factor, basis = self._directions(information, count)
-            first = _OPENING * jnp.sqrt(jnp.diagonal(factor.T @ spread @ factor))
-            half_width = jnp.where(search.sweeps == 0, first, search.half_width)
-            moved, (steps, at_end) = jax.lax.scan(along, search.unknowns, (basis.T, half_width))
-            move = jnp.abs(steps).max()
-            misfit = _misfit(cost, rows)
+            here, at_first = search.quadratic, search.sweeps == 0
+            information = here.curvature.information + regular
+            opening = _OPENING * jnp.sqrt(jnp.diagonal(here.factor.T @ spread @ here.factor))
+            later = jnp.maximum(search.off * here.ahead, finest) * search.growth
+            half_width = jnp.where(at_first, _FIRST * opening, later)
+            leash = jnp.where(at_first, opening, jnp.inf)
+
+            def along(u, column) -> tuple[Float[Array, " unknowns"], tuple[Scalar, Scalar, Bool[Array, ""]]]:
+                direction, half_width, leash = column
+                below, above = (jnp.minimum(room, leash) for room in _room(u, direction, limits))
+                predicted = -direction @ (here.curvature.gradient + information @ (u - search.unknowns))
+                predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
+                lower, upper = jnp.maximum(predicted - half_width, -below), jnp.minimum(predicted + half_width, above)
+                step, at_lower, at_upper = _bisect(slope(u, direction), lower, upper, self.halvings)
+                at_end = (at_lower & (lower > -below)) | (at_upper & (upper < above))
+                return u + step * direction, (step, step - predicted, at_end)
+
+            moved, (steps, errors, at_end) = jax.lax.scan(along, search.unknowns, (here.basis.T, half_width, leash))
+            off = _SAFETY * jnp.abs(errors).max() / jnp.maximum(jnp.abs(steps).max(), finest)
+            sound = jnp.isfinite(here.curvature.shot.cost) & jnp.isfinite(moved).all()
+            moved = jnp.where(sound, moved, search.unknowns)
+            there = look(moved)
+            misfit = _misfit(there.curvature.shot.cost, rows)
             coarse = _COARSE * jnp.maximum(misfit, 1.0)
             enough = jnp.where(last, jnp.maximum(self.tolerance * misfit, finest), coarse)
-            sound = jnp.isfinite(cost) & jnp.isfinite(moved).all()
-            shrunk = half_width * 2.0 ** (1 - self.halvings) + _SPOILT * move
             return _Search(
-                unknowns=jnp.where(sound, moved, search.unknowns),
-                half_width=jnp.where(at_end, _GROWTH * half_width, shrunk),
-                covariance=invert(information) * jnp.square(jnp.maximum(misfit, 1.0)),
+                unknowns=moved,
+                quadratic=there,
+                off=jnp.clip(off, _LEAST, 1.0),
+                growth=jnp.where(at_end, _GROWTH * search.growth, 1.0),
                 sweeps=search.sweeps + 1,
-                rollouts=search.rollouts + unknowns.size * (self.halvings + 1),
-                done=~sound | ((move <= enough) & ~(at_end & (half_width > finest)).any()),
+                done=~sound | (there.ahead <= enough),
             )
 
-        none = jnp.zeros((), dtype=int)
-        begin = _Search(unknowns, prior, spread, none, none, jnp.zeros((), dtype=bool))
-        return jax.lax.while_loop(lambda s: ~s.done & (s.sweeps < self.max_sweeps), sweep, begin)
+        begin = progress.unknowns[:size]
+        none, one = jnp.zeros((), dtype=int), jnp.ones((), dtype=float)
+        search = _Search(begin, look(begin), one, jnp.ones_like(begin), none, progress.done)
+        search = jax.lax.while_loop(lambda s: ~s.done & (s.sweeps < self.max_sweeps), sweep, search)
+        curvature = search.quadratic.curvature
+        misfit = jnp.maximum(_misfit(curvature.shot.cost, rows), 1.0)
+        covariance = jnp.square(misfit) * invert(curvature.information + regular)
+        rollouts = jnp.where(progress.done, 0, size * (1 + search.sweeps * (self.halvings + 1)))
+        return _Progress(
+            progress.unknowns.at[:size].set(search.unknowns),
+            progress.spread.at[:size, :size].set(covariance),
+            progress.sweeps + search.sweeps,
+            progress.rollouts + rollouts,
+            search.done,
+        ), curvature
 
     def _directions(
         self, information: Float[Array, "n n"], count: int
@@ -271,6 +355,11 @@ class IBSS(AbstractEstimator):
         back = jnp.argsort(order)
         factor = cholesky(information[jnp.ix_(order, order)])
         return factor[back], invert_factor(factor).T[back]
+
+
+def _prior(problem: ShootingProblem, bracket: Bracket) -> Float[Array, " unknowns"]:
+    """Standard deviation of each unknown without the flight: half of how far off it may be."""
+    return jnp.concatenate([bracket.half_width, problem.first_state()[1][: problem.free_size]]) / 2
 
 
 def _until(share: Scalar, rows: Rows) -> Rows:
@@ -308,8 +397,8 @@ def _room(
 
 def _bisect(
     slope: Callable[[Scalar], Scalar], lower: Scalar, upper: Scalar, halvings: int
-) -> tuple[Scalar, Bool[Array, ""]]:
-    """The middle of the bracket after `halvings`, and whether the search ended at one of the ends it began with."""
+) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
+    """The middle of the bracket after `halvings`, and whether the search ended at its lower or its upper end."""
 
     def halve(ends: tuple[Scalar, Scalar], _) -> tuple[tuple[Scalar, Scalar], None]:
         low, high = ends
@@ -318,4 +407,4 @@ def _bisect(
         return (jnp.where(value <= 0, middle, low), jnp.where(value >= 0, middle, high)), None
 
     (low, high), _ = jax.lax.scan(halve, (lower, upper), length=halvings)
-    return (low + high) / 2, (low == lower) | (high == upper)
+    return (low + high) / 2, low == lower, high == upper
