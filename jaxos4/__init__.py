@@ -22,11 +22,16 @@ from .dynamics import (
     CorrectedOS4 as CorrectedOS4,
     PublishedOS4 as PublishedOS4,
 )
-from .errors import InputError as InputError
+from .errors import InputError as InputError, TrainingError as TrainingError
 from .estimators import (
     IBSS as IBSS,
     AbstractEstimator as AbstractEstimator,
     Estimate as Estimate,
+    Hybrid as Hybrid,
+    NetworkEstimator as NetworkEstimator,
+    TrainedNetwork as TrainedNetwork,
+    load_network as load_network,
+    save_network as save_network,
 )
 from .excitation import (
     chirp as chirp,

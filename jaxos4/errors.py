@@ -1,5 +1,9 @@
-"""The one exception for what a user handed over and cannot be used."""
+"""Errors that are somebody's to mend, in one line: what, where, what to do."""
 
 
 class InputError(ValueError):
-    """Unusable input. The message is one line: what is wrong, where, and what to do."""
+    """A file or an argument cannot be used."""
+
+
+class TrainingError(RuntimeError):
+    """A network could not be trained."""

@@ -19,10 +19,12 @@ class Calibration(eqx.Module):
 
     - `levels`: rising, between 0 and 1.
     - `factors`: for each level and parameter, the half-width in standard deviations.
+    - `simultaneous`: for each level, the factor with which all parameters' intervals hold at once.
     """
 
     levels: Float[Array, " levels"]
     factors: Float[Array, "levels parameters"]
+    simultaneous: Float[Array, " levels"]
 
 
 class Estimate(eqx.Module):
@@ -32,7 +34,7 @@ class Estimate(eqx.Module):
     - `covariance`: of `parameters`. Shooting takes it from the Fisher information at the estimate and the problem's
       `sigma`, a network from its errors on simulated flights.
     - `initial_state`: the estimated, or known, state at the first sample, in cascade order.
-    - `cost`: 1/2 |W (y - x)|^2 there; NaN where the estimator does not simulate.
+    - `cost`: 1/2 |W (y - x)|^2 there, of the channels that the estimator looks at; infinite without an estimate.
     - `rollouts`: simulated flights that it took, whatever their channels: one for a shot with its slope, one for each
       unknown of a Fisher information.
     - `sweeps`: iterations over all directions, summed over the stages.
@@ -56,23 +58,29 @@ class Estimate(eqx.Module):
         """Standard deviation of each parameter, of one estimate or of a batch of them."""
         return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
 
-    def half_width(self, level: float) -> Float[Array, "*batch parameters"]:
+    def half_width(self, level: float, *, simultaneous: bool = False) -> Float[Array, "*batch parameters"]:
         """Half the width of an interval around each parameter that holds the truth in a share `level` of all flights.
 
-        **Raises:** `ValueError` for a level that is not between 0 and 1, or beyond what was calibrated.
+        **Arguments:**
+
+        - `level`: between 0 and 1; calibrated intervals reach from 50 to 99.9 %, and beyond grow no further.
+        - `simultaneous`: all parameters at once, instead of each for itself.
+
+        **Raises:** `ValueError` for another level.
         """
         if not 0 < level < 1:
             raise ValueError(f"`level` must lie between 0 and 1, got {level}.")
-        quantile = _deviations(jnp.asarray(level, dtype=float))
         if self.calibration is None:
-            return quantile * self.std
-        knots, factors = _deviations(self.calibration.levels), self.calibration.factors
-
-        @functools.partial(jnp.vectorize, signature="(l),(l,p)->(p)")
-        def at_level(knots, factors):
-            return jax.vmap(lambda f: jnp.interp(quantile, knots, f), in_axes=1)(factors)
-
-        return at_level(knots, factors) * self.std
+            each = 1 - (1 - level) / self.parameters.shape[-1] if simultaneous else level
+            return _deviations(jnp.asarray(each, dtype=float)) * self.std
+        knots, quantile = _deviations(self.calibration.levels), _deviations(jnp.asarray(level, dtype=float))
+        at = functools.partial(jnp.interp, quantile)
+        if simultaneous:
+            return (
+                jnp.vectorize(at, signature="(l),(l)->()")(knots, self.calibration.simultaneous)[..., None] * self.std
+            )
+        each_parameter = jax.vmap(at, in_axes=(None, 1))
+        return jnp.vectorize(each_parameter, signature="(l),(l,p)->(p)")(knots, self.calibration.factors) * self.std
 
 
 def _deviations(level: Float[Array, "*levels"]) -> Float[Array, "*levels"]:

@@ -21,7 +21,7 @@ from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS
 from ..information import cholesky, invert, invert_factor, invert_marginal
 from ..results import RESULTS
-from ..shooting import ROUNDING, Curvature, Rows, ShootingProblem
+from ..shooting import ROUNDING, Curvature, Rows, ShootingProblem, Shot
 from ._estimate import AbstractEstimator, Estimate
 
 DIRECTIONS = ("whitened", "coordinate")
@@ -41,6 +41,8 @@ _LEAST = 0.01
 _GROWTH = 4.0
 # A seed is missed where the answer is this many of its 99.9 % half-widths away: then the wide bracket is searched too.
 _MISSED = 2.0
+# So it is where the cost is this many of its standard deviations above what noise of the problem's sigma makes it.
+_UNEXPLAINED = 5.0
 
 
 class _Quadratic(NamedTuple):
@@ -127,7 +129,8 @@ class IBSS(AbstractEstimator):
         - `start`: where in the bracket the search begins; its center by default.
         - `seed`: an earlier estimate of the same flight. The search then begins against all of the problem's channels
           at once, in brackets around the seed that are sized by its covariance. Where that does not end well, or far
-          from the seed, the bracket is searched as if there were none, and the better answer is returned.
+          from the seed, or leaves more unexplained than noise, the bracket is searched as if there were none, and the
+          better answer is returned.
 
         **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
         """
@@ -145,26 +148,38 @@ class IBSS(AbstractEstimator):
             return self._finish(problem, trusted, bracket.valid, *wide)
 
         near = self._finish(problem, trusted, bracket.valid, *self._from_seed(problem, trusted, seed))
-        half_width = seed.half_width(0.999)
+        half_width = seed.half_width(0.999, simultaneous=True)
         far = jnp.abs(near.parameters - seed.parameters) > _MISSED * half_width
-        hit = (near.result == RESULTS.successful) & ~far.any()
-        wide = self._finish(problem, trusted, bracket.valid, *self._descend(problem, trusted, begin, asleep=hit))
-        better = ~hit & ((near.result != RESULTS.successful) | (wide.cost < near.cost))
-        best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
+        measurements = _measurements(problem.rows())
+        explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
+        told = jnp.isfinite(seed.covariance).all()
+        hit = told & (near.result == RESULTS.successful) & ~far.any() & explained
+
+        def search_wide(carry: tuple[Estimate, Bool[Array, ""]]) -> tuple[Estimate, Bool[Array, ""]]:
+            near, hit = carry
+            wide = self._finish(problem, trusted, bracket.valid, *self._descend(problem, trusted, begin, asleep=hit))
+            sound = told & (near.result == RESULTS.successful)
+            better = ~sound | ((wide.result == RESULTS.successful) & (wide.cost < near.cost))
+            best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
+            spent = near.rollouts + wide.rollouts, near.sweeps + wide.sweeps
+            return eqx.tree_at(lambda e: (e.rollouts, e.sweeps), best, spent), jnp.ones_like(hit)
+
+        # A loop and not a condition: a batch without a miss skips it as a whole.
+        best, _ = jax.lax.while_loop(lambda carry: ~carry[1], search_wide, (near, hit))
         return Estimate(
             parameters=best.parameters,
             covariance=best.covariance,
             initial_state=best.initial_state,
             cost=best.cost,
-            rollouts=seed.rollouts + near.rollouts + wide.rollouts,
-            sweeps=near.sweeps + wide.sweeps,
+            rollouts=seed.rollouts + best.rollouts,
+            sweeps=best.sweeps,
             result=best.result,
             seed=Bracket.around(seed.parameters, half_width),
         )
 
     def _from_seed(self, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> tuple[_Progress, Curvature]:
-        """Against all channels at once, from a seed; a lane whose seed failed is left where it is."""
-        progress = self._begin(problem, bracket, seed.parameters, asleep=seed.result != RESULTS.successful)
+        """Against all channels at once, from a seed; a lane whose seed says nothing is left where it is."""
+        progress = self._begin(problem, bracket, seed.parameters, asleep=~jnp.isfinite(seed.covariance).all())
         count = seed.parameters.shape[0]
         spread = progress.spread.at[:count, :count].set(
             jnp.where(progress.done, progress.spread[:count, :count], seed.covariance)
@@ -312,7 +327,9 @@ class IBSS(AbstractEstimator):
             sound = jnp.isfinite(here.curvature.shot.cost) & jnp.isfinite(moved).all()
             moved = jnp.where(sound, moved, search.unknowns)
             there = look(moved)
-            misfit = _misfit(there.curvature.shot.cost, rows)
+            cost, trusted = there.curvature.shot
+            there = there._replace(curvature=there.curvature._replace(shot=Shot(cost, trusted & sound)))
+            misfit = _misfit(cost, rows)
             coarse = _COARSE * jnp.maximum(misfit, 1.0)
             enough = jnp.where(last, jnp.maximum(self.tolerance * misfit, finest), coarse)
             return _Search(
@@ -379,8 +396,11 @@ def _finest(problem: ShootingProblem, rows: Rows) -> Scalar:
 
 def _misfit(cost: Scalar, rows: Rows) -> Scalar:
     """Root mean square of the weighted residuals: 1 where the noise is what the problem's sigma says."""
-    measurements = sum((~jnp.isnan(y)).sum() for y in rows.measured)
-    return jnp.sqrt(2 * cost / jnp.maximum(measurements, 1))
+    return jnp.sqrt(2 * cost / jnp.maximum(_measurements(rows), 1))
+
+
+def _measurements(rows: Rows) -> Int[Array, ""]:
+    return jnp.stack(rows.measured).size - jnp.isnan(jnp.stack(rows.measured)).sum()
 
 
 def _room(

@@ -1,0 +1,30 @@
+"""The hybrid: a network says where to look, and shooting finds the answer there."""
+
+from ..bracket import Bracket
+from ..shooting import ShootingProblem
+from ._estimate import AbstractEstimator, Estimate
+from .ibss import IBSS
+from .network import TrainedNetwork
+
+
+class Hybrid(AbstractEstimator):
+    """IBSS from brackets that a network seeds.
+
+    The network's answer and its covariance open the brackets, against all of the problem's channels at once. A seed
+    that does not hold the answer is noticed: brackets grow, and where the answer lies far from the seed, or does not
+    explain the flight, or the network had none, IBSS searches the whole bracket as it would alone. The estimate's
+    `seed` is the bracket that the network's intervals make (99.9 % for all parameters at once), so that hits can be
+    counted; `rollouts` are those of both.
+
+    **Arguments:**
+
+    - `network`: a trained network.
+    - `ibss`: how to shoot.
+    """
+
+    network: TrainedNetwork
+    ibss: IBSS = IBSS()
+
+    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """Identifies one flight. Raises as the network does."""
+        return self.ibss(problem, bracket, seed=self.network(problem, bracket))

@@ -1,0 +1,148 @@
+"""A trained network as one file: a zip of plain NumPy arrays and a header in JSON, from which nothing is executed."""
+
+import dataclasses
+import json
+import os
+import tokenize
+import zipfile
+import zlib
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._custom_types import as_float
+from .._files import write_atomically
+from ..airframe import Airframe
+from ..bracket import Bracket
+from ..dynamics import MODELS
+from ..errors import InputError
+from ..flight import Flight
+from ..shooting import ShootingProblem
+from .network import NetworkEstimator, TrainedNetwork, untrained
+
+_FORMAT = 1
+_LARGEST = 2**30
+# What a file that was cut, altered or never was one makes its readers raise.
+_BROKEN = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
+    """Writes a network with all that it was trained for: model, airframe, inputs, sampling, bracket, noise, version.
+
+    **Raises:** `ValueError` for a model that is not one of ours; `OSError` where the file cannot be written.
+    """
+    problem = network.problem
+    kinds = {kind: name for name, kind in MODELS.items()}
+    if type(problem.model) not in kinds:
+        name, known = type(problem.model).__name__, ", ".join(MODELS)
+        raise ValueError(f"`network` is for the model {name}; only networks for {known} can be saved.")
+    header = {
+        "format": _FORMAT,
+        "version": _version(),
+        "settings": dataclasses.asdict(network.settings),
+        "model": kinds[type(problem.model)],
+        "method": problem.method,
+        "checks": network.history.shape[0],
+    }
+    airframe = problem.model.airframe
+    arrays = {f"airframe.{f.name}": getattr(airframe, f.name) for f in dataclasses.fields(airframe)}
+    arrays |= {
+        "time": problem.flight.time,
+        "omega": problem.flight.omega,
+        "states": problem.flight.states,
+        "sigma": problem.sigma,
+    }
+    if problem.initial_state is not None:
+        arrays["initial_state"] = problem.initial_state
+    without = eqx.tree_at(lambda n: n.features.problem, network, None)
+    places = jax.tree_util.tree_leaves_with_path(eqx.filter(without, eqx.is_array))
+    arrays |= {_name(place): leaf for place, leaf in places}
+    with write_atomically(path) as beside, open(beside, "wb") as file:
+        np.savez(file, header=np.asarray(json.dumps(header)), **jax.tree.map(np.asarray, arrays))  # pyright: ignore[reportArgumentType]
+
+
+def load_network(path: str | os.PathLike[str]) -> TrainedNetwork:
+    """The network that `save_network` wrote, in the precision that is set now.
+
+    **Raises:** `InputError` for what is not such a file, whole and of this version; `OSError` where it cannot be read.
+    """
+    try:
+        with zipfile.ZipFile(path) as whole:
+            if sum(entry.file_size for entry in whole.infolist()) > _LARGEST:
+                raise InputError(f"{path}: larger than any network; give a file that `jaxos4 train` wrote.")
+        with np.load(path, allow_pickle=False) as file:
+            return _restore({name: file[name] for name in file.files})
+    except InputError:
+        raise
+    except (*_BROKEN, OSError) as error:
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
+        what = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a whole network file ({what}); train it again with `jaxos4 train`.") from None
+
+
+def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
+    header = json.loads(str(arrays["header"]))
+    if header["format"] != _FORMAT:
+        raise ValueError(f"format {header['format']}, expected {_FORMAT}")
+    for name, value in arrays.items():
+        whole = value.dtype.kind in "fui" and (name == "states" or not np.isnan(value).any())
+        if name != "header" and not whole:
+            raise ValueError(f"{name} is not what it should be")
+    settings = NetworkEstimator(**header["settings"] | {"noise": tuple(header["settings"]["noise"])})
+    airframe = Airframe(**{f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
+    problem = ShootingProblem(
+        MODELS[header["model"]](airframe),
+        Flight(arrays["time"], arrays["omega"], arrays["states"]),
+        sigma=arrays["sigma"],
+        initial_state=arrays.get("initial_state"),
+        channels=settings.channels,
+        method=header["method"],
+    )
+    blank = eqx.filter_eval_shape(untrained, settings, problem, Bracket.default(problem.model), jax.random.key(0))
+    blank = eqx.tree_at(lambda n: n.features.problem, blank, problem)
+    history = jax.ShapeDtypeStruct((header["checks"], 2), float)
+    blank = eqx.tree_at(lambda n: n.history, blank, history)
+
+    def fill(path: tuple, leaf: Any) -> Any:
+        if not isinstance(leaf, jax.ShapeDtypeStruct):
+            return leaf
+        name = _name(path)
+        value = arrays[name]
+        if value.shape != leaf.shape:
+            raise ValueError(f"{name} has shape {value.shape}, expected {leaf.shape}")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} is not finite")
+        return as_float(value) if jnp.issubdtype(leaf.dtype, jnp.floating) else jnp.asarray(value, leaf.dtype)
+
+    network = jax.tree_util.tree_map_with_path(fill, blank)
+    scaling, coordinates = network.scaling, network.features.coordinates
+    for positive in (*jax.tree.leaves(scaling), coordinates.width, airframe.mass, airframe.inertia):
+        if not (np.asarray(positive) > 0).all():
+            raise ValueError("a scale is not positive")
+    return network
+
+
+def _name(path: tuple) -> str:
+    return "network" + jax.tree_util.keystr(path)
+
+
+def _version() -> str:
+    from .. import __version__
+
+    return __version__
