@@ -70,7 +70,7 @@ def test_estimate_recovers_the_truth_within_its_intervals(run, tmp_path):
     assert (report["estimator"], report["model"], report["result"]) == ("ibss", "published", "successful")
     assert list(report["parameters"]) == [f"alpha{i}" for i in range(1, 9)]
     for name, row in report["parameters"].items():
-        assert {"estimate", "std", "ci95", "unit", "note"} == row.keys()
+        assert {"estimate", "std", "bound", "ci95", "unit", "note"} == row.keys()
         assert row["ci95"][0] < row["estimate"] < row["ci95"][1]
         assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4 * row["std"]
         assert name in out
@@ -223,3 +223,63 @@ def test_a_real_flight_is_read_fitted_and_told(run, tmp_path, shared_flights):
     assert np.all([row["estimate"] is None or np.isfinite(row["estimate"]) for row in report["parameters"].values()])
     # The plain model lacks the offsets and the lag of this vehicle: the user is told, on the page or by the result.
     assert "are not noise" in out or "No estimate" in out
+
+
+# Networks.
+
+
+@pytest.fixture(scope="module")
+def network_file(tmp_path_factory):
+    """A small network for the standard flight, and that flight."""
+    folder = tmp_path_factory.mktemp("network")
+    flight, network = folder / "flight.csv", folder / "flight.net"
+    for arguments in (
+        ["simulate", "--noise", "1", "--out", str(flight)],
+        ["train", str(flight), "--steps", "1000", "--out", str(network)],
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", ["jaxos4", *arguments])
+            with pytest.raises(SystemExit) as stop:
+                main()
+        assert not stop.value.code
+    return network, flight
+
+
+@pytest.mark.parametrize("estimator", ["network", "hybrid"])
+def test_a_trained_network_identifies_other_flights_of_its_inputs(run, tmp_path, network_file, estimator):
+    simulate(run, "other.csv", "--noise", "2", "--seed", "5", "--duration", "5")
+    options = ("--estimator", estimator, "--network", str(network_file[0]))
+    code, out, err = run("estimate", "other.csv", *options, "--out", "estimate.json")
+    assert code == 0, err
+    assert f"{estimator}, published model" in out
+    report = json.loads((tmp_path / "estimate.json").read_text())
+    assert (report["estimator"], report["result"]) == (estimator, "successful")
+    for name, row in report["parameters"].items():
+        assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4.5 * row["std"]
+        assert row["std"] >= 0.7 * row["bound"]
+
+
+def test_networks_that_do_not_fit_are_refused(run, tmp_path, network_file):
+    network, flight = (str(path) for path in network_file)
+    simulate(run, "chirp.csv", "--excitation", "chirp", "--duration", "5")
+    with_network = ("--estimator", "network", "--network", network)
+    refused(run("estimate", "chirp.csv", *with_network), "chirp.csv", "another series of rotor speeds", "jaxos4 train")
+    refused(run("estimate", flight, *with_network, "--model", "corrected"), "PublishedOS4, not CorrectedOS4")
+    refused(run("estimate", flight, *with_network, "--airframe", "voos"), "another airframe")
+    refused(run("estimate", flight, "--network", network), "--network", "ibss uses none")
+    refused(run("estimate", flight, "--estimator", "network", "--network", flight), "not a whole network file")
+    refused(run("estimate", flight, "--estimator", "network", "--network", "none.net"), "none.net", "No such file")
+    (tmp_path / "bracket.toml").write_text("alpha1 = [-1.0, 0.0]\n")
+    refused(run("estimate", flight, *with_network, "--bracket", "bracket.toml"), "--bracket")
+    refused(run("estimate", flight, *with_network, "--out", network), "would overwrite an input")
+
+
+def test_training_that_cannot_be_is_refused_and_writes_nothing(run, tmp_path, network_file):
+    flight = str(network_file[1])
+    refused(run("train", flight, "--out", "a.net", "--steps", "0"), "--steps", "1 to 1000000")
+    refused(run("train", flight, "--out", "a.net", "--seed", "-1"), "--seed")
+    refused(run("train", flight, "--out", flight), "would overwrite an input")
+    refused(run("train", flight, "--out", "missing/a.net"), "no such folder")
+    both = ("--features", "raw", "--approximator", "cmac")
+    refused(run("train", flight, "--out", "a.net", *both), "--approximator cmac", "score")
+    assert not list(tmp_path.iterdir())

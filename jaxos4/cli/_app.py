@@ -5,9 +5,10 @@ import sys
 import jax
 import typer
 
-from ..errors import InputError
+from ..errors import InputError, TrainingError
 from .estimate import estimate
 from .simulate import simulate
+from .train import train
 
 app = typer.Typer(
     add_completion=False,
@@ -17,6 +18,7 @@ app = typer.Typer(
 )
 app.command()(simulate)
 app.command()(estimate)
+app.command()(train)
 
 
 def main() -> None:
@@ -30,9 +32,12 @@ def main() -> None:
             raise SystemExit(1) from None
         typer.echo(f"jaxos4: {_one_line(error)}", err=True)
         raise SystemExit(2) from None
+    except TrainingError as error:
+        typer.echo(f"jaxos4: {_one_line(error)}", err=True)
+        raise SystemExit(1) from None
 
 
-def _one_line(error: InputError | OSError) -> str:
+def _one_line(error: InputError | OSError | TrainingError) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}; give a path that can be used."
     return " ".join(str(error).split())

@@ -3,7 +3,9 @@
 from enum import StrEnum
 
 from ..dynamics import CHANNELS, MODELS
+from ..estimators import APPROXIMATORS
 from ..excitation import EXCITATIONS
+from ..features import FEATURES
 from ..simulate import METHODS
 
 Model = StrEnum("Model", list(MODELS))
@@ -11,4 +13,6 @@ Excitation = StrEnum("Excitation", list(EXCITATIONS))
 Method = StrEnum("Method", list(METHODS))
 Channels = StrEnum("Channels", list(CHANNELS))
 InitialState = StrEnum("InitialState", ["free", "known"])
-Estimator = StrEnum("Estimator", ["ibss"])
+Estimator = StrEnum("Estimator", ["ibss", "network", "hybrid"])
+Features = StrEnum("Features", list(FEATURES))
+Approximator = StrEnum("Approximator", list(APPROXIMATORS))

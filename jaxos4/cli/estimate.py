@@ -1,5 +1,6 @@
 """`jaxos4 estimate`: the parameters that a flight tells, with their intervals."""
 
+import dataclasses
 import json
 import time
 from pathlib import Path
@@ -21,7 +22,7 @@ from ..airframe import load_airframe
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
 from ..errors import InputError
-from ..estimators import IBSS, AbstractEstimator, Estimate
+from ..estimators import IBSS, AbstractEstimator, Estimate, Hybrid, NetworkEstimator, TrainedNetwork, load_network
 from ..flight import STATE_NAMES, STATE_UNITS, Flight
 from ..information import cramer_rao_bound
 from ..logs import read_flight_and_notes
@@ -32,7 +33,8 @@ from ._bracket_file import load_bracket
 from ._check_output import check_output
 from ._choices import Channels, Estimator, InitialState, Model
 
-ESTIMATORS: dict[str, AbstractEstimator] = {"ibss": IBSS()}
+# How long a network is trained that only has to say where to look.
+SEED_STEPS = 2000
 # The noise levels are not known: they are estimated from the residuals, and where one turns out to be off by more than
 # this share, the fit is repeated with them. Weights within it cost less than one percent of the efficiency.
 OFF = 0.2
@@ -41,7 +43,7 @@ PASSES = 4
 COLOURED = 0.3
 # Residuals below this share of a channel's largest value are rounding, whatever their correlation.
 ROUNDING = 1e-9
-NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid")
+NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
 
 
 def estimate(
@@ -49,28 +51,53 @@ def estimate(
     estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
     model: Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")] = Model["published"],
     airframe: Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")] = "os4",
-    bracket: Annotated[Path | None, typer.Option(help="TOML file: alpha1 = [lower, upper], ...")] = None,
+    bracket: Annotated[Path | None, typer.Option(help="TOML file: alpha1 = \\[lower, upper], ...")] = None,
     channels: Annotated[
         Channels | None, typer.Option(help="What to compare; all that was measured by default.")
     ] = None,
     initial_state: Annotated[
         InitialState, typer.Option(help="free: estimated too; known: the first sample is exact.")
     ] = InitialState["free"],
+    network: Annotated[
+        Path | None,
+        typer.Option(help="A file from `jaxos4 train`, for the network and the hybrid; trained now without it."),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="A JSON file to write.")] = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, with 95 % intervals."""
     console = Console()
     vehicle = MODELS[model](load_airframe(airframe))
     where = Bracket.default(vehicle) if bracket is None else load_bracket(bracket, vehicle)
+    if network is not None and estimator == "ibss":
+        raise InputError("--network: ibss uses none; say --estimator network or --estimator hybrid, or leave it out.")
+    if network is not None and estimator == "network" and bracket is not None:
+        raise InputError("--bracket: the network looks in the bracket that it was trained in; leave one of them out.")
     if out is not None:
-        check_output(out, flight, Path(airframe), bracket)
+        check_output(out, flight, Path(airframe), bracket, network)
+    trained = None if network is None else load_network(network)
     recorded, notes = read_flight_and_notes(flight, vehicle.airframe)
     for note in notes:
         console.print(f"note: {note}", markup=False, highlight=False)
-    problem = _problem(flight, vehicle, recorded, channels, known=initial_state == "known")
+    problem = problem_of(flight, vehicle, recorded, channels, known=initial_state == "known")
 
     begin = time.perf_counter()
-    problem, found, rollouts = _fit(ESTIMATORS[estimator], problem, where)
+    method: AbstractEstimator = IBSS()
+    if estimator != "ibss":
+        if trained is None:
+            training = NetworkEstimator(channels=seen_channels(problem))
+            if estimator == "hybrid":
+                training = NetworkEstimator(channels=training.channels, steps=SEED_STEPS)
+            console.print(f"note: training a network for this flight, {training.steps} steps", highlight=False)
+            trained = fit_network(training, flight, problem, where, seed=0)
+        different = trained.mismatch(problem)
+        if different is not None:
+            raise InputError(
+                f"{network or 'the network'}: cannot be used on {flight}: {different}; train one with `jaxos4 train`."
+            )
+        method = trained if estimator == "network" else Hybrid(trained)
+    if estimator == "network" and trained is not None:
+        problem, where = problem.restrict(trained.channels), trained.bracket
+    problem, found, bound, rollouts = _fit(method, problem, where)
     seconds = time.perf_counter() - begin
 
     name = str(result_names(found.result))
@@ -81,7 +108,7 @@ def estimate(
         "rollouts": rollouts,
         "cost": _number(found.cost),
         "seconds": seconds,
-        "parameters": _parameters(vehicle, where, found),
+        "parameters": _parameters(vehicle, where, found, bound),
         "fit": {} if name in NO_ANSWER else _fit_quality(problem, found),
         "provenance": {
             "flight": str(flight),
@@ -91,28 +118,46 @@ def estimate(
             "samples": int(recorded.time.shape[0]),
             "sample_time": float(recorded.dt),
             "notes": list(notes),
+            **({} if trained is None else {"network": _network_provenance(network, trained)}),
             **_provenance(),
         },
     }
     if out is not None:
         with write_atomically(out) as beside:
             beside.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    if name in NO_ANSWER:
+    if name == "nonfinite_trajectory":
         console.print(
             "No estimate: wherever the search went, the model's trajectory left this flight before its end. The "
             "vehicle may do what the model lacks, or the airframe's constants or the units are far off.",
             highlight=False,
         )
-    else:
+    elif name not in NO_ANSWER:
         _print(console, report)
     if name != "successful":
         typer.echo(f"jaxos4: {name}: {RESULTS[found.result]}", err=True)
         raise typer.Exit(1)
 
 
-def _problem(
+def fit_network(
+    training: NetworkEstimator, flight: Path, problem: ShootingProblem, bracket: Bracket, *, seed: int
+) -> TrainedNetwork:
+    """A network for a flight's inputs."""
+    try:
+        return training.fit(problem, bracket, key=jax.random.key(seed), progress=True)
+    except ValueError as error:
+        raise InputError(f"{flight}: {error}") from None
+
+
+def seen_channels(problem: ShootingProblem) -> str:
+    """What a network looks at: the rates, or the attitude too where not all of them were measured."""
+    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
+    return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"
+
+
+def problem_of(
     path: Path, model: AbstractModel, flight: Flight, channels: Channels | None, *, known: bool
 ) -> ShootingProblem:
+    """What is to be explained: the channels that were measured, or those asked for."""
     measured = ~np.isnan(np.asarray(flight.states))
     beyond = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
     present = {name: measured[:, CASCADE_ORDER[part]].any() for name, part in beyond.items()}
@@ -136,8 +181,8 @@ def _problem(
 
 def _fit(
     estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket
-) -> tuple[ShootingProblem, Estimate, int]:
-    """The estimate, and the problem with the noise levels that it found."""
+) -> tuple[ShootingProblem, Estimate, Array, int]:
+    """The problem with the noise levels found, the estimate, the Cramer-Rao bound, and the rollouts that it took."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
@@ -146,41 +191,56 @@ def _fit(
         rollouts = int(found.rollouts)
         for number in range(1, PASSES + 1):
             if str(result_names(found.result)) in NO_ANSWER:
-                return problem, found, rollouts
+                return problem, found, found.std, rollouts
             used, problem = problem, problem.reweighted(problem.residuals(found.parameters, found.initial_state))
             settled = bool(jnp.all(jnp.abs(problem.sigma / used.sigma - 1) < OFF))
-            if settled or number == PASSES or found.result != RESULTS.successful:
+            if settled or number == PASSES or (found.calibration is None and found.result != RESULTS.successful):
                 break
             progress.update(task, completed=number, description=f"fitting with the noise found in pass {number}")
             found = jax.block_until_ready(estimator(problem, bracket))
             rollouts += int(found.rollouts)
+        if found.calibration is not None:  # a network's answer and its errors depend on the noise
+            found = jax.block_until_ready(estimator(problem, bracket))
+            rollouts += int(found.rollouts)
+            if str(result_names(found.result)) in NO_ANSWER:
+                return problem, found, found.std, rollouts
         bound = cramer_rao_bound(problem, found.parameters, found.initial_state)
         cost = problem.cost(found.parameters, found.initial_state)
-    return problem, eqx.tree_at(lambda e: (e.covariance, e.cost), found, (bound, cost)), rollouts
+    # What shooting finds is as good as the bound.
+    covariance = bound if found.calibration is None else found.covariance
+    found = eqx.tree_at(lambda e: (e.covariance, e.cost), found, (covariance, cost))
+    return problem, found, jnp.sqrt(jnp.diagonal(bound)), rollouts
 
 
-def _parameters(model: AbstractModel, bracket: Bracket, found: Estimate) -> dict[str, dict[str, Any]]:
-    table = {}
+def _parameters(
+    model: AbstractModel, bracket: Bracket, found: Estimate, bound: Float[Array, " parameters"]
+) -> dict[str, dict[str, Any]]:
+    table, half_width = {}, np.asarray(found.half_width(0.95))
     for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True)):
         value, std = float(found.parameters[i]), float(found.std[i])
         lower, upper = float(bracket.lower[i]), float(bracket.upper[i])
-        told = np.isfinite(std) and std <= (upper - lower) / 2
+        # A network's errors are those of the flight and the bracket together.
+        most = (upper - lower) / (2 if found.calibration is None else 4)
+        told = np.isfinite(std) and std <= most
         table[name] = {
             "estimate": value if told else None,
             "std": _number(std),
-            "ci95": [value - 1.96 * std, value + 1.96 * std] if told else None,
+            "bound": _number(bound[i]),
+            "ci95": [value - half_width[i], value + half_width[i]] if told else None,
             "unit": unit,
-            "note": _note(value, std, lower, upper) if told else "not told by this flight",
+            "note": _note(found, i, half_width[i], lower, upper) if told else "not told by this flight",
         }
     return table
 
 
-def _note(value: float, std: float, lower: float, upper: float) -> str:
-    notes = []
-    if abs(value) < 1.96 * std:
+def _note(found: Estimate, i: int, half_width: float, lower: float, upper: float) -> str:
+    notes, value = [], float(found.parameters[i])
+    if abs(value) < half_width:
         notes.append("below noise")
     if not lower <= value <= upper:
         notes.append("outside its bracket")
+    if found.seed is not None and not found.seed.lower[i] <= value <= found.seed.upper[i]:
+        notes.append("missed by the network, found beyond")
     return "; ".join(notes)
 
 
@@ -215,14 +275,20 @@ def _print(console: Console, report: dict[str, Any]) -> None:
             continue
         low, high = row["ci95"]
         interval = f"[{low:.5g}, {high:.5g}]"
-        table.add_row(name, row["unit"], f"{row['estimate']:.5g}", interval, f"{row['std']:.2g}", row["note"])
+        table.add_row(name, row["unit"], f"{row['estimate']:.5g}", interval, f"{row['bound']:.2g}", row["note"])
     console.print(table, markup=False)
     fit = report["fit"]
     shares = ", ".join(f"{name} {row['percent']:.1f}" for name, row in fit.items() if row["percent"] is not None)
     console.print("bound: Cramer-Rao, the least standard deviation that the noise found allows.", highlight=False)
     console.print(f"fit [%], 100 is a perfect prediction: {shares}.", highlight=False, markup=False)
     coloured = [name for name, row in fit.items() if (row["correlation"] or 0) > COLOURED]
-    if coloured:
+    if coloured and report["estimator"] == "network":
+        console.print(
+            f"The residuals of {', '.join(coloured)} are more than noise: the network's answer is not the best fit, "
+            "within its intervals. The hybrid goes on from there, and says whether the model explains this flight.",
+            highlight=False,
+        )
+    elif coloured:
         console.print(
             f"The residuals of {', '.join(coloured)} are not noise: the model does not explain this flight fully, and "
             "the intervals are too narrow.",
@@ -233,6 +299,12 @@ def _print(console: Console, report: dict[str, Any]) -> None:
         f"{report['result']}, {report['rollouts']} rollouts, {report['seconds']:.1f} s",
         highlight=False,
     )
+
+
+def _network_provenance(path: Path | None, network: TrainedNetwork) -> dict[str, Any]:
+    settings = {field.name: getattr(network.settings, field.name) for field in dataclasses.fields(network.settings)}
+    bracket = {"lower": network.bracket.lower.tolist(), "upper": network.bracket.upper.tolist()}
+    return {"file": None if path is None else str(path), "settings": settings, "bracket": bracket}
 
 
 def _provenance() -> dict[str, str]:
