@@ -31,3 +31,26 @@ def test_speed(tmp_path):
     report = json.loads((tmp_path / "out.json").read_text())
     assert report["provenance"]["precision"] == "float64"
     assert all(row["rate"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
+
+
+def test_networks(tmp_path):
+    load("networks").main(
+        flights=100,
+        seed=7,
+        cases=["standard"],
+        networks=["score, mlp"],
+        noises=[1.0],
+        steps=250,
+        many=50,
+        separate=False,
+        out=tmp_path / "out.json",
+    )
+    report = json.loads((tmp_path / "out.json").read_text())
+    rows = {row["estimator"]: row for row in report["rows"]}
+    assert report["one_call"]["flights"] == 50
+    assert list(rows) == ["score, mlp", "hybrid", "ibss"]
+    # Of 100 flights, each of eight parameters within five Monte-Carlo errors of the bound.
+    for name in ("hybrid", "ibss"):
+        assert np.all(np.abs(np.array(rows[name]["efficiency"]) - 1) < 5 * rows[name]["monte_carlo_error"])
+    assert rows["hybrid"]["rollouts"] < rows["ibss"]["rollouts"]
+    assert rows["hybrid"]["hit_rate"] > 0.9

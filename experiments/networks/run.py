@@ -1,0 +1,236 @@
+"""Networks, the hybrid and IBSS on unseen flights drawn over the whole bracket: RMSE / bound, coverage, rollouts, time.
+
+Parameters, noise and flights are new; each error is taken in units of the Cramer-Rao bound at that flight's own truth.
+"""
+
+import json
+import os
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+import jaxos4
+
+jax.config.update("jax_enable_x64", True)
+
+CHUNK = 250
+LEVELS = (0.5, 0.9, 0.99)
+NOISES = (0.1, 1.0, 10.0)
+
+
+class Case(NamedTuple):
+    """What is identified: a model on an excitation, in brackets so many times as wide as the default."""
+
+    model: type[jaxos4.AbstractModel] = jaxos4.PublishedOS4
+    excitation: str = "multisine"
+    wide: float = 1.0
+
+    @property
+    def bracket(self) -> jaxos4.Bracket:
+        """Around the OS4."""
+        model = self.model(jaxos4.OS4)
+        return jaxos4.Bracket.around(model.alpha, self.wide * model.half_width)
+
+    @property
+    def flight(self) -> jaxos4.Flight:
+        """The exact flight at the bracket's center."""
+        model = self.model(jaxos4.OS4)
+        omega = getattr(jaxos4, self.excitation)(model.airframe)
+        return jaxos4.simulate(model, model.alpha, omega, dt=0.01)
+
+    def problem(self, flight: jaxos4.Flight, noise: float | jax.Array, channels: str = "all") -> jaxos4.ShootingProblem:
+        """All flights start at rest, and it is known."""
+        sigma = noise * jaxos4.SENSOR_SIGMA
+        model = self.model(jaxos4.OS4)
+        return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=jnp.zeros(12), channels=channels)
+
+
+CASES = {
+    "standard": Case(),
+    "twice as wide": Case(wide=2.0),
+    "corrected": Case(model=jaxos4.CorrectedOS4),
+    "doublet": Case(excitation="doublet"),
+}
+NETWORKS = {
+    "score, mlp": {},
+    "raw, mlp": {"features": "raw", "steps": 3000},
+    "score, cmac": {"approximator": "cmac", "learning_rate": 0.005},
+}
+
+
+def unseen(
+    case: Case, estimator: jaxos4.AbstractEstimator, bound_channels: str, noises: list[float], flights: int, seed: int
+) -> Iterator[tuple[float, dict]]:
+    """For each noise, identifies `flights` flights that can be flown, of parameters drawn over the bracket."""
+    bracket, exact = case.bracket, case.flight
+
+    @eqx.filter_jit
+    @eqx.filter_vmap(in_axes=(0, None))
+    def fly(key, noise):
+        alpha_key, noise_key = jax.random.split(key)
+        u = jax.random.uniform(alpha_key, (8,), minval=-1, maxval=1)
+        alpha = bracket.center + u * bracket.half_width
+        truth = jaxos4.simulate(case.model(jaxos4.OS4), alpha, exact.omega, dt=0.01)
+        flight = jaxos4.WhiteNoise(noise * jaxos4.SENSOR_SIGMA)(truth, key=noise_key)
+        bound = jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(case.problem(truth, noise, bound_channels), alpha)))
+        flown = (truth.result == jaxos4.RESULTS.successful) & jnp.isfinite(bound).all()
+        return alpha, flight.states, bound, flown
+
+    @eqx.filter_jit
+    @eqx.filter_vmap(in_axes=(0, None, None))
+    def identify(states, noise, estimator):
+        return estimator(case.problem(eqx.tree_at(lambda f: f.states, exact, states), noise), bracket)
+
+    for noise in noises:
+        level, rows, seconds, chunk = jnp.asarray(noise), [], [], 0
+        while sum(len(r["alpha"]) for r in rows) < flights and chunk < 20 + 20 * flights / CHUNK:
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), chunk), CHUNK)
+            alpha, states, bound, flown = fly(keys, level)
+            begin, chunk = time.perf_counter(), chunk + 1
+            found = jax.block_until_ready(identify(states, level, estimator))
+            seconds.append(time.perf_counter() - begin)
+            error = found.parameters - alpha
+            row = {
+                "alpha": alpha,
+                "error": error,
+                "bound": bound,
+                "result": jaxos4.result_names(found.result),
+                "rollouts": found.rollouts,
+                "covered": jnp.stack([jnp.abs(error) < found.half_width(level) for level in LEVELS], axis=1),
+            }
+            if found.seed is not None:
+                row["hit"] = ((alpha >= found.seed.lower) & (alpha <= found.seed.upper)).all(axis=1)
+            rows.append({name: np.asarray(value)[np.asarray(flown)] for name, value in row.items()})
+        data = {name: np.concatenate([r[name] for r in rows])[:flights] for name in rows[0]}
+        yield noise, summary(data) | {"flights_per_second": CHUNK / float(np.median(seconds))}
+
+
+def summary(data: dict[str, np.ndarray]) -> dict:
+    """What a row of the table shows; errors of flights with an answer only, and how many those are."""
+    told = np.isin(data["result"], ["successful", "at_bound", "unidentifiable", "max_sweeps"])
+    error, bound = data["error"][told], data["bound"][told]
+    names, counts = np.unique(data["result"], return_counts=True)
+    return {
+        "flights": len(told),
+        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "efficiency": np.sqrt(np.mean((error / bound) ** 2, axis=0)).tolist(),
+        "rms_ratio": np.sqrt(np.mean(error**2, axis=0) / np.mean(bound**2, axis=0)).tolist(),
+        "monte_carlo_error": float(1 / np.sqrt(2 * max(told.sum(), 1))),
+        "covered": data["covered"][told].mean(axis=(0, 2)).tolist(),
+        "rollouts": float(data["rollouts"].mean()),
+        "hit_rate": float(data["hit"].mean()) if "hit" in data else None,
+    }
+
+
+def amortised(case: Case, network: jaxos4.TrainedNetwork, flights: int) -> dict:
+    """Identifies many noisy flights in one call: time, and what it adds to the memory of the process."""
+    keys = jax.random.split(jax.random.key(3), flights)
+    exact, bracket, noise = case.flight, case.bracket, jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)
+    noisy = eqx.filter_jit(jax.vmap(lambda key: noise(exact, key=key).states))(keys)
+
+    @eqx.filter_jit
+    @eqx.filter_vmap(in_axes=(0, None))
+    def identify(states, network):
+        return network(case.problem(eqx.tree_at(lambda f: f.states, exact, states), 1.0), bracket)
+
+    def peak() -> float:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    begin = time.perf_counter()
+    compiled = identify.lower(noisy, network).compile()
+    built, before = time.perf_counter(), peak()
+    jax.block_until_ready(compiled(noisy, network))
+    seconds = time.perf_counter() - built
+    return {
+        "flights": flights,
+        "compile_seconds": built - begin,
+        "seconds": seconds,
+        "data_mib": noisy.nbytes / 2**20,
+        "peak_mib": peak(),
+        "added_mib": peak() - before,
+    }
+
+
+def main(
+    flights: Annotated[int, typer.Option(help="Unseen flights for a row.")] = 2000,
+    seed: Annotated[int, typer.Option(help="Of the unseen flights; networks are trained with seed 0.")] = 7,
+    cases: Annotated[list[str], typer.Option(help="Which cases.")] = tuple(CASES),
+    networks: Annotated[list[str], typer.Option(help="Which networks, in the standard case.")] = tuple(NETWORKS),
+    noises: Annotated[list[float], typer.Option(help="Noise scales.")] = NOISES,
+    steps: Annotated[int | None, typer.Option(help="Of training, in place of each network's own.")] = None,
+    many: Annotated[int, typer.Option(help="Flights identified by one call.")] = 10_000,
+    separate: Annotated[bool, typer.Option(help="Also one network for each noise scale.")] = True,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+) -> None:
+    """Networks, hybrid and IBSS on flights drawn over the whole bracket."""
+    report: dict = {"flights": flights, "seed": seed, "version": jaxos4.__version__, "load": os.getloadavg()}
+    report |= {"rows": [], "training_seconds": {}}
+    console = Console(width=170)
+    table = Table(title="RMSE / Cramer-Rao bound: of the rates for a network alone, of all channels for the others")
+    parameters = [f"a{i}" for i in range(1, 9)]
+    for heading in ("case", "estimator", "noise", *parameters, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"):
+        table.add_column(heading, no_wrap=heading != "results")
+
+    def add(name: str, label: str, noise: float, row: dict) -> None:
+        report["rows"].append({"case": name, "estimator": label, "noise": noise, **row})
+        table.add_row(
+            name,
+            label,
+            f"{noise:g}",
+            *(f"{x:.2f}" for x in row["efficiency"]),
+            " ".join(f"{100 * x:.1f}" for x in row["covered"]),
+            "" if row["hit_rate"] is None else f"{100 * row['hit_rate']:.1f}",
+            f"{row['rollouts']:.0f}",
+            f"{row['flights_per_second'] or 0:.0f}",
+            ", ".join(f"{count} {what}" for what, count in row["results"].items()),
+        )
+        if out is not None:
+            out.write_text(json.dumps(report, indent=2) + "\n")
+
+    def fit(case: Case, settings: dict) -> tuple[jaxos4.TrainedNetwork, float]:
+        begin = time.perf_counter()
+        settings = settings if steps is None else {**settings, "steps": steps}
+        trained = jaxos4.NetworkEstimator(**settings).fit(
+            case.problem(case.flight, 1.0), case.bracket, key=jax.random.key(0), progress=True
+        )
+        return trained, time.perf_counter() - begin
+
+    for name in cases:
+        case = CASES[name]
+        for label in networks if name == "standard" else networks[:1]:
+            trained, seconds = fit(case, NETWORKS[label])
+            console.print(f"{name}: {label} trained in {seconds:.0f} s", highlight=False)
+            report["training_seconds"][f"{name}: {label}"] = seconds
+            for noise, row in unseen(case, trained, "rates", noises, flights, seed):
+                add(name, label, noise, row)
+            if label != networks[0]:
+                continue
+            if name == "standard":
+                report["one_call"] = amortised(case, trained, many)
+                console.print(f"one call: {report['one_call']}", highlight=False)
+            for other, estimator in (("hybrid", jaxos4.Hybrid(trained)), ("ibss", jaxos4.IBSS())):
+                for noise, row in unseen(case, estimator, "all", noises, flights, seed):
+                    add(name, other, noise, row)
+        for noise in noises if name == "standard" and separate else ():
+            trained, seconds = fit(case, {**NETWORKS[networks[0]], "noise": (noise, noise)})
+            label = f"{networks[0]}, this noise only"
+            report["training_seconds"][f"{name}: {label} {noise:g}"] = seconds
+            for _, row in unseen(case, trained, "rates", [noise], flights, seed):
+                add(name, label, noise, row)
+    console.print(table)
+    if out is not None:
+        out.write_text(json.dumps(report, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)
