@@ -1,6 +1,7 @@
 """A trained network as one file: a zip of plain NumPy arrays and a header in JSON, from which nothing is executed."""
 
 import dataclasses
+import importlib.metadata
 import json
 import os
 import tokenize
@@ -53,7 +54,7 @@ def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
         raise ValueError(f"`network` is for the model {name}; only networks for {known} can be saved.")
     header = {
         "format": _FORMAT,
-        "version": _version(),
+        "version": importlib.metadata.version("jaxos4"),
         "settings": dataclasses.asdict(network.settings),
         "model": kinds[type(problem.model)],
         "method": problem.method,
@@ -140,9 +141,3 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
 
 def _name(path: tuple) -> str:
     return "network" + jax.tree_util.keystr(path)
-
-
-def _version() -> str:
-    from .. import __version__
-
-    return __version__
