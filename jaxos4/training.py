@@ -96,9 +96,8 @@ def train(
 
     def mean_loss(weights: PyTree, pairs: Pair) -> Scalar:
         flown = jnp.isfinite(pairs.features).all(axis=1)
-        seen = jnp.where(
-            flown[:, None], pairs.features, 0.0
-        )  # what NaN touches has a NaN gradient, whatever its weight
+        # What NaN touches has a NaN gradient, whatever its weight.
+        seen = jnp.where(flown[:, None], pairs.features, 0.0)
         losses = jax.vmap(lambda pair: loss(eqx.combine(weights, structure), pair))(pairs._replace(features=seen))
         return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
 

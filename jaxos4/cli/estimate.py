@@ -84,9 +84,8 @@ def estimate(
     method: AbstractEstimator = IBSS()
     if estimator != "ibss":
         if trained is None:
-            training = NetworkEstimator(channels=seen_channels(problem))
-            if estimator == "hybrid":
-                training = NetworkEstimator(channels=training.channels, steps=SEED_STEPS)
+            steps = SEED_STEPS if estimator == "hybrid" else NetworkEstimator.steps
+            training = NetworkEstimator(channels=seen_channels(problem), steps=steps)
             console.print(f"note: training a network for this flight, {training.steps} steps", highlight=False)
             trained = fit_network(training, flight, problem, where, seed=0)
         different = trained.mismatch(problem)
@@ -94,9 +93,10 @@ def estimate(
             raise InputError(
                 f"{network or 'the network'}: cannot be used on {flight}: {different}; train one with `jaxos4 train`."
             )
-        method = trained if estimator == "network" else Hybrid(trained)
-    if estimator == "network" and trained is not None:
-        problem, where = problem.restrict(trained.channels), trained.bracket
+        if estimator == "hybrid":
+            method = Hybrid(trained)
+        else:
+            method, problem, where = trained, problem.restrict(trained.channels), trained.bracket
     problem, found, bound, rollouts = _fit(method, problem, where)
     seconds = time.perf_counter() - begin
 

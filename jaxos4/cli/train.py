@@ -29,7 +29,7 @@ def train(
     ] = InitialState["free"],
     features: Annotated[Features, typer.Option(help="What the network sees.")] = Features["score"],
     approximator: Annotated[Approximator, typer.Option(help="What it is made of.")] = Approximator["mlp"],
-    steps: Annotated[int, typer.Option(help="Length of the training.")] = NetworkEstimator().steps,
+    steps: Annotated[int, typer.Option(help="Length of the training.")] = NetworkEstimator.steps,
     seed: Annotated[int, typer.Option(help="Of the training.")] = 0,
 ) -> None:
     """Train a network for a flight's inputs, to identify any flight of the same inputs at once."""
