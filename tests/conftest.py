@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+from collections.abc import Iterator
 
 import hypothesis
 import jax
@@ -16,6 +17,13 @@ jaxtyping.install_import_hook("jaxos4", "typechecker.check")
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_programs_end_with_their_module() -> Iterator[None]:
+    """Every compiled program holds memory maps, and a process that reaches the kernel's limit of them (65,530) dies."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
