@@ -18,12 +18,12 @@ class Hybrid(AbstractEstimator):
 
     **Arguments:**
 
-    - `network`: a trained network.
-    - `ibss`: how to shoot.
+    - `network`: a trained network. One that looks at all the channels of the problem makes the shortest search.
+    - `ibss`: how to shoot. A seed is close enough for one halving less than a wide bracket takes.
     """
 
     network: TrainedNetwork
-    ibss: IBSS = IBSS()
+    ibss: IBSS = IBSS(halvings=3)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight. Raises as the network does."""
