@@ -1,6 +1,7 @@
 """Where the parameters are looked for: an interval for each."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Parameters, as_float
@@ -46,3 +47,8 @@ class Bracket(eqx.Module):
         """Whether every interval is finite and has its lower end below its upper one."""
         width = self.upper - self.lower
         return ((width > 0) & (width < float("inf"))).all()
+
+    @property
+    def usable(self) -> "Bracket":
+        """Itself where it is valid, else 0 +- 1: what a computation that must stay finite goes on with."""
+        return Bracket.around(jnp.where(self.valid, self.center, 0.0), jnp.where(self.valid, self.half_width, 1.0))

@@ -6,12 +6,15 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar
 from ..bracket import Bracket
 from ..results import RESULTS
 from ..shooting import ShootingProblem
+
+# How many half-widths around its bracket's center an answer may lie.
+REACH = 4.0
 
 
 class Calibration(eqx.Module):
@@ -41,6 +44,7 @@ class Estimate(eqx.Module):
     - `result`: how it ended.
     - `calibration`: of the intervals, where they were calibrated on simulated flights; `None`: Gaussian.
     - `seed`: the bracket that the search began from, where another estimator gave one.
+    - `history`: of a recursive estimator, the parameters after each sample.
     """
 
     parameters: Parameters
@@ -52,6 +56,7 @@ class Estimate(eqx.Module):
     result: RESULTS
     calibration: Calibration | None = None
     seed: Bracket | None = None
+    history: Float[Array, "samples parameters"] | None = None
 
     @property
     def std(self) -> Float[Array, "*batch parameters"]:
@@ -86,6 +91,58 @@ class Estimate(eqx.Module):
 def _deviations(level: Float[Array, "*levels"]) -> Float[Array, "*levels"]:
     """How many standard deviations to either side hold a share `level` of a Gaussian."""
     return jax.scipy.special.ndtri((1 + level) / 2)
+
+
+def conclude(
+    bracket: Bracket,
+    *,
+    parameters: Parameters,
+    covariance: Float[Array, "parameters parameters"],
+    initial_state: Float[Array, " size"],
+    cost: Scalar,
+    rollouts: Int[Array, ""] | int,
+    sweeps: Int[Array, ""] | int,
+    sound: Bool[Array, ""],
+    done: Bool[Array, ""],
+    reach: Scalar | float = REACH,
+    history: Float[Array, "samples parameters"] | None = None,
+) -> Estimate:
+    """What an algorithm found, as an estimate: its result told, and nothing that is not a number passed on.
+
+    **Arguments:**
+
+    - `sound`: whether the trajectory stayed sound to its end.
+    - `done`: whether the search ended by itself.
+    - `reach`: how many half-widths around the bracket's center an answer may lie.
+    """
+    valid, center = bracket.valid, jnp.where(bracket.valid, bracket.center, 0.0)
+    std, half_width = jnp.sqrt(jnp.diagonal(covariance)), jnp.where(valid, bracket.half_width, 1.0)
+    limit = (reach - 1e-3) * half_width
+    finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
+    sound = sound & jnp.isfinite(cost) & finite
+    result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
+    result = RESULTS.where((jnp.abs(parameters - center) > limit).any(), RESULTS.at_bound, result)
+    result = RESULTS.where((std > half_width).any(), RESULTS.unidentifiable, result)
+    result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
+    result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
+    told = sound & valid
+    return Estimate(
+        parameters=jnp.where(told, parameters, center),
+        covariance=jnp.where(told, covariance, jnp.inf),
+        initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
+        cost=jnp.where(told, cost, jnp.inf),
+        rollouts=jnp.asarray(rollouts, dtype=int),
+        sweeps=jnp.asarray(sweeps, dtype=int),
+        result=result,
+        history=None if history is None else jnp.where(told, history, center),
+    )
+
+
+def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
+    """Raises `ValueError` for a bracket of another length than the model's parameters."""
+    names = problem.model.parameter_names
+    if bracket.lower.shape != (len(names),):
+        raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
 
 
 class AbstractEstimator(eqx.Module):

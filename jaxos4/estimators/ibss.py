@@ -22,7 +22,7 @@ from ..dynamics import CASCADE_ORDER, CHANNELS
 from ..information import cholesky, invert, invert_factor, invert_marginal
 from ..results import RESULTS
 from ..shooting import ROUNDING, Curvature, Rows, ShootingProblem, Shot
-from ._estimate import AbstractEstimator, Estimate
+from ._estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
 
 DIRECTIONS = ("whitened", "coordinate")
 
@@ -97,7 +97,7 @@ class IBSS(AbstractEstimator):
     halvings: int = eqx.field(static=True, default=4)
     max_sweeps: int = eqx.field(static=True, default=60)
     tolerance: Scalar = eqx.field(converter=as_float, default=0.02)
-    reach: Scalar = eqx.field(converter=as_float, default=4.0)
+    reach: Scalar = eqx.field(converter=as_float, default=REACH)
 
     def __check_init__(self):
         if self.directions not in DIRECTIONS:
@@ -134,20 +134,17 @@ class IBSS(AbstractEstimator):
 
         **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
         """
+        check_bracket(problem, bracket)
         names = problem.model.parameter_names
-        if bracket.lower.shape != (len(names),):
-            raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
         if start is not None and jnp.shape(start) != (len(names),):
             raise ValueError(f"`start` must hold {len(names)} parameters, got shape {jnp.shape(start)}.")
-        trusted = Bracket.around(
-            jnp.where(bracket.valid, bracket.center, 0.0), jnp.where(bracket.valid, bracket.half_width, 1.0)
-        )
+        trusted = bracket.usable
         begin = trusted.center if start is None else as_float(start)
         if seed is None:
             wide = self._descend(problem, trusted, begin, asleep=jnp.zeros((), dtype=bool))
-            return self._finish(problem, trusted, bracket.valid, *wide)
+            return self._finish(problem, bracket, *wide)
 
-        near = self._finish(problem, trusted, bracket.valid, *self._from_seed(problem, trusted, seed))
+        near = self._finish(problem, bracket, *self._from_seed(problem, trusted, seed))
         half_width = seed.half_width(0.999, simultaneous=True)
         far = jnp.abs(near.parameters - seed.parameters) > _MISSED * half_width
         measurements = _measurements(problem.rows())
@@ -157,7 +154,7 @@ class IBSS(AbstractEstimator):
 
         def search_wide(carry: tuple[Estimate, Bool[Array, ""]]) -> tuple[Estimate, Bool[Array, ""]]:
             near, hit = carry
-            wide = self._finish(problem, trusted, bracket.valid, *self._descend(problem, trusted, begin, asleep=hit))
+            wide = self._finish(problem, bracket, *self._descend(problem, trusted, begin, asleep=hit))
             sound = told & (near.result == RESULTS.successful)
             better = ~sound | ((wide.result == RESULTS.successful) & (wide.cost < near.cost))
             best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
@@ -230,7 +227,6 @@ class IBSS(AbstractEstimator):
         self,
         problem: ShootingProblem,
         bracket: Bracket,
-        valid: Bool[Array, ""],
         progress: _Progress,
         curvature: Curvature,
     ) -> Estimate:
@@ -240,25 +236,17 @@ class IBSS(AbstractEstimator):
         if problem.free_size:
             initial_state = progress.unknowns[count:]
         (cost, trusted), _, information = curvature
-        bound = invert_marginal(information, count)
-        std = jnp.sqrt(jnp.diagonal(bound))
-        lower, upper = (limit[:count] for limit in self._limits(problem, bracket))
-        at_bound = jnp.minimum(parameters - lower, upper - parameters) < 1e-3 * bracket.half_width
-        sound = trusted & jnp.isfinite(cost) & jnp.isfinite(parameters).all() & jnp.isfinite(bound).all()
-        result = RESULTS.where(progress.done, RESULTS.successful, RESULTS.max_sweeps)
-        result = RESULTS.where(at_bound.any(), RESULTS.at_bound, result)
-        result = RESULTS.where((std > bracket.half_width).any(), RESULTS.unidentifiable, result)
-        result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
-        result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
-        sound = sound & valid
-        return Estimate(
-            parameters=jnp.where(sound, parameters, bracket.center),
-            covariance=jnp.where(sound, bound, jnp.inf),
-            initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
-            cost=jnp.where(sound, cost, jnp.inf),
+        return conclude(
+            bracket,
+            parameters=parameters,
+            covariance=invert_marginal(information, count),
+            initial_state=initial_state,
+            cost=cost,
             rollouts=progress.rollouts,
             sweeps=progress.sweeps,
-            result=result,
+            sound=trusted,
+            done=progress.done,
+            reach=self.reach,
         )
 
     def _search(
