@@ -20,6 +20,7 @@ from .dynamics import (
     DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH,
     AbstractModel as AbstractModel,
     CorrectedOS4 as CorrectedOS4,
+    InertialOS4 as InertialOS4,
     PublishedOS4 as PublishedOS4,
 )
 from .errors import InputError as InputError, TrainingError as TrainingError
@@ -29,8 +30,11 @@ from .estimators import (
     Estimate as Estimate,
     Hybrid as Hybrid,
     NetworkEstimator as NetworkEstimator,
+    OutputError as OutputError,
+    Profile as Profile,
     TrainedNetwork as TrainedNetwork,
     load_network as load_network,
+    profile_likelihood as profile_likelihood,
     save_network as save_network,
 )
 from .excitation import (
@@ -40,7 +44,13 @@ from .excitation import (
     step3211 as step3211,
 )
 from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
-from .information import cramer_rao_bound as cramer_rao_bound, fisher_information as fisher_information
+from .identifiability import Identifiability as Identifiability, identifiability as identifiability
+from .inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia
+from .information import (
+    cramer_rao_bound as cramer_rao_bound,
+    fisher_information as fisher_information,
+    robust_covariance as robust_covariance,
+)
 from .logs import read_flight as read_flight, write_flight as write_flight
 from .noise import (
     SENSOR_SIGMA as SENSOR_SIGMA,

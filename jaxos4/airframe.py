@@ -109,8 +109,20 @@ def alpha_from_inertia(inertia: Float[ArrayLike, "3"], gyroscopic: Float[ArrayLi
     Reference: the definitions below Eq. (13).
     """
     ix, iy, iz = jnp.asarray(inertia)
-    return jnp.stack(
-        [(iy - iz) / ix, gyroscopic / ix, 1 / ix, (iz - ix) / iy, gyroscopic / iy, 1 / iy, (ix - iy) / iz, 1 / iz]
+    return jnp.stack(alpha_scalars(ix, iy, iz, jnp.asarray(gyroscopic)))
+
+
+def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tuple[Scalar, ...]:
+    """`alpha_from_inertia`, scalar by scalar: what a scan needs."""
+    return (
+        (iy - iz) / ix,
+        gyroscopic / ix,
+        1 / ix,
+        (iz - ix) / iy,
+        gyroscopic / iy,
+        1 / iy,
+        (ix - iy) / iz,
+        1 / iz,
     )
 
 

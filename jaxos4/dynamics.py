@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector
-from .airframe import OS4, Airframe, alpha_from_inertia
+from .airframe import OS4, Airframe, alpha_from_inertia, alpha_scalars
 from .trigonometry import sincos
 
 
@@ -99,6 +99,11 @@ class AbstractModel(eqx.Module):
 
     @property
     @abc.abstractmethod
+    def gyroscopic_factor(self) -> Scalar:
+        """What multiplies J_R above Ix and Iy in alpha2 and alpha5."""
+
+    @property
+    @abc.abstractmethod
     def parameter_units(self) -> tuple[str, ...]:
         """The unit of each parameter."""
 
@@ -176,9 +181,12 @@ class PublishedOS4(AbstractModel):
     @property
     def alpha(self) -> Float[Array, "8"]:
         """alpha_1..8 as defined below Eq. (13)."""
-        return alpha_from_inertia(
-            self.airframe.inertia, jnp.asarray(self.airframe.rotor_inertia * self.airframe.drag_coefficient)
-        )
+        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
+
+    @property
+    def gyroscopic_factor(self) -> Scalar:
+        """The drag coefficient, as the paper prints alpha2 = J_R d / Ix."""
+        return jnp.asarray(self.airframe.drag_coefficient)
 
     @property
     def parameter_units(self) -> tuple[str, ...]:
@@ -219,7 +227,12 @@ class CorrectedOS4(AbstractModel):
     @property
     def alpha(self) -> Float[Array, "8"]:
         """alpha_1..8 with J_R in the place of J_R d."""
-        return alpha_from_inertia(self.airframe.inertia, jnp.asarray(self.airframe.rotor_inertia))
+        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
+
+    @property
+    def gyroscopic_factor(self) -> Scalar:
+        """1: alpha2 = J_R / Ix."""
+        return jnp.asarray(1.0)
 
     @property
     def parameter_units(self) -> tuple[str, ...]:
@@ -246,6 +259,68 @@ class CorrectedOS4(AbstractModel):
             (sin_psi * sin_theta * cos_phi - cos_psi * sin_phi) * forcing.thrust,
             cos_theta * cos_phi * forcing.thrust - self.airframe.gravity,
         )
+
+
+class InertialOS4(AbstractModel):
+    """A model's equations with Ix, Iy, Iz and J_R as the parameters, in place of the eight alphas.
+
+    A rigid body has no other alphas than those: four constants that are estimated know more than eight.
+
+    **Arguments:**
+
+    - `model`: `PublishedOS4` or `CorrectedOS4`; its alphas follow from the constants by the definitions below Eq. (13).
+    """
+
+    model: AbstractModel
+
+    def __init__(self, model: AbstractModel):
+        self.model = model
+
+    @property
+    def airframe(self) -> Airframe:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The inner model's."""
+        return self.model.airframe
+
+    @property
+    def alpha(self) -> Float[Array, "4"]:
+        """Ix, Iy, Iz, J_R of the airframe [kg m^2]."""
+        return jnp.append(jnp.asarray(self.airframe.inertia), jnp.asarray(self.airframe.rotor_inertia))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Ix, Iy, Iz, J_R."""
+        return ("Ix", "Iy", "Iz", "J_R")
+
+    @property
+    def parameter_units(self) -> tuple[str, ...]:
+        """All in kg m^2."""
+        return ("kg m^2",) * 4
+
+    @property
+    def half_width(self) -> Float[Array, "4"]:
+        """30 % of each inertia. Of J_R as much as the inner bracket leaves to alpha2: more than itself if need be."""
+        ix = jnp.asarray(self.airframe.inertia)[0]
+        return jnp.append(
+            0.3 * jnp.asarray(self.airframe.inertia), self.model.half_width[1] * ix / self.model.gyroscopic_factor
+        )
+
+    @property
+    def gyroscopic_factor(self) -> Scalar:
+        """The inner model's."""
+        return self.model.gyroscopic_factor
+
+    def alphas(self, parameters) -> tuple[Scalar, ...]:
+        """alpha_1..8 that the constants imply."""
+        ix, iy, iz, rotor = parameters
+        return alpha_scalars(ix, iy, iz, rotor * self.gyroscopic_factor)
+
+    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
+        """The inner model's, of the alphas."""
+        return self.model.angular_acceleration(rates, forcing, self.alphas(parameters))
+
+    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+        """The inner model's."""
+        return self.model.acceleration(attitude, forcing)
 
 
 MODELS = {"published": PublishedOS4, "corrected": CorrectedOS4}

@@ -276,10 +276,11 @@ def test_networks_that_do_not_fit_are_refused(run, tmp_path, network_file):
 
 def test_training_that_cannot_be_is_refused_and_writes_nothing(run, tmp_path, network_file):
     flight = str(network_file[1])
-    refused(run("train", flight, "--out", "a.net", "--steps", "0"), "--steps", "1 to 1000000")
+    refused(run("train", flight, "--out", "a.net", "--steps", "0"), "`steps` must be", "at least 1")
+    refused(run("train", flight, "--out", "a.net", "--noise", "2", "1"), "`noise` must be (lowest, highest)")
     refused(run("train", flight, "--out", "a.net", "--seed", "-1"), "--seed")
     refused(run("train", flight, "--out", flight), "would overwrite an input")
     refused(run("train", flight, "--out", "missing/a.net"), "no such folder")
     both = ("--features", "raw", "--approximator", "cmac")
-    refused(run("train", flight, "--out", "a.net", *both), "--approximator cmac", "score")
+    refused(run("train", flight, "--out", "a.net", *both), "`approximator`", "score")
     assert not list(tmp_path.iterdir())

@@ -1,5 +1,6 @@
 """`jaxos4 train`: a network for a flight's inputs, kept in a file."""
 
+import dataclasses
 import time
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +15,7 @@ from ..estimators import NetworkEstimator, save_network
 from ..logs import read_flight_and_notes
 from ._bracket_file import load_bracket
 from ._check_output import check_output
-from ._choices import Approximator, Features, InitialState, Model
+from ._choices import Approximator, Channels, Features, InitialState, Model
 from .estimate import fit_network, problem_of, seen_channels
 
 
@@ -29,33 +30,37 @@ def train(
     ] = InitialState["free"],
     features: Annotated[Features, typer.Option(help="What the network sees.")] = Features["score"],
     approximator: Annotated[Approximator, typer.Option(help="What it is made of.")] = Approximator["mlp"],
+    noise: Annotated[
+        tuple[float, float], typer.Option(help="Least and largest noise, in multiples of the standard one.")
+    ] = NetworkEstimator.noise,
+    channels: Annotated[
+        Channels | None, typer.Option(help="What it looks at; the rates without it, or the attitude without rates.")
+    ] = None,
     steps: Annotated[int, typer.Option(help="Length of the training.")] = NetworkEstimator.steps,
     seed: Annotated[int, typer.Option(help="Of the training.")] = 0,
 ) -> None:
     """Train a network for a flight's inputs, to identify any flight of the same inputs at once."""
     if not 0 <= seed < 2**63:
         raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
-    if not 1 <= steps <= 1_000_000:
-        raise InputError(f"--steps: must lie in 1 to 1000000, got {steps}.")
-    if features == "raw" and approximator == "cmac":
-        raise InputError("--approximator cmac: tiles every pair of features; use --features score with it.")
+    try:
+        settings = NetworkEstimator(features=features.value, approximator=approximator.value, noise=noise, steps=steps)
+    except ValueError as error:
+        raise InputError(f"options: {error}") from None
     check_output(out, flight, Path(airframe), bracket)
     vehicle = MODELS[model](load_airframe(airframe))
     where = Bracket.default(vehicle) if bracket is None else load_bracket(bracket, vehicle)
     recorded, notes = read_flight_and_notes(flight, vehicle.airframe)
     for note in notes:
         typer.echo(f"note: {note}")
-    problem = problem_of(flight, vehicle, recorded, None, known=initial_state == "known")
-    channels = seen_channels(problem)
-    training = NetworkEstimator(
-        features=features.value, approximator=approximator.value, channels=channels, steps=steps
-    )
+    problem = problem_of(flight, vehicle, recorded, channels, known=initial_state == "known")
+    seen = seen_channels(problem) if channels is None else channels.value
+    training = dataclasses.replace(settings, channels=seen)
     begin = time.perf_counter()
     network = fit_network(training, flight, problem, where, seed=seed)
     save_network(network, out)
     low, high = training.noise
     typer.echo(
-        f"{out}: {features.value} features of the {channels}, noise {low:g} to {high:g} times the standard one, "
+        f"{out}: {features.value} features of the {seen}, noise {low:g} to {high:g} times the standard one, "
         f"{model.value} model, {recorded.time.shape[0]} samples, loss {network.history[:, 1].min():.4g}, "
         f"{time.perf_counter() - begin:.0f} s"
     )

@@ -9,3 +9,5 @@ from .network import (
     TrainedNetwork as TrainedNetwork,
 )
 from .network_file import load_network as load_network, save_network as save_network
+from .output_error import OutputError as OutputError
+from .profile import Profile as Profile, profile_likelihood as profile_likelihood

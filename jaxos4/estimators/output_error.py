@@ -1,0 +1,128 @@
+"""Output error: nonlinear least squares of the simulated against the measured trajectory, by Levenberg-Marquardt.
+
+The prediction-error method of system identification for a model without process noise, and with white measurement
+noise maximum likelihood (Ljung, System Identification, chapter 7; Jategaonkar, Flight Vehicle System Identification,
+chapter 4). The minimiser is optimistix's.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from ..bracket import Bracket
+from ..dynamics import CHANNELS
+from ..information import cholesky, invert_factor, invert_marginal
+from ..shooting import ShootingProblem
+from ._estimate import AbstractEstimator, Estimate, check_bracket, conclude
+
+Unknowns = Float[Array, " unknowns"]
+
+
+class OutputError(AbstractEstimator):
+    """Levenberg-Marquardt on the weighted residuals, from the bracket's center, down the cascade of channels.
+
+    The rates are fitted first, then the attitude with them, then everything: from a wide bracket the residuals of all
+    channels alone lead to other minima. Unknowns are scaled by the bracket's half-widths (an initial state by how far
+    off it may be), so that the damping means the same for each.
+
+    **Arguments:**
+
+    - `tolerance`: of the step, relative and absolute in scaled unknowns, and of the cost.
+    - `max_steps`: for each stage.
+    """
+
+    tolerance: float = eqx.field(static=True, default=1e-8)
+    max_steps: int = eqx.field(static=True, default=100)
+
+    def __check_init__(self):
+        if not self.tolerance > 0:
+            raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
+        if not isinstance(self.max_steps, int) or self.max_steps < 1:
+            raise ValueError(f"`max_steps` must be an integer of at least 1, got {self.max_steps!r}.")
+
+    @eqx.filter_jit
+    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """Identifies one flight.
+
+        `rollouts` counts one for each trial and one for each of its tangents, `sweeps` the steps of all stages.
+
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        """
+        check_bracket(problem, bracket)
+        usable, count = bracket.usable, len(problem.model.parameter_names)
+        first_state, off = problem.first_state()
+        scale = jnp.concatenate([usable.half_width, off[: problem.free_size]])
+        unknowns = jnp.concatenate([usable.center, first_state[: problem.free_size]])
+        steps = rollouts = jnp.zeros((), dtype=int)
+        done = jnp.ones((), dtype=bool)
+        for channels, size in CHANNELS.items():
+            if size > problem.size:
+                continue
+            stage = problem.restrict(channels)
+            within = count + stage.free_size
+            solution = self._minimise(stage, unknowns[:within], scale[:within])
+            unknowns = unknowns.at[:within].set(solution.value * scale[:within])
+            taken = solution.stats["num_steps"]
+            steps, rollouts = steps + taken, rollouts + taken * (1 + within)
+            done = solution.result == optx.RESULTS.successful
+        parameters = unknowns[:count]
+        initial_state = unknowns[count:] if problem.free_size else first_state
+        (cost, sound), _, information = problem.curvature(problem.rows(), parameters, initial_state)
+        return conclude(
+            bracket,
+            parameters=parameters,
+            covariance=invert_marginal(information, count),
+            initial_state=initial_state,
+            cost=cost,
+            rollouts=rollouts + unknowns.shape[0],
+            sweeps=steps,
+            sound=sound,
+            done=done,
+        )
+
+    def _minimise(self, problem: ShootingProblem, unknowns: Unknowns, scale: Unknowns) -> optx.Solution:
+        """In scaled unknowns."""
+        count = len(problem.model.parameter_names)
+
+        def residuals(scaled: Unknowns, _) -> Float[Array, " residuals"]:
+            u = scaled * scale
+            return problem.residuals(u[:count], u[count:] if problem.free_size else None)
+
+        solver = optx.LevenbergMarquardt(self.tolerance, self.tolerance, linear_solver=NormalCholesky())
+        return optx.least_squares(residuals, solver, unknowns / scale, max_steps=self.max_steps, throw=False)
+
+
+class NormalCholesky(lx.AbstractLinearSolver):
+    """Least squares by the normal equations, in plain operations: LAPACK's batched kernels can wait for ever in a loop.
+
+    See `information.cholesky`. Damping keeps the equations regular.
+    """
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict) -> tuple:
+        """The matrix, and its inverse Cholesky factor."""
+        del options
+        matrix = operator.as_matrix()
+        return matrix, invert_factor(cholesky(jnp.einsum("ij,ik->jk", matrix, matrix)))
+
+    def compute(self, state: tuple, vector, options: dict):
+        """Solves for one right-hand side."""
+        del options
+        matrix, inverse = state
+        flat = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(vector)])
+        solution = inverse.T @ (inverse @ (matrix.T @ flat))
+        return solution, lx.RESULTS.successful, {}
+
+    def transpose(self, state, options):
+        """Not needed: what is minimised is not differentiated through."""
+        raise NotImplementedError("NormalCholesky solves forward only.")
+
+    def conj(self, state, options):
+        """Itself: residuals are real."""
+        return state, options
+
+    def assume_full_rank(self) -> bool:
+        """Of the columns: damping makes sure of it."""
+        return True

@@ -1,0 +1,95 @@
+"""What a flight can tell about each parameter, what it cannot, and why."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ._custom_types import Parameters, as_float
+from .bracket import Bracket
+from .information import cramer_rao_bound, fisher_information
+from .shooting import ShootingProblem
+
+# A parameter is told apart from 0 where it is this many standard deviations away: 95 %.
+_NOISE_FLOOR = 1.959964
+# Parameters that share more than this of a direction that the flight does not tell are named as partners.
+_PARTNER = 0.2
+
+
+class Identifiability(eqx.Module):
+    """The information of a flight in the parameters, in units of the bracket's half-widths.
+
+    - `parameters`: where it was taken.
+    - `half_width`: of the bracket.
+    - `std`: the Cramer-Rao bound, as standard deviations in the parameters' units.
+    - `std_alone`: the same if all other parameters were known.
+    - `eigenvalues`: of the scaled information, rising: below 1, the flight tells less about that direction than the
+      bracket did.
+    - `directions`: the eigenvectors, one a column, in half-widths.
+    """
+
+    parameters: Parameters
+    half_width: Parameters
+    std: Parameters
+    std_alone: Parameters
+    eigenvalues: Parameters
+    directions: Float[Array, "parameters parameters"]
+
+    @property
+    def told(self) -> Bool[Array, " parameters"]:
+        """Whether the flight tells more about each parameter than its bracket did."""
+        return self.std <= self.half_width
+
+    @property
+    def excited(self) -> Bool[Array, " parameters"]:
+        """Whether it would, if all other parameters were known."""
+        return self.std_alone <= self.half_width
+
+    @property
+    def noise_limit(self) -> Parameters:
+        """Multiples of the problem's sigma below which each parameter is told apart from 0, with 95 %."""
+        return jnp.abs(self.parameters) / (_NOISE_FLOOR * self.std)
+
+    def notes(self, names: tuple[str, ...]) -> dict[str, str]:
+        """For each parameter of which something must be said, what it is. Of one flight, not of a batch."""
+        notes = {}
+        told, excited, limit = (np.asarray(x) for x in (self.told, self.excited, self.noise_limit))
+        for i, name in enumerate(names):
+            if not excited[i]:
+                notes[name] = "not told: not excited"
+            elif not told[i]:
+                partners = ", ".join(names[j] for j in self._partners(i))
+                notes[name] = f"not told: only together with {partners}"
+            elif limit[i] < 1:
+                notes[name] = f"below the noise floor; identifiable below {limit[i]:.2g} times this noise"
+        return notes
+
+    def _partners(self, i: int) -> list[int]:
+        """The parameters with which `i` can be traded without the flight telling."""
+        vectors = np.asarray(self.directions) / np.sqrt(np.maximum(np.asarray(self.eigenvalues), 1e-300))
+        weakest = vectors[:, np.argmax(np.abs(vectors[i]))]
+        share = np.abs(weakest) / np.abs(weakest).max()
+        return [j for j in range(len(share)) if j != i and share[j] > _PARTNER] or [int(np.argsort(share)[-2])]
+
+
+@eqx.filter_jit
+def identifiability(
+    problem: ShootingProblem,
+    bracket: Bracket,
+    parameters: Parameters,
+    initial_state: Float[Array, " size"] | None = None,
+) -> Identifiability:
+    """What a problem's flight tells about its model's parameters near `parameters`, with the problem's sigma.
+
+    **Arguments:**
+
+    - `bracket`: its half-widths say how well each parameter is known without the flight; it must be valid.
+    - `initial_state`: where it is free, it is unknown too, and eliminated.
+    """
+    parameters, half_width = as_float(parameters), bracket.half_width
+    information = fisher_information(problem, parameters, initial_state)
+    eigenvalues, directions = jnp.linalg.eigh(information * half_width[:, None] * half_width[None, :])
+    diagonal = jnp.diagonal(information)
+    alone = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), jnp.inf)
+    bound = cramer_rao_bound(problem, parameters, initial_state)
+    return Identifiability(parameters, half_width, jnp.sqrt(jnp.diagonal(bound)), alone, eigenvalues, directions)

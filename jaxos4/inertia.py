@@ -1,0 +1,82 @@
+"""From alpha_1..8 and their covariance to the constants of a rigid body: Ix, Iy, Iz, J_R with theirs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ._custom_types import Scalar, as_float
+from .airframe import inertia_from_alpha
+from .dynamics import AbstractModel, InertialOS4
+from .information import cholesky, invert, invert_factor
+
+# Gauss-Newton converges quadratically here: the alphas are nearly linear in the constants over their errors.
+_STEPS = 20
+
+
+class InertiaFit(eqx.Module):
+    """The rigid body that explains eight alphas best.
+
+    - `constants`: Ix, Iy, Iz, J_R [kg m^2].
+    - `covariance`: of these.
+    - `mismatch`: (alpha - alpha(constants))^T C^-1 (alpha - alpha(constants)): chi-squared with four degrees of freedom
+      where the alphas are those of a rigid body.
+    - `p_value`: how often a rigid body's alphas would be as far off or farther.
+    - `triangle`: Iy + Iz - Ix, Iz + Ix - Iy, Ix + Iy - Iz [kg m^2]: none is negative for a rigid body.
+    - `triangle_std`: their standard deviations.
+    """
+
+    constants: Float[Array, "4"]
+    covariance: Float[Array, "4 4"]
+    mismatch: Scalar
+    p_value: Scalar
+    triangle: Float[Array, "3"]
+    triangle_std: Float[Array, "3"]
+
+    @property
+    def std(self) -> Float[Array, "*batch 4"]:
+        """Standard deviation of each constant."""
+        return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def is_rigid_body(self) -> Bool[Array, "*batch"]:
+        """Whether no triangle inequality is broken by more than two standard deviations."""
+        return (self.triangle > -2 * self.triangle_std).all(axis=-1)
+
+
+@eqx.filter_jit
+def fit_inertia(model: AbstractModel, alpha: Float[Array, "8"], covariance: Float[Array, "8 8"]) -> InertiaFit:
+    """Eight alphas, four constants: weighted least squares, by Gauss-Newton from the reciprocals of alpha3, 6, 8.
+
+    **Arguments:**
+
+    - `model`: says what stands above Ix and Iy in alpha2 and alpha5, see `gyroscopic_factor`.
+    - `alpha`, `covariance`: an estimate's; all of it finite, or nothing of what is returned is.
+    """
+    inertial, alpha = InertialOS4(model), as_float(alpha)
+    # W with W^T W the inverse of the covariance; an infinite one is no weight.
+    whiten = invert_factor(cholesky(as_float(covariance)))
+    first, gyroscopic = inertia_from_alpha(alpha)
+    begin = jnp.append(first, gyroscopic / model.gyroscopic_factor)
+    scale = jnp.append(first, jnp.sqrt(covariance[1, 1]) * first[0] / model.gyroscopic_factor)
+
+    def residuals(u: Float[Array, "4"]) -> Float[Array, "8"]:
+        return whiten @ (alpha - jnp.stack(inertial.alphas(tuple(u * scale))))
+
+    def step(u: Float[Array, "4"], _) -> tuple[Float[Array, "4"], None]:
+        jacobian = jax.jacfwd(residuals)(u)
+        return u - invert(jacobian.T @ jacobian) @ (jacobian.T @ residuals(u)), None
+
+    u, _ = jax.lax.scan(step, begin / scale, length=_STEPS)
+    jacobian = jax.jacfwd(residuals)(u)
+    spread = invert(jacobian.T @ jacobian) * scale[:, None] * scale[None, :]
+    mismatch = jnp.square(residuals(u)).sum()
+    sums = jnp.ones((3, 3)) - 2 * jnp.eye(3)
+    return InertiaFit(
+        constants=u * scale,
+        covariance=spread,
+        mismatch=mismatch,
+        p_value=jax.scipy.special.gammaincc(2.0, mismatch / 2),
+        triangle=sums @ (u * scale)[:3],
+        triangle_std=jnp.sqrt(jnp.diagonal(sums @ spread[:3, :3] @ sums.T)),
+    )

@@ -1,0 +1,165 @@
+"""What a flight cannot tell is named, with the right reason and the right figure."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DT, noisy_states, standard_flight, standard_problem
+
+import jaxos4
+
+MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
+
+
+def problem_of(omega, model_class=jaxos4.PublishedOS4, channels="rates", scale=1.0):
+    """The exact flight of an input, from rest."""
+    model = model_class(jaxos4.OS4)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=DT)
+    sigma = scale * jaxos4.SENSOR_SIGMA
+    return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=flight.states[0], channels=channels)
+
+
+def notes_of(problem, report=False):
+    model = problem.model
+    found = jaxos4.identifiability(problem, jaxos4.Bracket.default(model), model.alpha)
+    return found if report else found.notes(model.parameter_names)
+
+
+def test_a_hover_tells_nothing():
+    omega = jnp.full((301, 4), jaxos4.OS4.hover_speed)
+    notes = notes_of(problem_of(omega, channels="all"))
+    assert list(notes) == [f"alpha{i}" for i in range(1, 9)]
+    assert set(notes.values()) == {"not told: not excited"}
+
+
+@pytest.mark.parametrize(
+    ("axis", "lost"),
+    [
+        ("yaw", {"alpha1", "alpha2", "alpha3", "alpha4", "alpha6", "alpha7"}),
+        ("roll", {"alpha1", "alpha2", "alpha4", "alpha5", "alpha6", "alpha7", "alpha8"}),
+        ("pitch", {"alpha1", "alpha3", "alpha4", "alpha5", "alpha7", "alpha8"}),
+    ],
+)
+def test_one_axis_excited_tells_of_that_axis_alone(axis, lost):
+    """Eqs. (1)-(3): alpha2 multiplies q in p', alpha5 multiplies r in q', so that pitch and yaw tell of those too."""
+    omega = jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=[axis])
+    notes = notes_of(problem_of(omega))
+    assert {name for name, note in notes.items() if note.startswith("not told: not excited")} == lost
+
+
+def test_without_yaw_what_needs_yaw_is_named():
+    omega = jaxos4.multisine(jaxos4.OS4, duration=5.0, dt=DT, tones=((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), ()))
+    published, corrected = (notes_of(problem_of(omega, m)) for m in MODELS)
+    # p q alpha7 drives a little yaw by itself only where alpha7 is not 0; it is 0 for the OS4.
+    untold = {"alpha1", "alpha4", "alpha5", "alpha8"}
+    assert {name for name, note in published.items() if note.startswith("not told")} == untold
+    assert {"alpha1", "alpha4", "alpha8"} <= {n for n, note in corrected.items() if note.startswith("not told")}
+
+
+def test_what_is_told_only_together_is_named_with_its_partner():
+    """Roll torque and the product q r in one rhythm: neither alone, only their sum."""
+    problem = problem_of(standard_flight().omega)
+    found = notes_of(problem, report=True)
+    trade = jnp.zeros((8, 8)).at[0, 0].set(1.0).at[3, 3].set(1.0).at[0, 3].set(1.0).at[3, 0].set(1.0)
+    information = 1e6 * (jnp.eye(8) - jnp.diag(jnp.eye(8)[0] + jnp.eye(8)[3]) + trade) + 1e-4 * jnp.eye(8)
+    values, vectors = jnp.linalg.eigh(information)
+    std = jnp.sqrt(jnp.diagonal(jnp.linalg.inv(information)))
+    degenerate = eqx.tree_at(
+        lambda f: (f.half_width, f.std, f.std_alone, f.eigenvalues, f.directions),
+        found,
+        (jnp.ones(8), std, 1e-3 * jnp.ones(8), values, vectors),
+    )
+    notes = degenerate.notes(problem.model.parameter_names)
+    assert notes["alpha1"] == "not told: only together with alpha4"
+    assert notes["alpha4"] == "not told: only together with alpha1"
+    assert "alpha3" not in notes
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_the_published_gyroscopic_parameters_lie_below_the_noise_and_the_figure_is_right(scale):
+    problem = problem_of(standard_flight().omega, channels="all", scale=scale)
+    found = notes_of(problem, report=True)
+    notes = found.notes(problem.model.parameter_names)
+    below = {name for name, note in notes.items() if note.startswith("below the noise floor")}
+    assert {"alpha2", "alpha5", "alpha7"} <= below
+    # At that noise the bound is what it must be to tell the parameter from 0.
+    limit = float(found.noise_limit[1])
+    quieter = notes_of(problem_of(standard_flight().omega, channels="all", scale=scale * limit), report=True)
+    np.testing.assert_allclose(1.959964 * quieter.std[1], abs(problem.model.alpha[1]), rtol=1e-6)
+    # The noise of sigma = 1 at which alpha2 = 6e-9 appears does not depend on the noise that one has.
+    np.testing.assert_allclose(
+        scale * limit,
+        float(notes_of(problem_of(standard_flight().omega, channels="all"), True).noise_limit[1]),
+        rtol=1e-9,
+    )
+
+
+def test_the_corrected_models_gyroscopic_parameters_lie_above_it():
+    problem = problem_of(standard_flight(jaxos4.CorrectedOS4).omega, jaxos4.CorrectedOS4, channels="all")
+    notes = notes_of(problem)
+    assert "alpha2" not in notes
+    assert "alpha5" not in notes
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+def test_the_scaled_informations_inverse_is_the_bound(model_class):
+    problem = standard_problem(model_class, "all", free=True)
+    found = notes_of(problem, report=True)
+    rebuilt = (found.directions / found.eigenvalues) @ found.directions.T
+    bound = jaxos4.cramer_rao_bound(problem, problem.model.alpha)
+    np.testing.assert_allclose(rebuilt * np.outer(found.half_width, found.half_width), bound, rtol=1e-6)
+    assert np.all(found.std_alone <= found.std * (1 + 1e-9))
+
+
+@pytest.mark.parametrize("estimator", [jaxos4.IBSS(), jaxos4.OutputError()])
+def test_a_profile_is_the_parabola_of_the_bound(estimator):
+    problem = standard_problem(channels="rates", states=noisy_states(1, seed=3)[0])
+    bracket = jaxos4.Bracket.default(problem.model)
+    best = estimator(problem, bracket)
+    steps = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    values = best.parameters[2] + steps * best.std[2]
+    profile = jaxos4.profile_likelihood(estimator, problem, bracket, "alpha3", values)
+    assert set(jaxos4.result_names(profile.estimates.result)) == {"successful"}
+    np.testing.assert_allclose(profile.deviance, steps**2, rtol=0.02, atol=2e-3)
+    with pytest.raises(ValueError, match="`name` must be one of alpha1"):
+        jaxos4.profile_likelihood(estimator, problem, bracket, "alpha9", values)
+
+
+def residual_noise(flights, correlation_time):
+    """Errors of flights with Gauss-Markov noise, in naive and in robust standard deviations."""
+    problem = standard_problem(channels="rates")
+    truth, noise = problem.flight, jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, correlation_time)
+    keys = jax.random.split(jax.random.key(11), flights)
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def one(key):
+        noisy = eqx.tree_at(lambda p: p.flight, problem, noise(truth, key=key))
+        found = jaxos4.IBSS()(noisy, jaxos4.Bracket.default(problem.model))
+        robust = jaxos4.robust_covariance(noisy, found.parameters, found.initial_state)
+        error = found.parameters - problem.model.alpha
+        return error / found.std, error / jnp.sqrt(jnp.diagonal(robust))
+
+    return (np.asarray(x) for x in one(keys))
+
+
+def test_robust_intervals_hold_under_coloured_noise_where_naive_ones_do_not():
+    flights = 256
+    naive, robust = residual_noise(flights, 0.05)
+    covered = [(np.abs(x) < 1.96).mean() for x in (naive, robust)]
+    assert covered[0] < 0.6
+    # Residuals hold less slow noise than the measurements did: what the fit took for motion.
+    assert 0.85 < covered[1] < 0.98
+
+
+def test_robust_is_the_bound_under_white_noise():
+    problem = standard_problem(channels="attitude", states=noisy_states(1, seed=9)[0], duration=5.0, free=True)
+    found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
+    robust = jaxos4.robust_covariance(problem, found.parameters, found.initial_state)
+    ratio = np.sqrt(np.diagonal(robust)) / found.std
+    assert np.all((ratio > 0.7) & (ratio < 1.3))
+    # Where sigma is wrong by three, the robust one stays with the truth.
+    wrong = eqx.tree_at(lambda p: p.sigma, problem, problem.sigma / 3)
+    again = jaxos4.robust_covariance(wrong, found.parameters, found.initial_state)
+    np.testing.assert_allclose(again, robust, rtol=1e-6)

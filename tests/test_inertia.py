@@ -1,0 +1,121 @@
+"""The constants of a rigid body: from alphas, and estimated in place of them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.stats
+from helpers import DT, noisy_states, standard_flight, standard_problem
+
+import jaxos4
+from jaxos4.estimators.output_error import OutputError
+
+MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
+
+
+def constants(airframe=jaxos4.OS4):
+    """Ix, Iy, Iz, J_R."""
+    return np.append(np.asarray(airframe.inertia), airframe.rotor_inertia)
+
+
+def bound_of(model_class, channels="all"):
+    """The covariance of an efficient estimate of the standard flight."""
+    return jaxos4.cramer_rao_bound(standard_problem(model_class, channels), model_class(jaxos4.OS4).alpha)
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+@pytest.mark.parametrize("airframe", [jaxos4.OS4, jaxos4.OS4_SIMULATOR, jaxos4.VOOS])
+def test_exact_alphas_give_exact_constants(model_class, airframe):
+    model = model_class(airframe)
+    fit = jaxos4.fit_inertia(model, model.alpha, bound_of(model_class))
+    np.testing.assert_allclose(fit.constants[:3], constants(airframe)[:3], rtol=1e-9)
+    assert np.all(np.abs(fit.constants - constants(airframe)) < 1e-6 * fit.std)
+    assert fit.mismatch < 1e-9
+    assert fit.is_rigid_body
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+def test_it_is_the_weighted_least_squares_that_another_minimiser_finds(model_class):
+    model, covariance = model_class(jaxos4.OS4), np.asarray(bound_of(model_class))
+    alpha = np.random.default_rng(0).multivariate_normal(model.alpha, covariance)
+    fit = jaxos4.fit_inertia(model, jnp.asarray(alpha), jnp.asarray(covariance))
+    whiten, factor = np.linalg.inv(np.linalg.cholesky(covariance)), float(model.gyroscopic_factor)
+
+    def residuals(u):
+        ix, iy, iz, rotor = u * constants()
+        g = rotor * factor
+        own = [(iy - iz) / ix, g / ix, 1 / ix, (iz - ix) / iy, g / iy, 1 / iy, (ix - iy) / iz, 1 / iz]
+        return whiten @ (alpha - own)
+
+    best = scipy.optimize.least_squares(residuals, np.ones(4), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert np.abs((fit.constants - best.x * constants()) / fit.std).max() < 1e-4
+    spread = np.linalg.inv(best.jac.T @ best.jac) * np.outer(constants(), constants())
+    np.testing.assert_allclose(fit.std, np.sqrt(np.diagonal(spread)), rtol=1e-3)
+    # Unweighted, another answer: the weights matter, and a comparison that left them out would be seen.
+    plain = jaxos4.fit_inertia(model, jnp.asarray(alpha), jnp.diag(jnp.square(model.half_width)))
+    assert np.abs((fit.constants - plain.constants) / fit.std).max() > 0.3
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_intervals_hold_the_truth_and_the_mismatch_is_chi_squared(scale):
+    model, draws = jaxos4.CorrectedOS4(), 4000
+    covariance = scale**2 * np.asarray(bound_of(jaxos4.CorrectedOS4))
+    alphas = np.random.default_rng(1).multivariate_normal(model.alpha, covariance, size=draws)
+    fit = jax.vmap(lambda a: jaxos4.fit_inertia(model, a, jnp.asarray(covariance)))(jnp.asarray(alphas))
+    held = (np.abs(fit.constants - constants()) < 1.96 * fit.std).mean(axis=0)
+    assert np.all(np.abs(held - 0.95) < 4 * np.sqrt(0.95 * 0.05 / draws))
+    assert scipy.stats.kstest(fit.p_value, "uniform").pvalue > 1e-3
+    np.testing.assert_allclose(fit.p_value, scipy.stats.chi2.sf(fit.mismatch, 4), rtol=1e-6, atol=1e-12)
+
+
+def test_alphas_of_no_rigid_body_are_seen():
+    model, covariance = jaxos4.CorrectedOS4(), bound_of(jaxos4.CorrectedOS4)
+    std = np.sqrt(np.diagonal(covariance))
+    odd = jaxos4.fit_inertia(model, model.alpha.at[0].add(10 * std[0]), covariance)
+    assert odd.p_value < 1e-3
+    flat = jaxos4.alpha_from_inertia(np.array([0.005, 0.005, 0.013]), 6e-5)
+    fit = jaxos4.fit_inertia(model, flat, covariance)
+    assert fit.p_value > 0.99
+    assert not fit.is_rigid_body
+    assert fit.triangle[2] == pytest.approx(-0.003)
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+def test_a_model_in_constants_flies_as_the_one_in_alphas(model_class):
+    model = model_class(jaxos4.OS4)
+    inertial = jaxos4.InertialOS4(model)
+    flight = standard_flight(model_class)
+    ours = jaxos4.simulate(inertial, inertial.alpha, flight.omega, dt=DT)
+    np.testing.assert_allclose(ours.states, flight.states, rtol=1e-12, atol=1e-12)
+    assert inertial.parameter_names == ("Ix", "Iy", "Iz", "J_R")
+    other = jaxos4.simulate(inertial, inertial.alpha * 1.01, flight.omega, dt=DT)
+    assert np.abs(other.states - flight.states).max() > 1e-3
+
+
+@pytest.mark.parametrize("estimator", [jaxos4.IBSS(), OutputError()])
+def test_constants_are_estimated_directly_and_know_more_than_alphas(estimator):
+    flights, inertial = 64, jaxos4.InertialOS4(jaxos4.CorrectedOS4())
+    states = noisy_states(flights, jaxos4.CorrectedOS4)
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def identify(states):
+        problem = standard_problem(jaxos4.CorrectedOS4, "attitude", states=states)
+        problem = eqx.tree_at(lambda p: p.model, problem, inertial)
+        bracket = jaxos4.Bracket.around(1.1 * inertial.alpha, inertial.half_width)
+        return estimator(problem, bracket)
+
+    found = identify(states)
+    assert set(jaxos4.result_names(found.result)) == {"successful"}
+    errors = (found.parameters - constants()) / found.std
+    assert np.all(np.abs(np.sqrt((errors**2).mean(axis=0)) - 1) < 4 / np.sqrt(2 * flights))
+    problem = standard_problem(jaxos4.CorrectedOS4, "attitude")
+    from_alphas = jaxos4.fit_inertia(
+        problem.model, problem.model.alpha, jaxos4.cramer_rao_bound(problem, problem.model.alpha)
+    )
+    # Both ways use the same information, to first order.
+    np.testing.assert_allclose(np.median(found.std, axis=0), from_alphas.std, rtol=0.02)
+    alone = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, problem.model.alpha)))[[2, 5, 7]]
+    assert np.all(np.median(found.std, axis=0)[:3] < alone * constants()[:3] ** 2)

@@ -1,0 +1,169 @@
+"""Output error against an independent minimiser, the bound, and what cannot be identified."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from helpers import noisy_states, random_starts, standard_problem
+
+import jaxos4
+from jaxos4.estimators.output_error import OutputError
+
+MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
+
+
+def around(model_class, center):
+    """A bracket of the default width about any center: where the search starts."""
+    return jaxos4.Bracket.around(center, model_class(jaxos4.OS4).half_width)
+
+
+@eqx.filter_jit
+def identify(states, centers, model_class, channels, free=False, estimator=None):
+    """Many flights, each from its own start."""
+
+    def one(states, center):
+        problem = standard_problem(model_class, channels, states=states, free=free)
+        return (estimator or OutputError())(problem, around(model_class, center))
+
+    return eqx.filter_vmap(one)(states, centers)
+
+
+@pytest.mark.parametrize(("model_class", "channels"), [(MODELS[0], "all"), (MODELS[1], "attitude")])
+def test_without_noise_the_truth_is_found(model_class, channels):
+    model = model_class(jaxos4.OS4)
+    flights = 16
+    starts = random_starts(model, flights, seed=1)
+    found = identify(noisy_states(flights, model_class, scale=0.0), starts, model_class, channels)
+    assert set(jaxos4.result_names(found.result)) == {"successful"}
+    np.testing.assert_allclose(found.parameters, np.tile(model.alpha, (flights, 1)), rtol=1e-7, atol=1e-9)
+
+
+def test_it_is_the_minimum_that_another_minimiser_finds():
+    problem = standard_problem(channels="attitude", states=noisy_states(1, seed=4)[0])
+    found = OutputError()(problem, jaxos4.Bracket.default(problem.model))
+    scale = np.asarray(problem.model.half_width)
+    best = scipy.optimize.least_squares(
+        lambda u: np.asarray(problem.residuals(jnp.asarray(u * scale))),
+        np.asarray(problem.model.alpha) / scale,
+        xtol=1e-12,
+        ftol=1e-14,
+        gtol=1e-12,
+    )
+
+    def off(answer):
+        return np.abs((answer - best.x * scale) / found.std).max()
+
+    assert off(found.parameters) < 1e-4
+    # Stopped after the first step, it is far from there: the comparison can fail.
+    early = OutputError(max_steps=1)(problem, jaxos4.Bracket.around(problem.model.alpha + 0.5 * scale, scale))
+    assert jaxos4.result_names(early.result) == "max_sweeps"
+    assert off(early.parameters) > 0.1
+
+
+@pytest.mark.parametrize(("model_class", "channels"), [(MODELS[0], "all"), (MODELS[1], "rates")])
+def test_errors_are_those_of_the_bound(model_class, channels):
+    flights, alpha = 128, model_class(jaxos4.OS4).alpha
+    starts = random_starts(model_class(jaxos4.OS4), flights)
+    found = identify(noisy_states(flights, model_class), starts, model_class, channels)
+    assert set(jaxos4.result_names(found.result)) == {"successful"}
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(standard_problem(model_class, channels), alpha)))
+    efficiency = np.sqrt(np.mean(((found.parameters - alpha) / bound) ** 2, axis=0))
+    assert np.all(np.abs(efficiency - 1) < 4 / np.sqrt(2 * flights))
+    held = (np.abs(found.parameters - alpha) < found.half_width(0.95)).mean()
+    # Parameters are correlated: as if there were one of them.
+    assert abs(held - 0.95) < 4 * np.sqrt(0.95 * 0.05 / flights)
+
+
+def test_a_free_initial_state_gives_the_answer_of_ibss():
+    states, starts = noisy_states(4, seed=2), random_starts(jaxos4.PublishedOS4(), 4, seed=2)
+    ours, other = (
+        identify(states, starts, jaxos4.PublishedOS4, "all", True, e) for e in (OutputError(), jaxos4.IBSS())
+    )
+    assert np.abs((ours.parameters - other.parameters) / other.std).max() < 0.1
+    np.testing.assert_allclose(ours.std, other.std, rtol=1e-2)
+    assert np.abs(ours.initial_state - other.initial_state).max() < 0.01
+
+
+def test_many_lanes_at_once_come_back():
+    flights = 512
+    states, starts = noisy_states(flights, duration=0.5), random_starts(jaxos4.PublishedOS4(), flights)
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def short(states, center):
+        problem = standard_problem(channels="rates", states=states, duration=0.5)
+        return OutputError()(problem, around(jaxos4.PublishedOS4, center))
+
+    assert np.isfinite(short(states, starts).parameters).all()
+
+
+def test_a_poisoned_lane_leaves_the_others_alone():
+    states, starts = noisy_states(8, seed=5), random_starts(jaxos4.PublishedOS4(), 8, seed=5)
+    poisoned = states.at[3, 20].set(jnp.inf)
+    before, after = (identify(s, starts, jaxos4.PublishedOS4, "rates") for s in (states, poisoned))
+    names = jaxos4.result_names(after.result)
+    assert names[3] == "nonfinite_trajectory"
+    assert set(np.delete(names, 3)) == {"successful"}
+    assert eqx.tree_equal(*(jnp.delete(e.parameters, 3, axis=0) for e in (before, after)))
+    for leaf in (after.parameters, after.initial_state):
+        assert np.isfinite(leaf).all()
+
+
+def test_loop_and_vmap_agree():
+    states, starts = noisy_states(3, seed=6), random_starts(jaxos4.PublishedOS4(), 3, seed=6)
+    batch = identify(states, starts, jaxos4.PublishedOS4, "rates")
+    for i in range(3):
+        alone = OutputError()(
+            standard_problem(channels="rates", states=states[i]), around(jaxos4.PublishedOS4, starts[i])
+        )
+        assert np.abs((alone.parameters - batch.parameters[i]) / alone.std).max() < 1e-3
+
+
+def test_missing_samples_only_cost_precision():
+    states = noisy_states(1, seed=8)[0]
+    holes = states.at[100:200].set(jnp.nan)
+    whole, gappy = (
+        OutputError()(p, jaxos4.Bracket.default(p.model))
+        for p in (standard_problem(states=states), standard_problem(states=holes))
+    )
+    assert jaxos4.result_names(gappy.result) == "successful"
+    assert np.all(gappy.std > whole.std)
+    assert np.abs((gappy.parameters - whole.parameters) / gappy.std).max() < 3
+
+
+def test_what_cannot_be_told_is_said():
+    problem = standard_problem(channels="rates")
+    hover = jnp.full_like(problem.flight.omega, problem.model.airframe.hover_speed)
+    still = jaxos4.simulate(problem.model, problem.model.alpha, hover, dt=0.01)
+    lost = eqx.tree_at(lambda p: p.flight, problem, still)
+    assert jaxos4.result_names(OutputError()(lost, jaxos4.Bracket.default(problem.model)).result) == "unidentifiable"
+    center = problem.model.alpha
+    invalid = OutputError()(problem, jaxos4.Bracket(center, center))
+    assert jaxos4.result_names(invalid.result) == "bracket_invalid"
+    assert np.isfinite(invalid.parameters).all()
+    narrow = jaxos4.Bracket.around(center + 0.8 * problem.model.half_width, 0.15 * problem.model.half_width)
+    assert jaxos4.result_names(OutputError()(problem, narrow).result) == "at_bound"
+
+
+@pytest.mark.parametrize("settings", [{"tolerance": 0.0}, {"tolerance": -1.0}, {"max_steps": 0}, {"max_steps": 1.5}])
+def test_settings_out_of_range_are_named(settings):
+    with pytest.raises(ValueError, match=f"`{next(iter(settings))}` must be"):
+        OutputError(**settings)
+    with pytest.raises(ValueError, match="`bracket` must hold 8 parameters"):
+        OutputError()(standard_problem(), jaxos4.Bracket(jnp.zeros(3), jnp.ones(3)))
+
+
+def test_single_precision_reaches_the_bound_too():
+    problem = jax.tree.map(
+        lambda x: x.astype(np.float32) if eqx.is_array(x) and x.dtype == np.float64 else x,
+        standard_problem(channels="rates", states=noisy_states(1, seed=9)[0]),
+    )
+    double = OutputError()(
+        standard_problem(channels="rates", states=noisy_states(1, seed=9)[0]),
+        jaxos4.Bracket.default(jaxos4.PublishedOS4()),
+    )
+    with jax.enable_x64(False):
+        single = OutputError()(problem, jaxos4.Bracket.default(jaxos4.PublishedOS4()))
+    assert np.abs((np.asarray(single.parameters) - double.parameters) / double.std).max() < 0.1
