@@ -26,12 +26,16 @@ from .dynamics import (
 from .errors import InputError as InputError, TrainingError as TrainingError
 from .estimators import (
     IBSS as IBSS,
+    SVSF as SVSF,
     AbstractEstimator as AbstractEstimator,
+    EquationError as EquationError,
     Estimate as Estimate,
     Hybrid as Hybrid,
+    JointEKF as JointEKF,
     NetworkEstimator as NetworkEstimator,
     OutputError as OutputError,
     Profile as Profile,
+    RecursiveLeastSquares as RecursiveLeastSquares,
     TrainedNetwork as TrainedNetwork,
     load_network as load_network,
     profile_likelihood as profile_likelihood,

@@ -19,7 +19,7 @@ _PARTNER = 0.2
 class Identifiability(eqx.Module):
     """The information of a flight in the parameters, in units of the bracket's half-widths.
 
-    - `parameters`: where it was taken.
+    - `nominal`: the size that each parameter is expected to have: what the airframe implies.
     - `half_width`: of the bracket.
     - `std`: the Cramer-Rao bound, as standard deviations in the parameters' units.
     - `std_alone`: the same if all other parameters were known.
@@ -28,7 +28,7 @@ class Identifiability(eqx.Module):
     - `directions`: the eigenvectors, one a column, in half-widths.
     """
 
-    parameters: Parameters
+    nominal: Parameters
     half_width: Parameters
     std: Parameters
     std_alone: Parameters
@@ -47,8 +47,8 @@ class Identifiability(eqx.Module):
 
     @property
     def noise_limit(self) -> Parameters:
-        """Multiples of the problem's sigma below which each parameter is told apart from 0, with 95 %."""
-        return jnp.abs(self.parameters) / (_NOISE_FLOOR * self.std)
+        """Multiples of the problem's sigma below which a parameter of nominal size is told apart from 0, with 95 %."""
+        return jnp.abs(self.nominal) / (_NOISE_FLOOR * self.std)
 
     def notes(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of which something must be said, what it is. Of one flight, not of a batch."""
@@ -61,7 +61,7 @@ class Identifiability(eqx.Module):
                 partners = ", ".join(names[j] for j in self._partners(i))
                 notes[name] = f"not told: only together with {partners}"
             elif limit[i] < 1:
-                notes[name] = f"below the noise floor; identifiable below {limit[i]:.2g} times this noise"
+                notes[name] = f"below the noise floor at this noise; identifiable below {limit[i]:.2g} of it"
         return notes
 
     def _partners(self, i: int) -> list[int]:
@@ -92,4 +92,6 @@ def identifiability(
     diagonal = jnp.diagonal(information)
     alone = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), jnp.inf)
     bound = cramer_rao_bound(problem, parameters, initial_state)
-    return Identifiability(parameters, half_width, jnp.sqrt(jnp.diagonal(bound)), alone, eigenvalues, directions)
+    return Identifiability(
+        problem.model.alpha, half_width, jnp.sqrt(jnp.diagonal(bound)), alone, eigenvalues, directions
+    )

@@ -43,7 +43,7 @@ def robust_covariance(
     """The sandwich covariance of a fit whose residuals are coloured, or not of the size that sigma says.
 
     F^-1 (sum_t sum_s J_t^T R(t - s) J_s) F^-1 with R the autocovariance of the weighted residuals, between channels too
-    (Klein and Morelli, Aircraft System Identification, section 6.3): the noise is taken as stationary. Lags reach a
+    (Klein and Morelli, Aircraft System Identification, chapter 6): the noise is taken as stationary. Lags reach a
     tenth of the flight, under Bartlett's window so that the sum is positive. It needs flights many times longer than
     the noise's memory: slow noise that the fit took for motion is missing in the residuals. On the standard flight of
     5 s with Gauss-Markov noise of 0.05 s, 95 % intervals hold the truth in 88 % of all flights, and in 48 % with

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxos4.cli import main
+from jaxos4.estimators import BASELINES
 
 TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alpha6": 133.33333, "alpha8": 76.923077}
 
@@ -70,7 +71,7 @@ def test_estimate_recovers_the_truth_within_its_intervals(run, tmp_path):
     assert (report["estimator"], report["model"], report["result"]) == ("ibss", "published", "successful")
     assert list(report["parameters"]) == [f"alpha{i}" for i in range(1, 9)]
     for name, row in report["parameters"].items():
-        assert {"estimate", "std", "bound", "ci95", "unit", "note"} == row.keys()
+        assert {"estimate", "std", "bound", "ci95", "unit", "noise_limit", "note"} == row.keys()
         assert row["ci95"][0] < row["estimate"] < row["ci95"][1]
         assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4 * row["std"]
         assert name in out
@@ -81,6 +82,32 @@ def test_estimate_recovers_the_truth_within_its_intervals(run, tmp_path):
         assert abs(row["correlation"]) < 0.3
     # The noise levels were estimated: they are the standard sensor's, within 4 standard errors of 200 samples.
     assert report["fit"]["p"]["rms"] == pytest.approx(0.01, rel=4 / math.sqrt(2 * 200))
+
+
+@pytest.mark.parametrize("estimator", list(BASELINES))
+def test_baselines_recover_the_truth(run, tmp_path, estimator):
+    simulate(run, "flight.csv", "--noise", "1")
+    options = ("--estimator", estimator, "--channels", "rates", "--out", "e.json")
+    code, _, err = run("estimate", "flight.csv", *options)
+    report = json.loads((tmp_path / "e.json").read_text())
+    # Two seconds are too short for SVSF, and it says so.
+    assert (code, report["result"]) in ((0, "successful"), (1, "unidentifiable")), err
+    assert report["estimator"] == estimator
+    told = {name: row for name, row in report["parameters"].items() if row["estimate"] is not None}
+    assert {"alpha3", "alpha6", "alpha8"} <= set(told)
+    for name, row in told.items():
+        assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 5 * row["std"]
+
+
+def test_identifiability_names_what_a_flight_does_not_tell(run, tmp_path):
+    simulate(run, "flight.csv", "--noise", "1", "--excitation", "doublet", "--duration", "5")
+    code, out, err = run("identifiability", "flight.csv", "--channels", "rates")
+    assert code == 0, err
+    for name in ("alpha1", "alpha4", "alpha7"):  # products of rates: a doublet moves one axis at a time
+        assert f"{name}: not told: not excited" in out
+    assert "alpha2: below the noise floor at this noise; identifiable below" in out
+    assert "alpha3:" not in out
+    refused(run("identifiability", "missing.csv"), "missing.csv")
 
 
 def test_intervals_follow_the_noise_that_is_there(run, tmp_path):

@@ -7,6 +7,7 @@ import typer
 
 from ..errors import InputError, TrainingError
 from .estimate import estimate
+from .identifiability import identifiability
 from .simulate import simulate
 from .train import train
 
@@ -19,6 +20,7 @@ app = typer.Typer(
 app.command()(simulate)
 app.command()(estimate)
 app.command()(train)
+app.command()(identifiability)
 
 
 def main() -> None:

@@ -22,8 +22,18 @@ from ..airframe import load_airframe
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
 from ..errors import InputError
-from ..estimators import IBSS, AbstractEstimator, Estimate, Hybrid, NetworkEstimator, TrainedNetwork, load_network
+from ..estimators import (
+    BASELINES,
+    IBSS,
+    AbstractEstimator,
+    Estimate,
+    Hybrid,
+    NetworkEstimator,
+    TrainedNetwork,
+    load_network,
+)
 from ..flight import STATE_NAMES, STATE_UNITS, Flight
+from ..identifiability import Identifiability, identifiability
 from ..information import cramer_rao_bound
 from ..logs import read_flight_and_notes
 from ..noise import SENSOR_SIGMA
@@ -43,6 +53,10 @@ PASSES = 4
 COLOURED = 0.3
 # Residuals below this share of a channel's largest value are rounding, whatever their correlation.
 ROUNDING = 1e-9
+# Baselines that look at the body rates, whatever else was measured.
+RATES_ONLY = ("equation-error", "rls", "svsf")
+# Estimators that fit by shooting, and reach the bound: theirs is the covariance that the noise found implies.
+SHOOTING = ("ibss", "hybrid", "output-error")
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
 
 
@@ -68,8 +82,9 @@ def estimate(
     console = Console()
     vehicle = MODELS[model](load_airframe(airframe))
     where = Bracket.default(vehicle) if bracket is None else load_bracket(bracket, vehicle)
-    if network is not None and estimator == "ibss":
-        raise InputError("--network: ibss uses none; say --estimator network or --estimator hybrid, or leave it out.")
+    learned = estimator in ("network", "hybrid")
+    if network is not None and not learned:
+        raise InputError(f"--network: {estimator.value} uses none; say --estimator network or hybrid, or leave it out.")
     if network is not None and estimator == "network" and bracket is not None:
         raise InputError("--bracket: the network looks in the bracket that it was trained in; leave one of them out.")
     if out is not None:
@@ -81,8 +96,10 @@ def estimate(
     problem = problem_of(flight, vehicle, recorded, channels, known=initial_state == "known")
 
     begin = time.perf_counter()
-    method: AbstractEstimator = IBSS()
-    if estimator != "ibss":
+    method: AbstractEstimator = BASELINES[estimator]() if estimator in BASELINES else IBSS()
+    if estimator in RATES_ONLY:
+        problem = problem.restrict("rates")
+    if learned:
         if trained is None:
             steps = SEED_STEPS if estimator == "hybrid" else NetworkEstimator.steps
             training = NetworkEstimator(channels=seen_channels(problem), steps=steps)
@@ -97,7 +114,7 @@ def estimate(
             method = Hybrid(trained)
         else:
             method, problem, where = trained, problem.restrict(trained.channels), trained.bracket
-    problem, found, bound, rollouts = _fit(method, problem, where)
+    problem, found, bound, rollouts = fit(method, problem, where, shoots=estimator in SHOOTING)
     seconds = time.perf_counter() - begin
 
     name = str(result_names(found.result))
@@ -108,7 +125,7 @@ def estimate(
         "rollouts": rollouts,
         "cost": _number(found.cost),
         "seconds": seconds,
-        "parameters": _parameters(vehicle, where, found, bound),
+        "parameters": _parameters(problem, where, found, bound),
         "fit": {} if name in NO_ANSWER else _fit_quality(problem, found),
         "provenance": {
             "flight": str(flight),
@@ -179,8 +196,8 @@ def problem_of(
     return ShootingProblem(model, flight, sigma=SENSOR_SIGMA, initial_state=start, channels=chosen)
 
 
-def _fit(
-    estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket
+def fit(
+    estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket, *, shoots: bool
 ) -> tuple[ShootingProblem, Estimate, Array, int]:
     """The problem with the noise levels found, the estimate, the Cramer-Rao bound, and the rollouts that it took."""
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -194,28 +211,30 @@ def _fit(
                 return problem, found, found.std, rollouts
             used, problem = problem, problem.reweighted(problem.residuals(found.parameters, found.initial_state))
             settled = bool(jnp.all(jnp.abs(problem.sigma / used.sigma - 1) < OFF))
-            if settled or number == PASSES or (found.calibration is None and found.result != RESULTS.successful):
+            if settled or number == PASSES or (shoots and found.result != RESULTS.successful):
                 break
             progress.update(task, completed=number, description=f"fitting with the noise found in pass {number}")
             found = jax.block_until_ready(estimator(problem, bracket))
             rollouts += int(found.rollouts)
-        if found.calibration is not None:  # a network's answer and its errors depend on the noise
+        if not shoots:  # the answers and the errors of the others depend on the noise
             found = jax.block_until_ready(estimator(problem, bracket))
             rollouts += int(found.rollouts)
             if str(result_names(found.result)) in NO_ANSWER:
                 return problem, found, found.std, rollouts
         bound = cramer_rao_bound(problem, found.parameters, found.initial_state)
         cost = problem.cost(found.parameters, found.initial_state)
-    # What shooting finds is as good as the bound.
-    covariance = bound if found.calibration is None else found.covariance
+    covariance = bound if shoots else found.covariance
     found = eqx.tree_at(lambda e: (e.covariance, e.cost), found, (covariance, cost))
     return problem, found, jnp.sqrt(jnp.diagonal(bound)), rollouts
 
 
 def _parameters(
-    model: AbstractModel, bracket: Bracket, found: Estimate, bound: Float[Array, " parameters"]
+    problem: ShootingProblem, bracket: Bracket, found: Estimate, bound: Float[Array, " parameters"]
 ) -> dict[str, dict[str, Any]]:
-    table, half_width = {}, np.asarray(found.half_width(0.95))
+    table, half_width, model = {}, np.asarray(found.half_width(0.95)), problem.model
+    known = None
+    if str(result_names(found.result)) not in NO_ANSWER:
+        known = identifiability(problem, bracket, found.parameters, found.initial_state)
     for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True)):
         value, std = float(found.parameters[i]), float(found.std[i])
         lower, upper = float(bracket.lower[i]), float(bracket.upper[i])
@@ -228,9 +247,16 @@ def _parameters(
             "bound": _number(bound[i]),
             "ci95": [value - half_width[i], value + half_width[i]] if told else None,
             "unit": unit,
-            "note": _note(found, i, half_width[i], lower, upper) if told else "not told by this flight",
+            "noise_limit": None if known is None else _number(known.noise_limit[i]),
+            "note": _note(found, i, half_width[i], lower, upper) if told else _why_untold(known, name, model),
         }
     return table
+
+
+def _why_untold(known: Identifiability | None, name: str, model: AbstractModel) -> str:
+    reasons = {} if known is None else known.notes(model.parameter_names)
+    reason = reasons.get(name, "")
+    return reason if reason.startswith("not told") else "not told by this flight"
 
 
 def _note(found: Estimate, i: int, half_width: float, lower: float, upper: float) -> str:
@@ -277,6 +303,17 @@ def _print(console: Console, report: dict[str, Any]) -> None:
         interval = f"[{low:.5g}, {high:.5g}]"
         table.add_row(name, row["unit"], f"{row['estimate']:.5g}", interval, f"{row['bound']:.2g}", row["note"])
     console.print(table, markup=False)
+    below = [
+        f"{name} {row['noise_limit']:.2g}"
+        for name, row in report["parameters"].items()
+        if "below noise" in row["note"] and row["noise_limit"]
+    ]
+    if below:
+        console.print(
+            f"below noise: not told from 0. The airframe's values would show below this share of the noise found: "
+            f"{', '.join(below)}.",
+            highlight=False,
+        )
     fit = report["fit"]
     shares = ", ".join(f"{name} {row['percent']:.1f}" for name, row in fit.items() if row["percent"] is not None)
     console.print("bound: Cramer-Rao, the least standard deviation that the noise found allows.", highlight=False)

@@ -10,11 +10,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar
 from ..bracket import Bracket
+from ..information import invert
 from ..results import RESULTS
 from ..shooting import ShootingProblem
 
 # How many half-widths around its bracket's center an answer may lie.
 REACH = 4.0
+# Towards an initial state with the parameters known: the trajectory is nearly linear in it.
+_START_STEPS = 2
 
 
 class Calibration(eqx.Module):
@@ -136,6 +139,23 @@ def conclude(
         result=result,
         history=None if history is None else jnp.where(told, history, center),
     )
+
+
+def fit_start(
+    problem: ShootingProblem, parameters: Parameters
+) -> tuple[Float[Array, " size"], Scalar, Bool[Array, ""], int]:
+    """The initial state that explains the flight best with these parameters, for algorithms that do not look for one.
+
+    Two Gauss-Newton steps from the first measurements where it is free. Returns it with the cost there, whether the
+    trajectory is sound, and how many rollouts it took.
+    """
+    rows, (start, _) = problem.rows(), problem.first_state()
+    count, free = parameters.shape[0], problem.free_size
+    for _ in range(_START_STEPS if free else 0):
+        _, gradient, information = problem.curvature(rows, parameters, start)
+        start = start - (invert(information[count:, count:]) * gradient[count:]).sum(axis=-1)
+    cost, sound = problem.shot(rows, parameters, start)
+    return start, cost, sound, 1 + (_START_STEPS * (count + free) if free else 0)
 
 
 def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:

@@ -1,0 +1,349 @@
+"""The joint extended Kalman filter: its recursion, its errors against the bound, and when things go wrong."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DT, REFERENCES, noisy_states, random_starts, standard_flight, standard_problem
+
+import jaxos4
+from jaxos4.estimators.kalman import JointEKF
+
+PUBLISHED: Any = jaxos4.PublishedOS4
+CORRECTED: Any = jaxos4.CorrectedOS4
+HALF = jaxos4.DEFAULT_HALF_WIDTH
+ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])  # p, q, r, phi, theta, psi, x, vx, ...
+LANES = 32
+
+# Model, channels, whether the initial state is free.
+CASES = {
+    "published-rates": (PUBLISHED, "rates", False),
+    "published-rates-free": (PUBLISHED, "rates", True),
+    "corrected-all": (CORRECTED, "all", False),
+}
+every_case = pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.xdist_group(f"kalman-{case}")) for case in CASES]
+)
+
+
+@eqx.filter_jit
+def identify(estimator, problem, states, omega, lower, upper):
+    """One estimate for each lane of the last four arguments."""
+
+    @eqx.filter_vmap
+    def lane(states, omega, lower, upper):
+        flight = eqx.tree_at(lambda f: (f.states, f.omega), problem.flight, (states, omega))
+        return estimator(eqx.tree_at(lambda p: p.flight, problem, flight), jaxos4.Bracket(lower, upper))
+
+    return lane(states, omega, lower, upper)
+
+
+def lanes(case, states, *, seed=100, duration=5.0):
+    """Arguments of `identify`: brackets whose centers are off by up to 80 % of their half-width."""
+    model_class, channels, free = CASES[case]
+    center = random_starts(model_class(), len(states), seed=seed)
+    omega = jnp.tile(standard_flight(model_class, duration).omega, (len(states), 1, 1))
+    problem = standard_problem(model_class, channels, free=free, duration=duration)
+    return problem, states, omega, center - HALF, center + HALF
+
+
+@functools.cache
+def information(case):
+    model_class, channels, free = CASES[case]
+    problem = standard_problem(model_class, channels, free=free)
+    start = standard_flight(model_class).states[0][ORDER[: problem.size]]
+    return np.asarray(jaxos4.fisher_information(problem, model_class().alpha, start))
+
+
+def bound(case):
+    """Standard deviations at the Cramer-Rao bound."""
+    return np.sqrt(np.diagonal(np.linalg.inv(information(case))))
+
+
+def errors(case, estimates):
+    return np.asarray(estimates.parameters - CASES[case][0]().alpha)
+
+
+def names(estimates):
+    return jaxos4.result_names(estimates.result)
+
+
+@functools.cache
+def noisy(case):
+    model_class = CASES[case][0]
+    return identify(JointEKF(), *lanes(case, noisy_states(LANES, model_class)))
+
+
+# With the noise of the sensors.
+
+
+@every_case
+def test_errors_are_near_the_cramer_rao_bound(case):
+    estimates = noisy(case)
+    assert names(estimates).tolist() == ["successful"] * LANES
+    error = errors(case, estimates) / bound(case)
+    assert np.sqrt(np.mean(error**2, axis=0)).max() < 1.2 + 3 / np.sqrt(2 * LANES)
+    assert np.abs(error.mean(axis=0)).max() < 4 / np.sqrt(LANES)
+    square = np.einsum("ni,ij,nj->n", errors(case, estimates), information(case), errors(case, estimates)) / 8
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
+
+
+@every_case
+def test_estimates_know_their_errors(case):
+    estimates = noisy(case)
+    np.testing.assert_allclose(np.median(estimates.std / bound(case), axis=0), 1, atol=0.05)
+    inside = np.mean(np.abs(errors(case, estimates)) < 1.96 * np.asarray(estimates.std))
+    # Errors of one flight are correlated: count flights, not parameters, for the standard error.
+    assert abs(inside - 0.95) < 4 * np.sqrt(0.95 * 0.05 / LANES)
+
+
+def test_one_pass_is_not_enough_beyond_the_rates():
+    """Why there are passes: the plain filter keeps the errors of its first linearisations, and does not know it."""
+    case = "corrected-all"
+    plain = identify(JointEKF(passes=1), *lanes(case, noisy_states(LANES, CORRECTED)))
+    assert set(names(plain)) == {"successful"}
+    off = np.sqrt(np.mean((errors(case, plain) / bound(case)) ** 2, axis=0))
+    assert (off > 1.5).all(), off
+    assert (np.asarray(plain.sweeps) == 1).all()
+    assert (np.asarray(noisy(case).sweeps) > 2).all()
+    # Too few are told.
+    few = identify(JointEKF(passes=2), *lanes(case, noisy_states(LANES, CORRECTED)))
+    assert "max_sweeps" in names(few)
+    close = np.abs(errors(case, few) / bound(case)).max(axis=1) < 6
+    assert close[names(few) == "successful"].all()
+
+
+@every_case
+def test_history_ends_at_the_answer(case):
+    estimates = noisy(case)
+    history = np.asarray(estimates.history)
+    assert history.shape == (LANES, 501, 8)
+    np.testing.assert_array_equal(history[:, -1], estimates.parameters)
+    # The error shrinks on the way.
+    off = np.sqrt(np.mean(((history - np.asarray(CASES[case][0]().alpha)) / HALF) ** 2, axis=(0, 2)))
+    assert off[-1] < off[250] < off[60] < off[0]
+
+
+def test_a_free_initial_state_is_estimated():
+    case = "published-rates-free"
+    estimates = noisy(case)
+    assert estimates.initial_state.shape == (LANES, 3)
+    # Better than its one measurement, with all the flight behind it.
+    rms = np.sqrt(np.mean(np.square(estimates.initial_state), axis=0))
+    assert (rms < 0.5 * jaxos4.SENSOR_SIGMA[ORDER[:3]]).all(), rms
+
+
+def test_tiny_noise_gives_the_truth():
+    case = "published-rates"
+    problem, *rest = lanes(case, noisy_states(8, scale=1e-5))
+    problem = eqx.tree_at(lambda p: p.sigma, problem, 1e-5 * problem.sigma)
+    estimates = identify(JointEKF(), problem, *rest)
+    assert set(names(estimates)) == {"successful"}
+    assert np.abs(errors(case, estimates) / HALF).max() < 1e-5
+
+
+# Against other ways to the same numbers.
+
+
+def textbook(states, omega, center, half, sigma, *, start, free, derivative):
+    """The filter as a textbook has it: matrix gains, Jacobians by central differences, all channels at once.
+
+    The initial state's prior is three sigma around its measurement where it is free.
+    """
+    size, count = len(sigma), 8
+
+    def step(z, row):
+        full = np.zeros(12)
+        full[ORDER[:size]] = z[:size]
+        return np.concatenate([(full + DT * derivative(full, row, z[size:]))[ORDER[:size]], z[size:]])
+
+    z = np.concatenate([states[0] if free else start, center])
+    p = np.diag(np.concatenate([(3 * sigma if free else 0 * sigma) ** 2, half**2]))
+    h = np.eye(size, size + count)
+    history = []
+    for k, y in enumerate(states):
+        if k > 0 or free:
+            seen = ~np.isnan(y)
+            hs = h[seen]
+            gain = p @ hs.T @ np.linalg.inv(hs @ p @ hs.T + np.diag(sigma[seen] ** 2))
+            z = z + gain @ (y[seen] - hs @ z)
+            p = (np.eye(size + count) - gain @ hs) @ p
+        history.append(z[size:])
+        scale = np.concatenate([np.ones(size), half]) * 1e-4
+        f = np.stack([(step(z + d, omega[k]) - step(z - d, omega[k])) / (2 * d.sum()) for d in np.diag(scale)], axis=1)
+        z, p = step(z, omega[k]), f @ p @ f.T
+    return np.stack(history), p[size:, size:]
+
+
+@pytest.mark.parametrize(
+    ("model_class", "channels", "free"),
+    [(PUBLISHED, "rates", False), (PUBLISHED, "rates", True), (CORRECTED, "all", False)],
+)
+def test_agrees_with_the_textbook_filter(model_class, channels, free):
+    states = np.array(noisy_states(1, model_class, seed=3, duration=1.0)[0])
+    problem = standard_problem(model_class, channels, free=free, duration=1.0)
+    order = ORDER[: problem.size]
+    states[30:40, order[1]] = np.nan
+    states[50, order] = np.nan
+    center = np.asarray(random_starts(model_class(), 1, seed=4)[0])
+    problem = eqx.tree_at(lambda p: p.flight.states, problem, jnp.asarray(states))
+    estimate = JointEKF(passes=1)(problem, jaxos4.Bracket.around(center, HALF))
+    arguments = (states[:, order], np.asarray(problem.flight.omega), center, HALF, jaxos4.SENSOR_SIGMA[order])
+    settings = {"start": np.zeros(problem.size), "free": free, "derivative": REFERENCES[model_class]}
+    history, covariance = textbook(*arguments, **settings)
+    std = np.sqrt(np.diagonal(covariance))
+    assert estimate.history is not None
+    np.testing.assert_allclose(estimate.history / HALF, history / HALF, atol=1e-6)
+    np.testing.assert_allclose(estimate.covariance / np.outer(std, std), covariance / np.outer(std, std), atol=1e-6)
+    # The comparison can fail: a model with one wrong term, a sigma that is a hundredth off.
+    other = REFERENCES[CORRECTED if model_class is PUBLISHED else PUBLISHED]
+    for wrong in (
+        textbook(*arguments, **{**settings, "derivative": other}),
+        textbook(*arguments[:-1], 1.01 * arguments[-1], **settings),
+    ):
+        assert np.abs(estimate.history / HALF - wrong[0] / HALF).max() > 1e-4
+
+
+class Slopes(jaxos4.PublishedOS4):
+    """Linear in its parameters and without a state of its own: each rate is driven by torques alone."""
+
+    def angular_acceleration(self, rates, forcing, parameters):
+        """Linear in the parameters, without the rates."""
+        a1, a2, a3, a4, a5, a6, a7, a8 = parameters
+        t = (forcing.roll, forcing.pitch, forcing.yaw)
+        p = a3 * t[0] + a1 * t[1] / 100 + a2 * t[2] / 10
+        q = a6 * t[1] + a4 * t[2] / 100 + a5 * t[0] / 10
+        return jaxos4.dynamics.Rates(p, q, a8 * t[2] + a7 * t[0] / 100)
+
+
+def test_a_linear_model_with_a_wide_prior_is_least_squares():
+    problem = standard_problem(channels="rates", states=noisy_states(1, seed=5)[0])
+    problem = eqx.tree_at(lambda p: p.model, problem, Slopes(jaxos4.OS4))
+    slope = np.asarray(jax.jacfwd(problem.residuals)(jnp.zeros(8)))
+    best = np.linalg.lstsq(slope, -np.asarray(problem.residuals(jnp.zeros(8))), rcond=None)[0]
+    covariance = np.linalg.inv(slope.T @ slope)
+    std = np.sqrt(np.diagonal(covariance))
+    bracket = jaxos4.Bracket.around(best + 100 * std, 1e4 * std)
+    for passes in (1, 10):
+        estimate = JointEKF(passes=passes)(problem, bracket)
+        assert np.abs((estimate.parameters - best) / std).max() < 1e-4
+        np.testing.assert_allclose(estimate.std, std, rtol=1e-4)
+    assert int(estimate.sweeps) == 2  # the second moves nothing
+
+
+def test_agrees_with_shooting():
+    """The prior aside, which a wide bracket makes weak, both have the same optimum."""
+    case = "published-rates"
+    problem, states, omega, lower, upper = lanes(case, noisy_states(8))
+    middle = (lower + upper) / 2
+    wide = identify(JointEKF(), problem, states, omega, middle - 5 * HALF, middle + 5 * HALF)
+    shot = identify(jaxos4.IBSS(tolerance=1e-4), problem, states, omega, lower, upper)
+    assert np.abs((wide.parameters - shot.parameters) / shot.std).max() < 0.02
+    np.testing.assert_allclose(wide.std, shot.std, rtol=0.02)
+    np.testing.assert_allclose(wide.cost, shot.cost, rtol=1e-5)
+
+
+# When things go wrong: the others do not notice.
+
+
+def test_missing_samples_only_cost_precision():
+    case = "published-rates"
+    states = noisy_states(LANES, seed=7)
+    states = jnp.where(jax.random.bernoulli(jax.random.key(8), 0.3, states.shape), jnp.nan, states)
+    estimates = identify(JointEKF(), *lanes(case, states))
+    assert set(names(estimates)) == {"successful"}
+    error = errors(case, estimates)
+    assert (np.median(estimates.std, axis=0) > 1.05 * bound(case)).all()
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimates.covariance), error) / 8
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
+
+
+def test_failing_lanes_leave_their_neighbours_alone():
+    case = "published-rates"
+    problem, states, omega, lower, upper = lanes(case, noisy_states(LANES))
+    states, omega, lower, upper = (np.array(x) for x in (states, omega, lower, upper))
+    p, sound, expected = 7, noisy(case), {}
+
+    def broken_lane(lane, result):
+        expected[lane] = result
+        return lane
+
+    omega[broken_lane(1, "nonfinite_trajectory"), 250, 2] = np.nan
+    omega[broken_lane(3, "nonfinite_trajectory"), 30, 0] = np.inf
+    states[broken_lane(5, "nonfinite_trajectory"), 100, p] = np.inf
+    states[broken_lane(7, "nonfinite_trajectory"), 500, p] = -np.inf
+    lane = broken_lane(9, "bracket_invalid")
+    lower[lane, 0], upper[lane, 0] = upper[lane, 0], lower[lane, 0]
+    lower[broken_lane(11, "bracket_invalid"), 2] = np.nan
+    upper[broken_lane(13, "bracket_invalid"), 3] = np.inf
+    broken = identify(JointEKF(), problem, *(jnp.asarray(x) for x in (states, omega, lower, upper)))
+    assert {lane: str(names(broken)[lane]) for lane in expected} == expected
+    others = np.setdiff1d(np.arange(LANES), list(expected))
+    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(sound), strict=True):
+        np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
+    for leaf in (broken.parameters, broken.initial_state, broken.history):
+        assert np.isfinite(leaf).all()
+    for lane in expected:
+        assert np.isinf(broken.std[lane]).all()
+        assert np.isinf(broken.cost[lane])
+
+
+def test_what_was_not_measured_stays_as_uncertain_as_the_bracket():
+    problem = standard_problem(channels="rates")
+    for free in (False, True):
+        problem = standard_problem(channels="rates", free=free, states=jnp.full((501, 12), jnp.nan))
+        bracket = jaxos4.Bracket.default(PUBLISHED())
+        estimate = JointEKF()(problem, bracket)
+        np.testing.assert_allclose(estimate.parameters, bracket.center)
+        np.testing.assert_allclose(estimate.std, HALF)
+
+
+def test_loop_jit_and_vmap_agree():
+    case = "published-rates"
+    problem, states, _, lower, upper = lanes(case, noisy_states(LANES))
+    batched = noisy(case)
+    for lane in range(2):
+        data = eqx.tree_at(lambda p: p.flight.states, problem, states[lane])
+        alone = JointEKF()(data, jaxos4.Bracket(lower[lane], upper[lane]))
+        assert (np.abs(alone.parameters - batched.parameters[lane]) / bound(case)).max() < 1e-6
+        np.testing.assert_allclose(alone.covariance, batched.covariance[lane], rtol=1e-6)
+        assert int(alone.rollouts) == int(batched.rollouts[lane]) == 9 * int(alone.sweeps) + 1
+
+
+def test_single_precision_is_enough():
+    """Everything in float32 from the data on; the bracket's errors are a thousand times the rounding's."""
+    case = "published-rates"
+    problem, states, _, lower, upper = lanes(case, noisy_states(1))
+    double = JointEKF()(eqx.tree_at(lambda p: p.flight.states, problem, states[0]), jaxos4.Bracket(lower[0], upper[0]))
+    with jax.enable_x64(False):
+        model = PUBLISHED(jaxos4.OS4)
+        time, omega, measured = (
+            np.asarray(x, np.float32) for x in (problem.flight.time, problem.flight.omega, states[0])
+        )
+        flight = jaxos4.Flight(time, omega, measured)
+        single = JointEKF()(
+            jaxos4.ShootingProblem(
+                model, flight, channels="rates", sigma=jaxos4.SENSOR_SIGMA, initial_state=np.zeros(12, np.float32)
+            ),
+            jaxos4.Bracket(np.asarray(lower[0], np.float32), np.asarray(upper[0], np.float32)),
+        )
+    assert single.parameters.dtype == np.float32
+    assert str(names(single)) == "successful"
+    assert np.abs((np.asarray(single.parameters) - double.parameters) / double.std).max() < 0.05
+    np.testing.assert_allclose(single.std, double.std, rtol=0.02)
+
+
+@pytest.mark.parametrize("passes", [0, -1])
+def test_settings_out_of_range_are_named(passes):
+    with pytest.raises(ValueError, match=r"`passes` must be an integer of at least 1, got"):
+        JointEKF(passes=passes)
+
+
+def test_brackets_of_another_length_are_named():
+    problem = standard_problem(channels="rates", duration=0.1)
+    with pytest.raises(ValueError, match=r"`bracket` must hold 8 parameters, got 7"):
+        JointEKF()(problem, jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)))

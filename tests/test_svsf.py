@@ -1,0 +1,258 @@
+"""The smooth variable structure filter: its corrections, its errors against the bound, and when things go wrong."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DT, noisy_states, published_derivative, random_starts, standard_flight, standard_problem
+
+import jaxos4
+from jaxos4.estimators.svsf import SVSF
+
+PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
+HALF = jaxos4.DEFAULT_HALF_WIDTH
+RATES = [7, 9, 11]
+LANES = 64
+
+
+@eqx.filter_jit
+def identify(estimator, problem, states, omega, lower, upper):
+    """One estimate for each lane of the last four arguments."""
+
+    @eqx.filter_vmap
+    def lane(states, omega, lower, upper):
+        flight = eqx.tree_at(lambda f: (f.states, f.omega), problem.flight, (states, omega))
+        return estimator(eqx.tree_at(lambda p: p.flight, problem, flight), jaxos4.Bracket(lower, upper))
+
+    return lane(states, omega, lower, upper)
+
+
+def lanes(states, model_class=PUBLISHED, *, free=False, channels="rates", scale=1.0):
+    """Arguments of `identify`: brackets whose centers are off by up to 80 % of their half-width."""
+    center = random_starts(model_class(), len(states), seed=150)
+    omega = jnp.tile(standard_flight(model_class).omega, (len(states), 1, 1))
+    problem = standard_problem(model_class, channels, free=free)
+    problem = eqx.tree_at(lambda p: p.sigma, problem, scale * problem.sigma)
+    return problem, states, omega, center - HALF, center + HALF
+
+
+@functools.cache
+def bound(model_class=PUBLISHED):
+    """Standard deviations at the Cramer-Rao bound of the rates."""
+    problem = standard_problem(model_class, "rates")
+    return np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model_class().alpha)))
+
+
+def errors(estimates, model_class=PUBLISHED):
+    return np.asarray(estimates.parameters - model_class().alpha)
+
+
+def names(estimates):
+    return jaxos4.result_names(estimates.result)
+
+
+@functools.cache
+def noisy(model_class=PUBLISHED, scale=1.0):
+    return identify(SVSF(), *lanes(noisy_states(LANES, model_class, seed=50, scale=scale), model_class, scale=scale))
+
+
+# With the noise of the sensors.
+
+every_noise = pytest.mark.parametrize(
+    ("model_class", "scale", "most"), [(PUBLISHED, 1.0, 2.0), (PUBLISHED, 10.0, 2.0), (CORRECTED, 1.0, 2.5)]
+)
+
+
+@every_noise
+def test_errors_are_within_a_known_multiple_of_the_bound(model_class, scale, most):
+    estimates = noisy(model_class, scale)
+    assert names(estimates).tolist() == ["successful"] * LANES
+    error = errors(estimates, model_class) / (scale * bound(model_class))
+    efficiency = np.sqrt(np.mean(error**2, axis=0))
+    assert efficiency.max() < most * (1 + 3 / np.sqrt(2 * LANES)), efficiency
+    assert (np.abs(error.mean(axis=0)) < 4 * error.std(axis=0) / np.sqrt(LANES)).all()
+    # It is no better than an unbiased estimate can be.
+    assert (efficiency > 1 - 3 / np.sqrt(2 * LANES)).all()
+
+
+@every_noise
+def test_intervals_hold_the_truth(model_class, scale, most):
+    """The covariance is on the safe side: a bound for coverage from below only."""
+    estimates = noisy(model_class, scale)
+    inside = np.mean(np.abs(errors(estimates, model_class)) < 1.96 * np.asarray(estimates.std))
+    assert inside > 0.95 - 4 * np.sqrt(0.95 * 0.05 / LANES)
+    assert (np.median(estimates.std, axis=0) < 3 * most * scale * bound(model_class)).all()
+
+
+def test_history_is_what_was_averaged():
+    estimates = noisy()
+    history = np.asarray(estimates.history)
+    assert history.shape == (LANES, 501, 8)
+    late = np.arange(501) >= 0.5 * 501
+    np.testing.assert_allclose(history[:, late].mean(axis=1), estimates.parameters, rtol=1e-9, atol=1e-12)
+    assert (np.asarray(estimates.rollouts) == 4 * 12 + 1).all()
+
+
+def test_tiny_noise_gives_the_truth():
+    estimates = identify(SVSF(passes=8), *lanes(noisy_states(8, seed=50, scale=1e-3), scale=1e-3))
+    assert set(names(estimates)) == {"successful"}
+    assert np.abs(errors(estimates) / HALF).max() < 2e-3
+
+
+def test_a_free_initial_state_is_better_than_the_first_measurement():
+    states = noisy_states(LANES, seed=50)
+    estimates = identify(SVSF(), *lanes(states, free=True))
+    start, first = np.asarray(estimates.initial_state), np.asarray(states[:, 0, RATES])
+    # The flights begin at rest: what is not 0 is error.
+    assert np.sqrt(np.mean(start**2)) < 0.8 * np.sqrt(np.mean(first**2))
+    assert set(names(estimates)) == {"successful"}
+    covariance = jaxos4.cramer_rao_bound(standard_problem(channels="rates", free=True), PUBLISHED().alpha)
+    error = errors(estimates)
+    assert np.sqrt(np.mean(error**2 / np.diagonal(covariance), axis=0)).max() < 6
+    assert np.mean(np.abs(error) < 1.96 * np.asarray(estimates.std)) > 0.95 - 4 * np.sqrt(0.95 * 0.05 / LANES)
+
+
+# The corrections themselves.
+
+
+def plain(states, omega, center, *, gamma, rates_layer, parameter_layer, damping, equilibration):
+    """One pass in plain NumPy from the printed equations, with the one-step influence by finite differences."""
+    sigma = jaxos4.SENSOR_SIGMA[RATES]
+
+    def step(x, u, row):
+        full = np.zeros(12)
+        full[RATES] = x
+        return x + DT * published_derivative(full, row, center + u * HALF)[RATES]
+
+    x, u, left, phi, energy, history = np.zeros(3), np.zeros(8), np.zeros(3), np.zeros((3, 8)), np.zeros(8), []
+    for k, y in enumerate(states):
+        seen = ~np.isnan(y) & (k > 0)
+        e = np.where(seen, y - x, 0.0)
+        energy = energy + (np.where(seen[:, None], phi, 0) ** 2).sum(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit = np.where(energy > 0, np.minimum(np.sqrt(energy.max() / energy), equilibration), equilibration)
+        scaled = np.where(seen[:, None], phi * unit, 0)
+        damped = damping**2 * (energy.max() / (k + 1) if energy.max() > 0 else 1.0)
+        inverse = scaled.T @ np.linalg.inv(scaled @ scaled.T + damped * np.eye(3))
+        w = inverse @ e
+        layer = parameter_layer * np.sqrt((inverse**2) @ sigma**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sat = np.where(layer > 0, np.clip(w / layer, -1, 1), 0)
+        x = x + (np.abs(e) + gamma * left) * np.clip(e / (rates_layer * sigma), -1, 1)
+        u = np.clip(u + unit * (np.abs(w) + gamma * np.abs(w)) * sat, -4, 4)
+        left = np.where(seen, np.abs(y - x), left)
+        history.append(center + u * HALF)
+        phi = np.stack([(step(x, u + d, omega[k]) - step(x, u - d, omega[k])) / 2 for d in np.eye(8)], axis=1)
+        x = step(x, u, omega[k])
+    return np.stack(history)
+
+
+def test_agrees_with_plain_numpy():
+    states = np.array(noisy_states(1, seed=3, duration=1.0)[0])
+    states[30:40, RATES[1]] = np.nan
+    states[50] = np.nan
+    center = np.asarray(random_starts(PUBLISHED(), 1, seed=4)[0])
+    problem = standard_problem(channels="rates", duration=1.0, states=jnp.asarray(states))
+    # Narrow layers, so that corrections leave them too.
+    settings = {"gamma": 0.3, "rates_layer": 2.0, "parameter_layer": 2.0, "damping": 8.0, "equilibration": 20.0}
+    history = SVSF(**settings, passes=1, memory=False)(problem, jaxos4.Bracket.around(center, HALF)).history
+    assert history is not None
+    expected = plain(states[:, RATES], np.asarray(problem.flight.omega), center, **settings)
+    np.testing.assert_allclose(history / HALF, expected / HALF, atol=1e-9)
+    assert np.abs((expected[-1] - center) / HALF).max() > 0.05
+    # The comparison can fail.
+    for name, value in settings.items():
+        other = plain(states[:, RATES], np.asarray(problem.flight.omega), center, **{**settings, name: 1.1 * value})
+        assert np.abs(other / HALF - history / HALF).max() > 1e-6, name
+
+
+# When things go wrong: the others do not notice.
+
+
+def test_missing_samples_only_cost_precision():
+    states = noisy_states(LANES, seed=7)
+    states = jnp.where(jax.random.bernoulli(jax.random.key(8), 0.3, states.shape), jnp.nan, states)
+    estimates = identify(SVSF(), *lanes(states))
+    good = names(estimates) == "successful"
+    assert good.mean() > 0.9
+    error = errors(estimates)
+    assert np.sqrt(np.mean((error / bound()) ** 2, axis=0)).max() < 5
+    assert np.mean(np.abs(error) < 1.96 * np.asarray(estimates.std)) > 0.87
+
+
+def test_failing_lanes_leave_their_neighbours_alone():
+    problem, states, omega, lower, upper = lanes(noisy_states(LANES, seed=50))
+    states, omega, lower, upper = (np.array(x) for x in (states, omega, lower, upper))
+    p, sound, expected = 7, noisy(), {}
+
+    def broken_lane(lane, result):
+        expected[lane] = result
+        return lane
+
+    omega[broken_lane(1, "nonfinite_trajectory"), 250, 2] = np.nan
+    omega[broken_lane(3, "nonfinite_trajectory"), 30, 0] = np.inf
+    states[broken_lane(5, "nonfinite_trajectory"), 100, p] = np.inf
+    states[broken_lane(7, "nonfinite_trajectory"), 500, p] = -np.inf
+    lane = broken_lane(9, "bracket_invalid")
+    lower[lane, 0], upper[lane, 0] = upper[lane, 0], lower[lane, 0]
+    lower[broken_lane(11, "bracket_invalid"), 2] = np.nan
+    upper[broken_lane(13, "bracket_invalid"), 3] = np.inf
+    broken = identify(SVSF(), problem, *(jnp.asarray(x) for x in (states, omega, lower, upper)))
+    assert {lane: str(names(broken)[lane]) for lane in expected} == expected
+    others = np.setdiff1d(np.arange(LANES), list(expected))
+    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(sound), strict=True):
+        np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
+    for leaf in (broken.parameters, broken.initial_state, broken.history):
+        assert np.isfinite(leaf).all()
+    for lane in expected:
+        assert np.isinf(broken.std[lane]).all()
+        assert np.isinf(broken.cost[lane])
+
+
+def test_nothing_measured_leaves_the_bracket():
+    problem = standard_problem(channels="rates", states=jnp.full((501, 12), jnp.nan))
+    bracket = jaxos4.Bracket.default(PUBLISHED())
+    estimate = SVSF()(problem, bracket)
+    np.testing.assert_allclose(estimate.parameters, bracket.center)
+    np.testing.assert_allclose(estimate.std, HALF)
+
+
+def test_loop_jit_and_vmap_agree_and_other_channels_do_not_matter():
+    states = noisy_states(LANES, seed=50)
+    _, _, _, lower, upper = lanes(states)
+    batched = noisy()
+    for lane, channels in enumerate(("rates", "all")):
+        problem = standard_problem(channels=channels, states=states[lane])
+        alone = SVSF()(problem, jaxos4.Bracket(lower[lane], upper[lane]))
+        assert (np.abs(alone.parameters - batched.parameters[lane]) / bound()).max() < 1e-6
+        np.testing.assert_allclose(alone.covariance, batched.covariance[lane], rtol=1e-5, atol=1e-15)
+        if channels == "rates":
+            np.testing.assert_allclose(alone.cost, batched.cost[lane], rtol=1e-6)
+        assert alone.initial_state.shape == (problem.size,)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gamma": 1.0}, r"`gamma` must be at least 0 and below 1, got 1.0"),
+        ({"gamma": -0.1}, r"`gamma` must be at least 0 and below 1"),
+        ({"gamma": np.nan}, r"`gamma` must be at least 0 and below 1"),
+        ({"rates_layer": 0.0}, r"`rates_layer` must be positive and finite, got 0.0"),
+        ({"parameter_layer": -1.0}, r"`parameter_layer` must be positive and finite"),
+        ({"damping": np.inf}, r"`damping` must be positive and finite, got inf"),
+        ({"equilibration": 0.5}, r"`equilibration` must be finite and at least 1, got 0.5"),
+        ({"passes": 0}, r"`passes` must be an integer of at least 1, got 0"),
+    ],
+)
+def test_settings_out_of_range_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        SVSF(**settings)
+
+
+def test_brackets_of_another_length_are_named():
+    problem = standard_problem(channels="rates", duration=0.1)
+    with pytest.raises(ValueError, match=r"`bracket` must hold 8 parameters, got 7"):
+        SVSF()(problem, jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)))
