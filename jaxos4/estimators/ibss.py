@@ -150,7 +150,9 @@ class IBSS(AbstractEstimator):
         measurements = _measurements(problem.rows())
         explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
         told = jnp.isfinite(seed.covariance).all()
-        hit = told & (near.result == RESULTS.successful) & ~far.any() & explained
+        # What the flight does not tell near the seed, it does not tell elsewhere.
+        ended = (near.result == RESULTS.successful) | (near.result == RESULTS.unidentifiable)
+        hit = told & ended & ~far.any() & explained
 
         def search_wide(carry: tuple[Estimate, Bool[Array, ""]]) -> tuple[Estimate, Bool[Array, ""]]:
             near, hit = carry
