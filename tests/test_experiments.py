@@ -54,3 +54,22 @@ def test_networks(tmp_path):
         assert np.all(np.abs(np.array(rows[name]["efficiency"]) - 1) < 5 * rows[name]["monte_carlo_error"])
     assert rows["hybrid"]["rollouts"] < rows["ibss"]["rollouts"]
     assert rows["hybrid"]["hit_rate"] > 0.9
+
+
+def test_baselines(tmp_path):
+    load("baselines").main(
+        flights=32,
+        seed=5,
+        channels="rates",
+        estimators=["equation-error", "output-error"],
+        noises=["white"],
+        scales=[0.0, 1.0],
+        out=tmp_path / "out.json",
+    )
+    rows = json.loads((tmp_path / "out.json").read_text())["rows"]
+    exact, noisy = rows[:2], rows[2:]
+    assert all(row["answers"] == 32 for row in rows)
+    assert all(max(row["efficiency"]) < 1e-6 for row in exact)
+    # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
+    assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
+    assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]

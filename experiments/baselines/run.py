@@ -1,0 +1,138 @@
+"""Every estimator on the standard flight: RMSE / bound, bias, coverage, rollouts, seconds; by kind and scale of noise.
+
+Each flight starts its search anywhere within 80 % of the default bracket. The bound is that of white noise of the same
+standard deviation, so that what coloured and biased noise cost shows. Without noise errors are in units of the bound at
+scale 1.
+"""
+
+import functools
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+import jaxos4
+from jaxos4.estimators import BASELINES
+
+jax.config.update("jax_enable_x64", True)
+
+ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {"ibss": jaxos4.IBSS, **BASELINES}
+# What each scale of sigma multiplies: white; memory of 0.05 s; a constant per flight half of it, beside white noise.
+NOISES: dict[str, Callable[[np.ndarray], jaxos4.AbstractNoise]] = {
+    "white": jaxos4.WhiteNoise,
+    "coloured": functools.partial(jaxos4.GaussMarkov, correlation_time=0.05),
+    "biased": lambda sigma: jaxos4.Chain((jaxos4.WhiteNoise(sigma), jaxos4.ConstantBias(0.5 * sigma))),
+}
+
+
+def identify(
+    estimator: jaxos4.AbstractEstimator,
+    noise: jaxos4.AbstractNoise,
+    scale: float,
+    channels: str,
+    flights: int,
+    seed: int,
+) -> dict:
+    """One row of the table."""
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    exact = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
+    sigma = (scale or 1.0) * jaxos4.SENSOR_SIGMA
+
+    def problem(flight: jaxos4.Flight) -> jaxos4.ShootingProblem:
+        return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=exact.states[0], channels=channels)
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def one(key: jax.Array) -> jaxos4.Estimate:
+        noise_key, start_key = jax.random.split(key)
+        flight = noise(exact, key=noise_key) if scale else exact
+        center = model.alpha + jax.random.uniform(start_key, (8,), minval=-0.8, maxval=0.8) * model.half_width
+        return estimator(problem(flight), jaxos4.Bracket.around(center, model.half_width))
+
+    keys = jax.random.split(jax.random.key(seed), flights)
+    jax.block_until_ready(one(keys))
+    begin = time.perf_counter()
+    found = jax.block_until_ready(one(keys))
+    seconds = (time.perf_counter() - begin) / flights
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(exact), model.alpha)))
+    results = jaxos4.result_names(found.result)
+    told = np.isin(results, ["successful", "unidentifiable"])
+    errors = np.asarray(found.parameters - model.alpha)[told] / bound
+    names, counts = np.unique(results, return_counts=True)
+    inside = np.abs(np.asarray(found.parameters - model.alpha)) < np.asarray(found.half_width(0.95))
+    return {
+        "flights": flights,
+        "answers": int(told.sum()),
+        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "efficiency": np.sqrt(np.mean(errors**2, axis=0)).tolist() if told.any() else None,
+        "bias": np.mean(errors, axis=0).tolist() if told.any() else None,
+        "monte_carlo_error": float(1 / np.sqrt(2 * max(told.sum(), 1))),
+        "covered": inside[told].mean(axis=0).tolist() if told.any() else None,
+        "rollouts": float(np.mean(found.rollouts)),
+        "seconds": seconds,
+    }
+
+
+def main(
+    flights: Annotated[int, typer.Option(help="Flights for a row.")] = 200,
+    seed: Annotated[int, typer.Option(help="Of noise and starts.")] = 5,
+    channels: Annotated[str, typer.Option(help="What the estimators that can do so look at.")] = "rates",
+    estimators: Annotated[list[str], typer.Option(help="Which ones.")] = tuple(ESTIMATORS),
+    noises: Annotated[list[str], typer.Option(help="Which kinds of noise.")] = tuple(NOISES),
+    scales: Annotated[list[float], typer.Option(help="Multiples of the standard noise; 0: none.")] = (
+        0.0,
+        0.1,
+        1.0,
+        10.0,
+    ),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+) -> None:
+    """Every estimator at its documented settings on the standard flight."""
+    rows, table = [], Table(title=f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights")
+    for heading in (
+        "noise",
+        "scale",
+        "estimator",
+        *(f"a{i}" for i in range(1, 9)),
+        "bias",
+        "95 %",
+        "rollouts",
+        "ms",
+        "results",
+    ):
+        table.add_column(heading, no_wrap=heading != "results")
+    for kind in noises:
+        for scale in scales:
+            if scale == 0 and kind != noises[0]:
+                continue
+            for name in estimators:
+                noise = NOISES[kind](scale * jaxos4.SENSOR_SIGMA)
+                row = identify(ESTIMATORS[name](), noise, scale, channels, flights, seed)
+                rows.append({"noise": kind, "scale": scale, "estimator": name, **row})
+                table.add_row(
+                    kind if scale else "none",
+                    f"{scale:g}",
+                    name,
+                    *(f"{x:.2g}" for x in row["efficiency"] or ()),
+                    f"{np.abs(row['bias']).max():.2g}" if row["bias"] else "",
+                    f"{100 * np.mean(row['covered']):.0f}" if row["covered"] else "",
+                    f"{row['rollouts']:.0f}",
+                    f"{1000 * row['seconds']:.3g}",
+                    ", ".join(f"{count} {what}" for what, count in row["results"].items()),
+                )
+                if out is not None:
+                    report = {"version": jaxos4.__version__, "seed": seed, "channels": channels, "rows": rows}
+                    out.write_text(json.dumps(report, indent=2) + "\n")
+    Console(width=170).print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)
