@@ -103,6 +103,11 @@ class AbstractModel(eqx.Module):
         """What multiplies J_R above Ix and Iy in alpha2 and alpha5."""
 
     @property
+    def is_linear(self) -> bool:
+        """Whether the rate equations are linear in the parameters, as regression needs them."""
+        return True
+
+    @property
     @abc.abstractmethod
     def parameter_units(self) -> tuple[str, ...]:
         """The unit of each parameter."""
@@ -274,6 +279,8 @@ class InertialOS4(AbstractModel):
     model: AbstractModel
 
     def __init__(self, model: AbstractModel):
+        if not model.is_linear or len(model.parameter_names) != len(PARAMETER_NAMES):
+            raise ValueError("`model` must be one in alpha_1..8: PublishedOS4 or CorrectedOS4.")
         self.model = model
 
     @property
@@ -308,6 +315,11 @@ class InertialOS4(AbstractModel):
     def gyroscopic_factor(self) -> Scalar:
         """The inner model's."""
         return self.model.gyroscopic_factor
+
+    @property
+    def is_linear(self) -> bool:
+        """No: the alphas are ratios of the constants."""
+        return False
 
     def alphas(self, parameters) -> tuple[Scalar, ...]:
         """alpha_1..8 that the constants imply."""

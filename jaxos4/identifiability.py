@@ -54,13 +54,16 @@ class Identifiability(eqx.Module):
         """For each parameter of which something must be said, what it is. Of one flight, not of a batch."""
         notes = {}
         told, excited, limit = (np.asarray(x) for x in (self.told, self.excited, self.noise_limit))
+        nominal = np.asarray(self.nominal)
         for i, name in enumerate(names):
-            if not excited[i]:
+            if not np.isfinite(self.std[i]):
+                notes[name] = "not told: no trajectory, or no bracket, to judge by"
+            elif not excited[i]:
                 notes[name] = "not told: not excited"
             elif not told[i]:
                 partners = ", ".join(names[j] for j in self._partners(i))
                 notes[name] = f"not told: only together with {partners}"
-            elif limit[i] < 1:
+            elif limit[i] < 1 and nominal[i] != 0:
                 notes[name] = f"below the noise floor at this noise; identifiable below {limit[i]:.2g} of it"
         return notes
 
@@ -72,7 +75,6 @@ class Identifiability(eqx.Module):
         return [j for j in range(len(share)) if j != i and share[j] > _PARTNER] or [int(np.argsort(share)[-2])]
 
 
-@eqx.filter_jit
 def identifiability(
     problem: ShootingProblem,
     bracket: Bracket,
@@ -83,15 +85,30 @@ def identifiability(
 
     **Arguments:**
 
-    - `bracket`: its half-widths say how well each parameter is known without the flight; it must be valid.
+    - `bracket`: its half-widths say how well each parameter is known without the flight.
     - `initial_state`: where it is free, it is unknown too, and eliminated.
+
+    Standard deviations are infinite where the trajectory diverges at `parameters` or the bracket is not valid.
+
+    **Raises:** `ValueError` for parameters or a bracket of another length than the model's parameters.
     """
-    parameters, half_width = as_float(parameters), bracket.half_width
+    parameters, names = as_float(parameters), problem.model.parameter_names
+    for name, shape in (("parameters", parameters.shape), ("bracket", bracket.lower.shape)):
+        if shape != (len(names),):
+            raise ValueError(f"`{name}` must hold {len(names)} parameters, got shape {shape}.")
+    return _identifiability(problem, bracket, parameters, initial_state)
+
+
+@eqx.filter_jit
+def _identifiability(
+    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: Float[Array, " size"] | None
+) -> Identifiability:
+    sound = bracket.valid & jnp.isfinite(problem.cost(parameters, initial_state))
+    parameters, half_width = jnp.where(sound, parameters, problem.model.alpha), bracket.usable.half_width
     information = fisher_information(problem, parameters, initial_state)
     eigenvalues, directions = jnp.linalg.eigh(information * half_width[:, None] * half_width[None, :])
     diagonal = jnp.diagonal(information)
     alone = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), jnp.inf)
     bound = cramer_rao_bound(problem, parameters, initial_state)
-    return Identifiability(
-        problem.model.alpha, half_width, jnp.sqrt(jnp.diagonal(bound)), alone, eigenvalues, directions
-    )
+    std, alone = (jnp.where(sound, x, jnp.inf) for x in (jnp.sqrt(jnp.diagonal(bound)), alone))
+    return Identifiability(problem.model.alpha, half_width, std, alone, eigenvalues, directions)

@@ -5,13 +5,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._custom_types import Scalar, as_float
+from ._custom_types import Parameters, Scalar, as_float
 from .airframe import inertia_from_alpha
 from .dynamics import AbstractModel, InertialOS4
 from .information import cholesky, invert, invert_factor
 
 # Gauss-Newton converges quadratically here: the alphas are nearly linear in the constants over their errors.
 _STEPS = 20
+# Reciprocals of alpha3, 6, 8 within this factor of the airframe's inertia are where the fit starts.
+_FAR = 100.0
 
 
 class InertiaFit(eqx.Module):
@@ -45,18 +47,28 @@ class InertiaFit(eqx.Module):
 
 
 @eqx.filter_jit
-def fit_inertia(model: AbstractModel, alpha: Float[Array, "8"], covariance: Float[Array, "8 8"]) -> InertiaFit:
+def fit_inertia(
+    model: AbstractModel, alpha: Parameters, covariance: Float[Array, "parameters parameters"]
+) -> InertiaFit:
     """Eight alphas, four constants: weighted least squares, by Gauss-Newton from the reciprocals of alpha3, 6, 8.
 
     **Arguments:**
 
     - `model`: says what stands above Ix and Iy in alpha2 and alpha5, see `gyroscopic_factor`.
-    - `alpha`, `covariance`: an estimate's; all of it finite, or nothing of what is returned is.
+    - `alpha`, `covariance`: an estimate's. Where they are not finite, or no positive inertias fit them, the airframe's
+      constants are returned with an infinite covariance and mismatch, and a `p_value` of 0.
+
+    **Raises:** `ValueError` for other shapes, or a model that is not one in alpha_1..8.
     """
-    inertial, alpha = InertialOS4(model), as_float(alpha)
-    # W with W^T W the inverse of the covariance; an infinite one is no weight.
-    whiten = invert_factor(cholesky(as_float(covariance)))
+    inertial, alpha, covariance = InertialOS4(model), as_float(alpha), as_float(covariance)
+    if alpha.shape != (8,) or covariance.shape != (8, 8):
+        raise ValueError(
+            f"`alpha`, `covariance` must be of shapes (8,), (8, 8), got {alpha.shape}, {covariance.shape}."
+        )
+    whiten = invert_factor(cholesky(covariance))
+    nominal = jnp.asarray(model.airframe.inertia)
     first, gyroscopic = inertia_from_alpha(alpha)
+    first = jnp.where((first > nominal / _FAR) & (first < _FAR * nominal), first, nominal)
     begin = jnp.append(first, gyroscopic / model.gyroscopic_factor)
     scale = jnp.append(first, jnp.sqrt(covariance[1, 1]) * first[0] / model.gyroscopic_factor)
 
@@ -71,12 +83,16 @@ def fit_inertia(model: AbstractModel, alpha: Float[Array, "8"], covariance: Floa
     jacobian = jax.jacfwd(residuals)(u)
     spread = invert(jacobian.T @ jacobian) * scale[:, None] * scale[None, :]
     mismatch = jnp.square(residuals(u)).sum()
+    constants = u * scale
+    told = jnp.isfinite(spread).all() & jnp.isfinite(mismatch) & (constants[:3] > 0).all()
+    constants = jnp.where(told, constants, inertial.alpha)
+    spread, mismatch = jnp.where(told, spread, jnp.inf), jnp.where(told, mismatch, jnp.inf)
     sums = jnp.ones((3, 3)) - 2 * jnp.eye(3)
     return InertiaFit(
-        constants=u * scale,
+        constants=constants,
         covariance=spread,
         mismatch=mismatch,
-        p_value=jax.scipy.special.gammaincc(2.0, mismatch / 2),
-        triangle=sums @ (u * scale)[:3],
-        triangle_std=jnp.sqrt(jnp.diagonal(sums @ spread[:3, :3] @ sums.T)),
+        p_value=jnp.where(told, jax.scipy.special.gammaincc(2.0, mismatch / 2), 0.0),
+        triangle=sums @ constants[:3],
+        triangle_std=jnp.where(told, jnp.sqrt(jnp.diagonal(sums @ spread[:3, :3] @ sums.T)), jnp.inf),
     )

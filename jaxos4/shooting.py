@@ -171,7 +171,7 @@ class ShootingProblem(eqx.Module):
         """The trajectory of the simulated channels, in cascade order."""
 
         def step(state: State, forcing: Forcing) -> tuple[State, State]:
-            return self._step(state, forcing, tuple(parameters)), state
+            return self.step(state, forcing, tuple(parameters)), state
 
         _, states = jax.lax.scan(step, unstack(initial_state), self.rows().forcing)
         return stack(states)
@@ -184,7 +184,7 @@ class ShootingProblem(eqx.Module):
             state, shot = carry
             sound = shot.sound & _sound(state)
             shot = Shot(shot.cost + _half_square(_errors(row, state, weights, sound)), sound)
-            return (self._step(state, row.forcing, scalars), shot), None
+            return (self.step(state, row.forcing, scalars), shot), None
 
         return jax.lax.scan(step, (unstack(initial_state), _unfired()), rows)[0][1]
 
@@ -213,7 +213,7 @@ class ShootingProblem(eqx.Module):
                 total.gradient + sum(e * s for e, s in zip(errors, slopes, strict=True)),
                 total.information + sum(s[:, None] * s[None, :] for s in slopes),
             )
-            following, push = jax.linearize(lambda x, a: self._step(x, row.forcing, a), state, scalars)
+            following, push = jax.linearize(lambda x, a: self.step(x, row.forcing, a), state, scalars)
             return (following, jax.vmap(push)(tangent, parameter_tangents), total), None
 
         zero = Curvature(_unfired(), jnp.zeros(unknowns, dtype=float), 0 * identity)
@@ -239,7 +239,8 @@ class ShootingProblem(eqx.Module):
         sigma = jnp.where(sigma > 0, sigma, self.sigma[order])
         return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[order].set(sigma))
 
-    def _step(self, state: State, forcing: Forcing, parameters) -> State:
+    def step(self, state: State, forcing: Forcing, parameters) -> State:
+        """The state one sample later, as far down the cascade as `state` goes."""
         return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
 
     def _weights(self) -> tuple[Scalar, ...]:

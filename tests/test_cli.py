@@ -183,6 +183,8 @@ def test_bad_flights_are_refused_in_one_line(run, tmp_path, text, fragments):
         (["estimate", "positions.csv"], ["positions.csv", "rates"]),
         (["simulate", "--airframe", "tiny.toml", "--out", "new.csv"], ["tiny.toml", "inertia"]),
         (["estimate", "rates.csv", "--channels", "all"], ["rates.csv", "--channels"]),
+        (["estimate", "flight.csv", "--estimator", "rls", "--channels", "all"], ["--channels", "rls"]),
+        (["estimate", "rates.csv", "--estimator", "svsf"], ["rates.csv", "p, q and r"]),
         (["estimate", "rates.csv", "--channels", "rates", "--initial-state", "known"], ["rates.csv", "row 2", "r"]),
         (["simulate", "--out", "none/flight.csv"], ["none/flight.csv"]),
         (["simulate", "--out", "new.csv", "--duration", "-1"], ["duration"]),

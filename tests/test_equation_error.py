@@ -423,6 +423,15 @@ def test_brackets_of_another_length_are_named(estimator):
         estimator(standard_problem(duration=0.1), jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)))
 
 
+@BOTH
+def test_models_that_are_not_linear_are_refused(estimator):
+    problem = standard_problem(duration=0.1)
+    inertial = jaxos4.InertialOS4(problem.model)
+    problem = eqx.tree_at(lambda p: p.model, problem, inertial)
+    with pytest.raises(ValueError, match="linear in its parameters"):
+        estimator(problem, jaxos4.Bracket.default(inertial))
+
+
 SINGLE = """
 import json, sys
 import jax.numpy as jnp

@@ -119,3 +119,24 @@ def test_constants_are_estimated_directly_and_know_more_than_alphas(estimator):
     np.testing.assert_allclose(np.median(found.std, axis=0), from_alphas.std, rtol=0.02)
     alone = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, problem.model.alpha)))[[2, 5, 7]]
     assert np.all(np.median(found.std, axis=0)[:3] < alone * constants()[:3] ** 2)
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+def test_alphas_far_from_the_airframe_or_without_an_error_give_a_fit_or_say_that_there_is_none(model_class):
+    model, covariance = model_class(jaxos4.OS4), bound_of(model_class)
+    for alpha in (model.alpha.at[2].set(0.0), jnp.full(8, jnp.nan), -model.alpha):
+        fit = jaxos4.fit_inertia(model, alpha, covariance)
+        assert np.isfinite(fit.constants).all()
+        assert fit.p_value < 1e-6
+    for spread in (jnp.full((8, 8), jnp.inf), jnp.full((8, 8), jnp.nan)):
+        fit = jaxos4.fit_inertia(model, model.alpha, spread)
+        np.testing.assert_allclose(fit.constants, constants())
+        assert np.isposinf(fit.std).all()
+        assert fit.p_value == 0
+    with pytest.raises(ValueError, match=r"shapes \(8,\), \(8, 8\), got \(4,\)"):
+        jaxos4.fit_inertia(model, model.alpha[:4], covariance[:4, :4])
+
+
+def test_constants_stand_above_a_model_in_alphas_alone():
+    with pytest.raises(ValueError, match="must be one in alpha_1..8"):
+        jaxos4.InertialOS4(jaxos4.InertialOS4(jaxos4.CorrectedOS4()))

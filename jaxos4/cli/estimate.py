@@ -25,6 +25,7 @@ from ..errors import InputError
 from ..estimators import (
     BASELINES,
     IBSS,
+    WITH_PRIOR,
     AbstractEstimator,
     Estimate,
     Hybrid,
@@ -55,6 +56,8 @@ COLOURED = 0.3
 ROUNDING = 1e-9
 # Baselines that look at the body rates, whatever else was measured.
 RATES_ONLY = ("equation-error", "rls", "svsf")
+# Those that begin with the bracket as what is known, and mix it with what the flight tells.
+FILTERS = ("svsf", "kalman")
 # Estimators that fit by shooting, and reach the bound: theirs is the covariance that the noise found implies.
 SHOOTING = ("ibss", "hybrid", "output-error")
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
@@ -98,6 +101,10 @@ def estimate(
     begin = time.perf_counter()
     method: AbstractEstimator = BASELINES[estimator]() if estimator in BASELINES else IBSS()
     if estimator in RATES_ONLY:
+        if channels not in (None, "rates"):
+            raise InputError(f"--channels {channels}: {estimator} looks at the rates; use --estimator output-error.")
+        if np.isnan(np.asarray(recorded.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
+            raise InputError(f"{flight}: {estimator} needs p, q and r; use --estimator output-error.")
         problem = problem.restrict("rates")
     if learned:
         if trained is None:
@@ -125,7 +132,7 @@ def estimate(
         "rollouts": rollouts,
         "cost": _number(found.cost),
         "seconds": seconds,
-        "parameters": _parameters(problem, where, found, bound),
+        "parameters": _parameters(problem, where, found, bound, with_prior=estimator in FILTERS),
         "fit": {} if name in NO_ANSWER else _fit_quality(problem, found),
         "provenance": {
             "flight": str(flight),
@@ -229,7 +236,12 @@ def fit(
 
 
 def _parameters(
-    problem: ShootingProblem, bracket: Bracket, found: Estimate, bound: Float[Array, " parameters"]
+    problem: ShootingProblem,
+    bracket: Bracket,
+    found: Estimate,
+    bound: Float[Array, " parameters"],
+    *,
+    with_prior: bool,
 ) -> dict[str, dict[str, Any]]:
     table, half_width, model = {}, np.asarray(found.half_width(0.95)), problem.model
     known = None
@@ -239,7 +251,7 @@ def _parameters(
         value, std = float(found.parameters[i]), float(found.std[i])
         lower, upper = float(bracket.lower[i]), float(bracket.upper[i])
         # A network's errors are those of the flight and the bracket together.
-        most = (upper - lower) / (2 if found.calibration is None else 4)
+        most = (upper - lower) / 2 * (0.5 if found.calibration is not None else WITH_PRIOR if with_prior else 1.0)
         told = np.isfinite(std) and std <= most
         table[name] = {
             "estimate": value if told else None,

@@ -1,6 +1,11 @@
 """Estimators: a `ShootingProblem` and a `Bracket` in, an `Estimate` out; one algorithm a file."""
 
-from ._estimate import AbstractEstimator as AbstractEstimator, Calibration as Calibration, Estimate as Estimate
+from ._estimate import (
+    WITH_PRIOR as WITH_PRIOR,
+    AbstractEstimator as AbstractEstimator,
+    Calibration as Calibration,
+    Estimate as Estimate,
+)
 from .equation_error import EquationError as EquationError
 from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS

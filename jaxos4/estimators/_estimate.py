@@ -16,6 +16,8 @@ from ..shooting import ShootingProblem
 
 # How many half-widths around its bracket's center an answer may lie.
 REACH = 4.0
+# The standard deviation, in half-widths, where a filter that begins with one half-width owes as much to the flight.
+WITH_PRIOR = 0.5**0.5
 # Towards an initial state with the parameters known: the trajectory is nearly linear in it.
 _START_STEPS = 2
 
@@ -108,6 +110,7 @@ def conclude(
     sound: Bool[Array, ""],
     done: Bool[Array, ""],
     reach: Scalar | float = REACH,
+    most: float = 1.0,
     history: Float[Array, "samples parameters"] | None = None,
 ) -> Estimate:
     """What an algorithm found, as an estimate: its result told, and nothing that is not a number passed on.
@@ -117,6 +120,7 @@ def conclude(
     - `sound`: whether the trajectory stayed sound to its end.
     - `done`: whether the search ended by itself.
     - `reach`: how many half-widths around the bracket's center an answer may lie.
+    - `most`: the share of a half-width that the standard deviation of a parameter that is told may be.
     """
     valid, center = bracket.valid, jnp.where(bracket.valid, bracket.center, 0.0)
     std, half_width = jnp.sqrt(jnp.diagonal(covariance)), jnp.where(valid, bracket.half_width, 1.0)
@@ -125,7 +129,7 @@ def conclude(
     sound = sound & jnp.isfinite(cost) & finite
     result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
     result = RESULTS.where((jnp.abs(parameters - center) > limit).any(), RESULTS.at_bound, result)
-    result = RESULTS.where((std > half_width).any(), RESULTS.unidentifiable, result)
+    result = RESULTS.where((std > most * half_width).any(), RESULTS.unidentifiable, result)
     result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
     result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
     told = sound & valid

@@ -120,6 +120,11 @@ def regression(
     problem: ShootingProblem, bracket: Bracket, *, memory: Scalar, forgetting: Scalar | float, bridge: int
 ) -> Regression:
     """The regression of a flight's rates, whatever else the problem's channels are."""
+    if not problem.model.is_linear:
+        raise ValueError(
+            "regression needs a model whose rate equations are linear in its parameters: identify alpha_1..8, then "
+            "`fit_inertia`, or shoot."
+        )
     rates = problem.restrict("rates")
     anchored = problem.initial_state is not None
     anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)

@@ -74,18 +74,22 @@ class EquationError(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
+        linear in them.
         """
         check_bracket(problem, bracket)
         usable = bracket.usable
         data = regression(problem, usable, memory=self.memory, forgetting=1.0, bridge=self.bridge)
         steps, inverse = solve(*normal_equations(data.rows(data.rates)))
         parameters = parameters_of(usable, steps)
-        initial_state, cost, sound, rollouts = fit_start(problem, parameters)
+        covariance = covariance_of(usable, propagated_covariance(data, steps, inverse))
+        # What is not told may be anything: the flight is then compared with that of the bracket's center.
+        told = (jnp.sqrt(jnp.diagonal(covariance)) <= usable.half_width).all()
+        initial_state, cost, sound, rollouts = fit_start(problem, jnp.where(told, parameters, usable.center))
         return conclude(
             bracket,
             parameters=parameters,
-            covariance=covariance_of(usable, propagated_covariance(data, steps, inverse)),
+            covariance=covariance,
             initial_state=initial_state,
             cost=cost,
             rollouts=rollouts,

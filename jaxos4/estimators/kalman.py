@@ -16,7 +16,7 @@ from .._custom_types import Parameters, Scalar
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
-from ._estimate import AbstractEstimator, Estimate, check_bracket, conclude
+from ._estimate import WITH_PRIOR, AbstractEstimator, Estimate, check_bracket, conclude
 
 # The passes end once none moves a parameter by more than this many standard deviations.
 _SETTLED = 0.1
@@ -114,6 +114,7 @@ class JointEKF(AbstractEstimator):
             rollouts=last.passes * (count + problem.free_size + 1) + 1,
             sweeps=last.passes,
             sound=sound,
+            most=WITH_PRIOR,
             done=last.done,
             history=last.history,
         )
@@ -149,7 +150,7 @@ def _run(
         point = (states, parameters) if about is None else (nominal, about[0])
 
         def advance(x: Float[Array, " size"], a: Parameters) -> Float[Array, " size"]:
-            return stack(problem._step(unstack(x), row.forcing, tuple(a)))
+            return stack(problem.step(unstack(x), row.forcing, tuple(a)))
 
         following, push = jax.linearize(advance, *point)
         predicted = following + push(states - point[0], parameters - point[1])

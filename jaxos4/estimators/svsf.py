@@ -24,7 +24,7 @@ from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, stack, unstack
 from ..information import invert
 from ..shooting import Rows, ShootingProblem
-from ._estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude, fit_start
+from ._estimate import REACH, WITH_PRIOR, AbstractEstimator, Estimate, check_bracket, conclude, fit_start
 
 # The share of the last pass over which the parameters are averaged.
 _AVERAGED = 0.5
@@ -163,6 +163,7 @@ class SVSF(AbstractEstimator):
             rollouts=self.passes * (1 + 3 + count) + rollouts,
             sweeps=self.passes,
             sound=sound,
+            most=WITH_PRIOR,
             done=jnp.ones((), dtype=bool),
             history=box.center + box.half_width * history,
         )
@@ -197,7 +198,7 @@ class SVSF(AbstractEstimator):
         left = jnp.where(here, jnp.abs(measured - rates), left)
 
         def advance(x: Float[Array, "3"], u: Parameters) -> Float[Array, "3"]:
-            return stack(problem._step(unstack(x), row.forcing, tuple(box.center + box.half_width * u)))
+            return stack(problem.step(unstack(x), row.forcing, tuple(box.center + box.half_width * u)))
 
         following = advance(rates, parameters)
         by_rates, by_parameters = jax.jacfwd(advance, argnums=(0, 1))(rates, parameters)
