@@ -41,21 +41,22 @@ class Coordinates(eqx.Module):
 
     center: Float[Array, " unknowns"]
     width: Float[Array, " unknowns"]
-    first_state: Float[Array, " size"]
+    first_state: Float[Array, " starts"]
 
     @classmethod
     def of(cls, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> "Coordinates":
         """Of a problem's unknowns: an initial state lies as far from the first measurement as `noise` puts it."""
         first_state, off = problem.first_state()
-        free = problem.free_size
-        off = off + 3 * jnp.maximum(noise - 1, 0) * problem.sigma[CASCADE_ORDER[: problem.size]]
+        free = problem.windows * problem.free_size
+        sigma = jnp.tile(problem.sigma[CASCADE_ORDER[: problem.size]], problem.windows)
+        off = off + 3 * jnp.maximum(noise - 1, 0) * sigma
         return cls(
             jnp.concatenate([bracket.center, first_state[:free]]),
             jnp.concatenate([bracket.half_width, off[:free]]),
             first_state,
         )
 
-    def split(self, u: Float[Array, " unknowns"], parameters: int) -> tuple[Parameters, Float[Array, " size"]]:
+    def split(self, u: Float[Array, " unknowns"], parameters: int) -> tuple[Parameters, Float[Array, " starts"]]:
         """Parameters and initial state at coordinates `u`, in their units."""
         unknowns = self.center + u * self.width
         free = unknowns.shape[0] > parameters
@@ -97,7 +98,7 @@ class AbstractFeatures(eqx.Module):
 
     def _mismatch(self, problem: ShootingProblem) -> Float[Array, "samples size"]:
         """W (y - x(0)) of a measured flight, with the weights of training; 0 where nothing is measured in both."""
-        mismatch = self._weighted(problem, jnp.stack(problem.rows().measured, axis=-1))
+        mismatch = self._weighted(problem, problem.measured())
         return jnp.where(_measured(self.problem), mismatch, 0.0)
 
     def _weighted(
@@ -189,7 +190,7 @@ def _reference(problem: ShootingProblem, coordinates: Coordinates) -> Float[Arra
 
 
 def _measured(problem: ShootingProblem) -> Bool[Array, "samples size"]:
-    return ~jnp.isnan(jnp.stack(problem.rows().measured, axis=-1))
+    return ~jnp.isnan(problem.measured())
 
 
 def _squares(jacobian: Float[Array, "samples size unknowns"]) -> Float[Array, "unknowns unknowns"]:

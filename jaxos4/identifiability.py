@@ -79,7 +79,7 @@ def identifiability(
     problem: ShootingProblem,
     bracket: Bracket,
     parameters: Parameters,
-    initial_state: Float[Array, " size"] | None = None,
+    initial_state: Float[Array, " starts"] | None = None,
 ) -> Identifiability:
     """What a problem's flight tells about its model's parameters near `parameters`, with the problem's sigma.
 
@@ -101,7 +101,7 @@ def identifiability(
 
 @eqx.filter_jit
 def _identifiability(
-    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: Float[Array, " size"] | None
+    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: Float[Array, " starts"] | None
 ) -> Identifiability:
     sound = bracket.valid & jnp.isfinite(problem.cost(parameters, initial_state))
     parameters, half_width = jnp.where(sound, parameters, problem.model.alpha), bracket.usable.half_width

@@ -14,31 +14,32 @@ _LAGS = 0.1
 
 @eqx.filter_jit
 def fisher_information(
-    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " size"] | None = None
+    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
 ) -> Float[Array, "parameters parameters"]:
     """J^T W^2 J in the parameters, at `parameters`.
 
     Where the initial state is free it is eliminated (a Schur complement): what is left is what the flight tells about
     the parameters without knowing where it began.
     """
-    factor = marginal_factor(_information(problem, parameters, initial_state), parameters.shape[0])
+    count = parameters.shape[0]
+    factor = joint_factor(_information(problem, parameters, initial_state), count)[0, :count, -count:]
     return (factor[:, None, :] * factor[None, :, :]).sum(axis=-1)
 
 
 @eqx.filter_jit
 def cramer_rao_bound(
-    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " size"] | None = None
+    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
 ) -> Float[Array, "parameters parameters"]:
     """The least covariance that an unbiased estimate can have: the inverse of `fisher_information`.
 
     Parameters that the flight does not tell have a variance that is huge, not infinite.
     """
-    return invert_marginal(_information(problem, parameters, initial_state), parameters.shape[0])
+    return covariance_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
 
 
 @eqx.filter_jit
 def robust_covariance(
-    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " size"] | None = None
+    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
 ) -> Float[Array, "parameters parameters"]:
     """The sandwich covariance of a fit whose residuals are coloured, or not of the size that sigma says.
 
@@ -56,15 +57,17 @@ def robust_covariance(
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     count, free = parameters.shape[0], problem.free_size
 
-    def residuals(u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
-        return problem.residuals(u[:count], u[count:] if free else start).reshape(-1, problem.size)
+    def together(steps: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
+        """Residuals where all windows' initial states take the same step: no sample feels more than one of them."""
+        moved = problem.split(start) + (steps[count:] if free else 0.0)
+        return problem.residuals(parameters + steps[:count], moved.ravel()).reshape(-1, problem.size)
 
-    unknowns = jnp.concatenate([parameters, start[:free]])
-    inverse = invert(problem.curvature(problem.rows(), parameters, start).information)
     # How far each residual moves each parameter of the estimate.
-    moves = jnp.einsum("tcu,uv->tcv", jax.jacfwd(residuals)(unknowns), inverse[:, :count])
-    errors = residuals(unknowns)
-    measured = (~jnp.isnan(jnp.stack(problem.rows().measured, axis=-1))).astype(errors.dtype)
+    still = jnp.zeros(count + free)
+    inverse = covariances(problem.curvatures(parameters, start).information, count)[:, :, :count]
+    moves = jnp.einsum("tcu,tuv->tcv", jax.jacfwd(together)(still), inverse[problem.window_of_samples()])
+    errors = together(still)
+    measured = (~jnp.isnan(problem.measured())).astype(errors.dtype)
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
     def products(x: Float[Array, "samples size"]) -> Float[Array, "lags size size"]:
@@ -82,25 +85,52 @@ def robust_covariance(
     return jnp.fft.irfft(density, length, axis=0)[0]
 
 
-def _information(problem, parameters, initial_state) -> Float[Array, "unknowns unknowns"]:
+def _information(problem, parameters, initial_state) -> Float[Array, "windows unknowns unknowns"]:
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
-    return problem.curvature(problem.rows(), as_float(parameters), start).information
+    return problem.curvatures(as_float(parameters), start).information
 
 
-def marginal_factor(information: Float[Array, "n n"], count: int) -> Float[Array, "count count"]:
-    """L with L L^T the information in the first `count` unknowns when the others are unknown too.
+def joint_factor(information: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
+    """For each window A, with A A^T the inverse of the covariance of its unknowns when those of all are unknown.
 
-    The others come first in a Cholesky factorisation of the whole, whose last block is the factor of the Schur
-    complement: nothing is subtracted that single precision would lose.
+    The first `count` unknowns are shared by all windows, the others are each window's own. A window's own come first in
+    a Cholesky factorisation, in which the Schur complements of all windows are summed: block elimination, in time
+    linear in the windows, and nothing is subtracted that single precision would lose. The last `count` columns of A
+    hold the factor of what is shared.
     """
-    order = jnp.roll(jnp.arange(information.shape[0]), -count)
-    return cholesky(information[jnp.ix_(order, order)])[-count:, -count:]
+    size = information.shape[-1]
+    own = size - count
+    order, back = jnp.roll(jnp.arange(size), -count), jnp.roll(jnp.arange(size), count)
+    shared = information[:, :count, :count].sum(axis=0)
+    diagonal = jax.vmap(jnp.diagonal)(information).at[:, :count].set(jnp.diagonal(shared))
+    scale = _scale(diagonal)[:, order]
+    unit = information[:, order][:, :, order] / (scale[:, :, None] * scale[:, None, :])
+    rest, first = jax.vmap(lambda matrix: _eliminate(matrix, own))(unit)
+    _, last = _eliminate(rest[:, own:, own:].sum(axis=0), count, floor=size)
+    last = jnp.broadcast_to(jnp.pad(last, ((own, 0), (0, 0))), (information.shape[0], size, count))
+    return (scale[:, :, None] * jnp.concatenate([first, last], axis=-1))[:, back]
 
 
-def invert_marginal(information: Float[Array, "n n"], count: int) -> Float[Array, "count count"]:
-    """The covariance of the first `count` unknowns when the others are unknown too."""
-    inverse_factor = invert_factor(marginal_factor(information, count))
-    return (inverse_factor[:, :, None] * inverse_factor[:, None, :]).sum(axis=0)
+def covariances(information: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
+    """For each window the covariance of its unknowns, of which the first `count` are shared by all windows.
+
+    A direction without information gets a variance that is huge, not negative or infinite.
+    """
+    basis = inverse_transpose(joint_factor(information, count), count)
+    return (basis[:, :, None, :] * basis[:, None, :, :]).sum(axis=-1)
+
+
+def covariance_of_shared(information: Float[Array, "windows n n"], count: int) -> Float[Array, "count count"]:
+    """The covariance of the first `count` unknowns, which all windows share, when the others are unknown too."""
+    inverse = invert_factor(joint_factor(information, count)[0, :count, -count:])
+    return (inverse[:, :, None] * inverse[:, None, :]).sum(axis=0)
+
+
+def inverse_transpose(factor: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
+    """A^-T of each factor A that `joint_factor` made: its columns are directions of unit information."""
+    size = factor.shape[-1]
+    order, back = jnp.roll(jnp.arange(size), -count), jnp.roll(jnp.arange(size), count)
+    return jnp.swapaxes(jax.vmap(invert_factor)(factor[:, order]), 1, 2)[:, back]
 
 
 def invert(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -108,7 +138,7 @@ def invert(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     A direction without information gets a variance that is huge, not negative or infinite.
     """
-    return invert_marginal(information, information.shape[0])
+    return covariance_of_shared(information[None], information.shape[0])
 
 
 def cholesky(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -117,20 +147,34 @@ def cholesky(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
     In plain operations, as `invert_factor` is: they vectorise over a batch of small matrices, while LAPACK's batched
     kernels inside a loop can wait for one another for ever on a CPU (seen with jaxlib 0.10 and 512 lanes).
     """
-    count = information.shape[0]
-    diagonal = jnp.diagonal(information)
-    scale = jnp.where(diagonal > 0, jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
-    floor = jnp.finfo(information.dtype).eps * count
+    scale = _scale(jnp.diagonal(information))
+    _, factor = _eliminate(information / (scale[:, None] * scale[None, :]), information.shape[0])
+    return scale[:, None] * factor
+
+
+def _scale(diagonal: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """What makes a diagonal one of ones, where it is not 0."""
+    return jnp.where(diagonal > 0, jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
+
+
+def _eliminate(
+    matrix: Float[Array, "n n"], columns: int, *, floor: int | None = None
+) -> tuple[Float[Array, "n n"], Float[Array, "n columns"]]:
+    """The first columns of the Cholesky factor of a matrix with a unit diagonal, and what they leave to the others.
+
+    `floor`: of the pivots, in rounding errors; the size of the matrix by default.
+    """
+    size = matrix.shape[0]
+    least = jnp.finfo(matrix.dtype).eps * (floor or size)
 
     def eliminate_column(k, carry):
         rest, factor = carry
-        pivot = jnp.sqrt(jnp.maximum(rest[k, k], floor))
-        column = jnp.where(jnp.arange(count) > k, rest[:, k] / pivot, 0.0).at[k].set(pivot)
+        pivot = jnp.sqrt(jnp.maximum(rest[k, k], least))
+        column = jnp.where(jnp.arange(size) > k, rest[:, k] / pivot, 0.0).at[k].set(pivot)
         return rest - column[:, None] * column[None, :], factor.at[:, k].set(column)
 
-    unit_diagonal = information / (scale[:, None] * scale[None, :])
-    _, factor = jax.lax.fori_loop(0, count, eliminate_column, (unit_diagonal, jnp.zeros_like(information)))
-    return scale[:, None] * factor
+    nothing = jnp.zeros((size, columns), matrix.dtype)
+    return jax.lax.fori_loop(0, columns, eliminate_column, (matrix, nothing)) if columns else (matrix, nothing)
 
 
 def invert_factor(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar, StateVector, as_float
 from .dynamics import CASCADE_ORDER, CHANNELS, AbstractModel, Forcing, State, stack, unstack
@@ -30,14 +30,14 @@ _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2
 
 
 class Rows(NamedTuple):
-    """A flight as the scan reads it: one leaf a channel. `measured` is NaN where it says nothing."""
+    """A window as the scan reads it, or a batch of them: a leaf a channel. `measured` is NaN where it says nothing."""
 
     forcing: Forcing
-    measured: tuple[Float[Array, "*rows"], ...]
+    measured: tuple[Float[Array, "*windows rows"], ...]
 
 
 class Shot(NamedTuple):
-    """One simulated flight: the cost of its sound part, and whether that is all of it.
+    """One simulated window: the cost of its sound part, and whether that is all of it.
 
     A trajectory that passes theta = +-90 degrees or turns faster than anything flies is compared up to there: its
     slope still says which way to go, while its cost means nothing.
@@ -65,9 +65,13 @@ class ShootingProblem(eqx.Module):
     - `initial_state`: X at the first sample. `None`: free, estimated with the parameters.
     - `channels`: `"rates"`, `"attitude"` (with the rates), or `"all"`: what is compared, and how much is simulated.
     - `method`: the stepper, `"euler"` or `"rk4"`.
+    - `windows`: multiple shooting: the flight is cut into this many windows of equal length, each simulated from an
+      initial state of its own, so that what the model lacks adds up over a window only. Nothing ties the end of one to
+      the beginning of the next, which costs the information in the long drift of a flight that the model explains.
+      Initial states are then free.
 
     An *initial state* below is the part of X at the first sample that the channels need, in cascade order: p, q, r,
-    then phi, theta, psi, then x, vx, y, vy, z, vz.
+    then phi, theta, psi, then x, vx, y, vy, z, vz; of several windows, one after the other.
     """
 
     model: AbstractModel
@@ -76,6 +80,7 @@ class ShootingProblem(eqx.Module):
     initial_state: StateVector | None = None
     channels: str = eqx.field(static=True, default="all")
     method: str = eqx.field(static=True, default="euler")
+    windows: int = eqx.field(static=True, default=1)
 
     def __init__(
         self,
@@ -86,6 +91,7 @@ class ShootingProblem(eqx.Module):
         initial_state: Float[Array | np.ndarray, "12"] | None = None,
         channels: str = "all",
         method: str = "euler",
+        windows: int = 1,
     ):
         if channels not in CHANNELS:
             raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
@@ -97,9 +103,14 @@ class ShootingProblem(eqx.Module):
             raise ValueError(f"`sigma` must be positive and finite, got {np.asarray(sigma).tolist()}.")
         if initial_state is not None and np.shape(initial_state) != (12,):
             raise ValueError(f"`initial_state` must be `None` or of shape (12,), got {np.shape(initial_state)}.")
+        most = max(flight.states.shape[-2] // 2, 1)
+        if not isinstance(windows, int) or not 1 <= windows <= most:
+            raise ValueError(f"`windows` must be an integer from 1 to {most}, two samples each, got {windows!r}.")
+        if windows > 1 and initial_state is not None:
+            raise ValueError("`initial_state` must be `None` where there are several windows: each has its own.")
         self.model, self.flight, self.sigma = model, flight, as_float(sigma)
         self.initial_state = None if initial_state is None else as_float(initial_state)
-        self.channels, self.method = channels, method
+        self.channels, self.method, self.windows = channels, method, windows
 
     @property
     def size(self) -> int:
@@ -108,7 +119,7 @@ class ShootingProblem(eqx.Module):
 
     @property
     def free_size(self) -> int:
-        """How many unknowns the initial state adds to the parameters: `size`, or 0 where it is known."""
+        """How many unknowns an initial state adds to a window's parameters: `size`, or 0 where it is known."""
         return 0 if self.initial_state is not None else self.size
 
     def restrict(self, channels: str) -> "ShootingProblem":
@@ -120,64 +131,83 @@ class ShootingProblem(eqx.Module):
             initial_state=self.initial_state,
             channels=channels,
             method=self.method,
+            windows=self.windows,
         )
 
-    def rows(self) -> Rows:
-        """The flight as the scan reads it. Where the initial state is known, the first sample is no data."""
+    def measured(self) -> Float[Array, "samples size"]:
+        """What is compared, in cascade order. Where the initial state is known, the first sample is no data."""
         measured = self.flight.states[:, CASCADE_ORDER[: self.size]]
-        if self.initial_state is not None:
-            measured = measured.at[0].set(jnp.nan)
-        return Rows(self.model.forcing(self.flight.omega), tuple(measured.T))
+        return measured if self.initial_state is None else measured.at[0].set(jnp.nan)
 
-    def first_state(self) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
+    def rows(self) -> Rows:
+        """All windows as the scan reads them, with nothing measured beyond the end of one that is shorter."""
+        index, within = self._cut()
+        forcing = jax.tree.map(lambda leaf: leaf[index], self.model.forcing(self.flight.omega))
+        return Rows(forcing, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
+
+    def split(self, initial_state: Float[Array, " starts"]) -> Float[Array, "windows size"]:
+        """The initial state of each window."""
+        return initial_state.reshape(self.windows, self.size)
+
+    def first_state(self) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
         """The initial state where the search starts, and how far off it may be.
 
-        It is the known state, or each channel's first measurement (0 where there is none).
+        It is the known state, or in each window each channel's first measurement (0 where there is none).
         """
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
-        states, sigma = self.flight.states[:, order], self.sigma[order]
-        first = jnp.argmin(jnp.isnan(states), axis=0)
-        value = jnp.take_along_axis(states, first[None], axis=0)[0]
+        states, sigma = jnp.stack(self.rows().measured, axis=-1), self.sigma[order]
+        first = jnp.argmin(jnp.isnan(states), axis=1)
+        value = jnp.take_along_axis(states, first[:, None], axis=1)[:, 0]
         off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
-        return jnp.where(jnp.isnan(value), 0.0, value), off
+        return jnp.where(jnp.isnan(value), 0.0, value).ravel(), off.ravel()
 
     @eqx.filter_jit
-    def cost(self, parameters: Parameters, initial_state: Float[Array, " size"] | None = None) -> Scalar:
+    def cost(self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, after the first where the initial state is known.
 
         Infinite where the trajectory diverges or passes theta = +-90 degrees, and without a derivative there.
         `initial_state` defaults to `first_state`.
         """
         start = self.first_state()[0] if initial_state is None else initial_state
-        cost, sound = self.shot(self.rows(), parameters, start)
+        cost, sound = self.shots(parameters, start)
         return jnp.where(sound, cost, jnp.inf)
 
     @eqx.filter_jit
     def residuals(
-        self, parameters: Parameters, initial_state: Float[Array, " size"] | None = None
+        self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
     ) -> Float[Array, " residuals"]:
         """W (y - x), sample by sample with the channels in cascade order; 0 where nothing was measured."""
         start = self.first_state()[0] if initial_state is None else initial_state
-        rows = self.rows()
-        predicted = self.predict(parameters, start)
-        measured = jnp.stack(rows.measured, axis=-1)
+        predicted, measured = self.predict(parameters, start), self.measured()
         weight = 1 / self.sigma[CASCADE_ORDER[: self.size]]
         return jnp.where(jnp.isnan(measured), 0.0, weight * (measured - predicted)).ravel()
 
     @eqx.filter_jit
-    def predict(self, parameters: Parameters, initial_state: Float[Array, " size"]) -> Float[Array, "samples size"]:
+    def predict(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Float[Array, "samples size"]:
         """The trajectory of the simulated channels, in cascade order."""
 
         def step(state: State, forcing: Forcing) -> tuple[State, State]:
             return self.step(state, forcing, tuple(parameters)), state
 
-        _, states = jax.lax.scan(step, unstack(initial_state), self.rows().forcing)
-        return stack(states)
+        def window(start: Float[Array, " size"], forcing: Forcing) -> Float[Array, "length size"]:
+            return stack(jax.lax.scan(step, unstack(start), forcing)[1])
+
+        _, within = self._cut()
+        return jax.vmap(window)(self.split(initial_state), self.rows().forcing)[within]
+
+    def shots(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Shot:
+        """All windows, as one."""
+        each = jax.vmap(self.shot, in_axes=(0, None, 0))(self.rows(), parameters, self.split(initial_state))
+        return Shot(each.cost.sum(), each.sound.all())
+
+    def curvatures(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Curvature:
+        """Of each window, in the parameters and its own initial state."""
+        return jax.vmap(self.curvature, in_axes=(0, None, 0))(self.rows(), parameters, self.split(initial_state))
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
-        """The cost, of rows prepared once by `rows`: what a shooting method calls in its inner loop."""
+        """The cost of one window of `rows`, prepared once: what a shooting method calls in its inner loop."""
         scalars, weights = tuple(parameters), self._weights()
 
         def step(carry: tuple[State, Shot], row: Rows) -> tuple[tuple[State, Shot], None]:
@@ -189,7 +219,7 @@ class ShootingProblem(eqx.Module):
         return jax.lax.scan(step, (unstack(initial_state), _unfired()), rows)[0][1]
 
     def curvature(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Curvature:
-        """Cost, gradient and Fisher information J^T W^2 J in the parameters and, where it is free, the initial state.
+        """Of one window: cost, gradient, Fisher information J^T W^2 J in the parameters and, where free, initial state.
 
         Forward mode: one tangent for each unknown travels with the state, and their products are summed on the way.
         """
@@ -228,13 +258,13 @@ class ShootingProblem(eqx.Module):
         below what rounding adds up to over a flight: residuals can be rounding alone.
         """
         order = CASCADE_ORDER[: self.size]
-        measured = jnp.stack(self.rows().measured)
-        count = (~jnp.isnan(measured)).sum(axis=1)
-        unknowns = len(self.model.parameter_names) + self.free_size
+        measured = self.measured()
+        count = (~jnp.isnan(measured)).sum(axis=0)
+        unknowns = len(self.model.parameter_names) + self.windows * self.free_size
         left = jnp.maximum(1 - unknowns / jnp.maximum(count.sum(), 1), 1e-3)
         squares = jnp.square(residuals.reshape(-1, self.size)).sum(axis=0)
         sigma = self.sigma[order] * jnp.sqrt(squares / jnp.maximum(count * left, 1))
-        rounding = ROUNDING * jnp.finfo(sigma.dtype).eps * jnp.nan_to_num(jnp.nanmax(jnp.abs(measured), axis=1))
+        rounding = ROUNDING * jnp.finfo(sigma.dtype).eps * jnp.nan_to_num(jnp.nanmax(jnp.abs(measured), axis=0))
         sigma = jnp.where((count > 1) & jnp.isfinite(sigma), jnp.maximum(sigma, rounding), self.sigma[order])
         sigma = jnp.where(sigma > 0, sigma, self.sigma[order])
         return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[order].set(sigma))
@@ -242,6 +272,18 @@ class ShootingProblem(eqx.Module):
     def step(self, state: State, forcing: Forcing, parameters) -> State:
         """The state one sample later, as far down the cascade as `state` goes."""
         return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
+
+    def window_of_samples(self) -> Int[np.ndarray, " samples"]:
+        """The window in which each sample lies."""
+        return np.nonzero(self._cut()[1])[0]
+
+    def _cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+        """The samples of each window, and which of them are its own: some are a sample shorter than others."""
+        samples = self.flight.states.shape[-2]
+        ends = np.arange(self.windows + 1) * samples // self.windows
+        index = ends[:-1, None] + np.arange(np.diff(ends).max())
+        within = index < ends[1:, None]
+        return np.where(within, index, ends[1:, None] - 1), within
 
     def _weights(self) -> tuple[Scalar, ...]:
         return tuple(1 / self.sigma[CASCADE_ORDER[: self.size]])

@@ -6,7 +6,7 @@ from helpers import noisy_states, standard_problem
 
 import jaxos4
 from jaxos4.dynamics import CHANNELS
-from jaxos4.information import invert, invert_marginal, marginal_factor
+from jaxos4.information import covariance_of_shared, covariances, inverse_transpose, invert, joint_factor
 
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
 known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
@@ -152,13 +152,44 @@ def test_a_marginal_is_the_inverses_corner():
     joint = random_information(11, 1e3)
     expected = np.linalg.inv(joint)[:8, :8]
     scale = np.sqrt(np.diagonal(expected))
-    covariance = invert_marginal(joint, 8)
+    covariance = covariance_of_shared(joint[None], 8)
     np.testing.assert_allclose(covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-10)
-    factor = np.asarray(marginal_factor(joint, 8))
+    factor = np.asarray(joint_factor(joint[None], 8))[0, :8, -8:]
     np.testing.assert_array_equal(factor, np.tril(factor))
     np.testing.assert_allclose(
         (factor @ factor.T) * np.outer(scale, scale) @ (expected / np.outer(scale, scale)), np.eye(8), atol=1e-9
     )
+
+
+def arrow(blocks, count):
+    """The information of all windows' unknowns at once: what is shared, then each window's own."""
+    windows, size, _ = blocks.shape
+    own = size - count
+    whole = np.zeros((count + windows * own,) * 2)
+    for w, block in enumerate(np.asarray(blocks)):
+        places = np.concatenate([np.arange(count), count + w * own + np.arange(own)])
+        whole[np.ix_(places, places)] += block
+    return whole
+
+
+@pytest.mark.parametrize("windows", [1, 2, 7])
+def test_block_elimination_is_the_inverse_of_the_whole(windows):
+    rng = np.random.default_rng(windows)
+    slopes = rng.normal(size=(windows, 40, 11)) * 10.0 ** rng.uniform(-6, 6, 11)
+    blocks = jnp.asarray(np.swapaxes(slopes, 1, 2) @ slopes)
+    whole = arrow(blocks, 8)
+    unit = np.sqrt(np.diagonal(whole))
+    inverse = np.linalg.inv(whole / np.outer(unit, unit)) / np.outer(unit, unit)
+    scale = np.sqrt(np.diagonal(inverse))
+    found = np.asarray(covariances(blocks, 8))
+    for w in range(windows):
+        places = np.concatenate([np.arange(8), 8 + 3 * w + np.arange(3)])
+        own = np.outer(scale[places], scale[places])
+        np.testing.assert_allclose(found[w] / own, inverse[np.ix_(places, places)] / own, atol=1e-9)
+    factor = np.asarray(joint_factor(blocks, 8))
+    basis = np.asarray(inverse_transpose(jnp.asarray(factor), 8))
+    identity = np.broadcast_to(np.eye(11), basis.shape)
+    np.testing.assert_allclose(np.swapaxes(basis, 1, 2) @ factor, identity, atol=1e-9)
 
 
 def test_a_flight_that_hovers_tells_nothing():

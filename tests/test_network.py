@@ -42,15 +42,18 @@ def trained(free=False, seed=0, **changes):
     return jaxos4.NetworkEstimator(**(SMALL | changes)).fit(problem, BRACKET, key=jax.random.key(seed))
 
 
-def flights(count, *, seed=0, noise=1.0, bracket=BRACKET):
-    """Parameters drawn over the bracket, and the noisy states of their flights."""
+def flights(count, *, seed=0, noise=1.0, bracket=BRACKET, start_width=(0.0, 0.0, 0.0)):
+    """Parameters drawn over the bracket, initial rates over +-`start_width`, and the noisy states of their flights."""
+    width = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(jnp.asarray(start_width))
 
     @jax.vmap
     def fly(i):
         alpha_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), i))
+        start = width * jax.random.uniform(jax.random.fold_in(alpha_key, 1), (12,), minval=-1, maxval=1)
         u = jax.random.uniform(alpha_key, (8,), minval=-1, maxval=1)
         alpha = bracket.center + u * bracket.half_width
-        truth = jaxos4.simulate(PUBLISHED(), alpha, standard_flight(duration=DURATION).omega, dt=DT)
+        omega = standard_flight(duration=DURATION).omega
+        truth = jaxos4.simulate(PUBLISHED(), alpha, omega, dt=DT, initial_state=start)
         return alpha, jaxos4.WhiteNoise(noise * jaxos4.SENSOR_SIGMA)(truth, key=noise_key).states
 
     return fly(jnp.arange(count))
@@ -320,10 +323,11 @@ def test_an_invalid_bracket_is_a_result():
 
 def test_a_free_initial_state_is_estimated_too():
     network = trained(free=True)
-    alpha, states = flights(500, seed=17)
+    # Its intervals are calibrated over all the starts that it was trained for, and hold more often at their middle.
+    alpha, states = flights(500, seed=17, start_width=network.features.coordinates.width[8:])
     estimates = identify(network, states, free=True)
     assert estimates.initial_state.shape == (500, 3)
-    assert np.abs(estimates.initial_state).max() < 0.05
+    assert np.abs(estimates.initial_state).max() < 0.5  # +-0.3 rad/s, 30 standard deviations
     covered = np.mean(np.abs(estimates.parameters - alpha) < estimates.half_width(0.9), axis=0)
     assert np.abs(covered - 0.9).max() < 4.5 * np.sqrt(0.09 * (1 / 500 + 1 / 4000)) + 0.01
 

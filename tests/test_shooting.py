@@ -17,7 +17,7 @@ THETA = jaxos4.STATE_NAMES.index("theta")
 
 # Compiled once for each kind of problem, as `cost` and `residuals` are by themselves.
 slope_of = eqx.filter_jit(lambda problem, *args: jax.jacfwd(problem.cost)(*args))
-curvature_of = eqx.filter_jit(lambda problem, *args: problem.curvature(problem.rows(), *args))
+curvature_of = eqx.filter_jit(lambda problem, *args: jax.tree.map(lambda x: x[0], problem.curvatures(*args)))
 
 
 def measured(model_class=jaxos4.PublishedOS4):
@@ -166,7 +166,7 @@ def all_derivatives(problem, parameters, start):
         return problem.cost(u[:8], u[8:])
 
     u = jnp.concatenate([parameters, start])
-    return jax.value_and_grad(cost)(u), jax.jacfwd(cost)(u), problem.curvature(problem.rows(), parameters, start)
+    return jax.value_and_grad(cost)(u), jax.jacfwd(cost)(u), curvature_of(problem, parameters, start)
 
 
 @eqx.filter_jit
@@ -254,7 +254,7 @@ def test_a_shot_over_the_top_is_compared_up_to_there():
     start = jnp.zeros(6).at[4].set(1.4)
 
     def shot(parameters):
-        return problem.shot(problem.rows(), parameters, start)
+        return problem.shots(parameters, start)
 
     steep = off().at[5].set(1000.0)
     (cost, sound), (slope, _) = jax.jvp(lambda a: shot(a), (steep,), (jnp.zeros(8).at[5].set(1.0),))

@@ -5,6 +5,7 @@ from ._estimate import (
     AbstractEstimator as AbstractEstimator,
     Calibration as Calibration,
     Estimate as Estimate,
+    fit_start as fit_start,
 )
 from .equation_error import EquationError as EquationError
 from .hybrid import Hybrid as Hybrid

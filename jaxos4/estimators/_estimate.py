@@ -41,7 +41,8 @@ class Estimate(eqx.Module):
     - `parameters`: the estimate; where `result` says that there is none, the bracket's center, or 0 without one.
     - `covariance`: of `parameters`. Shooting takes it from the Fisher information at the estimate and the problem's
       `sigma`, a network from its errors on simulated flights.
-    - `initial_state`: the estimated, or known, state at the first sample, in cascade order.
+    - `initial_state`: the estimated, or known, state at the first sample, in cascade order; of several windows, one
+      after the other.
     - `cost`: 1/2 |W (y - x)|^2 there, of the channels that the estimator looks at; infinite without an estimate.
     - `rollouts`: simulated flights that it took, whatever their channels: one for a shot with its slope, one for each
       unknown of a Fisher information.
@@ -54,7 +55,7 @@ class Estimate(eqx.Module):
 
     parameters: Parameters
     covariance: Float[Array, "parameters parameters"]
-    initial_state: Float[Array, " size"]
+    initial_state: Float[Array, " starts"]
     cost: Scalar
     rollouts: Int[Array, ""]
     sweeps: Int[Array, ""]
@@ -103,7 +104,7 @@ def conclude(
     *,
     parameters: Parameters,
     covariance: Float[Array, "parameters parameters"],
-    initial_state: Float[Array, " size"],
+    initial_state: Float[Array, " starts"],
     cost: Scalar,
     rollouts: Int[Array, ""] | int,
     sweeps: Int[Array, ""] | int,
@@ -147,19 +148,26 @@ def conclude(
 
 def fit_start(
     problem: ShootingProblem, parameters: Parameters
-) -> tuple[Float[Array, " size"], Scalar, Bool[Array, ""], int]:
+) -> tuple[Float[Array, " starts"], Scalar, Bool[Array, ""], int]:
     """The initial state that explains the flight best with these parameters, for algorithms that do not look for one.
 
     Two Gauss-Newton steps from the first measurements where it is free. Returns it with the cost there, whether the
     trajectory is sound, and how many rollouts it took.
     """
-    rows, (start, _) = problem.rows(), problem.first_state()
+    start, _ = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
     for _ in range(_START_STEPS if free else 0):
-        _, gradient, information = problem.curvature(rows, parameters, start)
-        start = start - (invert(information[count:, count:]) * gradient[count:]).sum(axis=-1)
-    cost, sound = problem.shot(rows, parameters, start)
+        _, gradient, information = problem.curvatures(parameters, start)
+        own = jax.vmap(invert)(information[:, count:, count:])
+        start = start - (own * gradient[:, None, count:]).sum(axis=-1).ravel()
+    cost, sound = problem.shots(parameters, start)
     return start, cost, sound, 1 + (_START_STEPS * (count + free) if free else 0)
+
+
+def check_one_window(problem: ShootingProblem) -> None:
+    """Raises `ValueError` for a flight that is cut into windows, where an algorithm walks through it as a whole."""
+    if problem.windows > 1:
+        raise ValueError(f"`problem.windows` must be 1 for this estimator, got {problem.windows}: it shoots none.")
 
 
 def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:

@@ -20,6 +20,7 @@ from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, Rates
 from ..information import invert
 from ..shooting import ShootingProblem
+from ._estimate import check_one_window
 
 # The standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It decides
 # what a flight says nothing about, and nothing else.
@@ -125,10 +126,11 @@ def regression(
             "regression needs a model whose rate equations are linear in its parameters: identify alpha_1..8, then "
             "`fit_inertia`, or shoot."
         )
+    check_one_window(problem)
     rates = problem.restrict("rates")
     anchored = problem.initial_state is not None
     anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
-    measured = jnp.stack(rates.rows().measured, axis=-1)
+    measured = rates.measured()
     decay = jnp.asarray(forgetting, dtype=float)
     return Regression(problem, bracket, measured, anchor, anchored, memory, decay, bridge)
 

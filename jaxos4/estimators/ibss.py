@@ -5,6 +5,10 @@ flight at trial unknowns and returns the slope of the cost along a direction, by
 of the slope tells which half of the bracket holds the minimum. A *sweep* bisects along every direction once, each in a
 bracket around the point where the cost's quadratic model has its minimum; the bracket is as wide as the last sweep's
 predictions were off, and grows where a search ended at its end.
+
+Of a flight cut into windows, each has its initial state: directions of the parameters are bisected on the sum of the
+windows' slopes, those of the initial states in all windows at once, each on its own slope. Unknowns are held window by
+window, a row each, the same parameters in all of them.
 """
 
 from collections.abc import Callable
@@ -19,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Parameters, Scalar, as_float
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS
-from ..information import cholesky, invert, invert_factor, invert_marginal
+from ..information import covariance_of_shared, covariances, inverse_transpose, joint_factor
 from ..results import RESULTS
 from ..shooting import ROUNDING, Curvature, Rows, ShootingProblem, Shot
 from ._estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
@@ -52,23 +56,23 @@ class _Quadratic(NamedTuple):
     """
 
     curvature: Curvature
-    factor: Float[Array, "unknowns unknowns"]
-    basis: Float[Array, "unknowns unknowns"]
+    factor: Float[Array, "windows unknowns unknowns"]
+    basis: Float[Array, "windows unknowns unknowns"]
     ahead: Scalar
 
 
 class _Search(NamedTuple):
-    unknowns: Float[Array, " unknowns"]
+    unknowns: Float[Array, "windows unknowns"]
     quadratic: _Quadratic
     off: Scalar
-    growth: Float[Array, " unknowns"]
+    growth: Float[Array, "windows unknowns"]
     sweeps: Int[Array, ""]
     done: Bool[Array, ""]
 
 
 class _Progress(NamedTuple):
-    unknowns: Float[Array, " unknowns"]
-    spread: Float[Array, "unknowns unknowns"]
+    unknowns: Float[Array, "windows unknowns"]
+    spread: Float[Array, "windows unknowns unknowns"]
     sweeps: Int[Array, ""]
     rollouts: Int[Array, ""]
     done: Bool[Array, ""]
@@ -147,7 +151,7 @@ class IBSS(AbstractEstimator):
         near = self._finish(problem, bracket, *self._from_seed(problem, trusted, seed))
         half_width = seed.half_width(0.999, simultaneous=True)
         far = jnp.abs(near.parameters - seed.parameters) > _MISSED * half_width
-        measurements = _measurements(problem.rows())
+        measurements = jnp.sum(~jnp.isnan(problem.measured()))
         explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
         told = jnp.isfinite(seed.covariance).all()
         # What the flight does not tell near the seed, it does not tell elsewhere.
@@ -180,8 +184,8 @@ class IBSS(AbstractEstimator):
         """Against all channels at once, from a seed; a lane whose seed says nothing is left where it is."""
         progress = self._begin(problem, bracket, seed.parameters, asleep=~jnp.isfinite(seed.covariance).all())
         count = seed.parameters.shape[0]
-        spread = progress.spread.at[:count, :count].set(
-            jnp.where(progress.done, progress.spread[:count, :count], seed.covariance)
+        spread = progress.spread.at[:, :count, :count].set(
+            jnp.where(progress.done, progress.spread[:, :count, :count], seed.covariance)
         )
         return self._search(problem, problem.rows(), progress._replace(spread=spread), bracket, last=jnp.asarray(True))
 
@@ -213,8 +217,8 @@ class IBSS(AbstractEstimator):
         self, problem: ShootingProblem, bracket: Bracket, parameters: Parameters, *, asleep: Bool[Array, ""]
     ) -> _Progress:
         lower, upper = self._limits(problem, bracket)
-        unknowns = jnp.concatenate([parameters, problem.first_state()[0][: problem.free_size]])
-        spread = jnp.diag(jnp.square(_prior(problem, bracket)))
+        unknowns = _joined(problem, parameters, problem.first_state()[0])
+        spread = jax.vmap(jnp.diag)(jnp.square(_prior(problem, bracket)))
         none = jnp.zeros((), dtype=int)
         return _Progress(jnp.clip(unknowns, lower, upper), spread, none, none, asleep)
 
@@ -234,19 +238,16 @@ class IBSS(AbstractEstimator):
     ) -> Estimate:
         """The estimate, and how it ended."""
         count = bracket.lower.shape[0]
-        parameters, initial_state = progress.unknowns[:count], problem.first_state()[0]
-        if problem.free_size:
-            initial_state = progress.unknowns[count:]
-        (cost, trusted), _, information = curvature
+        initial_state = progress.unknowns[:, count:].ravel() if problem.free_size else problem.first_state()[0]
         return conclude(
             bracket,
-            parameters=parameters,
-            covariance=invert_marginal(information, count),
+            parameters=progress.unknowns[0, :count],
+            covariance=covariance_of_shared(curvature.information, count),
             initial_state=initial_state,
-            cost=cost,
+            cost=curvature.shot.cost.sum(),
             rollouts=progress.rollouts,
             sweeps=progress.sweeps,
-            sound=trusted,
+            sound=curvature.shot.sound.all(),
             done=progress.done,
             reach=self.reach,
         )
@@ -271,107 +272,128 @@ class IBSS(AbstractEstimator):
         """
         count = bracket.lower.shape[0]
         size = count + problem.free_size
-        first_state = problem.first_state()[0]
+        own = size - count
+        starts = problem.split(problem.first_state()[0])
         limits, finest = self._limits(problem, bracket), _finest(problem, rows)
-        regular = jnp.diag(1 / jnp.square(_prior(problem, bracket)))
-        spread = progress.spread[:size, :size]
+        prior = 1 / jnp.square(_prior(problem, bracket))
+        # What is known of the parameters without the flight counts once, not once a window.
+        regular = jax.vmap(jnp.diag)(prior.at[:, :count].divide(problem.windows))
+        spread = progress.spread[:, :size, :size]
+        is_shared = jnp.arange(size) >= own
 
-        def split(u):
-            return u[:count], u[count:] if problem.free_size else first_state
+        def gathered(shared: Bool[Array, ""], slopes: Float[Array, " windows"]) -> Float[Array, " windows"]:
+            """A slope along a direction that all windows share is the sum of theirs."""
+            return jnp.where(shared, slopes.sum(), slopes)
 
-        def slope(u, direction) -> Callable[[Scalar], Scalar]:
-            def at(step: Scalar) -> Scalar:
-                def cost(s: Scalar) -> Scalar:
-                    return problem.shot(rows, *split(u + s * direction)).cost
+        def fly(function, u):
+            return jax.vmap(function)(rows, u[:, :count], u[:, count:] if problem.free_size else starts)
 
-                _, value = jax.jvp(cost, (step,), (jnp.ones_like(step),))
+        def slope(u, direction, shared) -> Callable[[Float[Array, " windows"]], Float[Array, " windows"]]:
+            def at(step: Float[Array, " windows"]) -> Float[Array, " windows"]:
+                def cost(s: Float[Array, " windows"]) -> Float[Array, " windows"]:
+                    return fly(problem.shot, u + s[:, None] * direction).cost
+
+                value = gathered(shared, jax.jvp(cost, (step,), (jnp.ones_like(step),))[1])
                 return jnp.where(jnp.isfinite(value), value, step)  # a failing shot points back to where it came from
 
             return at
 
         def look(u) -> _Quadratic:
-            curvature = problem.curvature(rows, *split(u))
+            curvature = fly(problem.curvature, u)
             factor, basis = self._directions(curvature.information + regular, count)
-            return _Quadratic(curvature, factor, basis, jnp.abs(basis.T @ curvature.gradient).max())
+            slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
+            ahead = jnp.maximum(jnp.abs(slopes[:, own:].sum(axis=0)).max(), jnp.abs(slopes[:, :own]).max(initial=0.0))
+            return _Quadratic(curvature, factor, basis, ahead)
 
         def sweep(search: _Search) -> _Search:
             here, at_first = search.quadratic, search.sweeps == 0
             information = here.curvature.information + regular
-            opening = _OPENING * jnp.sqrt(jnp.diagonal(here.factor.T @ spread @ here.factor))
+            opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", here.factor, spread, here.factor))
             later = jnp.maximum(search.off * here.ahead, finest) * search.growth
             half_width = jnp.where(at_first, _FIRST * opening, later)
             leash = jnp.where(at_first, opening, jnp.inf)
 
-            def along(u, column) -> tuple[Float[Array, " unknowns"], tuple[Scalar, Scalar, Bool[Array, ""]]]:
-                direction, half_width, leash = column
+            def along(u, column):
+                direction, half_width, leash, shared = column
                 below, above = (jnp.minimum(room, leash) for room in _room(u, direction, limits))
-                predicted = -direction @ (here.curvature.gradient + information @ (u - search.unknowns))
+                ahead = here.curvature.gradient + jnp.einsum("wuv,wv->wu", information, u - search.unknowns)
+                predicted = gathered(shared, -(direction * ahead).sum(axis=-1))
                 predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
                 lower, upper = jnp.maximum(predicted - half_width, -below), jnp.minimum(predicted + half_width, above)
-                step, at_lower, at_upper = _bisect(slope(u, direction), lower, upper, self.halvings)
+                step, at_lower, at_upper = _bisect(slope(u, direction, shared), lower, upper, self.halvings)
                 at_end = (at_lower & (lower > -below)) | (at_upper & (upper < above))
-                return u + step * direction, (step, step - predicted, at_end)
+                return u + step[:, None] * direction, (step, step - predicted, at_end)
 
-            moved, (steps, errors, at_end) = jax.lax.scan(along, search.unknowns, (here.basis.T, half_width, leash))
+            columns = (jnp.moveaxis(here.basis, -1, 0), half_width.T, leash.T, is_shared)
+            moved, (steps, errors, at_end) = jax.lax.scan(along, search.unknowns, columns)
             off = _SAFETY * jnp.abs(errors).max() / jnp.maximum(jnp.abs(steps).max(), finest)
-            sound = jnp.isfinite(here.curvature.shot.cost) & jnp.isfinite(moved).all()
+            sound = jnp.isfinite(here.curvature.shot.cost).all() & jnp.isfinite(moved).all()
             moved = jnp.where(sound, moved, search.unknowns)
             there = look(moved)
             cost, trusted = there.curvature.shot
             there = there._replace(curvature=there.curvature._replace(shot=Shot(cost, trusted & sound)))
-            misfit = _misfit(cost, rows)
+            misfit = _misfit(cost.sum(), rows)
             coarse = _COARSE * jnp.maximum(misfit, 1.0)
             enough = jnp.where(last, jnp.maximum(self.tolerance * misfit, finest), coarse)
             return _Search(
                 unknowns=moved,
                 quadratic=there,
                 off=jnp.clip(off, _LEAST, 1.0),
-                growth=jnp.where(at_end, _GROWTH * search.growth, 1.0),
+                growth=jnp.where(at_end.T, _GROWTH * search.growth, 1.0),
                 sweeps=search.sweeps + 1,
                 done=~sound | (there.ahead <= enough),
             )
 
-        begin = progress.unknowns[:size]
+        begin = progress.unknowns[:, :size]
         none, one = jnp.zeros((), dtype=int), jnp.ones((), dtype=float)
         search = _Search(begin, look(begin), one, jnp.ones_like(begin), none, progress.done)
         search = jax.lax.while_loop(lambda s: ~s.done & (s.sweeps < self.max_sweeps), sweep, search)
         curvature = search.quadratic.curvature
-        misfit = jnp.maximum(_misfit(curvature.shot.cost, rows), 1.0)
-        covariance = jnp.square(misfit) * invert(curvature.information + regular)
+        misfit = jnp.maximum(_misfit(curvature.shot.cost.sum(), rows), 1.0)
+        covariance = jnp.square(misfit) * covariances(curvature.information + regular, count)
         rollouts = jnp.where(progress.done, 0, size * (1 + search.sweeps * (self.halvings + 1)))
         return _Progress(
-            progress.unknowns.at[:size].set(search.unknowns),
-            progress.spread.at[:size, :size].set(covariance),
+            progress.unknowns.at[:, :size].set(search.unknowns),
+            progress.spread.at[:, :size, :size].set(covariance),
             progress.sweeps + search.sweeps,
             progress.rollouts + rollouts,
             search.done,
         ), curvature
 
     def _directions(
-        self, information: Float[Array, "n n"], count: int
-    ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-        """A factor A of the information A A^T, and A^-T, whose columns are the search directions.
+        self, information: Float[Array, "windows n n"], count: int
+    ) -> tuple[Float[Array, "windows n n"], Float[Array, "windows n n"]]:
+        """A factor A of the information A A^T, and A^-T: the search directions, the initial state's first.
 
         The initial state comes first in the Cholesky factorisation, so that a step along a parameter takes the initial
-        state along to where it fits best.
+        states along to where they fit best.
         """
         if self.directions == "coordinate":
-            scale = jnp.sqrt(jnp.diagonal(information))
-            return jnp.diag(scale), jnp.diag(1 / scale)
-        order = jnp.roll(jnp.arange(information.shape[0]), -count)
-        back = jnp.argsort(order)
-        factor = cholesky(information[jnp.ix_(order, order)])
-        return factor[back], invert_factor(factor).T[back]
+            size = information.shape[-1]
+            diagonal = jax.vmap(jnp.diagonal)(information)
+            scale = jnp.sqrt(diagonal.at[:, :count].set(diagonal[:, :count].sum(axis=0)))
+            columns = jnp.eye(size)[:, jnp.roll(jnp.arange(size), -count)]
+            return scale[:, :, None] * columns, columns / scale[:, :, None]
+        factor = joint_factor(information, count)
+        return factor, inverse_transpose(factor, count)
 
 
-def _prior(problem: ShootingProblem, bracket: Bracket) -> Float[Array, " unknowns"]:
+def _joined(
+    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"]
+) -> Float[Array, "windows unknowns"]:
+    """The unknowns of each window: the parameters, and its initial state where that is free."""
+    shared = jnp.broadcast_to(parameters, (problem.windows, parameters.shape[0]))
+    return jnp.concatenate([shared, problem.split(initial_state)[:, : problem.free_size]], axis=1)
+
+
+def _prior(problem: ShootingProblem, bracket: Bracket) -> Float[Array, "windows unknowns"]:
     """Standard deviation of each unknown without the flight: half of how far off it may be."""
-    return jnp.concatenate([bracket.half_width, problem.first_state()[1][: problem.free_size]]) / 2
+    return _joined(problem, bracket.half_width, problem.first_state()[1]) / 2
 
 
 def _until(share: Scalar, rows: Rows) -> Rows:
-    """The rows with nothing measured after a share of the flight."""
-    samples = rows.measured[0].size
+    """The rows with nothing measured after a share of each window."""
+    samples = rows.measured[0].shape[-1]
     within = jnp.arange(samples) < jnp.ceil(share * samples)
     return Rows(rows.forcing, tuple(jnp.where(within, y, jnp.nan) for y in rows.measured))
 
@@ -394,23 +416,28 @@ def _measurements(rows: Rows) -> Int[Array, ""]:
 
 
 def _room(
-    u: Float[Array, " n"], direction: Float[Array, " n"], limits: tuple[Float[Array, " n"], Float[Array, " n"]]
-) -> tuple[Scalar, Scalar]:
-    """How far one can go from `u` against and along `direction` within `limits`."""
+    u: Float[Array, "windows n"],
+    direction: Float[Array, "windows n"],
+    limits: tuple[Float[Array, " n"], Float[Array, " n"]],
+) -> tuple[Float[Array, " windows"], Float[Array, " windows"]]:
+    """How far one can go in each window from `u` against and along `direction` within `limits`."""
     to_lower, to_upper = ((limit - u) / jnp.where(direction == 0, 1.0, direction) for limit in limits)
     ahead = jnp.where(direction > 0, to_upper, to_lower)
     behind = jnp.where(direction > 0, to_lower, to_upper)
-    above = jnp.where(direction == 0, jnp.inf, ahead).min()
-    below = jnp.where(direction == 0, jnp.inf, -behind).min()
+    above = jnp.where(direction == 0, jnp.inf, ahead).min(axis=-1)
+    below = jnp.where(direction == 0, jnp.inf, -behind).min(axis=-1)
     return jnp.maximum(below, 0.0), jnp.maximum(above, 0.0)
 
 
 def _bisect(
-    slope: Callable[[Scalar], Scalar], lower: Scalar, upper: Scalar, halvings: int
-) -> tuple[Scalar, Bool[Array, ""], Bool[Array, ""]]:
-    """The middle of the bracket after `halvings`, and whether the search ended at its lower or its upper end."""
+    slope: Callable[[Float[Array, " windows"]], Float[Array, " windows"]],
+    lower: Float[Array, " windows"],
+    upper: Float[Array, " windows"],
+    halvings: int,
+) -> tuple[Float[Array, " windows"], Bool[Array, " windows"], Bool[Array, " windows"]]:
+    """The middle of each bracket after `halvings`, and whether its search ended at its lower or its upper end."""
 
-    def halve(ends: tuple[Scalar, Scalar], _) -> tuple[tuple[Scalar, Scalar], None]:
+    def halve(ends, _):
         low, high = ends
         middle = (low + high) / 2
         value = slope(middle)

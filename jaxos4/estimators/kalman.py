@@ -16,7 +16,7 @@ from .._custom_types import Parameters, Scalar
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
-from ._estimate import WITH_PRIOR, AbstractEstimator, Estimate, check_bracket, conclude
+from ._estimate import WITH_PRIOR, AbstractEstimator, Estimate, check_bracket, check_one_window, conclude
 
 # The passes end once none moves a parameter by more than this many standard deviations.
 _SETTLED = 0.1
@@ -81,10 +81,12 @@ class JointEKF(AbstractEstimator):
         - `problem`: what is filtered; NaN is not measured.
         - `bracket`: the prior of the parameters.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a flight that
+        is cut into windows.
         """
         check_bracket(problem, bracket)
-        rows, prior = problem.rows(), bracket.usable
+        check_one_window(problem)
+        rows, prior = jax.tree.map(lambda leaf: leaf[0], problem.rows()), bracket.usable
         count, size = prior.center.shape[0], problem.size
         start = problem.first_state()[0]
 
@@ -103,7 +105,7 @@ class JointEKF(AbstractEstimator):
         first = _Filtered(*_run(problem, rows, prior, None), once, jnp.asarray(self.passes == 1))
         last = jax.lax.while_loop(lambda f: ~f.done & (f.passes < self.passes), again, first)
         parameters, initial_state = split(last.joint)
-        cost, sound = problem.shot(rows, parameters, initial_state)
+        cost, sound = problem.shots(parameters, initial_state)
         factor = last.root[size : size + count]
         return conclude(
             bracket,

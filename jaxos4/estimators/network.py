@@ -20,7 +20,7 @@ from ..dynamics import CASCADE_ORDER, CHANNELS
 from ..errors import TrainingError
 from ..features import FEATURES, AbstractFeatures, Coordinates
 from ..flight import STATE_NAMES
-from ..information import invert
+from ..information import covariances
 from ..results import RESULTS
 from ..shooting import ShootingProblem
 from ..training import Pair, draw_many, train
@@ -222,6 +222,8 @@ class TrainedNetwork(AbstractEstimator):
             return f"it was trained with the method {own.method!r}, not {problem.method!r}"
         if problem.flight.omega.shape != own.flight.omega.shape:
             return f"it was trained for {own.flight.omega.shape[0]} samples, not {problem.flight.omega.shape[0]}"
+        if problem.windows != own.windows:
+            return f"it was trained for {own.windows} windows, not {problem.windows}"
         if (problem.initial_state is None) != (own.initial_state is None):
             return "it was trained for an initial state that is " + ("free" if own.initial_state is None else "known")
         looked_at = CASCADE_ORDER[: own.size]
@@ -264,7 +266,7 @@ class TrainedNetwork(AbstractEstimator):
         rms, correlation, factors, simultaneous = _at_scale(self.errors, within)
         std = jnp.exp(answer.log_spread[:count]) * self.scaling.bound(within)[:count] * rms * seen.inflation
         deviations = std * coordinates.width[:count]
-        shot = problem.shot(problem.rows(), parameters, initial_state)
+        shot = problem.shots(parameters, initial_state)
         outside = jnp.abs(answer.u[:count]) > 1 + factors[-1] * std
         vague = std > _VAGUE
 
@@ -306,7 +308,7 @@ class TrainedNetwork(AbstractEstimator):
         theirs, ours = (jax.tree.leaves(p.model.airframe) for p in (problem, own))
         airframe = [differ(a, b, _SAME * jnp.abs(b).max()) for a, b in zip(theirs, ours, strict=True)]
         width = self.features.coordinates.width[len(own.model.parameter_names) :]
-        first_state, theirs_off = (x[:size] for x in problem.first_state())
+        first_state, theirs_off = (problem.split(x)[:, :size].ravel() for x in problem.first_state())
         start = first_state - self.features.coordinates.first_state
         off = 1.5 * width + theirs_off if width.size else _SAME * (1 + jnp.abs(self.features.coordinates.first_state))
         return {
@@ -327,8 +329,9 @@ def untrained(settings: NetworkEstimator, problem: ShootingProblem, bracket: Bra
     first_key, sample_key = jax.random.split(key)
 
     start = coordinates.split(jnp.zeros_like(coordinates.center), count)
-    information = problem.curvature(problem.rows(), *start).information
-    unit = jnp.sqrt(jnp.diagonal(invert(information))) / coordinates.width
+    # Of each window, the parameters' first: as the unknowns are ordered, every window after the other.
+    std = jnp.sqrt(jax.vmap(jnp.diagonal)(covariances(problem.curvatures(*start).information, count)))
+    unit = jnp.concatenate([std[0, :count], std[:, count:].ravel()]) / coordinates.width
 
     samples = draw_many(features, scales, max(_CHUNK, _PER_FEATURE * features.size), key=sample_key)
     flown = jnp.isfinite(samples.features).all(axis=1)

@@ -24,7 +24,7 @@ from ..flight import Flight
 from ..shooting import ShootingProblem
 from .network import NetworkEstimator, TrainedNetwork, untrained
 
-_FORMAT = 1
+_FORMAT = 2
 _LARGEST = 2**30
 # What a file that was cut, altered or never was one makes its readers raise.
 _BROKEN = (
@@ -58,6 +58,7 @@ def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
         "settings": dataclasses.asdict(network.settings),
         "model": kinds[type(problem.model)],
         "method": problem.method,
+        "windows": problem.windows,
         "checks": network.history.shape[0],
     }
     airframe = problem.model.airframe
@@ -114,6 +115,7 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
         initial_state=arrays.get("initial_state"),
         channels=settings.channels,
         method=header["method"],
+        windows=header["windows"],
     )
     blank = eqx.filter_eval_shape(untrained, settings, problem, Bracket.default(problem.model), jax.random.key(0))
     blank = eqx.tree_at(lambda n: n.features.problem, blank, problem)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ..bracket import Bracket
 from ..dynamics import CHANNELS
-from ..information import cholesky, invert_factor, invert_marginal
+from ..information import cholesky, covariance_of_shared, invert_factor
 from ..shooting import ShootingProblem
 from ._estimate import AbstractEstimator, Estimate, check_bracket, conclude
 
@@ -53,33 +53,33 @@ class OutputError(AbstractEstimator):
         """
         check_bracket(problem, bracket)
         usable, count = bracket.usable, len(problem.model.parameter_names)
-        first_state, off = problem.first_state()
-        scale = jnp.concatenate([usable.half_width, off[: problem.free_size]])
-        unknowns = jnp.concatenate([usable.center, first_state[: problem.free_size]])
+        starts, off = (problem.split(x) for x in problem.first_state())
+        parameters = usable.center
         steps = rollouts = jnp.zeros((), dtype=int)
         done = jnp.ones((), dtype=bool)
         for channels, size in CHANNELS.items():
             if size > problem.size:
                 continue
             stage = problem.restrict(channels)
-            within = count + stage.free_size
-            solution = self._minimise(stage, unknowns[:within], scale[:within])
-            unknowns = unknowns.at[:within].set(solution.value * scale[:within])
+            free = stage.free_size
+            scale = jnp.concatenate([usable.half_width, off[:, :free].ravel()])
+            solution = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free].ravel()]), scale)
+            found = solution.value * scale
+            parameters, starts = found[:count], starts.at[:, :free].set(found[count:].reshape(problem.windows, free))
             taken = solution.stats["num_steps"]
-            steps, rollouts = steps + taken, rollouts + taken * (1 + within)
+            steps, rollouts = steps + taken, rollouts + taken * (1 + count + free)
             done = solution.result == optx.RESULTS.successful
-        parameters = unknowns[:count]
-        initial_state = unknowns[count:] if problem.free_size else first_state
-        (cost, sound), _, information = problem.curvature(problem.rows(), parameters, initial_state)
+        initial_state = starts.ravel()
+        shots, _, information = problem.curvatures(parameters, initial_state)
         return conclude(
             bracket,
             parameters=parameters,
-            covariance=invert_marginal(information, count),
+            covariance=covariance_of_shared(information, count),
             initial_state=initial_state,
-            cost=cost,
-            rollouts=rollouts + unknowns.shape[0],
+            cost=shots.cost.sum(),
+            rollouts=rollouts + count + problem.free_size,
             sweeps=steps,
-            sound=sound,
+            sound=shots.sound.all(),
             done=done,
         )
 

@@ -24,7 +24,16 @@ from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, stack, unstack
 from ..information import invert
 from ..shooting import Rows, ShootingProblem
-from ._estimate import REACH, WITH_PRIOR, AbstractEstimator, Estimate, check_bracket, conclude, fit_start
+from ._estimate import (
+    REACH,
+    WITH_PRIOR,
+    AbstractEstimator,
+    Estimate,
+    check_bracket,
+    check_one_window,
+    conclude,
+    fit_start,
+)
 
 # The share of the last pass over which the parameters are averaged.
 _AVERAGED = 0.5
@@ -117,11 +126,13 @@ class SVSF(AbstractEstimator):
         - `problem`: what is filtered: its rates, whatever its channels; NaN is not measured.
         - `bracket`: where the filter begins, and the units of its settings.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters.
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a flight that
+        is cut into windows.
         """
         check_bracket(problem, bracket)
+        check_one_window(problem)
         box, rates = bracket.usable, problem.restrict("rates")
-        rows, start = rates.rows(), rates.first_state()
+        rows, start = jax.tree.map(lambda leaf: leaf[0], rates.rows()), rates.first_state()
         count, samples = box.center.shape[0], rows.measured[0].shape[0]
         averaged = jnp.arange(samples) >= (1 - _AVERAGED) * samples
         shares = averaged / averaged.sum()
