@@ -16,6 +16,7 @@ from .airframe import (
     plus_layout as plus_layout,
 )
 from .bracket import Bracket as Bracket
+from .diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
 from .dynamics import (
     DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH,
     AbstractModel as AbstractModel,

@@ -11,6 +11,9 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS") or "cpu")
+# Compiled programs are shared by the workers and with later runs.
+jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).resolve().parents[1] / ".pytest_cache/jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 # Before the first import of jaxos4: every annotated function and module in it is checked from here on.
 jaxtyping.install_import_hook("jaxos4", "typechecker.check")

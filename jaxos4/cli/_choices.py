@@ -1,6 +1,10 @@
-"""What the options choose from."""
+"""What the options choose from, and the options that commands share."""
 
 from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from ..dynamics import CHANNELS, MODELS
 from ..estimators import APPROXIMATORS, BASELINES
@@ -16,3 +20,17 @@ InitialState = StrEnum("InitialState", ["free", "known"])
 Estimator = StrEnum("Estimator", list(("ibss", "network", "hybrid", *BASELINES)))
 Features = StrEnum("Features", list(FEATURES))
 Approximator = StrEnum("Approximator", list(APPROXIMATORS))
+
+FlightFile = Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
+ModelOption = Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")]
+AirframeOption = Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")]
+BracketOption = Annotated[Path | None, typer.Option(help="TOML file: alpha1 = \\[lower, upper], ...")]
+ChannelsOption = Annotated[Channels | None, typer.Option(help="What to compare; all that was measured without it.")]
+InitialStateOption = Annotated[
+    InitialState, typer.Option(help="free: estimated too; known: the first sample is exact.")
+]
+WindowOption = Annotated[
+    float | None,
+    typer.Option(metavar="SECONDS", help="Multiple shooting: windows of this length, each from a state of its own."),
+]
+OutOption = Annotated[Path | None, typer.Option(help="A JSON file to write.")]

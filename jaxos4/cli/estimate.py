@@ -8,19 +8,15 @@ from typing import Annotated, Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-import rich.box
 import typer
 from jaxtyping import Array, Float
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from .._files import write_atomically
-from ..airframe import load_airframe
 from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
+from ..diagnostics import Diagnostics, residual_diagnostics
+from ..dynamics import CASCADE_ORDER, PARAMETER_NAMES, AbstractModel
 from ..errors import InputError
 from ..estimators import (
     BASELINES,
@@ -31,79 +27,91 @@ from ..estimators import (
     Hybrid,
     NetworkEstimator,
     TrainedNetwork,
+    fit_start,
     load_network,
 )
-from ..flight import STATE_NAMES, STATE_UNITS, Flight
+from ..flight import STATE_NAMES, STATE_UNITS
 from ..identifiability import Identifiability, identifiability
-from ..information import cramer_rao_bound
+from ..inertia import fit_inertia
+from ..information import robust_covariance
 from ..logs import read_flight_and_notes
-from ..noise import SENSOR_SIGMA
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem
-from ._bracket_file import load_bracket
 from ._check_output import check_output
-from ._choices import Channels, Estimator, InitialState, Model
+from ._choices import (
+    AirframeOption,
+    BracketOption,
+    ChannelsOption,
+    Estimator,
+    FlightFile,
+    InitialState,
+    InitialStateOption,
+    Model,
+    ModelOption,
+    OutOption,
+    WindowOption,
+)
+from ._fitting import NO_ANSWER, fit, fit_network, load_job, problem_of, seen_channels
+from ._page import COLOURED, print_page
 
 # How long a network is trained that only has to say where to look.
 SEED_STEPS = 2000
-# The noise levels are not known: they are estimated from the residuals, and where one turns out to be off by more than
-# this share, the fit is repeated with them. Weights within it cost less than one percent of the efficiency.
-OFF = 0.2
-PASSES = 4
-# Residuals whose neighbours correlate by more than this are not noise.
-COLOURED = 0.3
-# Residuals below this share of a channel's largest value are rounding, whatever their correlation.
-ROUNDING = 1e-9
 # Baselines that look at the body rates, whatever else was measured.
 RATES_ONLY = ("equation-error", "rls", "svsf")
 # Those that begin with the bracket as what is known, and mix it with what the flight tells.
 FILTERS = ("svsf", "kalman")
 # Estimators that fit by shooting, and reach the bound: theirs is the covariance that the noise found implies.
 SHOOTING = ("ibss", "hybrid", "output-error")
-NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
+# How far apart correlations of residuals are looked at, in samples.
+LAGS = 25
 
 
 def estimate(
-    flight: Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")],
+    flight: FlightFile,
     estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
-    model: Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")] = Model["published"],
-    airframe: Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")] = "os4",
-    bracket: Annotated[Path | None, typer.Option(help="TOML file: alpha1 = \\[lower, upper], ...")] = None,
-    channels: Annotated[
-        Channels | None, typer.Option(help="What to compare; all that was measured by default.")
-    ] = None,
-    initial_state: Annotated[
-        InitialState, typer.Option(help="free: estimated too; known: the first sample is exact.")
-    ] = InitialState["free"],
+    model: ModelOption = Model["published"],
+    airframe: AirframeOption = "os4",
+    bracket: BracketOption = None,
+    channels: ChannelsOption = None,
+    initial_state: InitialStateOption = InitialState["free"],
+    window: WindowOption = None,
     network: Annotated[
         Path | None,
         typer.Option(help="A file from `jaxos4 train`, for the network and the hybrid; trained now without it."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="A JSON file to write.")] = None,
+    validate: Annotated[
+        Path | None, typer.Option(metavar="OTHER.csv", help="A flight that is not fitted, to be predicted.")
+    ] = None,
+    out: OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, with 95 % intervals."""
     console = Console()
-    vehicle = MODELS[model](load_airframe(airframe))
-    where = Bracket.default(vehicle) if bracket is None else load_bracket(bracket, vehicle)
     learned = estimator in ("network", "hybrid")
     if network is not None and not learned:
         raise InputError(f"--network: {estimator.value} uses none; say --estimator network or hybrid, or leave it out.")
     if network is not None and estimator == "network" and bracket is not None:
         raise InputError("--bracket: the network looks in the bracket that it was trained in; leave one of them out.")
+    if estimator in RATES_ONLY and channels not in (None, "rates"):
+        raise InputError(f"--channels {channels}: {estimator} looks at the rates; use --estimator output-error.")
+    if window is not None and estimator in (*RATES_ONLY, "kalman"):
+        raise InputError(f"--window: {estimator} does not shoot; use --estimator ibss, hybrid or output-error.")
     if out is not None:
-        check_output(out, flight, Path(airframe), bracket, network)
+        check_output(out, flight, Path(airframe), bracket, network, validate)
     trained = None if network is None else load_network(network)
-    recorded, notes = read_flight_and_notes(flight, vehicle.airframe)
+    problem, where, notes = load_job(flight, model, airframe, bracket, channels, initial_state, window)
+    other = None
+    if validate is not None:
+        known = problem.initial_state is not None
+        recorded, said = read_flight_and_notes(validate, problem.model.airframe)
+        other = problem_of(validate, problem.model, recorded, None, known=known, window=window)
+        notes += tuple(f"{validate}: {note}" for note in said)
     for note in notes:
         console.print(f"note: {note}", markup=False, highlight=False)
-    problem = problem_of(flight, vehicle, recorded, channels, known=initial_state == "known")
 
     begin = time.perf_counter()
     method: AbstractEstimator = BASELINES[estimator]() if estimator in BASELINES else IBSS()
     if estimator in RATES_ONLY:
-        if channels not in (None, "rates"):
-            raise InputError(f"--channels {channels}: {estimator} looks at the rates; use --estimator output-error.")
-        if np.isnan(np.asarray(recorded.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
+        if np.isnan(np.asarray(problem.restrict("rates").flight.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
             raise InputError(f"{flight}: {estimator} needs p, q and r; use --estimator output-error.")
         problem = problem.restrict("rates")
     if learned:
@@ -121,10 +129,21 @@ def estimate(
             method = Hybrid(trained)
         else:
             method, problem, where = trained, problem.restrict(trained.channels), trained.bracket
+    if other is not None:
+        other = other.restrict(problem.channels) if other.size > problem.size else other
+        if np.isnan(np.asarray(other.measured())).all():
+            raise InputError(f"{validate}: nothing to compare was measured among the {problem.channels} channels.")
     problem, found, bound, rollouts = fit(method, problem, where, shoots=estimator in SHOOTING)
+    name = str(result_names(found.result))
+    answered = name not in NO_ANSWER
+    left = None
+    if answered:
+        left = _diagnostics(problem, found.parameters, found.initial_state, fitted=True)
+        if estimator in SHOOTING and (left.autocorrelation[:, 0] > COLOURED).any():
+            robust = robust_covariance(problem, found.parameters, found.initial_state)
+            found = eqx.tree_at(lambda e: e.covariance, found, robust)
     seconds = time.perf_counter() - begin
 
-    name = str(result_names(found.result))
     report = {
         "estimator": estimator.value,
         "model": model.value,
@@ -133,14 +152,17 @@ def estimate(
         "cost": _number(found.cost),
         "seconds": seconds,
         "parameters": _parameters(problem, where, found, bound, with_prior=estimator in FILTERS),
-        "fit": {} if name in NO_ANSWER else _fit_quality(problem, found),
+        "constants": _constants(problem.model, found) if answered else {},
+        "fit": {} if left is None else _quality(problem, left),
+        "validation": None if other is None or not answered else _validation(problem, found, other, validate),
         "provenance": {
             "flight": str(flight),
             "airframe": airframe,
             "channels": problem.channels,
             "initial_state": initial_state.value,
-            "samples": int(recorded.time.shape[0]),
-            "sample_time": float(recorded.dt),
+            "windows": problem.windows,
+            "samples": int(problem.flight.time.shape[0]),
+            "sample_time": float(problem.flight.dt),
             "notes": list(notes),
             **({} if trained is None else {"network": _network_provenance(network, trained)}),
             **_provenance(),
@@ -152,87 +174,14 @@ def estimate(
     if name == "nonfinite_trajectory":
         console.print(
             "No estimate: wherever the search went, the model's trajectory left this flight before its end. The "
-            "vehicle may do what the model lacks, or the airframe's constants or the units are far off.",
+            "vehicle may do what the model lacks (try --window 1), or the airframe's constants or units are far off.",
             highlight=False,
         )
-    elif name not in NO_ANSWER:
-        _print(console, report)
+    elif answered:
+        print_page(console, report)
     if name != "successful":
         typer.echo(f"jaxos4: {name}: {RESULTS[found.result]}", err=True)
         raise typer.Exit(1)
-
-
-def fit_network(
-    training: NetworkEstimator, flight: Path, problem: ShootingProblem, bracket: Bracket, *, seed: int
-) -> TrainedNetwork:
-    """A network for a flight's inputs."""
-    try:
-        return training.fit(problem, bracket, key=jax.random.key(seed), progress=True)
-    except ValueError as error:
-        raise InputError(f"{flight}: {error}") from None
-
-
-def seen_channels(problem: ShootingProblem) -> str:
-    """What a network looks at: the rates, or the attitude too where not all of them were measured."""
-    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
-    return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"
-
-
-def problem_of(
-    path: Path, model: AbstractModel, flight: Flight, channels: Channels | None, *, known: bool
-) -> ShootingProblem:
-    """What is to be explained: the channels that were measured, or those asked for."""
-    measured = ~np.isnan(np.asarray(flight.states))
-    beyond = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
-    present = {name: measured[:, CASCADE_ORDER[part]].any() for name, part in beyond.items()}
-    if not (present["rates"] or present["attitude"]):
-        raise InputError(f"{path}: neither rates nor attitude were measured; log p, q, r or phi, theta, psi.")
-    chosen = channels.value if channels else [name for name, there in present.items() if there][-1]
-    if not present[chosen]:
-        missing = ", ".join(STATE_NAMES[i] for i in CASCADE_ORDER[beyond[chosen]])
-        raise InputError(f"{path}: --channels {chosen}: none of {missing} was measured; leave --channels out.")
-    start = None
-    if known:
-        needed = CASCADE_ORDER[: CHANNELS[chosen]]
-        missing = [STATE_NAMES[i] for i in needed if not measured[0, i]]
-        if missing:
-            raise InputError(
-                f"{path}: row 2: --initial-state known needs {', '.join(missing)} there; use --initial-state free."
-            )
-        start = jnp.nan_to_num(flight.states[0])
-    return ShootingProblem(model, flight, sigma=SENSOR_SIGMA, initial_state=start, channels=chosen)
-
-
-def fit(
-    estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket, *, shoots: bool
-) -> tuple[ShootingProblem, Estimate, Array, int]:
-    """The problem with the noise levels found, the estimate, the Cramer-Rao bound, and the rollouts that it took."""
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("compiling and fitting", total=PASSES)
-        found = jax.block_until_ready(estimator(problem, bracket))
-        rollouts = int(found.rollouts)
-        for number in range(1, PASSES + 1):
-            if str(result_names(found.result)) in NO_ANSWER:
-                return problem, found, found.std, rollouts
-            used, problem = problem, problem.reweighted(problem.residuals(found.parameters, found.initial_state))
-            settled = bool(jnp.all(jnp.abs(problem.sigma / used.sigma - 1) < OFF))
-            if settled or number == PASSES or (shoots and found.result != RESULTS.successful):
-                break
-            progress.update(task, completed=number, description=f"fitting with the noise found in pass {number}")
-            found = jax.block_until_ready(estimator(problem, bracket))
-            rollouts += int(found.rollouts)
-        if not shoots:  # the answers and the errors of the others depend on the noise
-            found = jax.block_until_ready(estimator(problem, bracket))
-            rollouts += int(found.rollouts)
-            if str(result_names(found.result)) in NO_ANSWER:
-                return problem, found, found.std, rollouts
-        bound = cramer_rao_bound(problem, found.parameters, found.initial_state)
-        cost = problem.cost(found.parameters, found.initial_state)
-    covariance = bound if shoots else found.covariance
-    found = eqx.tree_at(lambda e: (e.covariance, e.cost), found, (covariance, cost))
-    return problem, found, jnp.sqrt(jnp.diagonal(bound)), rollouts
 
 
 def _parameters(
@@ -282,72 +231,58 @@ def _note(found: Estimate, i: int, half_width: float, lower: float, upper: float
     return "; ".join(notes)
 
 
-def _fit_quality(problem: ShootingProblem, found: Estimate) -> dict[str, dict[str, Any]]:
-    """For each channel: noise level [unit], share of the motion explained, correlation of neighbouring residuals."""
-    columns = CASCADE_ORDER[: problem.size]
-    measured = np.asarray(problem.flight.states)[:, columns]
-    error = measured - np.asarray(problem.predict(found.parameters, found.initial_state))
-    quality = {}
-    for i, column in enumerate(columns):
-        there = ~np.isnan(measured[:, i])
-        e, y = error[there, i], measured[there, i]
-        if len(e) < 3:
-            continue
-        quality[STATE_NAMES[column]] = {
-            "rms": _number(np.sqrt(np.mean(e**2))),
+def _constants(model: AbstractModel, found: Estimate) -> dict[str, Any]:
+    """Ix, Iy, Iz, J_R of the rigid body that explains the alphas best; empty where they are not told."""
+    if model.parameter_names != PARAMETER_NAMES:
+        return {}
+    rigid = fit_inertia(model, found.parameters, found.covariance)
+    inertias = np.asarray(rigid.constants), np.asarray(rigid.std)
+    if not np.isfinite(inertias[1]).all() or (inertias[1] > np.abs(inertias[0]))[:3].any():
+        return {}
+    return {
+        **{
+            name: {"estimate": float(value), "std": float(std), "unit": "kg m^2"}
+            for name, value, std in zip(("Ix", "Iy", "Iz", "J_R"), *inertias, strict=True)
+        },
+        "consistency_p": float(rigid.p_value),
+        "rigid_body": bool(rigid.is_rigid_body),
+    }
+
+
+def _diagnostics(problem: ShootingProblem, parameters: Array, initial_state: Array, *, fitted: bool) -> Diagnostics:
+    lags = min(LAGS, problem.flight.states.shape[0] // 2)
+    return residual_diagnostics(problem, parameters, initial_state, fitted=fitted, lags=lags)
+
+
+def _quality(problem: ShootingProblem, left: Diagnostics) -> dict[str, dict[str, Any]]:
+    return {
+        STATE_NAMES[column]: {
+            "rms": float(left.rms[i]),
             "unit": STATE_UNITS[column],
-            "percent": _number(100 * (1 - np.linalg.norm(e) / max(np.linalg.norm(y - y.mean()), 1e-300))),
-            "correlation": _number((e[1:] @ e[:-1]) / (e @ e)) if np.abs(e).max() > ROUNDING * np.abs(y).max() else 0.0,
+            "percent": _number(left.percent[i]),
+            "level": float(left.level[i]),
+            "level_p": float(left.level_p[i]),
+            "correlation": float(left.autocorrelation[i, 0]),
+            "white_p": float(left.white_p[i]),
+            "input_correlation": dict(zip(("roll", "pitch", "yaw"), left.input_correlation[i].tolist(), strict=True)),
+            "input_p": float(left.input_p[i]),
         }
-    return quality
+        for i, column in enumerate(CASCADE_ORDER[: problem.size])
+        if left.count[i] > 2
+    }
 
 
-def _print(console: Console, report: dict[str, Any]) -> None:
-    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("parameter", "unit", "estimate", "95 % interval", "bound", "note"):
-        right = heading in ("estimate", "bound")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "note")
-    for name, row in report["parameters"].items():
-        if row["estimate"] is None:
-            table.add_row(name, row["unit"], "-", "-", "-", row["note"])
-            continue
-        low, high = row["ci95"]
-        interval = f"[{low:.5g}, {high:.5g}]"
-        table.add_row(name, row["unit"], f"{row['estimate']:.5g}", interval, f"{row['bound']:.2g}", row["note"])
-    console.print(table, markup=False)
-    below = [
-        f"{name} {row['noise_limit']:.2g}"
-        for name, row in report["parameters"].items()
-        if "below noise" in row["note"] and row["noise_limit"]
-    ]
-    if below:
-        console.print(
-            f"below noise: not told from 0. The airframe's values would show below this share of the noise found: "
-            f"{', '.join(below)}.",
-            highlight=False,
-        )
-    fit = report["fit"]
-    shares = ", ".join(f"{name} {row['percent']:.1f}" for name, row in fit.items() if row["percent"] is not None)
-    console.print("bound: Cramer-Rao, the least standard deviation that the noise found allows.", highlight=False)
-    console.print(f"fit [%], 100 is a perfect prediction: {shares}.", highlight=False, markup=False)
-    coloured = [name for name, row in fit.items() if (row["correlation"] or 0) > COLOURED]
-    if coloured and report["estimator"] == "network":
-        console.print(
-            f"The residuals of {', '.join(coloured)} are more than noise: the network's answer is not the best fit, "
-            "within its intervals. The hybrid goes on from there, and says whether the model explains this flight.",
-            highlight=False,
-        )
-    elif coloured:
-        console.print(
-            f"The residuals of {', '.join(coloured)} are not noise: the model does not explain this flight fully, and "
-            "the intervals are too narrow.",
-            highlight=False,
-        )
-    console.print(
-        f"{report['estimator']}, {report['model']} model, {report['provenance']['channels']} channels: "
-        f"{report['result']}, {report['rollouts']} rollouts, {report['seconds']:.1f} s",
-        highlight=False,
-    )
+def _validation(problem: ShootingProblem, found: Estimate, other: ShootingProblem, path: Path | None) -> dict[str, Any]:
+    """How the parameters predict another flight, of which only the initial state is fitted."""
+    other = eqx.tree_at(lambda p: p.sigma, other, problem.sigma)
+    start, cost, sound, _ = eqx.filter_jit(fit_start)(other, found.parameters)
+    told = bool(sound)
+    left = _diagnostics(other, found.parameters, start, fitted=False) if told else None
+    return {
+        "flight": str(path),
+        "cost": _number(cost) if told else None,
+        "fit": None if left is None else _quality(other, left),
+    }
 
 
 def _network_provenance(path: Path | None, network: TrainedNetwork) -> dict[str, Any]:

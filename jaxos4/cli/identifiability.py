@@ -1,53 +1,58 @@
 """`jaxos4 identifiability`: what a flight can tell of each parameter, and why not of the others."""
 
+import json
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import rich.box
-import typer
 from rich.console import Console
 from rich.table import Table
 
-from ..airframe import load_airframe
-from ..bracket import Bracket
-from ..dynamics import MODELS
+from .._files import write_atomically
 from ..estimators import IBSS
+from ..flight import STATE_NAMES
 from ..identifiability import identifiability as information_of
-from ..logs import read_flight_and_notes
 from ..results import result_names
-from ._bracket_file import load_bracket
-from ._choices import Channels, InitialState, Model
-from .estimate import NO_ANSWER, fit, problem_of
+from ._check_output import check_output
+from ._choices import (
+    AirframeOption,
+    BracketOption,
+    ChannelsOption,
+    FlightFile,
+    InitialState,
+    InitialStateOption,
+    Model,
+    ModelOption,
+    OutOption,
+    WindowOption,
+)
+from ._fitting import NO_ANSWER, fit, load_job
 
 # Of a direction, what is not shown: shares of a half-width below this one of the largest.
 SMALL = 0.1
 
 
 def identifiability(
-    flight: Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")],
-    model: Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")] = Model["published"],
-    airframe: Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")] = "os4",
-    bracket: Annotated[Path | None, typer.Option(help="TOML file: alpha1 = \\[lower, upper], ...")] = None,
-    channels: Annotated[
-        Channels | None, typer.Option(help="What is looked at; all that was measured without it.")
-    ] = None,
-    initial_state: Annotated[
-        InitialState, typer.Option(help="free: estimated too; known: the first sample is exact.")
-    ] = InitialState["free"],
+    flight: FlightFile,
+    model: ModelOption = Model["published"],
+    airframe: AirframeOption = "os4",
+    bracket: BracketOption = None,
+    channels: ChannelsOption = None,
+    initial_state: InitialStateOption = InitialState["free"],
+    window: WindowOption = None,
+    out: OutOption = None,
 ) -> None:
     """What a flight tells of alpha_1..8, and why not of others: not excited, not told apart, below the noise."""
     console = Console()
-    vehicle = MODELS[model](load_airframe(airframe))
-    where = Bracket.default(vehicle) if bracket is None else load_bracket(bracket, vehicle)
-    recorded, notes = read_flight_and_notes(flight, vehicle.airframe)
-    for note in notes:
+    if out is not None:
+        check_output(out, flight, Path(airframe), bracket)
+    problem, where, said = load_job(flight, model, airframe, bracket, channels, initial_state, window)
+    for note in said:
         console.print(f"note: {note}", markup=False, highlight=False)
-    problem = problem_of(flight, vehicle, recorded, channels, known=initial_state == "known")
     problem, found, _, _ = fit(IBSS(), problem, where, shoots=True)
     fitted = str(result_names(found.result)) not in NO_ANSWER
     if not fitted:
-        console.print("note: no fit; what follows is at the bracket's center, for the standard noise", highlight=False)
+        console.print("note: no fit; what follows is at the bracket's center", highlight=False)
     known = information_of(problem, where, found.parameters, found.initial_state if fitted else None)
 
     table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
@@ -56,8 +61,9 @@ def identifiability(
     std, alone, share, limit = (
         np.asarray(x) for x in (known.std, known.std_alone, known.std / known.half_width, known.noise_limit)
     )
-    names = vehicle.parameter_names
-    for i, (name, unit) in enumerate(zip(names, vehicle.parameter_units, strict=True)):
+    names, units = problem.model.parameter_names, problem.model.parameter_units
+    notes = known.notes(names)
+    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         shows = f"{limit[i]:.2g} x" if known.told[i] and limit[i] > 0 else "-"
         table.add_row(name, unit, f"{std[i]:.2g}", f"{alone[i]:.2g}", f"{share[i]:.2g}", shows)
     console.print(table, markup=False)
@@ -67,7 +73,7 @@ def identifiability(
         "would be told from 0.",
         highlight=False,
     )
-    for name, note in known.notes(names).items():
+    for name, note in notes.items():
         console.print(f"{name}: {note}", highlight=False)
     weakest = np.asarray(known.directions)[:, 0]
     parts = [
@@ -80,3 +86,28 @@ def identifiability(
     console.print(
         f"told least, in half-widths: {' '.join(parts)}, to {size} (1: as well as the bracket).", highlight=False
     )
+    if out is not None:
+        report = {
+            "flight": str(flight),
+            "fitted": fitted,
+            "sigma": dict(zip(STATE_NAMES, problem.sigma.tolist(), strict=True)),
+            "parameters": {
+                name: {
+                    "bound": _number(std[i]),
+                    "others_known": _number(alone[i]),
+                    "half_width": float(known.half_width[i]),
+                    "noise_limit": _number(limit[i]),
+                    "unit": units[i],
+                    "note": notes.get(name, ""),
+                }
+                for i, name in enumerate(names)
+            },
+            "eigenvalues": known.eigenvalues.tolist(),
+            "directions": known.directions.T.tolist(),
+        }
+        with write_atomically(out) as beside:
+            beside.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _number(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None

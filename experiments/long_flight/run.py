@@ -1,0 +1,129 @@
+"""Long flights that drift away from their model: one shot against windows with an initial state each.
+
+The rotors turn a little off what was recorded, a constant factor for each rotor and flight. The model has no term for
+that: body rates run away from what it makes of the recorded speeds, the more the longer it is simulated in one piece.
+"""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+import jaxos4
+
+jax.config.update("jax_enable_x64", True)
+
+ESTIMATORS = ("ibss", "output-error", "hybrid")
+# What every estimator is judged on: the parameters whose size the flight tells.
+TOLD = (0, 2, 3, 5, 7)
+
+
+def drifting(duration: float, drift: float, flights: int, seed: int) -> tuple[jaxos4.Flight, jax.Array]:
+    """What was recorded, with the model's own flight, and the states of the flights as they were measured."""
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    recorded = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=duration), dt=0.01)
+    noise = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)
+
+    @jax.jit
+    @jax.vmap
+    def fly(key: jax.Array) -> jax.Array:
+        factor_key, noise_key = jax.random.split(key)
+        actual = recorded.omega * (1 + drift * jax.random.normal(factor_key, (4,)))
+        return noise(jaxos4.simulate(model, model.alpha, actual, dt=0.01), key=noise_key).states
+
+    return recorded, fly(jax.random.split(jax.random.key(seed), flights))
+
+
+def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int, steps: int) -> dict:
+    """One row of the table."""
+    model, flights = jaxos4.PublishedOS4(jaxos4.OS4), states.shape[0]
+    bracket = jaxos4.Bracket.default(model)
+    bracket = jaxos4.Bracket.around(bracket.center + 0.3 * bracket.half_width, bracket.half_width)
+
+    def problem(states: jax.Array) -> jaxos4.ShootingProblem:
+        flight = eqx.tree_at(lambda f: f.states, recorded, states)
+        return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", windows=windows)
+
+    if name == "hybrid":
+        # Windows begin where this flight was measured to be: a network of windows serves the flight that it is for.
+        begin = time.perf_counter()
+        found = []
+        for flown in states:
+            network = jaxos4.NetworkEstimator(steps=steps).fit(problem(flown), bracket, key=jax.random.key(0))
+            found.append(jaxos4.Hybrid(network)(problem(flown), bracket))
+        seconds = (time.perf_counter() - begin) / flights
+        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    else:
+        estimator = jaxos4.IBSS() if name == "ibss" else jaxos4.OutputError()
+        one = eqx.filter_jit(eqx.filter_vmap(lambda states: estimator(problem(states), bracket)))
+        jax.block_until_ready(one(states))
+        begin = time.perf_counter()
+        found = jax.block_until_ready(one(states))
+        seconds = (time.perf_counter() - begin) / flights
+    names, counts = np.unique(jaxos4.result_names(found.result), return_counts=True)
+    answered = jaxos4.result_names(found.result) == "successful"
+    errors = np.asarray(found.parameters / model.alpha - 1)[:, TOLD]
+    return {
+        "windows": windows,
+        "estimator": name,
+        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "successful": int(answered.sum()),
+        "percent": (100 * np.sqrt(np.mean(errors[answered] ** 2, axis=0))).tolist() if answered.any() else None,
+        "rollouts": float(np.mean(found.rollouts)),
+        "seconds": seconds,
+    }
+
+
+def main(
+    duration: Annotated[float, typer.Option(help="Of each flight [s].")] = 60.0,
+    flights: Annotated[int, typer.Option(help="For a row; the hybrid trains a network for each.")] = 8,
+    seed: Annotated[int, typer.Option(help="Of drifts and noise.")] = 3,
+    drifts: Annotated[list[float], typer.Option(help="Standard deviation of the rotors' factors.")] = (0.0, 1e-4, 1e-3),
+    windows: Annotated[list[int], typer.Option(help="How many.")] = (1, 6, 30, 120),
+    estimators: Annotated[list[str], typer.Option(help="Which ones.")] = ESTIMATORS,
+    steps: Annotated[int, typer.Option(help="Training of the hybrid's networks.")] = 1000,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+) -> None:
+    """One shot against windows."""
+    rows, table = [], Table(title=f"RMS error [%] on {flights} flights of {duration:g} s, rates")
+    for heading in (
+        "drift",
+        "windows",
+        "estimator",
+        *(f"a{i + 1}" for i in TOLD),
+        "rollouts",
+        "s",
+        "results",
+    ):
+        table.add_column(heading, no_wrap=heading != "results")
+    for drift in drifts:
+        recorded, states = drifting(duration, drift, flights, seed)
+        for count in windows:
+            for name in estimators:
+                row = identify(name, recorded, states, count, steps)
+                rows.append({"drift": drift, **row})
+                table.add_row(
+                    f"{drift:g}",
+                    str(count),
+                    name,
+                    *(f"{x:.2g}" for x in row["percent"] or [np.nan] * len(TOLD)),
+                    f"{row['rollouts']:.0f}",
+                    f"{row['seconds']:.2g}",
+                    ", ".join(f"{number} {what}" for what, number in row["results"].items()),
+                )
+                if out is not None:
+                    report = {"version": jaxos4.__version__, "seed": seed, "duration": duration, "rows": rows}
+                    out.write_text(json.dumps(report, indent=2) + "\n")
+    Console(width=150).print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,110 @@
+"""The page that `jaxos4 estimate` prints."""
+
+from typing import Any
+
+import rich.box
+from rich.console import Console
+from rich.table import Table
+
+# Residuals whose neighbours correlate by more than this are not noise.
+COLOURED = 0.3
+# The share of fits of true models that a test of all channels' residuals may call wrong.
+SIGNIFICANCE = 0.01
+# Standard deviations to either side that hold 95 % of a Gaussian.
+NINETY_FIVE = 1.96
+
+
+def print_page(console: Console, report: dict[str, Any]) -> None:
+    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in ("parameter", "unit", "estimate", "95 % interval", "bound", "note"):
+        right = heading in ("estimate", "bound")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "note")
+    for name, row in report["parameters"].items():
+        if row["estimate"] is None:
+            table.add_row(name, row["unit"], "-", "-", "-", row["note"])
+            continue
+        low, high = row["ci95"]
+        interval = f"[{low:.5g}, {high:.5g}]"
+        table.add_row(name, row["unit"], f"{row['estimate']:.5g}", interval, f"{row['bound']:.2g}", row["note"])
+    console.print(table, markup=False)
+    below = [
+        f"{name} {row['noise_limit']:.2g}"
+        for name, row in report["parameters"].items()
+        if "below noise" in row["note"] and row["noise_limit"]
+    ]
+    if below:
+        console.print(
+            f"below noise: not told from 0. The airframe's values would show below this share of the noise found: "
+            f"{', '.join(below)}.",
+            highlight=False,
+        )
+    fit = report["fit"]
+    shares = ", ".join(f"{name} {row['percent']:.1f}" for name, row in fit.items() if row["percent"] is not None)
+    console.print("bound: Cramer-Rao, the least standard deviation that the noise found allows.", highlight=False)
+    console.print(f"fit [%], 100 is a perfect prediction: {shares}.", highlight=False, markup=False)
+    coloured = [name for name, row in fit.items() if row["correlation"] > COLOURED]
+    if coloured and report["estimator"] == "network":
+        console.print(
+            f"The residuals of {', '.join(coloured)} are more than noise: the network's answer is not the best fit, "
+            "within its intervals. The hybrid goes on from there, and says whether the model explains this flight.",
+            highlight=False,
+        )
+    elif coloured:
+        console.print(
+            f"The residuals of {', '.join(coloured)} are not noise: the model does not explain this flight fully. The "
+            "intervals allow for their colour where the estimator shoots, and are still too narrow for slow errors.",
+            highlight=False,
+        )
+    _print_tests(console, fit)
+    _print_constants(console, report["constants"])
+    _print_validation(console, report["validation"])
+    console.print(
+        f"{report['estimator']}, {report['model']} model, {report['provenance']['channels']} channels: "
+        f"{report['result']}, {report['rollouts']} rollouts, {report['seconds']:.1f} s",
+        highlight=False,
+    )
+
+
+def _print_tests(console: Console, fit: dict[str, Any]) -> None:
+    for what, key in (("white (Ljung-Box)", "white_p"), ("free of the inputs (cross-correlation)", "input_p")):
+        failed = [name for name, row in fit.items() if row[key] * len(fit) < SIGNIFICANCE]
+        said = f"not those of {', '.join(failed)}" if failed else "all"
+        console.print(f"residuals {what}, tests at {SIGNIFICANCE:.0%}: {said}.", highlight=False)
+
+
+def _print_constants(console: Console, constants: dict[str, Any]) -> None:
+    if not constants:
+        return
+    parts = [
+        f"{name} {row['estimate']:.4g} +- {NINETY_FIVE * row['std']:.2g}"
+        if abs(row["estimate"]) > NINETY_FIVE * row["std"]
+        else f"{name} below noise"
+        for name, row in constants.items()
+        if isinstance(row, dict)
+    ]
+    agree = f"the alphas agree with one rigid body, p = {constants['consistency_p']:.2g}"
+    if constants["consistency_p"] < SIGNIFICANCE:
+        agree = f"the alphas are not those of one rigid body, p = {constants['consistency_p']:.1g}"
+    elif not constants["rigid_body"]:
+        agree = "no body has such inertias: one exceeds the sum of the others"
+    console.print(f"inertias [kg m^2]: {', '.join(parts)}; {agree}.", highlight=False, markup=False)
+
+
+def _print_validation(console: Console, validation: dict[str, Any] | None) -> None:
+    if validation is None:
+        return
+    if validation["fit"] is None:
+        console.print(
+            f"validation on {validation['flight']}: the model's trajectory leaves it before its end.", highlight=False
+        )
+        return
+    parts = [
+        f"{name} {row['percent']:.1f} ({row['level'] ** 0.5:.2g})"
+        for name, row in validation["fit"].items()
+        if row["percent"] is not None
+    ]
+    console.print(
+        f"validation on {validation['flight']} [%] (residuals in multiples of the noise): {', '.join(parts)}.",
+        highlight=False,
+        markup=False,
+    )
