@@ -82,7 +82,7 @@ def _diagnostics(
     there = ~jnp.isnan(measured)
     errors = problem.residuals(parameters, initial_state).reshape(measured.shape)
     # A trajectory that diverges leaves nothing to judge.
-    there &= jnp.isfinite(errors).all()
+    there &= jnp.isfinite(problem.cost(parameters, initial_state)) & jnp.isfinite(errors).all()
     errors = jnp.where(there, errors, 0.0)
     count = there.sum(axis=0)
     known = count >= _FEWEST

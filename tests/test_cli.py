@@ -84,6 +84,28 @@ def test_estimate_recovers_the_truth_within_its_intervals(run, tmp_path):
     assert report["fit"]["p"]["rms"] == pytest.approx(0.01, rel=4 / math.sqrt(2 * 200))
 
 
+def test_windows_and_a_flight_that_was_not_fitted(run, tmp_path):
+    simulate(run, "flight.csv", "--noise", "1")
+    simulate(run, "other.csv", "--noise", "1", "--seed", "1", "--excitation", "doublet", "--duration", "5")
+    options = ("--channels", "rates", "--window", "0.5", "--validate", "other.csv", "--out", "e.json")
+    code, out, err = run("estimate", "flight.csv", *options)
+    assert code == 0, err
+    assert "validation on other.csv" in out
+    assert "residuals white (Ljung-Box), tests at 1%: all" in " ".join(out.split())
+    report = json.loads((tmp_path / "e.json").read_text())
+    assert report["provenance"]["windows"] == 4
+    for row in (*report["fit"].values(), *report["validation"]["fit"].values()):
+        assert row["percent"] > 90
+        assert row["level"] == pytest.approx(1, abs=0.5)
+        assert row["white_p"] > 1e-4
+        assert row["input_p"] > 1e-4
+    assert list(report["validation"]["fit"]) == ["p", "q", "r"]
+    for name, truth in (("Ix", 7.5e-3), ("Iy", 7.5e-3), ("Iz", 1.3e-2)):
+        row = report["constants"][name]
+        assert abs(row["estimate"] - truth) < 4 * row["std"]
+    assert report["constants"]["consistency_p"] > 1e-4
+
+
 @pytest.mark.parametrize("estimator", list(BASELINES))
 def test_baselines_recover_the_truth(run, tmp_path, estimator):
     simulate(run, "flight.csv", "--noise", "1")
@@ -101,8 +123,15 @@ def test_baselines_recover_the_truth(run, tmp_path, estimator):
 
 def test_identifiability_names_what_a_flight_does_not_tell(run, tmp_path):
     simulate(run, "flight.csv", "--noise", "1", "--excitation", "doublet", "--duration", "5")
-    code, out, err = run("identifiability", "flight.csv", "--channels", "rates")
+    code, out, err = run("identifiability", "flight.csv", "--channels", "rates", "--out", "known.json")
     assert code == 0, err
+    known = json.loads((tmp_path / "known.json").read_text())
+    assert known["fitted"]
+    assert known["sigma"]["p"] == pytest.approx(0.01, rel=0.2)
+    assert known["parameters"]["alpha1"]["note"] == "not told: not excited"
+    assert known["parameters"]["alpha3"]["note"] == ""
+    assert known["parameters"]["alpha3"]["bound"] < known["parameters"]["alpha3"]["half_width"]
+    assert len(known["directions"]) == len(known["eigenvalues"]) == 8
     for name in ("alpha1", "alpha4", "alpha7"):  # products of rates: a doublet moves one axis at a time
         assert f"{name}: not told: not excited" in out
     assert "alpha2: below the noise floor at this noise; identifiable below" in out
@@ -185,6 +214,16 @@ def test_bad_flights_are_refused_in_one_line(run, tmp_path, text, fragments):
         (["estimate", "rates.csv", "--channels", "all"], ["rates.csv", "--channels"]),
         (["estimate", "flight.csv", "--estimator", "rls", "--channels", "all"], ["--channels", "rls"]),
         (["estimate", "rates.csv", "--estimator", "svsf"], ["rates.csv", "p, q and r"]),
+        (["estimate", "flight.csv", "--estimator", "kalman", "--window", "1"], ["--window", "kalman"]),
+        (["estimate", "flight.csv", "--window", "0"], ["--window", "positive"]),
+        (["estimate", "flight.csv", "--window", "nan"], ["--window", "positive"]),
+        (["estimate", "flight.csv", "--window", "0.01"], ["--window", "flight.csv"]),
+        (["estimate", "flight.csv", "--window", "1", "--initial-state", "known"], ["--window", "free"]),
+        (["estimate", "flight.csv", "--validate", "none.csv"], ["none.csv"]),
+        (["estimate", "flight.csv", "--validate", "positions.csv"], ["positions.csv", "rates"]),
+        (["estimate", "rates.csv", "--channels", "rates", "--validate", "angles.csv"], ["angles.csv", "rates"]),
+        (["estimate", "flight.csv", "--validate", "flight.csv", "--out", "flight.csv"], ["flight.csv", "overwrite"]),
+        (["identifiability", "flight.csv", "--out", "flight.csv"], ["flight.csv", "overwrite"]),
         (["estimate", "rates.csv", "--channels", "rates", "--initial-state", "known"], ["rates.csv", "row 2", "r"]),
         (["simulate", "--out", "none/flight.csv"], ["none/flight.csv"]),
         (["simulate", "--out", "new.csv", "--duration", "-1"], ["duration"]),
@@ -206,6 +245,7 @@ def test_bad_arguments_are_refused_in_one_line(run, tmp_path, arguments, fragmen
     (tmp_path / "long.toml").write_text("mass = 1" + "0" * 5000 + "\n")
     (tmp_path / "huge.toml").write_text("alpha1 = [0, 1" + "0" * 400 + "]\n")
     (tmp_path / "positions.csv").write_text("t,omega1,omega2,omega3,omega4,x\n0,1,1,1,1,0\n0.1,1,1,1,1,0\n")
+    (tmp_path / "angles.csv").write_text("t,omega1,omega2,omega3,omega4,phi\n0,1,1,1,1,0\n0.1,1,1,1,1,0\n")
     (tmp_path / "tiny.toml").write_text(
         "mass = 0.65\ninertia = [1e-320, 1e-320, 1e-320]\narm = 0.23\nthrust_coefficient = 3e-5\n"
         "drag_coefficient = 7e-7\nrotor_inertia = 6e-5\n"

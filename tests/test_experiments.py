@@ -73,3 +73,39 @@ def test_baselines(tmp_path):
     # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
     assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
     assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]
+
+
+def test_coverage(tmp_path):
+    load("coverage").main(
+        flights=100,
+        seed=11,
+        model="published",
+        channels="rates",
+        estimators=["ibss", "hybrid", "output-error"],
+        scales=[1.0],
+        steps=250,
+        out=tmp_path / "out.json",
+    )
+    rows = json.loads((tmp_path / "out.json").read_text())["rows"]
+    assert [row["estimator"] for row in rows] == ["ibss", "hybrid", "output-error"]
+    for row in rows:
+        assert row["results"] == {"successful": 100}
+        covered = np.array(row["covered"] + row["constants_covered"])
+        assert np.all(np.abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 100))
+
+
+def test_long_flight(tmp_path):
+    load("long_flight").main(
+        duration=10.0,
+        flights=2,
+        seed=3,
+        drifts=[1e-3],
+        windows=[1, 20],
+        estimators=["ibss"],
+        steps=200,
+        out=tmp_path / "out.json",
+    )
+    one, many = json.loads((tmp_path / "out.json").read_text())["rows"]
+    assert many["results"] == {"successful": 2}
+    assert max(many["percent"]) < 5
+    assert one["percent"] is None or max(one["percent"]) > 3 * max(many["percent"])

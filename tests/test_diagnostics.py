@@ -1,0 +1,116 @@
+"""Diagnostics of residuals: right about true models, and not blind to wrong ones."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from helpers import noisy_states, standard_flight, standard_problem
+
+import jaxos4
+
+LAGS = 25
+
+
+@eqx.filter_jit
+@eqx.filter_vmap
+def judged(states):
+    """Of the best fit of a flight."""
+    problem = standard_problem(states=states, channels="rates")
+    found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
+    return jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+
+
+def coloured_states(count, noise):
+    flight, keys = standard_flight(), jax.random.split(jax.random.key(5), count)
+    return jax.vmap(lambda key: noise(flight, key=key).states)(keys)
+
+
+def test_figures_are_those_of_plain_numpy():
+    states = noisy_states(1)[0]
+    problem = standard_problem(states=states, channels="attitude")
+    alpha = problem.model.alpha * 1.01
+    found = jaxos4.residual_diagnostics(problem, alpha, fitted=False)
+    order = [7, 9, 11, 6, 8, 10]
+    y = np.asarray(states)[1:, order]
+    x = np.asarray(problem.predict(alpha, problem.first_state()[0]))[1:]
+    e, n = y - x, len(y)
+    np.testing.assert_array_equal(found.count, n)
+    np.testing.assert_allclose(found.rms, np.sqrt(np.mean(e**2, axis=0)))
+    percent = 100 * (1 - np.linalg.norm(e, axis=0) / np.linalg.norm(y - y.mean(axis=0), axis=0))
+    np.testing.assert_allclose(found.percent, percent, rtol=1e-9)
+    level = np.square(e / jaxos4.SENSOR_SIGMA[order]).sum(axis=0)
+    np.testing.assert_allclose(found.level, level / n, rtol=1e-12)
+    below = scipy.stats.chi2.cdf(level, n)
+    np.testing.assert_allclose(found.level_p, 2 * np.minimum(below, 1 - below), rtol=1e-6, atol=1e-12)
+    for i in range(6):
+        r = np.array([e[k:, i] @ e[: n - k, i] for k in range(1, LAGS + 1)]) / (e[:, i] @ e[:, i])
+        box = n * (n + 2) * np.sum(r**2 / (n - np.arange(1, LAGS + 1)))
+        np.testing.assert_allclose(found.white_p[i], scipy.stats.chi2.sf(box, LAGS), rtol=1e-6, atol=1e-12)
+        # Each lag as a mean over its own pairs.
+        np.testing.assert_allclose(found.autocorrelation[i], r * n / (n - np.arange(1, LAGS + 1)), atol=1e-12)
+
+
+def test_true_models_pass_as_often_as_the_level_says():
+    flights = 400
+    found = judged(noisy_states(flights, seed=21))
+    error = np.sqrt(0.05 * 0.95 / (3 * flights))
+    for p in (found.white_p, found.level_p):
+        assert abs(float((p < 0.05).mean()) - 0.05) < 4 * error
+    assert scipy.stats.kstest(np.asarray(found.white_p[:, 0]), "uniform").pvalue > 1e-3
+    assert abs(float(found.level.mean()) - 1) < 4 * np.sqrt(2 / (3 * 500 * flights))
+    # On the safe side: the best of many tests that agree with one another.
+    assert float((found.input_p < 0.05).mean()) < 0.05 + 4 * error
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_missing_samples_do_not_look_like_colour(share):
+    states, rng = noisy_states(200, seed=22), np.random.default_rng(0)
+    sparse = jnp.where(rng.random(states.shape) < share, jnp.nan, states)
+    found = judged(sparse)
+    assert abs(float((found.white_p < 0.05).mean()) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 600)
+
+
+def test_coloured_noise_and_a_wrong_size_are_seen():
+    found = judged(coloured_states(32, jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.05)))
+    assert (found.white_p < 1e-6).all()
+    np.testing.assert_allclose(found.autocorrelation[:, :, 0].mean(), np.exp(-0.01 / 0.05), atol=0.05)
+    louder = judged(noisy_states(32, scale=1.3))
+    assert (louder.level_p < 1e-4).all()
+    np.testing.assert_allclose(louder.level.mean(), 1.69, rtol=0.03)
+
+
+def test_what_an_input_does_that_the_model_lacks_is_seen_in_its_channel():
+    """The roll torque acts three samples late, on the roll rate alone."""
+    flight, model = standard_flight(), jaxos4.PublishedOS4()
+    late = jnp.asarray(np.roll(np.asarray(flight.states[:, 7]), 3)).at[:3].set(0.0)
+    states = flight.states.at[:, 7].set(late)
+    noise = jaxos4.SENSOR_SIGMA * jax.random.normal(jax.random.key(1), states.shape)
+    problem = standard_problem(states=states + noise, channels="rates")
+    found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(model))
+    left = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+    assert left.input_p[0] < 1e-6
+    assert jnp.abs(left.input_correlation[0]).argmax() == 0
+    assert left.input_p[2] > 1e-3
+
+
+def test_nothing_measured_rounding_alone_and_divergence_are_no_figures_to_worry_about():
+    problem = standard_problem(channels="attitude")
+    exact = jaxos4.residual_diagnostics(problem, problem.model.alpha)
+    assert (exact.white_p == 1).all()
+    assert (exact.input_p == 1).all()
+    unmeasured = eqx.tree_at(lambda p: p.flight.states, problem, problem.flight.states.at[:, 6].set(jnp.nan))
+    found = jaxos4.residual_diagnostics(unmeasured, problem.model.alpha)
+    assert found.count.tolist() == [500, 500, 500, 0, 500, 500]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    diverged = jaxos4.residual_diagnostics(problem, problem.model.alpha.at[2].set(1e9))
+    assert (diverged.count == 0).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(diverged))
+
+
+@pytest.mark.parametrize("lags", [0, 501])
+def test_lags_that_cannot_be_are_named(lags):
+    problem = standard_problem(channels="rates")
+    with pytest.raises(ValueError, match="`lags` must lie in 1 to 500"):
+        jaxos4.residual_diagnostics(problem, problem.model.alpha, lags=lags)
