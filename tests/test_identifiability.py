@@ -193,11 +193,15 @@ def test_where_the_model_cannot_fly_nothing_is_told():
 
 
 @pytest.mark.parametrize("name", ["ibss", *BASELINES])
-def test_no_estimator_invents_numbers_for_a_hover(name):
+def test_no_estimator_invents_numbers_for_a_hover_or_a_single_axis(name):
     estimator = jaxos4.IBSS() if name == "ibss" else BASELINES[name]()
-    problem = problem_of(jnp.full((301, 4), jaxos4.OS4.hover_speed))
-    noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(problem.flight, key=jax.random.key(0))
-    problem = eqx.tree_at(lambda p: p.flight, problem, noisy)
-    found = estimator(problem, jaxos4.Bracket.default(problem.model))
-    assert str(jaxos4.result_names(found.result)) == "unidentifiable"
-    assert np.isfinite(found.parameters).all()
+    identify = eqx.filter_jit(lambda problem: estimator(problem, jaxos4.Bracket.default(problem.model)))
+    for omega in (
+        jnp.full((501, 4), jaxos4.OS4.hover_speed),
+        jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=["roll"]),
+    ):
+        problem = problem_of(omega)
+        noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(problem.flight, key=jax.random.key(0))
+        found = identify(eqx.tree_at(lambda p: p.flight, problem, noisy))
+        assert str(jaxos4.result_names(found.result)) == "unidentifiable"
+        assert np.isfinite(found.parameters).all()

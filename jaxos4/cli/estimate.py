@@ -174,7 +174,7 @@ def estimate(
     if name == "nonfinite_trajectory":
         console.print(
             "No estimate: wherever the search went, the model's trajectory left this flight before its end. The "
-            "vehicle may do what the model lacks (try --window 1), or the airframe's constants or units are far off.",
+            "vehicle may do what the model lacks (try a shorter --window), or the airframe or the units are far off.",
             highlight=False,
         )
     elif answered:

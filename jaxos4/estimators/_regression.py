@@ -15,12 +15,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Scalar
+from .._custom_types import Parameters, Scalar
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, Rates
 from ..information import invert
 from ..shooting import ShootingProblem
-from ._estimate import check_one_window
+from ._estimate import Estimate, check_one_window, conclude, fit_start
 
 # The standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It decides
 # what a flight says nothing about, and nothing else.
@@ -206,3 +206,32 @@ def check_bridge(value: int) -> None:
     """Raises `ValueError` for another setting than a number of samples."""
     if not isinstance(value, int) or value < 0:
         raise ValueError(f"`bridge` must be an integer of at least 0, got {value!r}.")
+
+
+def answer(
+    problem: ShootingProblem,
+    bracket: Bracket,
+    parameters: Parameters,
+    covariance: Float[Array, "parameters parameters"],
+    *,
+    history: Float[Array, "samples parameters"] | None = None,
+) -> Estimate:
+    """A regression's parameters as an estimate: the initial state and the cost are those of shooting with them.
+
+    What is not told may be anything: the flight is then compared with that of the bracket's center.
+    """
+    usable = bracket.usable
+    told = (jnp.sqrt(jnp.diagonal(covariance)) <= usable.half_width).all()
+    initial_state, cost, sound, rollouts = fit_start(problem, jnp.where(told, parameters, usable.center))
+    return conclude(
+        bracket,
+        parameters=parameters,
+        covariance=covariance,
+        initial_state=initial_state,
+        cost=cost,
+        rollouts=rollouts,
+        sweeps=1,
+        sound=sound,
+        done=jnp.ones((), dtype=bool),
+        history=history,
+    )

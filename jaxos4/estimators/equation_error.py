@@ -1,13 +1,13 @@
 """Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares."""
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from .._custom_types import Scalar, as_float
 from ..bracket import Bracket
 from ..shooting import ShootingProblem
-from ._estimate import AbstractEstimator, Estimate, check_bracket, conclude, fit_start
+from ._estimate import AbstractEstimator, Estimate, check_bracket
 from ._regression import (
+    answer,
     check_bridge,
     check_share,
     covariance_of,
@@ -83,17 +83,4 @@ class EquationError(AbstractEstimator):
         steps, inverse = solve(*normal_equations(data.rows(data.rates)))
         parameters = parameters_of(usable, steps)
         covariance = covariance_of(usable, propagated_covariance(data, steps, inverse))
-        # What is not told may be anything: the flight is then compared with that of the bracket's center.
-        told = (jnp.sqrt(jnp.diagonal(covariance)) <= usable.half_width).all()
-        initial_state, cost, sound, rollouts = fit_start(problem, jnp.where(told, parameters, usable.center))
-        return conclude(
-            bracket,
-            parameters=parameters,
-            covariance=covariance,
-            initial_state=initial_state,
-            cost=cost,
-            rollouts=rollouts,
-            sweeps=1,
-            sound=sound,
-            done=jnp.ones((), dtype=bool),
-        )
+        return answer(problem, bracket, parameters, covariance)
