@@ -7,9 +7,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar, as_float
 from .dynamics import CASCADE_ORDER
-from .shooting import ShootingProblem
+from .shooting import ROUNDING, ShootingProblem
 
-# Residuals below this share of a channel's largest value are rounding, whatever their correlation.
+# Residuals below this share of a channel's largest value are rounding, whatever their correlation; in single precision
+# below as many rounding errors as add up over a flight.
 _ROUNDING = 1e-9
 # A channel with fewer measurements than this has no diagnostics.
 _FEWEST = 3
@@ -21,26 +22,31 @@ class Diagnostics(eqx.Module):
     p-values are what is left of the null hypothesis: near 0, residuals are not what they should be. Where fewer than
     three samples were measured, or residuals are rounding alone, nothing speaks against them: 1.
 
+    - `sound`: whether the trajectory stayed sound to its end; nothing else means anything where it did not.
     - `count`: measured samples.
     - `rms`: of the residuals, in the channel's unit.
-    - `percent`: 100 (1 - |y - x| / |y - mean y|): 100 is a perfect prediction, 0 is as good as the mean.
+    - `percent`: 100 (1 - |y - x| / |y - mean y|): 100 is a perfect prediction, 0 is as good as the mean. 0 where the
+      channel does not move.
     - `level`: mean square of the weighted residuals: 1 where they are as large as the problem's sigma says. The
       *normalised innovation level* of a model without process noise.
     - `level_p`: of that being so, two-sided (chi-squared).
     - `autocorrelation`: of neighbouring residuals, of those two samples apart, and so on.
+    - `colour`: the first of those that any two measured samples tell.
     - `white_p`: of all those being 0 (Ljung and Box 1978; with missing samples each lag counts its pairs, Stoffer
-      and Toloi 1992).
+      and Toloi 1992). Of one window only, 1 of several: an initial state fitted to each correlates what is left of it.
     - `input_correlation`: with the roll, pitch and yaw torques, each at the lag where it is largest.
     - `input_p`: of there being none at any lag and torque, with the residuals' own colour allowed for
       (Ljung, System Identification, chapter 16) and Bonferroni's correction: on the safe side.
     """
 
+    sound: Bool[Array, ""]
     count: Int[Array, " size"]
     rms: Float[Array, " size"]
     percent: Float[Array, " size"]
     level: Float[Array, " size"]
     level_p: Float[Array, " size"]
     autocorrelation: Float[Array, "size lags"]
+    colour: Float[Array, " size"]
     white_p: Float[Array, " size"]
     input_correlation: Float[Array, "size 3"]
     input_p: Float[Array, " size"]
@@ -62,19 +68,28 @@ def residual_diagnostics(
     - `fitted`: whether the parameters were fitted to this flight, which takes degrees of freedom.
     - `lags`: how many sample times apart correlations are looked at, at most.
 
-    **Raises:** `ValueError` for a number of lags that the flight has not.
+    **Raises:** `ValueError` for a number of lags that the flight has not, or parameters or an initial state of another
+    length than the problem's.
     """
+    parameters = as_float(parameters)
+    start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
+    for name, value, length in (
+        ("parameters", parameters, len(problem.model.parameter_names)),
+        ("initial_state", start, problem.windows * problem.size),
+    ):
+        if value.shape != (length,):
+            raise ValueError(f"`{name}` must be of shape ({length},), got {value.shape}.")
     samples = problem.flight.states.shape[-2]
     if not 1 <= lags < samples:
         raise ValueError(f"`lags` must lie in 1 to {samples - 1} for {samples} samples, got {lags}.")
-    return _diagnostics(problem, as_float(parameters), initial_state, fitted, lags)
+    return _diagnostics(problem, parameters, start, fitted, lags)
 
 
 @eqx.filter_jit
 def _diagnostics(
     problem: ShootingProblem,
     parameters: Parameters,
-    initial_state: Float[Array, " starts"] | None,
+    initial_state: Float[Array, " starts"],
     fitted: bool,
     lags: int,
 ) -> Diagnostics:
@@ -82,7 +97,8 @@ def _diagnostics(
     there = ~jnp.isnan(measured)
     errors = problem.residuals(parameters, initial_state).reshape(measured.shape)
     # A trajectory that diverges leaves nothing to judge.
-    there &= jnp.isfinite(problem.cost(parameters, initial_state)) & jnp.isfinite(errors).all()
+    sound = jnp.isfinite(problem.cost(parameters, initial_state)) & jnp.isfinite(errors).all()
+    there &= sound
     errors = jnp.where(there, errors, 0.0)
     count = there.sum(axis=0)
     known = count >= _FEWEST
@@ -91,34 +107,44 @@ def _diagnostics(
     values = jnp.where(there, measured, 0.0)
     motion = jnp.where(there, measured - values.sum(axis=0) / most, 0.0)
     size = jnp.abs(values).max(axis=0)
-    trivial = ~known | (sigma * jnp.abs(errors).max(axis=0) <= _ROUNDING * size)
+    rounding = max(_ROUNDING, ROUNDING * float(jnp.finfo(sigma.dtype).eps))
+    trivial = ~known | (sigma * jnp.abs(errors).max(axis=0) <= rounding * size)
 
     unknowns = problem.windows * problem.free_size + (parameters.shape[0] if fitted else 0)
     freedom = jnp.maximum(count * (1 - unknowns / jnp.maximum(count.sum(), 1)), 1.0)
-    below = jax.scipy.special.gammainc(freedom / 2, squares / 2)
+    below, above = (
+        tail(freedom / 2, squares / 2) for tail in (jax.scipy.special.gammainc, jax.scipy.special.gammaincc)
+    )
     spread = jnp.sqrt(jnp.square(motion).sum(axis=0))
+    moved = known & (spread > rounding * size * jnp.sqrt(most))
 
     correlation, pairs = jax.vmap(lambda e, t: _correlations(e, e, t, t, lags), in_axes=1)(errors, there)
     after, pairs = correlation[:, lags + 1 :], pairs[:, lags + 1 :]
     box = ((most + 2) / most) * (pairs * jnp.square(after)).sum(axis=1)
+    told = pairs > 0
+    colour = jnp.take_along_axis(after, jnp.argmax(told, axis=1)[:, None], axis=1)[:, 0]
+    # Nothing to test is nothing against it.
+    whitish = jax.scipy.special.gammaincc(jnp.maximum(told.sum(axis=1), 1) / 2, box / 2)
     torques = jnp.stack(problem.model.forcing(problem.flight.omega)[:3], axis=1)
     # The last row of rotor speeds drives nothing.
     driving = jnp.arange(torques.shape[0]) < torques.shape[0] - 1
-    torques = jnp.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
+    moves = jnp.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
+    moving = jnp.abs(moves).max(axis=0) > rounding * jnp.abs(torques[:-1]).max(axis=0)
+    torques = jnp.where(moving, moves, 0.0)
     strongest, least_p = jax.vmap(
         lambda e, t, own: jax.vmap(lambda u: _with_input(e, t, own, u, driving, lags), in_axes=1)(torques),
         in_axes=(1, 1, 0),
     )(errors, there, after)
     return Diagnostics(
+        sound=sound,
         count=count,
         rms=jnp.where(known, sigma * jnp.sqrt(squares / most), 0.0),
-        percent=jnp.where(
-            known, 100 * (1 - sigma * jnp.sqrt(squares) / jnp.maximum(spread, jnp.finfo(spread.dtype).tiny)), 0.0
-        ),
+        percent=jnp.where(moved, 100 * (1 - sigma * jnp.sqrt(squares) / jnp.where(moved, spread, 1.0)), 0.0),
         level=jnp.where(known, squares / freedom, 1.0),
-        level_p=jnp.where(known, 2 * jnp.minimum(below, 1 - below), 1.0),
+        level_p=jnp.where(known, 2 * jnp.minimum(below, above), 1.0),
         autocorrelation=jnp.where(trivial[:, None], 0.0, after),
-        white_p=jnp.where(trivial, 1.0, jax.scipy.special.gammaincc(lags / 2, box / 2)),
+        colour=jnp.where(trivial, 0.0, colour),
+        white_p=jnp.where(trivial | (problem.windows > 1), 1.0, whitish),
         input_correlation=jnp.where(trivial[:, None], 0.0, strongest),
         input_p=jnp.where(trivial, 1.0, jnp.minimum(3 * least_p.min(axis=1), 1.0)),
     )

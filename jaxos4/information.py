@@ -50,8 +50,8 @@ def robust_covariance(
     5 s with Gauss-Markov noise of 0.05 s, 95 % intervals hold the truth in 88 % of all flights, and in 48 % with
     the Cramer-Rao bound.
 
-    **Arguments:** as of `cramer_rao_bound`, at a fit's answer: the residuals there are taken as the noise. NaN where
-    the trajectory diverges.
+    **Arguments:** as of `cramer_rao_bound`, at a fit's answer: the residuals there are taken as the noise. Infinite
+    where the trajectory diverges or nothing was measured.
     """
     parameters = as_float(parameters)
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
@@ -82,7 +82,8 @@ def robust_covariance(
     spectrum = jnp.fft.rfft(window[:, None, None] * autocovariance, axis=0)
     slopes = jnp.fft.rfft(moves, length, axis=0)
     density = jnp.einsum("fcu,fcd,fdv->fuv", jnp.conj(slopes), spectrum, slopes)
-    return jnp.fft.irfft(density, length, axis=0)[0]
+    sound = jnp.isfinite(problem.cost(parameters, start)) & (measured.sum() > 0)
+    return jnp.where(sound, jnp.fft.irfft(density, length, axis=0)[0], jnp.inf)
 
 
 def _information(problem, parameters, initial_state) -> Float[Array, "windows unknowns unknowns"]:

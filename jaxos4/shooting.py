@@ -68,7 +68,8 @@ class ShootingProblem(eqx.Module):
     - `windows`: multiple shooting: the flight is cut into this many windows of equal length, each simulated from an
       initial state of its own, so that what the model lacks adds up over a window only. Nothing ties the end of one to
       the beginning of the next, which costs the information in the long drift of a flight that the model explains.
-      Initial states are then free.
+      Initial states are then free, and each simulated channel should be measured in some windows at least: nothing
+      else tells where a window began.
 
     An *initial state* below is the part of X at the first sample that the channels need, in cascade order: p, q, r,
     then phi, theta, psi, then x, vx, y, vy, z, vz; of several windows, one after the other.

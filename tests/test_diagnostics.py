@@ -105,6 +105,8 @@ def test_nothing_measured_rounding_alone_and_divergence_are_no_figures_to_worry_
     assert found.count.tolist() == [500, 500, 500, 0, 500, 500]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
     diverged = jaxos4.residual_diagnostics(problem, problem.model.alpha.at[2].set(1e9))
+    assert not diverged.sound
+    assert exact.sound
     assert (diverged.count == 0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(diverged))
 
@@ -114,3 +116,47 @@ def test_lags_that_cannot_be_are_named(lags):
     problem = standard_problem(channels="rates")
     with pytest.raises(ValueError, match="`lags` must lie in 1 to 500"):
         jaxos4.residual_diagnostics(problem, problem.model.alpha, lags=lags)
+
+
+def test_what_was_measured_now_and_then_is_tested_at_the_lags_that_there_are():
+    """Every fifth sample: five of 25 lags have pairs at all."""
+    kept = (jnp.arange(501) % 5 == 0)[:, None]
+    white = judged(jnp.where(kept, noisy_states(200, seed=23), jnp.nan))
+    assert abs(float((white.white_p < 0.05).mean()) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 600)
+    slow = jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.1)
+    coloured = judged(jnp.where(kept, coloured_states(16, slow), jnp.nan))
+    assert np.median(coloured.white_p) < 1e-3
+    # Five samples, half a correlation time, apart; some of it is taken for motion.
+    assert 0.3 < float(coloured.colour.mean()) < np.exp(-0.5)
+
+
+def test_channels_and_inputs_that_stand_still_say_so():
+    model = jaxos4.PublishedOS4()
+    omega = jnp.broadcast_to(jnp.array([220.0, 226.0, 221.0, 227.0]), (501, 4))
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)
+    noise = 0.2 * jaxos4.SENSOR_SIGMA * jax.random.normal(jax.random.key(2), flight.states.shape)
+    still = (flight.states + noise).at[:, 11].set(0.1)
+    problem = jaxos4.ShootingProblem(
+        model,
+        eqx.tree_at(lambda f: f.states, flight, still),
+        sigma=jaxos4.SENSOR_SIGMA,
+        initial_state=flight.states[0],
+        channels="rates",
+    )
+    found = jaxos4.residual_diagnostics(problem, model.alpha)
+    assert (found.input_correlation == 0).all()
+    assert (found.input_p == 1).all()
+    assert found.percent[2] == 0
+
+
+def test_windows_have_no_verdict_on_whiteness():
+    problem = standard_problem(states=noisy_states(1)[0], channels="rates", free=True)
+    problem = jaxos4.ShootingProblem(problem.model, problem.flight, sigma=problem.sigma, channels="rates", windows=20)
+    found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
+    left = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+    assert (left.white_p == 1).all()
+    np.testing.assert_allclose(left.level, 1, atol=5 * np.sqrt(2 / 430))
+    with pytest.raises(ValueError, match=r"`initial_state` must be of shape \(60,\)"):
+        jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state[:30])
+    with pytest.raises(ValueError, match=r"`parameters` must be of shape \(8,\)"):
+        jaxos4.residual_diagnostics(problem, found.parameters[:7], found.initial_state)

@@ -90,6 +90,7 @@ def test_coverage(tmp_path):
     assert [row["estimator"] for row in rows] == ["ibss", "hybrid", "output-error"]
     for row in rows:
         assert row["results"] == {"successful": 100}
+        np.testing.assert_allclose(row["std"], 1, atol=0.05)  # and not by being wide
         covered = np.array(row["covered"] + row["constants_covered"])
         assert np.all(np.abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 100))
 

@@ -177,6 +177,13 @@ def test_robust_is_honest_where_most_samples_are_missing():
     assert np.all((ratio > 0.6) & (ratio < 1.4))
 
 
+def test_robust_tells_nothing_from_nothing():
+    problem = standard_problem(channels="rates")
+    blank = eqx.tree_at(lambda p: p.flight.states, problem, jnp.full((501, 12), jnp.nan))
+    for broken, alpha in ((blank, problem.model.alpha), (problem, problem.model.alpha.at[2].set(1e9))):
+        assert np.isposinf(jaxos4.robust_covariance(broken, alpha)).all()
+
+
 def test_where_the_model_cannot_fly_nothing_is_told():
     problem = standard_problem(channels="rates")
     names, bracket = problem.model.parameter_names, jaxos4.Bracket.default(problem.model)

@@ -170,3 +170,17 @@ def test_windows_and_estimators_that_have_none_are_refused():
     for estimator in (jaxos4.EquationError(), jaxos4.RecursiveLeastSquares(), jaxos4.SVSF(), jaxos4.JointEKF()):
         with pytest.raises(ValueError, match="`problem.windows` must be 1"):
             estimator(problem, jaxos4.Bracket.default(problem.model))
+
+
+def test_the_cost_of_each_estimator_is_that_of_its_answer():
+    """A doublet seen from a bracket that is off: some parameters are not told."""
+    model = jaxos4.PublishedOS4()
+    flight = jaxos4.simulate(model, model.alpha, jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT), dt=DT)
+    noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
+    problem = jaxos4.ShootingProblem(model, noisy, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
+    bracket = jaxos4.Bracket.around(model.alpha + 0.4 * model.half_width, model.half_width)
+    for estimator in (*SHOOTING, jaxos4.EquationError(), jaxos4.RecursiveLeastSquares(), jaxos4.SVSF()):
+        found = estimator(problem, bracket)
+        assert str(jaxos4.result_names(found.result)) == "unidentifiable"
+        cost = problem.cost(found.parameters, found.initial_state)
+        np.testing.assert_allclose(found.cost, cost, rtol=1e-9)

@@ -24,7 +24,7 @@ from jaxos4.dynamics import MODELS
 
 jax.config.update("jax_enable_x64", True)
 
-ESTIMATORS = ("ibss", "hybrid", "output-error")
+ESTIMATORS = {"ibss": jaxos4.IBSS, "hybrid": jaxos4.Hybrid, "output-error": jaxos4.OutputError}
 CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
 # Flights in one call: what fits in memory beside the residuals' derivatives.
 CHUNK = 250
@@ -57,11 +57,13 @@ def cover(
     names, counts = np.unique(jaxos4.result_names(found.result), return_counts=True)
     # A flight without an estimate has an infinite interval: it counts as not covered.
     errors, half_width = np.abs(found.parameters - model.alpha), np.asarray(found.half_width(0.95))
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(exact.states), model.alpha)))
     truth = np.append(np.asarray(model.airframe.inertia), model.airframe.rotor_inertia)
     outside = np.abs(rigid.constants - truth) > scipy.stats.norm.ppf(0.975) * np.asarray(rigid.std)
     told = np.isfinite(half_width)
     return {
         "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "std": np.median(found.std / bound, axis=0).tolist(),
         "covered": (told & (errors < half_width)).mean(axis=0).tolist(),
         "constants_covered": (np.isfinite(rigid.std) & ~outside).mean(axis=0).tolist(),
         "inconsistent": float((rigid.p_value < 0.05).mean()),
@@ -74,7 +76,7 @@ def main(
     seed: Annotated[int, typer.Option(help="Of noise and starts.")] = 11,
     model: Annotated[str, typer.Option(help="published or corrected.")] = "published",
     channels: Annotated[str, typer.Option(help="rates, attitude or all.")] = "all",
-    estimators: Annotated[list[str], typer.Option(help="Which ones.")] = ESTIMATORS,
+    estimators: Annotated[list[str], typer.Option(help="Which ones.")] = tuple(ESTIMATORS),
     scales: Annotated[list[float], typer.Option(help="Multiples of the standard noise.")] = (0.1, 1.0, 10.0),
     steps: Annotated[int, typer.Option(help="Training of the hybrid's network.")] = jaxos4.NetworkEstimator.steps,
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
@@ -105,10 +107,7 @@ def main(
                     vehicle, exact, sigma=jaxos4.SENSOR_SIGMA, initial_state=exact.states[0], channels=channels
                 )
                 network = training.fit(standard, jaxos4.Bracket.default(vehicle), key=jax.random.key(0))
-            if name == "hybrid":
-                estimator: jaxos4.AbstractEstimator = jaxos4.Hybrid(network)
-            else:
-                estimator = jaxos4.IBSS() if name == "ibss" else jaxos4.OutputError()
+            estimator = jaxos4.Hybrid(network) if name == "hybrid" else ESTIMATORS[name]()
             row = cover(estimator, problem, exact, scale, flights, seed)
             rows.append({"scale": scale, "estimator": name, **row})
             table.add_row(

@@ -21,7 +21,7 @@ import jaxos4
 
 jax.config.update("jax_enable_x64", True)
 
-ESTIMATORS = ("ibss", "output-error", "hybrid")
+SHOOTING = {"ibss": jaxos4.IBSS, "output-error": jaxos4.OutputError}
 # What every estimator is judged on: the parameters whose size the flight tells.
 TOLD = (0, 2, 3, 5, 7)
 
@@ -62,7 +62,7 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
         seconds = (time.perf_counter() - begin) / flights
         found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
     else:
-        estimator = jaxos4.IBSS() if name == "ibss" else jaxos4.OutputError()
+        estimator = SHOOTING[name]()
         one = eqx.filter_jit(eqx.filter_vmap(lambda states: estimator(problem(states), bracket)))
         jax.block_until_ready(one(states))
         begin = time.perf_counter()
@@ -84,11 +84,11 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
 
 def main(
     duration: Annotated[float, typer.Option(help="Of each flight [s].")] = 60.0,
-    flights: Annotated[int, typer.Option(help="For a row; the hybrid trains a network for each.")] = 8,
+    flights: Annotated[int, typer.Option(help="For a row.")] = 8,
     seed: Annotated[int, typer.Option(help="Of drifts and noise.")] = 3,
     drifts: Annotated[list[float], typer.Option(help="Standard deviation of the rotors' factors.")] = (0.0, 1e-4, 1e-3),
     windows: Annotated[list[int], typer.Option(help="How many.")] = (1, 6, 30, 120),
-    estimators: Annotated[list[str], typer.Option(help="Which ones.")] = ESTIMATORS,
+    estimators: Annotated[list[str], typer.Option(help="Or hybrid: it trains for each flight.")] = tuple(SHOOTING),
     steps: Annotated[int, typer.Option(help="Training of the hybrid's networks.")] = 1000,
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
@@ -114,7 +114,7 @@ def main(
                     f"{drift:g}",
                     str(count),
                     name,
-                    *(f"{x:.2g}" for x in row["percent"] or [np.nan] * len(TOLD)),
+                    *((f"{x:.2g}" for x in row["percent"]) if row["percent"] else "-" * len(TOLD)),
                     f"{row['rollouts']:.0f}",
                     f"{row['seconds']:.2g}",
                     ", ".join(f"{number} {what}" for what, number in row["results"].items()),

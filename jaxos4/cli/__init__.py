@@ -1,3 +1,3 @@
-"""The command line: `jaxos4 simulate`, `jaxos4 estimate`."""
+"""The command line: `jaxos4 simulate`, `estimate`, `identifiability`, `train`."""
 
 from ._app import main as main

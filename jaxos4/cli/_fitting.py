@@ -91,11 +91,25 @@ def problem_of(
                 f"{path}: row 2: --initial-state known needs {', '.join(missing)} there; use --initial-state free."
             )
         start = jnp.nan_to_num(flight.states[0])
-    windows, samples = 1, flight.states.shape[0]
+    windows, samples, dt = 1, flight.states.shape[0], float(flight.dt)
     if window is not None:
-        windows = max(round(samples * float(flight.dt) / window), 1)
-        if windows > samples // 2:
-            raise InputError(f"--window {window:g}: less than two samples of {path}; give at least {2 * flight.dt:g}.")
+        if window < 2 * dt:
+            raise InputError(f"--window {window:g}: less than two samples of {path}; give at least {2 * dt:g}.")
+        windows = min(max(round(samples * dt / window), 1), samples // 2)
+    columns = CASCADE_ORDER[: CHANNELS[chosen]]
+    if windows > 1:
+        absent = [STATE_NAMES[i] for i in columns if not measured[:, i].any()]
+        if absent and chosen != "rates":
+            raise InputError(
+                f"{path}: --window: {', '.join(absent)} were not measured, and no window could tell where it began; "
+                "use --channels rates."
+            )
+    unknowns = len(model.parameter_names) + (0 if known else windows * len(columns))
+    if measured[:, columns].sum() <= unknowns:
+        raise InputError(
+            f"{path}: {measured[:, columns].sum()} measurements for {unknowns} unknowns; give a longer flight"
+            + ("." if window is None else ", or fewer windows.")
+        )
     return ShootingProblem(model, flight, sigma=SENSOR_SIGMA, initial_state=start, channels=chosen, windows=windows)
 
 

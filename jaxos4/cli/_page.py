@@ -55,7 +55,7 @@ def print_page(console: Console, report: dict[str, Any]) -> None:
             "intervals allow for their colour where the estimator shoots, and are still too narrow for slow errors.",
             highlight=False,
         )
-    _print_tests(console, fit)
+    _print_tests(console, fit, report["provenance"]["windows"])
     _print_constants(console, report["constants"])
     _print_validation(console, report["validation"])
     console.print(
@@ -65,9 +65,13 @@ def print_page(console: Console, report: dict[str, Any]) -> None:
     )
 
 
-def _print_tests(console: Console, fit: dict[str, Any]) -> None:
+def _print_tests(console: Console, fit: dict[str, Any], windows: int) -> None:
+    if not fit:
+        return
     for what, key in (("white (Ljung-Box)", "white_p"), ("free of the inputs (cross-correlation)", "input_p")):
         failed = [name for name, row in fit.items() if row[key] * len(fit) < SIGNIFICANCE]
+        if key == "white_p" and windows > 1:
+            continue
         said = f"not those of {', '.join(failed)}" if failed else "all"
         console.print(f"residuals {what}, tests at {SIGNIFICANCE:.0%}: {said}.", highlight=False)
 

@@ -1,7 +1,6 @@
 """`jaxos4 estimate`: the parameters that a flight tells, with their intervals."""
 
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +12,6 @@ import typer
 from jaxtyping import Array, Float
 from rich.console import Console
 
-from .._files import write_atomically
 from ..bracket import Bracket
 from ..diagnostics import Diagnostics, residual_diagnostics
 from ..dynamics import CASCADE_ORDER, PARAMETER_NAMES, AbstractModel
@@ -52,6 +50,7 @@ from ._choices import (
     WindowOption,
 )
 from ._fitting import NO_ANSWER, fit, fit_network, load_job, problem_of, seen_channels
+from ._json import finite, write_json
 from ._page import COLOURED, print_page
 
 # How long a network is trained that only has to say where to look.
@@ -95,6 +94,8 @@ def estimate(
         raise InputError(f"--channels {channels}: {estimator} looks at the rates; use --estimator output-error.")
     if window is not None and estimator in (*RATES_ONLY, "kalman"):
         raise InputError(f"--window: {estimator} does not shoot; use --estimator ibss, hybrid or output-error.")
+    if window is not None and network is not None:
+        raise InputError("--window: a network of windows serves one flight alone; leave --network out.")
     if out is not None:
         check_output(out, flight, Path(airframe), bracket, network, validate)
     trained = None if network is None else load_network(network)
@@ -139,7 +140,7 @@ def estimate(
     left = None
     if answered:
         left = _diagnostics(problem, found.parameters, found.initial_state, fitted=True)
-        if estimator in SHOOTING and (left.autocorrelation[:, 0] > COLOURED).any():
+        if estimator in SHOOTING and (left.colour > COLOURED).any():
             robust = robust_covariance(problem, found.parameters, found.initial_state)
             found = eqx.tree_at(lambda e: e.covariance, found, robust)
     seconds = time.perf_counter() - begin
@@ -149,7 +150,7 @@ def estimate(
         "model": model.value,
         "result": name,
         "rollouts": rollouts,
-        "cost": _number(found.cost),
+        "cost": finite(found.cost),
         "seconds": seconds,
         "parameters": _parameters(problem, where, found, bound, with_prior=estimator in FILTERS),
         "constants": _constants(problem.model, found) if answered else {},
@@ -169,12 +170,12 @@ def estimate(
         },
     }
     if out is not None:
-        with write_atomically(out) as beside:
-            beside.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_json(report, out)
     if name == "nonfinite_trajectory":
+        remedy = " (try a --window, or a shorter one)" if estimator in (*SHOOTING, "network") else ""
         console.print(
             "No estimate: wherever the search went, the model's trajectory left this flight before its end. The "
-            "vehicle may do what the model lacks (try a shorter --window), or the airframe or the units are far off.",
+            f"vehicle may do what the model lacks{remedy}, or the airframe's constants or the units are far off.",
             highlight=False,
         )
     elif answered:
@@ -204,11 +205,11 @@ def _parameters(
         told = np.isfinite(std) and std <= most
         table[name] = {
             "estimate": value if told else None,
-            "std": _number(std),
-            "bound": _number(bound[i]),
+            "std": finite(std),
+            "bound": finite(bound[i]),
             "ci95": [value - half_width[i], value + half_width[i]] if told else None,
             "unit": unit,
-            "noise_limit": None if known is None else _number(known.noise_limit[i]),
+            "noise_limit": None if known is None else finite(known.noise_limit[i]),
             "note": _note(found, i, half_width[i], lower, upper) if told else _why_untold(known, name, model),
         }
     return table
@@ -259,10 +260,10 @@ def _quality(problem: ShootingProblem, left: Diagnostics) -> dict[str, dict[str,
         STATE_NAMES[column]: {
             "rms": float(left.rms[i]),
             "unit": STATE_UNITS[column],
-            "percent": _number(left.percent[i]),
+            "percent": finite(left.percent[i]),
             "level": float(left.level[i]),
             "level_p": float(left.level_p[i]),
-            "correlation": float(left.autocorrelation[i, 0]),
+            "correlation": float(left.colour[i]),
             "white_p": float(left.white_p[i]),
             "input_correlation": dict(zip(("roll", "pitch", "yaw"), left.input_correlation[i].tolist(), strict=True)),
             "input_p": float(left.input_p[i]),
@@ -280,7 +281,7 @@ def _validation(problem: ShootingProblem, found: Estimate, other: ShootingProble
     left = _diagnostics(other, found.parameters, start, fitted=False) if told else None
     return {
         "flight": str(path),
-        "cost": _number(cost) if told else None,
+        "cost": finite(cost) if told else None,
         "fit": None if left is None else _quality(other, left),
     }
 
@@ -300,7 +301,3 @@ def _provenance() -> dict[str, str]:
         "device": jax.devices()[0].device_kind,
         "precision": "float64",
     }
-
-
-def _number(x: Float[Array | np.ndarray, ""] | float | np.floating) -> float | None:
-    return float(x) if np.isfinite(x) else None

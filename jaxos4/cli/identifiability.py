@@ -1,6 +1,5 @@
 """`jaxos4 identifiability`: what a flight can tell of each parameter, and why not of the others."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +7,9 @@ import rich.box
 from rich.console import Console
 from rich.table import Table
 
-from .._files import write_atomically
 from ..estimators import IBSS
 from ..flight import STATE_NAMES
-from ..identifiability import identifiability as information_of
+from ..identifiability import Identifiability, identifiability as information_of
 from ..results import result_names
 from ._check_output import check_output
 from ._choices import (
@@ -27,6 +25,7 @@ from ._choices import (
     WindowOption,
 )
 from ._fitting import NO_ANSWER, fit, load_job
+from ._json import finite, write_json
 
 # Of a direction, what is not shown: shares of a half-width below this one of the largest.
 SMALL = 0.1
@@ -75,6 +74,31 @@ def identifiability(
     )
     for name, note in notes.items():
         console.print(f"{name}: {note}", highlight=False)
+    if np.isfinite(std).all():
+        _print_weakest(console, known, names)
+    if out is not None:
+        report = {
+            "flight": str(flight),
+            "fitted": fitted,
+            "sigma": dict(zip(STATE_NAMES, problem.sigma.tolist(), strict=True)),
+            "parameters": {
+                name: {
+                    "bound": finite(std[i]),
+                    "others_known": finite(alone[i]),
+                    "half_width": float(known.half_width[i]),
+                    "noise_limit": finite(limit[i]) if np.isfinite(std[i]) else None,
+                    "unit": units[i],
+                    "note": notes.get(name, ""),
+                }
+                for i, name in enumerate(names)
+            },
+            "eigenvalues": known.eigenvalues.tolist() if np.isfinite(std).all() else None,
+            "directions": known.directions.T.tolist() if np.isfinite(std).all() else None,
+        }
+        write_json(report, out)
+
+
+def _print_weakest(console: Console, known: Identifiability, names: tuple[str, ...]) -> None:
     weakest = np.asarray(known.directions)[:, 0]
     parts = [
         f"{weakest[i]:+.2f} {names[i]}"
@@ -86,28 +110,3 @@ def identifiability(
     console.print(
         f"told least, in half-widths: {' '.join(parts)}, to {size} (1: as well as the bracket).", highlight=False
     )
-    if out is not None:
-        report = {
-            "flight": str(flight),
-            "fitted": fitted,
-            "sigma": dict(zip(STATE_NAMES, problem.sigma.tolist(), strict=True)),
-            "parameters": {
-                name: {
-                    "bound": _number(std[i]),
-                    "others_known": _number(alone[i]),
-                    "half_width": float(known.half_width[i]),
-                    "noise_limit": _number(limit[i]),
-                    "unit": units[i],
-                    "note": notes.get(name, ""),
-                }
-                for i, name in enumerate(names)
-            },
-            "eigenvalues": known.eigenvalues.tolist(),
-            "directions": known.directions.T.tolist(),
-        }
-        with write_atomically(out) as beside:
-            beside.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _number(x: float) -> float | None:
-    return float(x) if np.isfinite(x) else None

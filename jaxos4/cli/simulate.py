@@ -15,15 +15,15 @@ from ..noise import SENSOR_SIGMA, WhiteNoise
 from ..results import RESULTS, result_names
 from ..simulate import simulate as fly
 from ._check_output import check_output
-from ._choices import Excitation, Method, Model
+from ._choices import AirframeOption, Excitation, Method, Model, ModelOption
 
 MOST_SAMPLES = 5_000_000  # more no longer fit an ordinary machine's memory
 
 
 def simulate(
     out: Annotated[Path, typer.Option(help="The flight file to write (CSV).")],
-    model: Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")] = Model["published"],
-    airframe: Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")] = "os4",
+    model: ModelOption = Model["published"],
+    airframe: AirframeOption = "os4",
     excitation: Annotated[Excitation, typer.Option(help="The shape of the inputs.")] = Excitation["multisine"],
     duration: Annotated[float, typer.Option(help="Length [s].")] = 5.0,
     dt: Annotated[float, typer.Option(help="Sample time [s].")] = 0.01,

@@ -19,7 +19,7 @@ REACH = 4.0
 # The standard deviation, in half-widths, where a filter that begins with one half-width owes as much to the flight.
 WITH_PRIOR = 0.5**0.5
 # Towards an initial state with the parameters known: the trajectory is nearly linear in it.
-_START_STEPS = 2
+_START_STEPS = 4
 
 
 class Calibration(eqx.Module):
@@ -151,15 +151,20 @@ def fit_start(
 ) -> tuple[Float[Array, " starts"], Scalar, Bool[Array, ""], int]:
     """The initial state that explains the flight best with these parameters, for algorithms that do not look for one.
 
-    Two Gauss-Newton steps from the first measurements where it is free. Returns it with the cost there, whether the
-    trajectory is sound, and how many rollouts it took.
+    A few Gauss-Newton steps from the first measurements where it is free, held by how far off those may be. Returns it
+    with the cost there, whether the trajectory is sound, and how many rollouts it took.
     """
-    start, _ = problem.first_state()
+    first, off = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
-    for _ in range(_START_STEPS if free else 0):
+
+    def improve(start: Float[Array, " starts"], _) -> tuple[Float[Array, " starts"], None]:
         _, gradient, information = problem.curvatures(parameters, start)
-        own = jax.vmap(invert)(information[:, count:, count:])
-        start = start - (own * gradient[:, None, count:]).sum(axis=-1).ravel()
+        known = 1 / jnp.square(problem.split(off))
+        own = jax.vmap(invert)(information[:, count:, count:] + jax.vmap(jnp.diag)(known))
+        slope = gradient[:, count:] + known * problem.split(start - first)
+        return start - (own * slope[:, None, :]).sum(axis=-1).ravel(), None
+
+    start = jax.lax.scan(improve, first, length=_START_STEPS)[0] if free else first
     cost, sound = problem.shots(parameters, start)
     return start, cost, sound, 1 + (_START_STEPS * (count + free) if free else 0)
 

@@ -218,18 +218,20 @@ def answer(
 ) -> Estimate:
     """A regression's parameters as an estimate: the initial state and the cost are those of shooting with them.
 
-    What is not told may be anything: the flight is then compared with that of the bracket's center.
+    What is not told may be anything: where the flight cannot be simulated with it, the bracket's center is returned.
     """
     usable = bracket.usable
     told = (jnp.sqrt(jnp.diagonal(covariance)) <= usable.half_width).all()
-    initial_state, cost, sound, rollouts = fit_start(problem, jnp.where(told, parameters, usable.center))
+    flies = jnp.isfinite(problem.cost(parameters))
+    parameters = jnp.where(told | flies, parameters, usable.center)
+    initial_state, cost, sound, rollouts = fit_start(problem, parameters)
     return conclude(
         bracket,
         parameters=parameters,
         covariance=covariance,
         initial_state=initial_state,
         cost=cost,
-        rollouts=rollouts,
+        rollouts=rollouts + 1,
         sweeps=1,
         sound=sound,
         done=jnp.ones((), dtype=bool),

@@ -28,6 +28,9 @@ class OutputError(AbstractEstimator):
     channels alone lead to other minima. Unknowns are scaled by the bracket's half-widths (an initial state by how far
     off it may be), so that the damping means the same for each.
 
+    The Jacobian is dense: of a flight cut into windows it grows with the square of their number, where IBSS eliminates
+    them one by one.
+
     **Arguments:**
 
     - `tolerance`: of the step, relative and absolute in scaled unknowns, and of the cost.
@@ -67,7 +70,7 @@ class OutputError(AbstractEstimator):
             found = solution.value * scale
             parameters, starts = found[:count], starts.at[:, :free].set(found[count:].reshape(problem.windows, free))
             taken = solution.stats["num_steps"]
-            steps, rollouts = steps + taken, rollouts + taken * (1 + count + free)
+            steps, rollouts = steps + taken, rollouts + taken * (1 + count + problem.windows * free)
             done = solution.result == optx.RESULTS.successful
         initial_state = starts.ravel()
         shots, _, information = problem.curvatures(parameters, initial_state)
