@@ -155,12 +155,13 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
             f"{source}: neither a file nor one of the presets {', '.join(PRESETS)}; give one of them."
         ) from None
     try:
-        return _from_table(table)
+        return airframe_from_table(table)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
 
 
-def _from_table(table: dict[str, Any]) -> Airframe:
+def airframe_from_table(table: dict[str, Any]) -> Airframe:
+    """The airframe in a TOML table, keys as in `load_airframe`. Raises `InputError` that says what is wrong."""
     table = dict(table)
     if "arm" in table:
         if "rotor_positions" in table:

@@ -174,3 +174,17 @@ class Chain(AbstractNoise):
 
 def _normal(key: Key, like: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     return jax.random.normal(key, like.shape, like.dtype)
+
+
+# Memory [s] of coloured noise; offsets and steps in multiples of the white noise beside them; share that is lost.
+_MEMORY, _OFFSET, _STEP, _LOST = 0.05, 0.5, 2.0, 0.1
+
+NOISES: dict[str, Callable[[ArrayLike], AbstractNoise]] = {
+    "white": WhiteNoise,
+    "coloured": lambda sigma: GaussMarkov(sigma, _MEMORY),
+    "biased": lambda sigma: Chain((WhiteNoise(sigma), ConstantBias(_OFFSET * as_float(sigma)))),
+    "quantised": lambda sigma: Chain((WhiteNoise(sigma), Quantisation(_STEP * as_float(sigma)))),
+    "lossy": lambda sigma: Chain((WhiteNoise(sigma), Dropouts(_LOST))),
+}
+"""Kinds of noise of a standard deviation: white; with a memory of 0.05 s; white with an offset that lasts a flight, of
+half its size; white, rounded to twice its size; white, with a tenth of the samples lost."""

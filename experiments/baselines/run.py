@@ -5,7 +5,6 @@ standard deviation, so that what coloured and biased noise cost shows. Without n
 scale 1.
 """
 
-import functools
 import json
 import time
 from collections.abc import Callable
@@ -21,16 +20,11 @@ from rich.table import Table
 
 import jaxos4
 from jaxos4.estimators import BASELINES
+from jaxos4.noise import NOISES
 
 jax.config.update("jax_enable_x64", True)
 
 ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {"ibss": jaxos4.IBSS, **BASELINES}
-# What each scale of sigma multiplies: white; memory of 0.05 s; a constant per flight half of it, beside white noise.
-NOISES: dict[str, Callable[[np.ndarray], jaxos4.AbstractNoise]] = {
-    "white": jaxos4.WhiteNoise,
-    "coloured": functools.partial(jaxos4.GaussMarkov, correlation_time=0.05),
-    "biased": lambda sigma: jaxos4.Chain((jaxos4.WhiteNoise(sigma), jaxos4.ConstantBias(0.5 * sigma))),
-}
 
 
 def identify(

@@ -9,6 +9,7 @@ from ..errors import InputError, TrainingError
 from .estimate import estimate
 from .identifiability import identifiability
 from .simulate import simulate
+from .study import study
 from .train import train
 
 app = typer.Typer(
@@ -21,6 +22,7 @@ app.command()(simulate)
 app.command()(estimate)
 app.command()(train)
 app.command()(identifiability)
+app.command()(study)
 
 
 def main() -> None:

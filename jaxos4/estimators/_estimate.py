@@ -51,6 +51,8 @@ class Estimate(eqx.Module):
     - `calibration`: of the intervals, where they were calibrated on simulated flights; `None`: Gaussian.
     - `seed`: the bracket that the search began from, where another estimator gave one.
     - `history`: of a recursive estimator, the parameters after each sample.
+    - `brackets`: of a search that records them, from where to where each sweep looked in each parameter; NaN where
+      there were fewer sweeps.
     """
 
     parameters: Parameters
@@ -63,6 +65,7 @@ class Estimate(eqx.Module):
     calibration: Calibration | None = None
     seed: Bracket | None = None
     history: Float[Array, "samples parameters"] | None = None
+    brackets: Float[Array, "sweeps 2 parameters"] | None = None
 
     @property
     def std(self) -> Float[Array, "*batch parameters"]:

@@ -1,5 +1,7 @@
 """The hybrid: a network says where to look, and shooting finds the answer there."""
 
+import equinox as eqx
+
 from ..bracket import Bracket
 from ..shooting import ShootingProblem
 from ._estimate import AbstractEstimator, Estimate
@@ -23,7 +25,7 @@ class Hybrid(AbstractEstimator):
     """
 
     network: TrainedNetwork
-    ibss: IBSS = IBSS(halvings=3)
+    ibss: IBSS = eqx.field(default_factory=lambda: IBSS(halvings=3))
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight. Raises as the network does."""

@@ -68,6 +68,7 @@ class _Search(NamedTuple):
     growth: Float[Array, "windows unknowns"]
     sweeps: Int[Array, ""]
     done: Bool[Array, ""]
+    brackets: Float[Array, "record 2 parameters"] | None
 
 
 class _Progress(NamedTuple):
@@ -76,6 +77,7 @@ class _Progress(NamedTuple):
     sweeps: Int[Array, ""]
     rollouts: Int[Array, ""]
     done: Bool[Array, ""]
+    brackets: Float[Array, "record 2 parameters"] | None
 
 
 class IBSS(AbstractEstimator):
@@ -93,6 +95,7 @@ class IBSS(AbstractEstimator):
     - `tolerance`: the search ends once no direction has more than this share of its standard deviation to go, judged
       from the actual residuals, so that noise-free data are fitted to rounding.
     - `reach`: hard limits, in half-widths of the bracket around its center.
+    - `record`: how many sweeps' brackets the estimate keeps, to show how a search went.
 
     An initial state that is free is searched like the parameters, from the first measurement of each channel.
     """
@@ -102,11 +105,12 @@ class IBSS(AbstractEstimator):
     max_sweeps: int = eqx.field(static=True, default=60)
     tolerance: Scalar = eqx.field(converter=as_float, default=0.02)
     reach: Scalar = eqx.field(converter=as_float, default=REACH)
+    record: int = eqx.field(static=True, default=0)
 
     def __check_init__(self):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
-        for name, least in (("halvings", 2), ("max_sweeps", 1)):
+        for name, least in (("halvings", 2), ("max_sweeps", 1), ("record", 0)):
             value = getattr(self, name)
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
@@ -178,6 +182,7 @@ class IBSS(AbstractEstimator):
             sweeps=best.sweeps,
             result=best.result,
             seed=Bracket.around(seed.parameters, half_width),
+            brackets=best.brackets,
         )
 
     def _from_seed(self, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> tuple[_Progress, Curvature]:
@@ -220,7 +225,8 @@ class IBSS(AbstractEstimator):
         unknowns = _joined(problem, parameters, problem.first_state()[0])
         spread = jax.vmap(jnp.diag)(jnp.square(_prior(problem, bracket)))
         none = jnp.zeros((), dtype=int)
-        return _Progress(jnp.clip(unknowns, lower, upper), spread, none, none, asleep)
+        brackets = jnp.full((self.record, 2, parameters.shape[0]), jnp.nan) if self.record else None
+        return _Progress(jnp.clip(unknowns, lower, upper), spread, none, none, asleep, brackets)
 
     def _limits(
         self, problem: ShootingProblem, bracket: Bracket
@@ -239,7 +245,7 @@ class IBSS(AbstractEstimator):
         """The estimate, and how it ended."""
         count = bracket.lower.shape[0]
         initial_state = progress.unknowns[:, count:].ravel() if problem.free_size else problem.first_state()[0]
-        return conclude(
+        estimate = conclude(
             bracket,
             parameters=progress.unknowns[0, :count],
             covariance=covariance_of_shared(curvature.information, count),
@@ -251,6 +257,7 @@ class IBSS(AbstractEstimator):
             done=progress.done,
             reach=self.reach,
         )
+        return eqx.tree_at(lambda e: e.brackets, estimate, progress.brackets, is_leaf=lambda leaf: leaf is None)
 
     def _search(
         self,
@@ -325,6 +332,8 @@ class IBSS(AbstractEstimator):
                 return u + step[:, None] * direction, (step, step - predicted, at_end)
 
             columns = (jnp.moveaxis(here.basis, -1, 0), half_width.T, leash.T, is_shared)
+            widest = jnp.abs(here.basis * half_width[:, None, :]).max(axis=(0, 2))[:count]
+            around = search.unknowns[0, :count] + jnp.stack([-widest, widest])
             moved, (steps, errors, at_end) = jax.lax.scan(along, search.unknowns, columns)
             off = _SAFETY * jnp.abs(errors).max() / jnp.maximum(jnp.abs(steps).max(), finest)
             sound = jnp.isfinite(here.curvature.shot.cost).all() & jnp.isfinite(moved).all()
@@ -342,11 +351,12 @@ class IBSS(AbstractEstimator):
                 growth=jnp.where(at_end.T, _GROWTH * search.growth, 1.0),
                 sweeps=search.sweeps + 1,
                 done=~sound | (there.ahead <= enough),
+                brackets=_kept(search.brackets, progress.sweeps + search.sweeps, around),
             )
 
         begin = progress.unknowns[:, :size]
         none, one = jnp.zeros((), dtype=int), jnp.ones((), dtype=float)
-        search = _Search(begin, look(begin), one, jnp.ones_like(begin), none, progress.done)
+        search = _Search(begin, look(begin), one, jnp.ones_like(begin), none, progress.done, progress.brackets)
         search = jax.lax.while_loop(lambda s: ~s.done & (s.sweeps < self.max_sweeps), sweep, search)
         curvature = search.quadratic.curvature
         misfit = jnp.maximum(_misfit(curvature.shot.cost.sum(), rows), 1.0)
@@ -358,6 +368,7 @@ class IBSS(AbstractEstimator):
             progress.sweeps + search.sweeps,
             progress.rollouts + rollouts,
             search.done,
+            search.brackets,
         ), curvature
 
     def _directions(
@@ -376,6 +387,13 @@ class IBSS(AbstractEstimator):
             return scale[:, :, None] * columns, columns / scale[:, :, None]
         factor = joint_factor(information, count)
         return factor, inverse_transpose(factor, count)
+
+
+def _kept(
+    brackets: Float[Array, "record 2 parameters"] | None, sweep: Int[Array, ""], around: Float[Array, "2 parameters"]
+) -> Float[Array, "record 2 parameters"] | None:
+    """The record with one more sweep; what is beyond its length is dropped."""
+    return None if brackets is None else brackets.at[sweep].set(around, mode="drop")
 
 
 def _joined(

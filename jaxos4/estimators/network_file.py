@@ -4,9 +4,7 @@ import dataclasses
 import importlib.metadata
 import json
 import os
-import tokenize
 import zipfile
-import zlib
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._custom_types import as_float
-from .._files import write_atomically
+from .._files import BROKEN, write_atomically
 from ..airframe import Airframe
 from ..bracket import Bracket
 from ..dynamics import MODELS
@@ -26,20 +24,6 @@ from .network import NetworkEstimator, TrainedNetwork, untrained
 
 _FORMAT = 2
 _LARGEST = 2**30
-# What a file that was cut, altered or never was one makes its readers raise.
-_BROKEN = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
@@ -91,7 +75,7 @@ def load_network(path: str | os.PathLike[str]) -> TrainedNetwork:
             return _restore({name: file[name] for name in file.files})
     except InputError:
         raise
-    except (*_BROKEN, OSError) as error:
+    except (*BROKEN, OSError) as error:
         if isinstance(error, OSError) and error.filename is not None:
             raise
         what = " ".join(str(error).split())[:120]

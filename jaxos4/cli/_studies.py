@@ -1,0 +1,54 @@
+"""What `study` and `compare` share: devices, a bar over the cells, and the Dataset at the end."""
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+import xarray as xr
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+from ..study import OUTCOMES, Step, Store, Study, assemble, open_store, save_dataset
+
+
+def use_all_cores() -> None:
+    """Makes a device of each core that this process may use: cells run side by side. Before anything is computed."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jax.config.update("jax_num_cpu_devices", cores)
+
+
+def device_name() -> str:
+    """The devices of this process, in words."""
+    devices = jax.local_devices()
+    return f"{len(devices)} x {devices[0].device_kind}"
+
+
+def carry_out(study: Study, out: Path, device: str, run: Callable[[Store], Iterator[Step]]) -> xr.Dataset:
+    """Runs what is missing of a study, with a bar, and writes its Dataset. Raises as `open_store` and the run do."""
+    console = Console(stderr=True)
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with open_store(out, study, device) as store:
+        bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        task = bar.add_task("", total=study.count)
+        with bar:
+            for step in run(store):
+                bar.update(task, completed=step.done, description=step.label)
+            bar.update(task, description="writing the Dataset")
+            dataset = assemble(store)
+            save_dataset(dataset, out)
+    return dataset
+
+
+def summary(dataset: xr.Dataset) -> str:
+    """How many estimates there are, and how they ended."""
+    codes, counts = np.unique(dataset["result"].to_numpy(), return_counts=True)
+    ends = ", ".join(f"{count} {OUTCOMES[code]}" for code, count in zip(codes, counts, strict=True))
+    return f"{dataset['result'].size} estimates: {ends}"

@@ -1,0 +1,69 @@
+"""`jaxos4 study`: a noise study, resumed by the same command."""
+
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from ..errors import InputError
+from ..study import Study, check_store, load_study, plan, run_here, run_on_cluster
+from ._studies import carry_out, device_name, summary, use_all_cores
+
+Executor = StrEnum("Executor", ["local", "dask"])
+
+
+def study(
+    specification: Annotated[Path, typer.Argument(metavar="SPEC.toml", help="What is flown, measured and identified.")],
+    out: Annotated[Path, typer.Option(help="The study's folder: new, or to be resumed.")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what there is to do.")] = False,
+    executor: Annotated[Executor, typer.Option(help="This machine's devices, or a Dask cluster.")] = Executor["local"],
+    scheduler: Annotated[str | None, typer.Option(help="Address of the Dask scheduler.")] = None,
+) -> None:
+    """Run a noise study, or go on with it: cells that are there are kept."""
+    wanted = load_study(specification)
+    if (executor is Executor["dask"]) != (scheduler is not None):
+        raise InputError("--executor dask and --scheduler ADDRESS: give both, or neither.")
+    use_all_cores()
+    if dry_run:
+        _say_plan(wanted, out)
+        return
+    if scheduler is None:
+        dataset = carry_out(wanted, out, device_name(), run_here)
+    else:
+        with _connected(scheduler) as client:
+            dataset = carry_out(wanted, out, "Dask cluster", partial(run_on_cluster, client=client))
+    typer.echo(f"{out}: {summary(dataset)}; `jaxos4 report {out}` shows them.")
+
+
+def _say_plan(wanted: Study, out: Path) -> None:
+    missing, devices = check_store(out, wanted), len(jax.local_devices())
+    rows = plan(wanted, missing, devices)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("estimator", "cells", "flights", "memory [MiB]", "time [min]"):
+        table.add_column(heading, justify="left" if heading == "estimator" else "right")
+    for row in rows:
+        table.add_row(row.estimator, str(row.cells), str(row.flights), f"{row.memory:.0f}", f"{row.seconds / 60:.1f}")
+    Console(highlight=False).print(table)
+    flights, minutes = sum(row.flights for row in rows), sum(row.seconds for row in rows) / 60
+    typer.echo(
+        f"{len(missing)} of {wanted.count} cells to be run, {flights} flights identified, on {devices} devices of this "
+        f"machine: about {minutes:.0f} minutes, roughly."
+    )
+
+
+def _connected(address: str):
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--executor dask: needs the package distributed; install jaxos4[dask].") from None
+    try:
+        return Client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        what = " ".join(str(error).split())[:120]
+        raise InputError(f"--scheduler {address}: no Dask scheduler answers there ({what}).") from None

@@ -1,0 +1,324 @@
+"""The cells of a study, computed: pure functions of the specification, the cell's index, and the network it needs.
+
+Every cell is `batch` flights in one call of one program on one device. Vectorised arithmetic differs in its last digits
+with the length of a batch, and with the number of devices that a program is divided among; this way results are the
+same bit for bit however many cells are run side by side, in whichever process.
+"""
+
+import io
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._custom_types import Key, Parameters, Scalar, States, as_float
+from ..bracket import Bracket
+from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
+from ..estimators import BASELINES, IBSS, AbstractEstimator, Estimate, Hybrid, NetworkEstimator, TrainedNetwork
+from ..excitation import EXCITATIONS
+from ..flight import Flight
+from ..information import cramer_rao_bound
+from ..noise import NOISES, SENSOR_SIGMA
+from ..results import NAMES, RESULTS, result_names
+from ..shooting import ShootingProblem
+from ..simulate import simulate
+from .specification import NETWORKED, Cell, Scenario, Study
+
+LEVELS = (0.5, 0.9, 0.95, 0.99)
+# How an estimate ended, as a study counts it: `failed` where the cell could not be computed, `not_run` where it has
+# not been yet. The place in this list is the code that is stored.
+OUTCOMES = (*NAMES, "failed", "not_run")
+# Sweeps of a search by IBSS that are kept, of a scenario's first flight.
+_RECORD = 64
+# The share of a bracket's half-width by which it may be off the parameters that all flights have.
+_OFF = 0.8
+
+
+class Job(NamedTuple):
+    """A network that cells of a study need: what it is trained for."""
+
+    model: str
+    airframe: str
+    excitation: str
+    duration: float
+    width: float
+    channels: str
+
+
+class _Fleet(NamedTuple):
+    """What the flights of a scenario have in common, whatever their noise."""
+
+    model: AbstractModel
+    bracket: Bracket
+    omega: Array
+    dt: Scalar
+
+
+def jobs(study: Study) -> list[Job]:
+    """The networks of a study."""
+    networked = (cell.scenario for cell in _scenarios(study) if cell.scenario.estimator in NETWORKED)
+    return list(dict.fromkeys(job_of(study, scenario) for scenario in networked))
+
+
+def job_of(study: Study, scenario: Scenario) -> Job:
+    """The network that a scenario's estimator needs."""
+    channels = scenario.seen
+    if scenario.estimator == "hybrid":
+        channels = min(channels, study.network.hybrid_channels, key=CHANNELS.__getitem__)
+    return Job(scenario.model, scenario.airframe, scenario.excitation, scenario.duration, scenario.width, channels)
+
+
+def train(study: Study, job: Job, *, progress: bool = False) -> TrainedNetwork:
+    """A network for all noises and scales of a study. Raises as `NetworkEstimator.fit` does."""
+    with jax.enable_x64(study.precision == "float64"):
+        settings = study.network
+        scales = [scale or 1.0 for scale in study.scales]
+        training = NetworkEstimator(
+            features=settings.features,
+            approximator=settings.approximator,
+            channels=job.channels,
+            noise=(min(scales), max(scales)),
+            steps=settings.steps,
+            held_out=settings.held_out,
+        )
+        fleet = _fleet(study, job)
+        exact = simulate(fleet.model, fleet.bracket.center, fleet.omega, dt=fleet.dt, method=study.fit_method)
+        problem = _problem(study, fleet, exact.states, as_float(1.0), job.channels)
+        key = jax.random.fold_in(jax.random.key(study.network.seed), jobs(study).index(job))
+        return training.fit(problem, fleet.bracket, key=key, progress=progress)
+
+
+def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
+    """Identifies the flights of a cell on the default device. Raises as the estimator does.
+
+    **Arguments:**
+
+    - `network`: that of `job_of`, where the estimator needs one.
+    """
+    with jax.enable_x64(study.precision == "float64"):
+        scenario, fleet = cell.scenario, _fleet(study, cell.scenario)
+        flown = _fly(study, fleet, cell)
+        blank = _problem(study, fleet, flown.states[0], as_float(scenario.scale or 1.0), scenario.seen)
+        found = _identify(_estimator(scenario.estimator, network), blank, fleet.bracket, flown.states)
+        return _results(study, cell, flown, jax.tree.map(np.asarray, found))
+
+
+def bracket_of(study: Study, model: str, airframe: str, width: float) -> Bracket:
+    """The bracket that all searches, and the networks, of a model, an airframe and a width get."""
+    with jax.enable_x64(study.precision == "float64"):
+        return _bracket(study, MODELS[model](study.vehicle(airframe)), width)
+
+
+def program_of(study: Study, cell: Cell) -> tuple:
+    """Cells of which this is the same are run by the same compiled program."""
+    scenario = cell.scenario._replace(noise="", scale=0.0, method="")
+    return scenario, job_of(study, scenario) if scenario.estimator in NETWORKED else None
+
+
+class _Flown(NamedTuple):
+    truth: Float[Array, "lanes parameters"]
+    states: Float[Array, "lanes samples 12"]
+    bound: Float[Array, "lanes parameters"]
+
+
+class _Found(NamedTuple):
+    parameters: Float[Array, "lanes parameters"]
+    std: Float[Array, "lanes parameters"]
+    half_width: Float[Array, "lanes parameters levels"]
+    cost: Float[Array, " lanes"]
+    rollouts: Int[Array, " lanes"]
+    initial_state: Float[Array, "lanes starts"]
+    result: RESULTS
+    seed: Bracket | None
+    brackets: Float[Array, "lanes record 2 parameters"] | None
+
+
+def _scenarios(study: Study) -> list[Cell]:
+    """The first cell of each scenario."""
+    return [study.cell(index) for index in range(0, study.count, study.blocks)]
+
+
+def _fleet(study: Study, scenario: Scenario | Job) -> _Fleet:
+    airframe = study.vehicle(scenario.airframe)
+    model = MODELS[scenario.model](airframe)
+    omega = EXCITATIONS[scenario.excitation](airframe, duration=scenario.duration, dt=study.dt)
+    return _Fleet(model, _bracket(study, model, scenario.width), omega, as_float(study.dt))
+
+
+def _bracket(study: Study, model: AbstractModel, width: float) -> Bracket:
+    center, half_width = model.alpha, width * model.half_width
+    if study.truth == "airframe":
+        key = jax.random.fold_in(jax.random.key(study.seed), 0)
+        center = center + half_width * jax.random.uniform(key, center.shape, minval=-_OFF, maxval=_OFF, dtype=float)
+    return Bracket.around(center, half_width)
+
+
+def _problem(study: Study, fleet: _Fleet, states: States, scale: Scalar, channels: str) -> ShootingProblem:
+    samples = fleet.omega.shape[0]
+    start = jnp.zeros(12) if study.initial_state == "known" else None
+    return ShootingProblem(
+        fleet.model,
+        Flight(fleet.dt * jnp.arange(samples), fleet.omega, states),
+        sigma=scale * SENSOR_SIGMA,
+        initial_state=start,
+        channels=channels,
+        method=study.fit_method,
+    )
+
+
+def _fly(study: Study, fleet: _Fleet, cell: Cell) -> _Flown:
+    """The flights of a cell: those of the same number are the same, but for the scale, in all scenarios."""
+    truth, exact, states = _flights(study, fleet, cell)
+    scale = as_float(cell.scenario.scale)
+    bound = scale * _bounds(_problem(study, fleet, exact[0], as_float(1.0), cell.scenario.seen), exact, truth)
+    return _Flown(truth, states, bound)
+
+
+def _flights(
+    study: Study, fleet: _Fleet, cell: Cell
+) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes samples 12"], Float[Array, "lanes samples 12"]]:
+    """True parameters, true states and measured states of a cell."""
+    return _measured(
+        fleet,
+        cell.first + jnp.arange(study.batch),
+        as_float(cell.scenario.scale),
+        jax.random.fold_in(jax.random.key(study.seed), 1),
+        method=cell.scenario.method,
+        kind=cell.scenario.noise,
+        drawn=study.truth == "drawn",
+    )
+
+
+@eqx.filter_jit
+def _measured(
+    fleet: _Fleet, numbers: Int[Array, " lanes"], scale: Scalar, key: Key, *, method: str, kind: str, drawn: bool
+) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes samples 12"], Float[Array, "lanes samples 12"]]:
+    """True parameters, true states and measured states."""
+
+    def one(number: Int[Array, ""]) -> tuple[Parameters, States, States]:
+        truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
+        truth = fleet.model.alpha
+        if drawn:
+            u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
+            truth = fleet.bracket.center + u * fleet.bracket.half_width
+        exact = simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method)
+        noisy = NOISES[kind](scale * SENSOR_SIGMA)(exact, key=noise_key)
+        return truth, exact.states, noisy.states
+
+    return jax.vmap(one)(numbers)
+
+
+@eqx.filter_jit
+def _bounds(
+    blank: ShootingProblem, exact: Float[Array, "lanes samples 12"], truth: Float[Array, "lanes parameters"]
+) -> Float[Array, "lanes parameters"]:
+    """Cramer-Rao standard deviations at the noise of scale 1."""
+
+    def one(states: States, parameters: Parameters) -> Parameters:
+        problem = eqx.tree_at(lambda p: p.flight.states, blank, states)
+        start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
+        return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem, parameters, start)))
+
+    return jax.vmap(one)(exact, truth)
+
+
+@eqx.filter_jit
+def _identify(
+    estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"]
+) -> _Found:
+    def one(states: States) -> _Found:
+        found: Estimate = estimator(eqx.tree_at(lambda p: p.flight.states, blank, states), bracket)
+        half_width = jnp.stack([found.half_width(level) for level in LEVELS], axis=-1)
+        return _Found(
+            parameters=found.parameters,
+            std=found.std,
+            half_width=half_width,
+            cost=found.cost,
+            rollouts=found.rollouts,
+            initial_state=found.initial_state,
+            result=found.result,
+            seed=found.seed,
+            brackets=found.brackets,
+        )
+
+    return jax.vmap(one)(states)
+
+
+def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:
+    if name in BASELINES:
+        return BASELINES[name]()
+    if name == "ibss":
+        return IBSS(record=_RECORD)
+    if network is None:
+        raise ValueError(f"`network` must be given for {name!r}.")
+    return network if name == "network" else Hybrid(network)
+
+
+def _results(study: Study, cell: Cell, flown: _Flown, found: _Found) -> dict[str, np.ndarray]:
+    """What is kept of a cell. Where there is no answer its numbers are missing (NaN), and its result says why."""
+    count = min(study.batch, study.flights - cell.first)
+    truth, outcome = np.asarray(flown.truth), np.array([OUTCOMES.index(n) for n in result_names(found.result)])
+    told = np.asarray(np.isfinite(found.std).all(axis=-1) & np.isfinite(found.parameters).all(axis=-1))
+    hit = np.full(study.batch, -1)
+    if found.seed is not None:
+        hit = ((truth >= found.seed.lower) & (truth <= found.seed.upper)).all(axis=-1).astype(int)
+    results = {
+        "truth": truth,
+        "estimate": np.where(told[:, None], found.parameters, np.nan),
+        "std": np.where(told[:, None], found.std, np.nan),
+        "half_width": np.where(told[:, None, None], found.half_width, np.nan),
+        "bound": np.asarray(flown.bound),
+        "initial_state": np.where(told[:, None], found.initial_state, np.nan),
+        "cost": np.where(told, found.cost, np.nan),
+        "rollouts": found.rollouts.astype(np.int32),
+        "result": outcome.astype(np.int8),
+        "hit": hit.astype(np.int8),
+    }
+    results = {name: value[:count] for name, value in results.items()}
+    if found.brackets is not None and cell.first == 0:
+        results["brackets"] = found.brackets[0]
+    return results
+
+
+def example(study: Study, cell: Cell, found: dict[str, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The states [samples, 12] of a cell's first flight: `true`, `measured`, and as each estimator's answer flies.
+
+    **Arguments:**
+
+    - `found`: the results of each estimator's cell of the same flights.
+    """
+    with jax.enable_x64(study.precision == "float64"):
+        fleet = _fleet(study, cell.scenario)
+        _, true, measured = _flights(study, fleet, cell)
+        states = {"true": true[0], "measured": measured[0]}
+        for name, results in found.items():
+            parameters, start = results["estimate"][0], results["initial_state"][0]
+            if np.isfinite(parameters).all():
+                state = np.zeros(12)
+                state[CASCADE_ORDER[: start.size]] = start
+                flight = simulate(
+                    fleet.model,
+                    parameters,
+                    fleet.omega,
+                    dt=fleet.dt,
+                    initial_state=as_float(state),
+                    method=study.fit_method,
+                )
+                states[name] = flight.states
+        return {name: np.asarray(value) for name, value in states.items()}
+
+
+def encode(results: dict[str, np.ndarray]) -> bytes:
+    """The bytes of a cell's file: the same for the same results."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **results)  # pyright: ignore[reportArgumentType]
+    return buffer.getvalue()
+
+
+def decode(data: bytes) -> dict[str, np.ndarray]:
+    """The results in the bytes of a cell's file. Raises `ValueError` and its like for bytes that are not one."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}

@@ -1,0 +1,225 @@
+"""The results of a study as an xarray Dataset: every finished cell in its place, with units, names and provenance."""
+
+import itertools
+import json
+import math
+from pathlib import Path
+
+import jax
+import msgspec
+import numpy as np
+import xarray as xr
+
+from .._files import write_atomically
+from ..dynamics import MODELS
+from ..estimators import TrainedNetwork
+from ..flight import STATE_NAMES, STATE_UNITS
+from ..training import CHECK
+from .cell import LEVELS, OUTCOMES, bracket_of, example, jobs
+from .specification import AXES, Cell, Study
+from .store import RESULTS_FILE, Store
+
+# The dimensions of the axes, in their order: an axis is a plural.
+DIMS = tuple("channels" if axis == "channels" else axis.removesuffix("s") for axis in AXES)
+_LANES = (*DIMS, "flight")
+# Of what is kept for each flight: dimensions beyond the flight, type, unit, and what it is.
+_VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "truth": (("parameter",), "f8", "unit", "true parameter"),
+    "estimate": (("parameter",), "f8", "unit", "estimated parameter; missing where `result` says that there is none"),
+    "std": (("parameter",), "f8", "unit", "standard deviation that the estimator gives"),
+    "half_width": (("parameter", "level"), "f8", "unit", "half the interval that claims to hold the truth at `level`"),
+    "bound": (("parameter",), "f8", "unit", "Cramer-Rao standard deviation, white noise, of the channels `seen`"),
+    "result": ((), "i1", "1", "how the estimate ended"),
+    "rollouts": ((), "i4", "1", "simulated flights that the estimate took"),
+    "cost": ((), "f8", "1", "1/2 |W (y - x)|^2 at the estimate, of the channels `seen`"),
+    "hit": ((), "i1", "1", "whether the hybrid's seed bracket held the truth; -1 for other estimators"),
+}
+_AXES_ATTRIBUTES = {
+    "model": ("equations that are fitted, and flown", "1"),
+    "airframe": ("airframe that is flown", "1"),
+    "excitation": ("rotor speeds that are flown", "1"),
+    "duration": ("length of a flight", "s"),
+    "method": ("how true flights are simulated", "1"),
+    "noise": ("kind of sensor noise", "1"),
+    "scale": ("noise in multiples of the standard sensors'", "1"),
+    "width": ("bracket in multiples of the default half-width", "1"),
+    "channels": ("what was measured", "1"),
+    "estimator": ("estimator", "1"),
+    "flight": ("number of the flight: the same draws in all scenarios", "1"),
+    "parameter": ("parameter", "1"),
+    "level": ("share of intervals that should hold the truth", "1"),
+}
+
+
+def assemble(store: Store) -> xr.Dataset:
+    """The Dataset of a study's finished cells; the others are `not_run`.
+
+    The dimensions are the axes of the grid, each there even where it has length 1; `flight`, `parameter`, `level`; and
+    those of the example flight and of the networks' training.
+
+    **Raises:** `InputError` where a cell's file was damaged.
+    """
+    study = store.study
+    names = MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_names
+    sizes = dict(zip(DIMS, study.shape, strict=True)) | {
+        "flight": study.flights,
+        "parameter": len(names),
+        "level": len(LEVELS),
+    }
+    arrays = {
+        name: np.full([sizes[dim] for dim in (*_LANES, *more)], np.nan if kind == "f8" else -1, kind)
+        for name, (more, kind, _, _) in _VARIABLES.items()
+    }
+    arrays["result"][...] = OUTCOMES.index("not_run")
+    arrays["rollouts"][...] = 0
+    failures = []
+    for cell in study.cells():
+        results = store.read(cell.number)
+        if results is None:
+            continue
+        lanes = (*cell.place, slice(cell.first, min(cell.first + study.batch, study.flights)))
+        if "failed" in results:
+            arrays["result"][lanes] = OUTCOMES.index("failed")
+            where = dict(zip(DIMS, cell.scenario, strict=True))
+            failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
+            continue
+        for name in _VARIABLES:
+            arrays[name][lanes] = results[name]
+    dataset = xr.Dataset(
+        {
+            name: ((*_LANES, *more), arrays[name], {"long_name": long_name, "units": unit})
+            for name, (more, _, unit, long_name) in _VARIABLES.items()
+        },
+        coords=_coordinates(study, names),
+        attrs=_provenance(store, failures),
+    )
+    dataset["truth"] = dataset["truth"].max("estimator", keep_attrs=True)  # the same for all that have run
+    codes = np.arange(len(OUTCOMES), dtype=np.int8)
+    dataset["result"].attrs |= {"flag_values": codes, "flag_meanings": " ".join(OUTCOMES)}
+    return dataset.assign(_brackets(study) | _seen(study) | _example(store) | _training(store))
+
+
+def save_dataset(dataset: xr.Dataset, directory: Path) -> Path:
+    """Writes a study's Dataset into its folder, whole or not at all."""
+    path = directory / RESULTS_FILE
+    encoding = {
+        name: {"zlib": True, "complevel": 4}
+        for name, variable in dataset.data_vars.items()
+        if variable.dtype.kind in "fi" and variable.ndim
+    }
+    with write_atomically(path) as beside:
+        dataset.to_netcdf(beside, engine="h5netcdf", encoding=encoding)
+    return path
+
+
+def _coordinates(study: Study, names: tuple[str, ...]) -> dict:
+    values = {dim: list(getattr(study, axis)) for dim, axis in zip(DIMS, AXES, strict=True)}
+    values |= {"flight": np.arange(study.flights), "parameter": list(names), "level": list(LEVELS)}
+    coordinates = {
+        dim: (dim, values[dim], {"long_name": long_name, "units": unit})
+        for dim, (long_name, unit) in _AXES_ATTRIBUTES.items()
+    }
+    units = list(MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_units)
+    return coordinates | {"unit": ("parameter", units, {"long_name": "unit of the parameter", "units": "1"})}
+
+
+def _provenance(store: Store, failures: list[dict]) -> dict[str, str | int]:
+    study = store.study
+    return {
+        "title": study.title,
+        "specification": msgspec.json.encode(study).decode(),
+        "version": store.version,
+        "jax": jax.__version__,
+        "precision": study.precision,
+        "device": store.device,
+        "seed": study.seed,
+        "failures": json.dumps(failures),
+    }
+
+
+def _brackets(study: Study) -> dict:
+    """The bracket that all searches and networks of a model, an airframe and a width get."""
+    shape = [len(study.models), len(study.airframes), len(study.widths)]
+    brackets = [bracket_of(study, *which) for which in itertools.product(study.models, study.airframes, study.widths)]
+    dims = ("model", "airframe", "width", "parameter")
+    return {
+        name: (dims, np.stack([getattr(b, part) for b in brackets]).reshape(*shape, -1), _named(what, "unit"))
+        for name, part, what in (
+            ("center", "center", "middle of the bracket"),
+            ("bracket_half_width", "half_width", "half the width of the bracket"),
+        )
+    }
+
+
+def _seen(study: Study) -> dict:
+    scenario = study.cell(0).scenario
+    seen = [[scenario._replace(channels=c, estimator=e).seen for e in study.estimators] for c in study.channels]
+    return {"seen": (("channels", "estimator"), seen, _named("channels that the estimator looks at", "1"))}
+
+
+def _example(store: Store) -> dict:
+    """The first flight of the first scenario whose noise is nearest the standard one, and how IBSS searched it."""
+    study = store.study
+    scale = min(study.scales, key=lambda s: abs(math.log(s)) if s > 0 else math.inf)
+    first = study.cell(0).scenario._replace(scale=scale)
+    cells: dict[str, Cell] = {
+        cell.scenario.estimator: cell
+        for cell in study.cells()
+        if cell.first == 0 and cell.scenario._replace(estimator=first.estimator) == first
+    }
+    found = {name: store.read(cell.number) for name, cell in cells.items()}
+    found = {name: results for name, results in found.items() if results is not None and "failed" not in results}
+    if not found:
+        return {}
+    states = example(study, cells[next(iter(found))], found)
+    blank = np.full_like(states["true"], np.nan)
+    simulated = np.stack([states.get(name, blank) for name in study.estimators])
+    time = study.dt * np.arange(len(blank))
+    both = ("sample", "state")
+    variables = {
+        "time": ("sample", time, _named("time", "s")),
+        "state": ("state", list(STATE_NAMES), _named("state", "1")),
+        "state_unit": ("state", list(STATE_UNITS), _named("unit of the state", "1")),
+        "example_true": (both, states["true"], _named("true states of the example flight", "state_unit")),
+        "example_measured": (both, states["measured"], _named("its measured states", "state_unit")),
+        "example_simulated": (
+            ("estimator", *both),
+            simulated,
+            _named("its states as simulated with the estimate", "state_unit"),
+        ),
+    }
+    brackets = found.get("ibss", {}).get("brackets")
+    if brackets is not None:
+        brackets = brackets[np.isfinite(brackets).all(axis=(1, 2))]
+        lower, upper = brackets[:, 0], brackets[:, 1]
+        along = ("sweep", "parameter")
+        variables |= {
+            "sweep": ("sweep", np.arange(1, len(brackets) + 1), _named("sweep of IBSS over the example flight", "1")),
+            "search_half_width": (along, (upper - lower) / 2, _named("half the width of the sweep's bracket", "unit")),
+            "search_estimate": (along, (upper + lower) / 2, _named("middle of the sweep's bracket", "unit")),
+        }
+    return variables
+
+
+def _training(store: Store) -> dict:
+    """The losses of the networks that were trained."""
+    needed = jobs(store.study)
+    networks: list[TrainedNetwork | None] = [store.read_network(number) for number in range(len(needed))]
+    histories = [np.zeros((0, 2)) if network is None else np.asarray(network.history) for network in networks]
+    if not any(len(history) for history in histories):
+        return {}
+    checks = max(map(len, histories))
+    losses = np.stack([np.pad(h, ((0, checks - len(h)), (0, 0)), constant_values=np.nan) for h in histories])
+    labels = [" ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in job) for job in needed]
+    steps = np.minimum(CHECK * np.arange(1, checks + 1), store.study.network.steps)
+    both = ("training", "check")
+    return {
+        "training": ("training", labels, _named("network", "1")),
+        "training_step": ("check", steps, _named("steps of training", "1")),
+        "training_loss": (both, losses[:, :, 0], _named("loss in training", "1")),
+        "validation_loss": (both, losses[:, :, 1], _named("loss on unseen flights", "1")),
+    }
+
+
+def _named(long_name: str, units: str) -> dict[str, str]:
+    return {"long_name": long_name, "units": units}

@@ -1,0 +1,145 @@
+"""Runs the cells of a study that are not there yet, on the devices of this process."""
+
+import concurrent.futures
+import itertools
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+
+from ..errors import InputError, TrainingError
+from ..estimators import TrainedNetwork, save_network
+from .cell import Job, encode, job_of, jobs, program_of, run_cell, train
+from .specification import NETWORKED, Cell, Study
+from .store import Store
+
+# What a cell that cannot be computed raises: it is kept as failed, with the message, and the study goes on.
+FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
+# A device helps with what another one has compiled where at least so many cells are left: fewer are done sooner than
+# compiled.
+_WORTH_COMPILING = 8
+
+Network: TypeAlias = TrainedNetwork | str | None
+
+
+class Step(NamedTuple):
+    """`done` cells are there, and what is at work now, in words."""
+
+    done: int
+    label: str
+
+
+class _Program:
+    """Cells that one compiled program can identify, and the network that they need."""
+
+    def __init__(self, cells: list[Cell], study: Study, needed: list[Job]):
+        self.waiting, self.network = deque(cells), network_number(study, cells[0], needed)
+        self.devices: set[jax.Device] = set()
+
+
+def run_here(store: Store) -> Iterator[Step]:
+    """Computes the cells that are missing, each device at its own.
+
+    A device compiles and runs programs by itself: a program that was divided among devices would be another program,
+    and differ in the last digits. First each device takes a program that no other has; then it helps with the longest.
+    A cell that cannot be computed is kept as failed, and stays so: delete its file to try it again.
+    """
+    study, missing = store.study, store.missing()
+    needed, done = jobs(study), study.count - len(missing)
+    grouped = itertools.groupby(map(study.cell, missing), key=lambda cell: program_of(study, cell))
+    programs = [_Program(list(cells), study, needed) for _, cells in grouped]
+    networks: dict[int, Network] = {}
+    untrained = deque(dict.fromkeys(p.network for p in programs if p.network is not None))
+    devices = deque(jax.local_devices())
+    running: dict[concurrent.futures.Future, tuple[jax.Device, str, Cell | int]] = {}
+    with concurrent.futures.ThreadPoolExecutor(len(devices)) as pool:
+        try:
+            while True:
+                for _ in range(len(devices)):
+                    device = devices.popleft()
+                    if untrained:
+                        number = untrained.popleft()
+                        task = pool.submit(_train, store, number, needed[number], device)
+                        running[task] = device, f"training for {needed[number].channels}", number
+                    elif (program := _next(programs, networks, device)) is not None:
+                        program.devices.add(device)
+                        cell = program.waiting.popleft()
+                        network = None if program.network is None else networks[program.network]
+                        task = pool.submit(_compute, study, cell, network, device)
+                        running[task] = device, label_of(study, cell), cell
+                    else:
+                        devices.append(device)
+                yield Step(done, ", ".join(dict.fromkeys(label for _, label, _ in running.values())))
+                if not running:
+                    return
+                finished, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+                for task in finished:
+                    device, _, what = running.pop(task)
+                    devices.append(device)
+                    if isinstance(what, int):
+                        networks[what] = task.result()
+                    else:
+                        data, seconds = task.result()
+                        store.write(store.cell_file(what.number), data, cell=what.number, seconds=seconds)
+                        done += 1
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _next(programs: list[_Program], networks: dict[int, Network], device: jax.Device) -> _Program | None:
+    """What a device that is free does: what it was at, what nobody is at, or what is the longest."""
+    ready = [p for p in programs if p.waiting and (p.network is None or p.network in networks)]
+    own = [p for p in ready if device in p.devices]
+    new = [p for p in ready if not p.devices]
+    long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
+    return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
+
+
+def _train(store: Store, number: int, job: Job, device: jax.Device) -> Network:
+    """The network, kept and read back as any later run reads it; or why there is none."""
+    begin = time.perf_counter()
+    with jax.default_device(device):
+        if (network := store.read_network(number)) is not None:
+            return network
+        try:
+            network = train(store.study, job)
+        except FAILURES as error:
+            return str(error)
+        with jax.enable_x64(store.study.precision == "float64"):
+            save_network(network, store.network_file(number))
+        store.log(network=number, seconds=round(time.perf_counter() - begin, 3))
+        return store.read_network(number)
+
+
+def _compute(study: Study, cell: Cell, network: Network, device: jax.Device) -> tuple[bytes, float]:
+    with jax.default_device(device):
+        return compute(study, cell, network)
+
+
+def compute(study: Study, cell: Cell, network: Network) -> tuple[bytes, float]:
+    """The bytes of a cell's file, and the seconds that it took. A network that is a string says why there is none."""
+    begin = time.perf_counter()
+    try:
+        results = failed(network) if isinstance(network, str) else run_cell(study, cell, network)
+    except FAILURES as error:
+        results = failed(str(error))
+    return encode(results), round(time.perf_counter() - begin, 3)
+
+
+def failed(message: str) -> dict[str, np.ndarray]:
+    """What is kept of a cell that could not be computed."""
+    return {"failed": np.asarray(" ".join(message.split())[:500])}
+
+
+def network_number(study: Study, cell: Cell, needed: list[Job]) -> int | None:
+    """The place among the study's networks of the one that a cell needs."""
+    return needed.index(job_of(study, cell.scenario)) if cell.scenario.estimator in NETWORKED else None
+
+
+def label_of(study: Study, cell: Cell) -> str:
+    """What a cell does, in a word or two: what it shares with the whole study is left out."""
+    *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in cell.scenario)
+    return " ".join([estimator, *itertools.compress(shared, (length > 1 for length in study.shape))])
