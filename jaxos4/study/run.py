@@ -5,7 +5,7 @@ import itertools
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -22,8 +22,6 @@ FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError
 # compiled.
 _WORTH_COMPILING = 8
 
-Network: TypeAlias = TrainedNetwork | str | None
-
 
 class Step(NamedTuple):
     """`done` cells are there, and what is at work now, in words."""
@@ -37,7 +35,7 @@ class _Program:
 
     def __init__(self, cells: list[Cell], study: Study, needed: list[Job]):
         self.waiting, self.network = deque(cells), network_number(study, cells[0], needed)
-        self.devices: set[jax.Device] = set()
+        self.devices: set[Any] = set()
 
 
 def run_here(store: Store) -> Iterator[Step]:
@@ -51,10 +49,10 @@ def run_here(store: Store) -> Iterator[Step]:
     needed, done = jobs(study), study.count - len(missing)
     grouped = itertools.groupby(map(study.cell, missing), key=lambda cell: program_of(study, cell))
     programs = [_Program(list(cells), study, needed) for _, cells in grouped]
-    networks: dict[int, Network] = {}
+    networks: dict[int, TrainedNetwork | str | None] = {}
     untrained = deque(dict.fromkeys(p.network for p in programs if p.network is not None))
     devices = deque(jax.local_devices())
-    running: dict[concurrent.futures.Future, tuple[jax.Device, str, Cell | int]] = {}
+    running: dict[concurrent.futures.Future, tuple[Any, str, Cell | int]] = {}
     with concurrent.futures.ThreadPoolExecutor(len(devices)) as pool:
         try:
             while True:
@@ -89,7 +87,7 @@ def run_here(store: Store) -> Iterator[Step]:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _next(programs: list[_Program], networks: dict[int, Network], device: jax.Device) -> _Program | None:
+def _next(programs: list[_Program], networks: dict[int, TrainedNetwork | str | None], device: Any) -> _Program | None:
     """What a device that is free does: what it was at, what nobody is at, or what is the longest."""
     ready = [p for p in programs if p.waiting and (p.network is None or p.network in networks)]
     own = [p for p in ready if device in p.devices]
@@ -98,7 +96,7 @@ def _next(programs: list[_Program], networks: dict[int, Network], device: jax.De
     return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
 
 
-def _train(store: Store, number: int, job: Job, device: jax.Device) -> Network:
+def _train(store: Store, number: int, job: Job, device: Any) -> TrainedNetwork | str | None:
     """The network, kept and read back as any later run reads it; or why there is none."""
     begin = time.perf_counter()
     with jax.default_device(device):
@@ -114,12 +112,12 @@ def _train(store: Store, number: int, job: Job, device: jax.Device) -> Network:
         return store.read_network(number)
 
 
-def _compute(study: Study, cell: Cell, network: Network, device: jax.Device) -> tuple[bytes, float]:
+def _compute(study: Study, cell: Cell, network: TrainedNetwork | str | None, device: Any) -> tuple[bytes, float]:
     with jax.default_device(device):
         return compute(study, cell, network)
 
 
-def compute(study: Study, cell: Cell, network: Network) -> tuple[bytes, float]:
+def compute(study: Study, cell: Cell, network: TrainedNetwork | str | None) -> tuple[bytes, float]:
     """The bytes of a cell's file, and the seconds that it took. A network that is a string says why there is none."""
     begin = time.perf_counter()
     try:
