@@ -8,6 +8,7 @@ import typer
 from ..errors import InputError, TrainingError
 from .estimate import estimate
 from .identifiability import identifiability
+from .report import report
 from .simulate import simulate
 from .train import train
 
@@ -21,6 +22,7 @@ app.command()(simulate)
 app.command()(estimate)
 app.command()(train)
 app.command()(identifiability)
+app.command()(report)
 
 
 def main() -> None:
