@@ -15,7 +15,8 @@ TOLD = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
 
 @pytest.fixture(scope="module", params=[False, True], ids=["one truth", "a truth each"])
 def study(request):
-    return synthetic_study(flights=12, drawn=request.param, channels=("rates", "all"), example=False)
+    estimators = ("ibss", "network", "hybrid", "svsf")
+    return synthetic_study(flights=12, drawn=request.param, scales=(0.1, 10.0), estimators=estimators, example=False)
 
 
 def cells(study):
@@ -64,7 +65,9 @@ def test_errors_efficiency_and_bounds_against_plain_loops(study):
             center = middle.isel(without | {"parameter": p})
             same(center["absolute"], rms(distances))
             told_by_any = not zero and not any(abs(truth[f, p]) < 1.96 * least[f, p] for f in flights)
-            shares = [100 * d / abs(truth[f, p]) for d, f in zip(distances, flights, strict=True)] if told_by_any else []
+            shares = (
+                [100 * d / abs(truth[f, p]) for d, f in zip(distances, flights, strict=True)] if told_by_any else []
+            )
             same(center["percent"], rms(shares))
 
 
@@ -114,7 +117,7 @@ def test_accuracy_is_against_the_least_bound(study):
 
 
 def test_the_frontier_is_where_the_truth_is_1_96_bounds():
-    study = synthetic_study(flights=3, example=False)
+    study = synthetic_study(flights=3, spoiled=False, example=False)
     frontier = metrics.frontier(study).squeeze().sel(estimator="ibss")
     truth = abs(study["truth"].isel(scale=0, flight=0).squeeze().values)
     assert np.allclose(frontier, truth / (1.96 * BOUND["all"]))

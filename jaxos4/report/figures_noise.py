@@ -3,7 +3,6 @@
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
 from .. import metrics
 from .legend import legend
@@ -112,7 +111,6 @@ def frontier(data: xr.Dataset) -> Figure | None:
         panel.text(least, float(y), "its truth is 0: told at no noise", va="center", fontsize=7.5)
     panel.set_xscale("log")
     log_axis(panel, "x")
-    panel.xaxis.set_minor_locator(NullLocator())
     low, high = panel.get_xlim()
     panel.set_xlim(low, high * (high / low) ** 0.06)
     panel.set_yticks(range(len(parameters)), parameters)

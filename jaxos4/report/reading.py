@@ -36,7 +36,7 @@ def read_results(directory: Path) -> xr.Dataset:
     if not path.is_file():
         raise InputError(f"{directory}: holds no {RESULTS_FILE}; give a folder that `jaxos4 study` wrote.")
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as opened:
+        with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
             dataset = opened.load()
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         what = " ".join(str(error).split())[:120]

@@ -26,7 +26,7 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
 
 
 def _rich(table: tables.Table) -> Table:
-    made = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    made = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=0)  # 80 columns must do
     made.add_column("", no_wrap=True)
     for heading in table.headings:
         made.add_column(Text(heading), justify="right", no_wrap=True)
