@@ -18,6 +18,9 @@ _BOUND_DASHES = ("solid", "dot", "dash")
 _HEIGHT = 210
 # Of a logarithmic axis with more ticks than powers of ten: its largest value over its least.
 _DENSE = 100.0
+# And of one with ticks of its own, where these are many enough to fall on it: RMSE / bound near 1.
+_NARROW = 5.0
+_TICKS = [0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0]
 
 
 def charts(data: xr.Dataset) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -92,7 +95,7 @@ def _efficiency(data: xr.Dataset) -> dict[str, Any] | None:
                 "width": 2,
             }
             traces.append(trace)
-        axis = _log(found["efficiency"].isel(parameter=place)) | {"line_at": 1}
+        axis = _log(found["efficiency"]) | {"line_at": 1, "shared": True}
         panels.append({"title": name, "x": _scale_axis(data), "y": axis, "traces": traces})
     return _chart(panels)
 
@@ -175,7 +178,10 @@ def _scale_axis(data: xr.Dataset) -> dict[str, Any]:
 def _log(values: xr.DataArray) -> dict[str, Any]:
     """The axis of these values; `dense`: they span so little that powers of ten would not do."""
     some = values.values[values.values > 0]
-    return {"type": "log", "dense": bool(some.size and some.max() < _DENSE * some.min())}
+    span = some.max() / some.min() if some.size else np.inf
+    if span < _NARROW and some.min() > _TICKS[0] and some.max() < _TICKS[-1]:
+        return {"type": "log", "ticks": _TICKS, "labels": [f"{tick:g}" for tick in _TICKS]}
+    return {"type": "log", "dense": bool(span < _DENSE)}
 
 
 def _without_nan(x: Any) -> Any:

@@ -77,12 +77,16 @@ def efficiency(data: xr.Dataset) -> Figure | None:
         one = found.isel(parameter=place)
         _draw_estimators(panel, data, one["efficiency"], one)
         scale_axis(panel, data["scale"].values)
-        log_axis(panel, "y")
+        panel.set_yscale("log")
         panel.set_title(name)
         if place >= len(axes) - _COLUMNS:
             panel.set_xlabel("noise scale")
         if place % _COLUMNS == 0:
             panel.set_ylabel("RMSE / bound")
+    lows, highs = zip(*(panel.get_ylim() for panel in axes), strict=True)
+    for panel in axes:
+        panel.set_ylim(min(lows), max(highs))
+        log_axis(panel, "y")
     legend(figure, data)
     return figure
 

@@ -71,6 +71,7 @@ def coverage(data: xr.Dataset) -> Figure | None:
         return None
     style, levels = styles(names(data, "estimator")), data["level"].values
     figure, axes = grid(data.sizes["scale"], columns=4, width=2.25 * min(data.sizes["scale"], 4) + 1.2, height=2.8)
+    lowest = min(float(found["low"].min()), float(levels.min())) - 0.04
     for place, panel in enumerate(axes):
         one = found.isel(scale=place)
         for x, level in enumerate(levels):
@@ -83,7 +84,7 @@ def coverage(data: xr.Dataset) -> Figure | None:
             panel.plot(at, shares, color=look.color, marker=look.marker, linestyle="none", markersize=4, gid=gid)
         panel.set_title(f"noise scale {data['scale'].values[place]:g}")
         panel.set_xticks(range(len(levels)), [f"{100 * level:g} %" for level in levels])
-        panel.set_ylim(-0.02, 1.02)
+        panel.set_ylim(lowest, 1.02)
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
         panel.grid(axis="x", visible=False)
         panel.set_xlabel("level claimed")

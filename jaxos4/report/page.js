@@ -30,6 +30,7 @@
     };
     const x = axis(panel.x, "y" + suffix, [left, left + wide]);
     const y = axis(panel.y, "x" + suffix, [bottom, Math.min(bottom + high, 1)]);
+    if (number && panel.y.shared) y.matches = "y"; // one scale for all panels, also when one is zoomed
     if (column && panel.y.type === "category") y.showticklabels = false;
     if (row < rows - 1 && number + columns < chart.count) delete x.title;
     y.automargin = column === 0;

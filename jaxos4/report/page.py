@@ -41,7 +41,7 @@ def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once
         .render(
             title=attributes.get("title", "") or "A study",
             command=attributes.get("command", ""),
-            specification=attributes.get("specification", ""),
+            specification=_indented(attributes.get("specification", "")),
             provenance=[(label, attributes[name]) for name, label in _PROVENANCE if name in attributes],
             estimators=[(place, name, look.color) for place, (name, look) in enumerate(known.items())],
             sections=shown,
@@ -89,6 +89,18 @@ def _figure(drawn: Drawn) -> dict[str, Any]:
         "svg": Markup(inline(drawn.svg, drawn.stem, label)),  # noqa: S704, drawn by us: names in it are outlines
         "chart": "",
     }
+
+
+def _indented(specification: str) -> str:
+    """For reading: a JSON object with a line for each of its names; anything else as it is."""
+    try:
+        table = json.loads(specification)
+    except ValueError:
+        return specification
+    if not isinstance(table, dict):
+        return specification
+    lines = (f"  {json.dumps(name)}: {json.dumps(value, ensure_ascii=False)}" for name, value in table.items())
+    return "{\n" + ",\n".join(lines) + "\n}"
 
 
 def _script_json(x: Any) -> Markup:
