@@ -1,3 +1,3 @@
-"""The command line: `jaxos4 simulate`, `estimate`, `identifiability`, `train`."""
+"""The command line: `jaxos4 simulate`, `estimate`, `identifiability`, `train`, `report`."""
 
 from ._app import main as main

@@ -6,8 +6,10 @@ import jax
 import typer
 
 from ..errors import InputError, TrainingError
+from .compare import compare
 from .estimate import estimate
 from .identifiability import identifiability
+from .report import report
 from .simulate import simulate
 from .study import study
 from .train import train
@@ -22,7 +24,9 @@ app.command()(simulate)
 app.command()(estimate)
 app.command()(train)
 app.command()(identifiability)
+app.command()(compare)
 app.command()(study)
+app.command()(report)
 
 
 def main() -> None:

@@ -127,7 +127,8 @@ def _provenance(store: Store, failures: list[dict]) -> dict[str, str | int]:
     study = store.study
     return {
         "title": study.title,
-        "specification": msgspec.json.encode(study).decode(),
+        "specification": msgspec.toml.encode(study).decode(),
+        "command": "jaxos4 study study.toml --out DIR",
         "version": store.version,
         "jax": jax.__version__,
         "precision": study.precision,

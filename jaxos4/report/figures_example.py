@@ -1,0 +1,137 @@
+"""Figures of one flight and of the trainings: the search, trajectories, the path in space, the loss."""
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from .legend import legend
+from .scenario import names
+from .style import FAINT, INK, estimator_gid, grid, log_axis, styles
+
+# Of the searches by parameter, whose lines are no estimators.
+_LOOKS = ("o-", "s--", "D-.", "^:", "v-", "P--", "X-.", "*:")
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#c46a9b", "#b97f00", "#3b97ce", "#7f7f7f", "#8e5ea8")
+
+
+def search(data: xr.Dataset) -> Figure | None:
+    """Half-widths of the brackets of IBSS after each sweep, and how far their middle moves, in the first ones."""
+    if "search_half_width" not in data:
+        return None
+    width = data["search_half_width"].transpose("sweep", "parameter")
+    first = width.isel(sweep=0)
+    moves = abs(data["search_estimate"] - data["search_estimate"].isel(sweep=-1)) / first
+    figure, axes = grid(2, columns=2, height=3.2)
+    titles = ("half-width of the bracket", "distance to the last estimate")
+    for panel, values, title in zip(axes, (width / first, moves.transpose("sweep", "parameter")), titles, strict=True):
+        for place, name in enumerate(names(data, "parameter")):
+            y = values.isel(parameter=place).values
+            kind = {"color": _COLORS[place % 8], "label": name, "markersize": 4}
+            panel.plot(data["sweep"].values, np.where(y > 0, y, np.nan), _LOOKS[place % 8], **kind)
+        panel.set_title(title)
+        panel.set_xlabel("sweep")
+        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+        log_axis(panel, "y")
+    axes[0].set_ylabel("in first half-widths")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=8, handlelength=2.5)
+    return figure
+
+
+def trajectories(data: xr.Dataset) -> Figure | None:
+    """The example flight: what was measured, what was true, and what each estimate simulates."""
+    shown = _measured_states(data)
+    if not shown:
+        return None
+    figure, axes = grid(len(shown), columns=3, height=1.75)
+    for panel, place in zip(axes, shown, strict=True):
+        panel.plot(_time(data), data["example_measured"].isel(state=place), ".", color=FAINT, markersize=2)
+        panel.plot(_time(data), data["example_true"].isel(state=place), color=INK, linewidth=1.0)
+        _simulated(panel, data, data["example_simulated"].isel(state=place))
+        _title(panel, data, place, place in shown[-3:])
+    legend(figure, data, markers=False)
+    return figure
+
+
+def deviations(data: xr.Dataset) -> Figure | None:
+    """The same flight: how far each simulation is from the truth."""
+    shown = _measured_states(data)
+    if not shown:
+        return None
+    figure, axes = grid(len(shown), columns=3, height=1.75)
+    for panel, place in zip(axes, shown, strict=True):
+        panel.axhline(0, color=INK, linewidth=0.8)
+        _simulated(panel, data, (data["example_simulated"] - data["example_true"]).isel(state=place))
+        _title(panel, data, place, place in shown[-3:])
+    legend(figure, data, markers=False)
+    return figure
+
+
+def path(data: xr.Dataset) -> Figure | None:
+    """The example flight in space."""
+    if "example_true" not in data:
+        return None
+    states = names(data, "state")
+    if not {"x", "y", "z"} <= set(states):
+        return None
+    at = [states.index(axis) for axis in "xyz"]
+    if not np.isfinite(data["example_true"].isel(state=at).values).any():
+        return None
+    figure = Figure(figsize=(6.5, 5.0), layout="constrained")
+    panel = figure.add_subplot(projection="3d")
+    panel.plot(*data["example_measured"].isel(state=at).values.T, ".", color=FAINT, markersize=1.5, label="measured")
+    panel.plot(*data["example_true"].isel(state=at).values.T, color=INK, linewidth=1.2)
+    for place, look in enumerate(styles(names(data, "estimator")).values()):
+        line = data["example_simulated"].isel(estimator=place, state=at).values
+        if np.isfinite(line).any():
+            panel.plot(*line.T, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(place))
+    for name, label in zip("xyz", (panel.set_xlabel, panel.set_ylabel, panel.set_zlabel), strict=True):
+        label(f"{name} [m]")
+    legend(figure, data, markers=False)
+    return figure
+
+
+def training(data: xr.Dataset) -> Figure | None:
+    """The loss of each network on what it trains on and on what it does not."""
+    if "training_loss" not in data:
+        return None
+    labels = names(data, "training")
+    figure, axes = grid(len(labels), columns=3, width=3.2 * min(len(labels), 3) + 0.6, height=2.6)
+    for place, (panel, label) in enumerate(zip(axes, labels, strict=True)):
+        one = data.isel(training=place)
+        step = one["training_step"].values
+        panel.plot(step, one["training_loss"].values, color=_COLORS[0], marker="o", markersize=3.5, label="training")
+        panel.plot(step, one["validation_loss"].values, "s--", color=_COLORS[1], markersize=3.5, label="validation")
+        losses = np.stack([one["training_loss"].values, one["validation_loss"].values])
+        if not (losses <= 0).any() and np.isfinite(losses).any():
+            log_axis(panel, "y")
+        panel.set_title(label)
+        panel.set_xlabel("step")
+        if place % 3 == 0:
+            panel.set_ylabel("loss")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _measured_states(data: xr.Dataset) -> list[int]:
+    if "example_measured" not in data:
+        return []
+    there = data["example_measured"].notnull() & data["example_true"].notnull()
+    return [int(place) for place in np.flatnonzero(there.any("sample").values)]
+
+
+def _time(data: xr.Dataset) -> np.ndarray:
+    return data["time"].values
+
+
+def _simulated(panel, data: xr.Dataset, values: xr.DataArray) -> None:
+    for place, look in enumerate(styles(names(data, "estimator")).values()):
+        y = values.isel(estimator=place).values
+        if np.isfinite(y).any():
+            panel.plot(_time(data), y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=estimator_gid(place))
+
+
+def _title(panel, data: xr.Dataset, place: int, last: bool) -> None:
+    one = data["state"].isel(state=place)
+    panel.set_title(f"{one.item()} [{data['state_unit'].isel(state=place).item()}]")
+    if last:
+        panel.set_xlabel("time [s]")

@@ -1,0 +1,144 @@
+"""Figures of how estimates scatter: errors, coverage of their intervals, accuracy for its price."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from .. import metrics
+from .figures_noise import positive_scales
+from .legend import legend
+from .scenario import names
+from .style import FAINT, INK, estimator_gid, grid, log_axis, styles
+
+# The quantiles that a box shows: its whiskers hold 95 %, as two bounds to either side do of a Gaussian at the bound.
+QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+# Where an estimator that spends no rollouts stands on a logarithmic axis.
+NO_ROLLOUTS = 0.5
+
+
+def nearest_scale(data: xr.Dataset) -> int:
+    """The place of the noise scale nearest 1 by ratio, which pictures of one scale show."""
+    scales = data["scale"].values
+    positive = np.where(scales > 0, scales, np.finfo(float).tiny)
+    return int(np.argmin(np.abs(np.log(positive))))
+
+
+def error_quantiles(data: xr.Dataset) -> xr.DataArray:
+    """`QUANTILES` of the errors in bounds, over the flights told."""
+    found = metrics.normalised_error(data)
+    some = found.notnull().any("flight")
+    return found.where(some, 0.0).quantile(list(QUANTILES), dim="flight").where(some)
+
+
+def distribution(data: xr.Dataset) -> Figure | None:
+    """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1."""
+    found = error_quantiles(data.isel(scale=nearest_scale(data)))
+    if not found.notnull().any():
+        return None
+    style = styles(names(data, "estimator"))
+    figure, axes = grid(data.sizes["parameter"], columns=4, height=0.28 * len(style) + 0.75)
+    reach = _reach(found)
+    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
+        for x in (-metrics.NOISE_FLOOR, metrics.NOISE_FLOOR):
+            panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
+        panel.axvline(0, color=INK, linewidth=0.8)
+        for row, look in enumerate(style.values()):
+            low, first, middle, third, high = found.isel(parameter=place, estimator=row).values
+            marks: dict[str, Any] = {"color": look.color, "gid": estimator_gid(row)}
+            if not np.isfinite(middle):
+                panel.text(0, row, "nothing told", va="center", ha="center", fontsize=7, gid=marks["gid"])
+                continue
+            panel.plot([low, high], [row, row], linewidth=1.2, solid_capstyle="butt", **marks)
+            panel.plot([first, third], [row, row], linewidth=7, solid_capstyle="butt", alpha=0.55, **marks)
+            panel.plot([middle], [row], marker=look.marker, markersize=4.5, **marks)
+        panel.set_title(name)
+        panel.set_xlim(-reach, reach)
+        panel.set_ylim(len(style) - 0.4, -0.6)
+        panel.set_yticks(range(len(style)), list(style) if place % 4 == 0 else [])
+        panel.grid(axis="y", visible=False)
+        if place >= len(axes) - 4:
+            panel.set_xlabel("error / bound")
+    return figure
+
+
+def coverage(data: xr.Dataset) -> Figure | None:
+    """Share of intervals that hold the truth against the share that they claim, at each noise scale."""
+    found = metrics.mean_coverage(data)
+    if not found["coverage"].notnull().any():
+        return None
+    style, levels = styles(names(data, "estimator")), data["level"].values
+    figure, axes = grid(data.sizes["scale"], columns=4, width=2.25 * min(data.sizes["scale"], 4) + 1.2, height=2.8)
+    lowest = min(float(found["low"].min()), float(levels.min())) - 0.04
+    for place, panel in enumerate(axes):
+        one = found.isel(scale=place)
+        for x, level in enumerate(levels):
+            panel.hlines(level, x - 0.45, x + 0.45, color=INK, linewidth=1.4)
+        for row, look in enumerate(style.values()):
+            shift = 0.7 * (row / max(len(style) - 1, 1) - 0.5)
+            at, part, gid = np.arange(len(levels)) + shift, one.isel(estimator=row), estimator_gid(row)
+            panel.vlines(at, part["low"].values, part["high"].values, color=look.color, linewidth=1.0, gid=gid)
+            shares = part["coverage"].values
+            panel.plot(at, shares, color=look.color, marker=look.marker, linestyle="none", markersize=4, gid=gid)
+        panel.set_title(f"noise scale {data['scale'].values[place]:g}")
+        panel.set_xticks(range(len(levels)), [f"{100 * level:g} %" for level in levels])
+        panel.set_ylim(lowest, 1.02)
+        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
+        panel.grid(axis="x", visible=False)
+        panel.set_xlabel("level claimed")
+        if place % 4 == 0:
+            panel.set_ylabel("intervals that hold the truth")
+    legend(figure, data, lines=False)
+    return figure
+
+
+def rollouts(data: xr.Dataset) -> Figure | None:
+    """RMSE / least bound over all parameters against the rollouts that an identification takes; a line joins scales."""
+    data = positive_scales(data)
+    x, y = metrics.mean_rollouts(data), metrics.accuracy(data)
+    there = (x.notnull() & y.notnull()).transpose("scale", "estimator").values
+    if not there.any():
+        return None
+    figure, (panel,) = grid(1, columns=1, width=7.0, height=3.6)
+    panel.axhline(1, color=INK, linewidth=1.1)
+    for row, look in enumerate(styles(names(data, "estimator")).values()):
+        at = there[:, row]
+        across, up = price(x.isel(estimator=row).values[at]), y.isel(estimator=row).values[at]
+        gid = estimator_gid(row)
+        panel.plot(across, up, color=look.color, linestyle=look.dash, linewidth=1.0, gid=gid)
+        sizes = 26 + 30 * np.flatnonzero(at)
+        panel.scatter(across, up, s=sizes, color=look.color, marker=look.marker, alpha=0.8, linewidths=0, gid=gid)
+    log_axis(panel, "x")
+    log_axis(panel, "y")
+    _rollout_ticks(panel, x.values[x.notnull().values])
+    scales = ", ".join(f"{scale:g}" for scale in data["scale"].values)
+    panel.set_xlabel(f"rollouts for one flight (larger markers: larger noise scale of {scales})")
+    panel.set_ylabel("RMSE / least bound, mean of all parameters")
+    legend(figure, data)
+    return figure
+
+
+def price(spent: np.ndarray) -> np.ndarray:
+    """Rollouts as places on a logarithmic axis, on which none stand at `NO_ROLLOUTS`."""
+    return np.where(spent > 0, np.maximum(spent, NO_ROLLOUTS), NO_ROLLOUTS)
+
+
+def rollout_ticks(spent: np.ndarray) -> dict[float, str]:
+    """The ticks that suit these numbers of rollouts."""
+    top = int(np.ceil(np.log10(max(float(spent.max()), 10.0))))
+    ticks = {NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
+    return ticks | {10.0**power: f"{10**power:,}" for power in range(top + 1)}
+
+
+def _rollout_ticks(panel, spent: np.ndarray) -> None:
+    ticks = rollout_ticks(spent)
+    panel.set_xticks(list(ticks), list(ticks.values()))
+    panel.set_xlim(min(ticks) / 1.5 if 0 in np.floor(spent) else None, max(ticks) * 1.2)
+
+
+def _reach(found: xr.DataArray) -> float:
+    """Half the width of the panels: what all boxes need, but not what a hopeless estimator would make of it."""
+    largest = np.nanmax(np.abs(found.values), initial=0.0)
+    return float(np.clip(1.08 * largest, 3.0, 12.0))

@@ -1,0 +1,68 @@
+"""The Dataset of a study, read back from the folder that it was written to."""
+
+from pathlib import Path
+
+import xarray as xr
+
+from .. import metrics
+from ..errors import InputError
+
+RESULTS_FILE = "results.nc"
+"""The file of a study's folder that holds its Dataset."""
+
+_DIMENSIONS = (*metrics.SCENARIO, "flight", "parameter")
+_VARIABLES = {
+    "truth": tuple(name for name in _DIMENSIONS if name != "estimator"),
+    "center": ("model", "airframe", "width", "parameter"),
+    "estimate": _DIMENSIONS,
+    "half_width": (*_DIMENSIONS, "level"),
+    "bound": _DIMENSIONS,
+    "result": (*metrics.SCENARIO, "flight"),
+    "rollouts": (*metrics.SCENARIO, "flight"),
+    "hit": (*metrics.SCENARIO, "flight"),
+    "seen": ("channels", "estimator"),
+    "unit": ("parameter",),
+}
+
+
+def read_results(directory: Path) -> xr.Dataset:
+    """The Dataset in a study's folder.
+
+    **Raises:** `InputError` where there is none, or the file is something else.
+    """
+    path = directory / RESULTS_FILE
+    if not directory.is_dir():
+        raise InputError(f"{directory}: there is no such folder; give one that `jaxos4 study` wrote.")
+    if not path.is_file():
+        raise InputError(f"{directory}: holds no {RESULTS_FILE}; give a folder that `jaxos4 study` wrote.")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
+            dataset = opened.load()
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        what = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
+    missing = what_is_missing(dataset)
+    if missing:
+        raise InputError(f"{path}: not the results of a study: {missing}; give a folder that `jaxos4 study` wrote.")
+    return dataset
+
+
+def what_is_missing(dataset: xr.Dataset) -> str:
+    """What keeps a Dataset from being a study's, or nothing."""
+    for name, dimensions in _VARIABLES.items():
+        if name not in dataset.variables:
+            return f"no variable `{name}`"
+        if set(dataset[name].dims) != set(dimensions):
+            return f"`{name}` is not along {', '.join(dimensions)}"
+    for name in (*_DIMENSIONS, "level"):
+        if dataset.sizes[name] == 0:
+            return f"nothing along `{name}`"
+        if name not in dataset.coords:
+            return f"no coordinate `{name}`"
+    for name in ("truth", "center", "estimate", "half_width", "bound", "rollouts", "hit", "scale", "level"):
+        if dataset[name].dtype.kind not in "fiu":
+            return f"`{name}` does not hold numbers"
+    attributes = dataset["result"].attrs
+    if not {"flag_values", "flag_meanings"} <= attributes.keys():
+        return "`result` does not say what its codes mean"
+    return ""

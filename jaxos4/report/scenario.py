@@ -1,0 +1,63 @@
+"""A study cut into pieces that a table or a figure can show: everything fixed but noise scale, estimator and flight."""
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import xarray as xr
+
+from ..metrics import SCENARIO
+
+# What one table or figure shows side by side.
+_SHOWN = ("scale", "estimator")
+
+_PHRASES = {
+    "model": "{} model",
+    "airframe": "airframe {}",
+    "excitation": "{}",
+    "duration": "{:g} s",
+    "method": "truth by {}",
+    "noise": "{} noise",
+    "width": "bracket x {:g}",
+    "channels": "{} channels",
+}
+
+
+class Scenario(NamedTuple):
+    """One value of every dimension but noise scale and estimator."""
+
+    number: int
+    label: str
+    data: xr.Dataset
+
+
+def scenarios(dataset: xr.Dataset) -> Iterator[Scenario]:
+    """All of them, numbered from 1; the label names what differs, or everything where there is only one."""
+    fixed = [name for name in SCENARIO if name not in _SHOWN]
+    varied = [name for name in fixed if dataset.sizes[name] > 1] or fixed
+    for number, at in enumerate(itertools.product(*(range(dataset.sizes[name]) for name in fixed)), start=1):
+        data = dataset.isel(dict(zip(fixed, at, strict=True)))
+        yield Scenario(number, ", ".join(_PHRASES[name].format(data[name].item()) for name in varied), data)
+
+
+def count(dataset: xr.Dataset) -> int:
+    """How many scenarios there are."""
+    return sum(1 for _ in scenarios(dataset))
+
+
+def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
+    """The labels along a dimension."""
+    return [str(name) for name in data[dimension].values]
+
+
+def bounds(data: xr.Dataset) -> dict[str, int]:
+    """The bounds to compare with: what some estimator looks at, and the place of the first one that does.
+
+    Of those, one whose cells are there is taken.
+    """
+    found: dict[str, int] = {}
+    there = data["bound"].notnull().any([name for name in data["bound"].dims if name != "estimator"])
+    order = sorted(range(data.sizes["estimator"]), key=lambda i: not there[i])
+    for place in order:
+        found.setdefault(str(data["seen"].isel(estimator=place).item()), place)
+    return dict(sorted(found.items(), key=lambda item: item[1]))

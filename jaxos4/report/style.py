@@ -1,0 +1,153 @@
+"""How figures look: colours that the colour-blind tell apart, with markers and dashes; bytes that do not vary."""
+
+import contextlib
+import io
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+INK = "#1b1e23"
+GRID = "#d9dce1"
+PAPER = "#ffffff"
+FAINT = "#8a9099"
+
+
+Dash = tuple[float, tuple[float, ...]]
+"""Where a dash pattern begins, and its lengths of ink and gap, in line widths."""
+
+SOLID: Dash = (0, ())
+_DASHED: Dash = (0, (4, 1.6))
+_DOTTED: Dash = (0, (1, 1.65))
+_DASH_DOT: Dash = (0, (6.4, 1.6, 1, 1.6))
+
+
+class Style(NamedTuple):
+    """How one series is drawn: in matplotlib, and in plotly's words."""
+
+    color: str
+    marker: str
+    dash: Dash
+    symbol: str
+    plotly_dash: str
+
+
+# After Okabe and Ito (2008), darkened where a light one would vanish on white; each at least 3:1 on white and on dark.
+_STYLES = (
+    Style("#0072b2", "o", SOLID, "circle", "solid"),
+    Style("#d55e00", "s", _DASHED, "square", "dash"),
+    Style("#009e73", "D", _DASH_DOT, "diamond", "dashdot"),
+    Style("#c46a9b", "^", _DOTTED, "triangle-up", "dot"),
+    Style("#b97f00", "v", (0, (5, 1)), "triangle-down", "longdash"),
+    Style("#3b97ce", "P", (0, (3, 1, 1, 1)), "cross", "longdashdot"),
+    Style("#7f7f7f", "X", (0, (1, 1)), "x", "dot"),
+    Style("#8e5ea8", "*", (0, (7, 2, 1, 2)), "star", "dashdot"),
+)
+_KNOWN = ("ibss", "network", "hybrid", "output-error", "equation-error", "rls", "svsf", "kalman")
+BOUND_DASHES = (SOLID, _DOTTED, _DASHED)
+
+_RC: dict[Any, Any] = {
+    "axes.edgecolor": INK,
+    "axes3d.xaxis.panecolor": "none",
+    "axes3d.yaxis.panecolor": "none",
+    "axes3d.zaxis.panecolor": "none",
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.labelsize": 8.5,
+    "axes.linewidth": 0.7,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": "none",
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 5,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "jaxos4",
+    "text.color": INK,
+    "text.parse_math": False,  # names come from files: a dollar sign in one is a dollar sign
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+}
+
+
+@contextlib.contextmanager
+def drawing() -> Iterator[None]:
+    """Inside, figures look the same whatever the user's matplotlib settings; outside, these are untouched."""
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_RC)
+        yield
+
+
+def styles(estimators: Sequence[str]) -> dict[str, Style]:
+    """A style for each estimator: the same in every study for those of this library, the unused ones for others."""
+    free = [style for name, style in zip(_KNOWN, _STYLES, strict=True) if name not in estimators] or list(_STYLES)
+    others = [name for name in estimators if name not in _KNOWN]
+    chosen = {name: free[i % len(free)] for i, name in enumerate(others)}
+    return {name: chosen.get(name) or _STYLES[_KNOWN.index(name)] for name in estimators}
+
+
+def estimator_gid(place: int) -> str:
+    """The id of what belongs to one estimator in a drawing, by which the page hides it."""
+    return f"estimator-{place}"
+
+
+def grid(panels: int, *, columns: int, width: float = 9.0, height: float = 2.1) -> tuple[Figure, list[Axes]]:
+    """A figure of small multiples; `height` is that of one row [inch], without the legend."""
+    columns = min(columns, panels)
+    rows = -(-panels // columns)
+    figure = Figure(figsize=(width, height * rows + 0.5), layout="constrained")
+    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(panels)]
+    return figure, axes
+
+
+def log_axis(axes: Axes, which: str) -> None:
+    """A logarithmic axis with plain numbers."""
+    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    low, high = sorted(axes.get_xlim() if which == "x" else axes.get_ylim())
+    if low > 0 and high / low < 5:
+        axis.set_major_locator(MaxNLocator(5))
+    elif low > 0 and high / low < 30:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("e-0", "e-")))
+    axis.set_minor_locator(NullLocator())  # each tick takes its time, and nobody reads them
+
+
+def scale_axis(axes: Axes, scales: np.ndarray) -> None:
+    """The noise scales along x, each with its tick."""
+    axes.set_xscale("log")
+    axes.set_xticks(list(scales), [f"{scale:g}" for scale in scales])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlim(scales.min() / 1.8, scales.max() * 1.8)
+
+
+def svg(figure: Figure) -> bytes:
+    """The figure as SVG, the same bytes each time."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()
+
+
+def pdf(figure: Figure) -> bytes:
+    """The figure as PDF, the same bytes each time."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
+    return buffer.getvalue()

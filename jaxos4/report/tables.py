@@ -1,0 +1,226 @@
+"""The tables of a study, as rows of text: for the page and for the terminal alike."""
+
+import json
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from .. import metrics
+from .numbers import MISSING, percent, plain
+from .scenario import bounds, names
+
+MARKS = ("", "†", "‡")
+"""What follows a number that is no percentage, by the codes of `metrics.no_percentage`."""
+
+LEVEL = 0.95
+"""The level whose coverage is told parameter by parameter, or the nearest that there is."""
+
+_MOST_LISTED = 20
+
+
+class Cell(NamedTuple):
+    """A number as text, with its interval, and the mark of what is unusual about it."""
+
+    text: str
+    interval: str = ""
+    mark: str = ""
+
+
+class Row(NamedTuple):
+    """`estimator`: the place of the one that it belongs to, if any, with which the page hides it."""
+
+    label: str
+    cells: tuple[Cell, ...]
+    estimator: int | None = None
+
+
+class Group(NamedTuple):
+    """Rows of one noise scale."""
+
+    label: str
+    rows: tuple[Row, ...]
+
+
+class Table(NamedTuple):
+    """Groups of rows under headings.
+
+    - `source`: the variables and the functions that its numbers come from.
+    - `units`: of the columns, where they have some.
+    - `notes`: what its marks mean.
+    """
+
+    name: str
+    caption: str
+    source: str
+    headings: tuple[str, ...]
+    groups: tuple[Group, ...]
+    units: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
+    """RMS errors in percent of the truth, with rows for the bounds and for the bracket's centre alone."""
+    found, best, middle = metrics.estimator_error(data), metrics.bound_error(data), metrics.center_error(data)
+    used: set[int] = set()
+
+    def cells(of: xr.Dataset) -> tuple[Cell, ...]:
+        made = []
+        for place in range(data.sizes["parameter"]):
+            one = of.isel(parameter=place)
+            reason = int(one["reason"])
+            value = float(one["absolute" if reason else "percent"])
+            mark = "" if np.isnan(value) else MARKS[reason]
+            used.update({reason} if mark else ())
+            made.append(Cell(plain(value, digits), mark=mark))
+        return tuple(made)
+
+    groups = []
+    for place in range(data.sizes["scale"]):
+        rows = [Row(f"bound, {seen}", cells(best.isel(scale=place, estimator=at))) for seen, at in bounds(data).items()]
+        rows += [
+            Row(name, cells(found.isel(scale=place, estimator=at)), at)
+            for at, name in enumerate(names(data, "estimator"))
+        ]
+        rows.append(Row("bracket centre", cells(middle.isel(scale=place))))
+        groups.append(Group(_noise(data, place), tuple(rows)))
+    return Table(
+        "error",
+        "RMS error [% of the truth; where marked, in the parameter's unit]",
+        "estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)",
+        tuple(names(data, "parameter")),
+        tuple(groups),
+        units=tuple(names(data, "unit")),
+        notes=tuple(
+            f"{MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, where a percentage "
+            "means nothing."
+            for code in sorted(used)
+        ),
+    )
+
+
+def efficiency_table(data: xr.Dataset) -> Table:
+    """RMSE / bound with Monte-Carlo intervals."""
+    found = metrics.efficiency(data)
+
+    def cells(one: xr.Dataset) -> tuple[Cell, ...]:
+        numbers = (one[name].values for name in ("efficiency", "low", "high"))
+        return tuple(Cell(plain(value), _interval(plain(a), plain(b))) for value, a, b in zip(*numbers, strict=True))
+
+    return Table(
+        "efficiency",
+        "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do",
+        "estimate, truth, bound, result (metrics.efficiency)",
+        tuple(names(data, "parameter")),
+        _groups(data, lambda at: cells(found.isel(at))),
+    )
+
+
+def coverage_table(data: xr.Dataset) -> Table:
+    """Coverage of each parameter at `LEVEL`."""
+    level = int(np.argmin(np.abs(data["level"].values - LEVEL)))
+    found = metrics.coverage(data).isel(level=level)
+    return Table(
+        "coverage",
+        f"Intervals of {100 * data['level'].values[level]:g} % that hold the truth [%], with 95 % Wilson intervals",
+        "estimate, truth, half_width, result (metrics.coverage)",
+        tuple(names(data, "parameter")),
+        _groups(data, lambda at: _shares(found.isel(at), "coverage")),
+    )
+
+
+def levels_table(data: xr.Dataset) -> Table:
+    """Coverage at every level, averaged over the parameters."""
+    found = metrics.mean_coverage(data)
+    return Table(
+        "levels",
+        "Intervals that hold the truth [%] by the level that they claim, averaged over the parameters",
+        "estimate, truth, half_width, result (metrics.mean_coverage)",
+        tuple(f"{100 * level:g} %" for level in data["level"].values),
+        _groups(data, lambda at: _shares(found.isel(at), "coverage")),
+    )
+
+
+def result_table(data: xr.Dataset) -> Table:
+    """How many flights ended with each result that occurs, the rollouts that they took, and hits of the seeds."""
+    counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
+    known = names(counts, "code")
+    occurs = [place for place in range(len(known)) if bool((counts.isel(code=place) > 0).any())]
+
+    def cells(at: dict[str, int]) -> tuple[Cell, ...]:
+        hit = hits.isel(at)
+        last = _shares(hit.expand_dims("parameter"), "hit_rate")[0]
+        numbers = [Cell(str(int(counts.isel(at).isel(code=place)))) for place in occurs]
+        return (*numbers, Cell(plain(float(spent.isel(at)))), last)
+
+    return Table(
+        "results",
+        "Flights by result, mean rollouts of those identified, and seed brackets of the hybrid that held the truth [%]",
+        "result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)",
+        (*(known[place].replace("_", " ") for place in occurs), "rollouts", "seed hits"),
+        _groups(data, cells),
+    )
+
+
+class Trouble(NamedTuple):
+    """Flights without numbers: at most 20 of them by place and result, and how many there are."""
+
+    listed: tuple[str, ...]
+    total: int
+
+
+def troubled_flights(data: xr.Dataset) -> Trouble:
+    """The flights that were run and are not among those told."""
+    bad = (metrics.was_run(data) & ~metrics.told(data)).transpose("scale", "estimator", "flight").values
+    known = {value: name.replace("_", " ") for name, value in metrics.codes(data).items()}
+    results = data["result"].transpose("scale", "estimator", "flight").values
+    estimators, flights = names(data, "estimator"), names(data, "flight")
+    places = [tuple(int(i) for i in place) for place in np.argwhere(bad)]
+    listed = tuple(
+        f"{_noise(data, scale)}, {estimators[at]}, flight {flights[flight]}: "
+        f"{known.get(int(results[scale, at, flight]), 'unknown result')}"
+        for scale, at, flight in places[:_MOST_LISTED]
+    )
+    return Trouble(listed, len(places))
+
+
+def failed_cells(dataset: xr.Dataset) -> Trouble:
+    """The cells of a study that raised an error, with its message; and how many there are."""
+    failures: list[dict[str, Any]] = json.loads(dataset.attrs.get("failures", "[]"))
+    listed = tuple(f"{_cell_name(failure['cell'])}: {failure['message']}" for failure in failures[:_MOST_LISTED])
+    return Trouble(listed, len(failures))
+
+
+def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
+    """How many cells of the study are not there yet, and of how many."""
+    missing = (dataset["result"] == metrics.codes(dataset)["not_run"]).all("flight")
+    return int(missing.sum()), missing.size
+
+
+def _cell_name(cell: Any) -> str:
+    if not isinstance(cell, dict):
+        return str(cell)
+    return ", ".join(f"{name} {value}" for name, value in cell.items())
+
+
+def _noise(data: xr.Dataset, place: int) -> str:
+    return f"noise x {data['scale'].values[place]:g}"
+
+
+def _groups(data: xr.Dataset, cells) -> tuple[Group, ...]:
+    return tuple(Group(_noise(data, place), tuple(_rows(data, place, cells))) for place in range(data.sizes["scale"]))
+
+
+def _rows(data: xr.Dataset, scale: int, cells) -> Iterator[Row]:
+    for at, name in enumerate(names(data, "estimator")):
+        yield Row(name, cells({"scale": scale, "estimator": at}), at)
+
+
+def _shares(one: xr.Dataset, name: str) -> tuple[Cell, ...]:
+    numbers = (one[part].values for part in (name, "low", "high"))
+    return tuple(Cell(percent(value), _interval(percent(a), percent(b))) for value, a, b in zip(*numbers, strict=True))
+
+
+def _interval(low: str, high: str) -> str:
+    return "" if MISSING in (low, high) else f"{low} to {high}"

@@ -1,0 +1,38 @@
+"""The headline table of a study, for a terminal."""
+
+import rich.box
+import xarray as xr
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from . import tables
+from .scenario import scenarios
+
+
+def error_table(dataset: xr.Dataset) -> RenderableType:
+    """RMS errors in percent of the truth by parameter, estimator and noise scale, a table for each scenario.
+
+    With rows for the Cramer-Rao bound and for the bracket's centre alone; absolute errors are marked, and below the
+    tables it says why.
+    """
+    parts: list[RenderableType] = []
+    notes: dict[str, None] = {}
+    for scenario in scenarios(dataset):
+        table = tables.error_table(scenario.data, digits=2)
+        parts += [Text(f"RMS error [%], {scenario.label}"), _rich(table)]
+        notes |= dict.fromkeys(table.notes)
+    return Group(*parts, *(Text(note) for note in notes))
+
+
+def _rich(table: tables.Table) -> Table:
+    made = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=0)  # 80 columns must do
+    made.add_column("", no_wrap=True)
+    for heading in table.headings:
+        made.add_column(Text(heading), justify="right", no_wrap=True)
+    for group in table.groups:
+        made.add_row(Text(group.label, style="bold"))
+        for row in group.rows:
+            last = row is group.rows[-1] and group is not table.groups[-1]
+            made.add_row(Text(row.label), *(Text(f"{cell.text}{cell.mark}") for cell in row.cells), end_section=last)
+    return made

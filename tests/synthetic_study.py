@@ -1,0 +1,202 @@
+"""A study that nobody ran: a Dataset of the layout that studies write, from a random generator with a fixed seed."""
+
+import json
+
+import numpy as np
+import xarray as xr
+
+PARAMETERS = tuple(f"alpha{i}" for i in range(1, 9))
+UNITS = ("1", "1/s", "1/(kg m^2)", "1", "1/s", "1/(kg m^2)", "1", "1/(kg m^2)")
+TRUTH = np.array([-0.73333333, 6e-9, 133.33333, 0.73333333, 6e-9, 133.33333, 0.0, 76.923077])
+HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
+# Cramer-Rao standard deviations of the standard flight at a noise scale of 1.
+BOUND = {
+    "rates": np.array([6e-3, 1.1e-3, 0.147, 5.9e-3, 1.9e-3, 0.147, 5.2e-3, 0.085]),
+    "attitude": np.array([2.6e-3, 4e-4, 0.131, 2.8e-3, 9.2e-4, 0.132, 1.3e-3, 0.069]),
+    "all": np.array([1.0e-3, 1.4e-4, 0.0387, 1.1e-3, 3.3e-4, 0.036, 1.2e-3, 0.068]),
+}
+# How each estimator errs, in its bounds: spread, bias and rollouts; and whether it looks at the rates alone.
+ESTIMATORS = {
+    "ibss": (1.0, 0.0, 600, False),
+    "network": (1.15, 0.0, 0, True),
+    "hybrid": (1.0, 0.0, 90, False),
+    "output-error": (1.02, 0.0, 110, False),
+    "equation-error": (2.5, 1.5, 0, True),
+    "rls": (2.6, 1.5, 0, True),
+    "svsf": (4.0, 3.0, 0, True),
+    "kalman": (1.3, 0.2, 24, False),
+}
+RESULTS = (
+    "successful",
+    "at_bound",
+    "unidentifiable",
+    "nonfinite_trajectory",
+    "attitude_singularity",
+    "bracket_invalid",
+    "network_mismatch",
+    "max_sweeps",
+    "failed",
+    "not_run",
+)
+LEVELS = np.array([0.5, 0.9, 0.95, 0.99])
+GAUSSIAN = np.array([0.67449, 1.64485, 1.95996, 2.57583])
+SCENARIO = ("model", "airframe", "excitation", "duration", "method", "noise", "scale", "width", "channels", "estimator")
+STATES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
+STATE_UNITS = ("m", "m/s") * 3 + ("rad", "rad/s") * 3
+
+
+def synthetic_study(
+    *,
+    flights=40,
+    scales=(0.1, 1.0, 10.0),
+    estimators=("ibss", "network", "hybrid", "equation-error", "svsf"),
+    models=("published",),
+    channels=("all",),
+    seed=0,
+    spoiled=True,
+    drawn=False,
+    example=True,
+):
+    """The Dataset. `spoiled`: with a failed cell, one that was not run, and flights of other results.
+
+    `drawn`: each flight has a truth of its own, drawn over 60 % of the bracket.
+    """
+    rng = np.random.default_rng(seed)
+    coordinates = {
+        "model": list(models),
+        "airframe": ["os4"],
+        "excitation": ["multisine"],
+        "duration": [5.0],
+        "method": ["euler"],
+        "noise": ["white"],
+        "scale": list(scales),
+        "width": [1.0],
+        "channels": list(channels),
+        "estimator": list(estimators),
+    }
+    shape = tuple(len(values) for values in coordinates.values())
+    truth = np.broadcast_to(TRUTH, (*shape[:-1], flights, 8)).copy()
+    if drawn:
+        truth += 0.6 * HALF_WIDTH * rng.uniform(-1, 1, truth.shape)
+    estimate = np.full((*shape, flights, 8), np.nan)
+    std, bound = estimate.copy(), estimate.copy()
+    half_width = np.full((*shape, flights, 8, 4), np.nan)
+    result = np.full((*shape, flights), RESULTS.index("successful"), dtype=np.int8)
+    rollouts = np.zeros((*shape, flights), dtype=np.int32)
+    cost = np.full((*shape, flights), np.nan)
+    hit = np.full((*shape, flights), -1, dtype=np.int8)
+    failures = []
+    seen = np.array([["rates" if ESTIMATORS[e][3] else c for e in estimators] for c in channels])
+    for index in np.ndindex(shape):
+        spread, bias, shots, _ = ESTIMATORS[estimators[index[-1]]]
+        sigma = scales[index[6]] * BOUND[seen[index[8], index[9]]]
+        bound[index] = sigma
+        estimate[index] = truth[index[:-1]] + sigma * (spread * rng.standard_normal((flights, 8)) + bias)
+        std[index] = sigma * min(spread, 1.5)
+        half_width[index] = std[index][..., None] * GAUSSIAN
+        rollouts[index] = rng.poisson(shots, flights)
+        cost[index] = 0.5 * rng.chisquare(500, flights)
+        if estimators[index[-1]] == "hybrid":
+            hit[index] = rng.random(flights) < 0.97
+    if spoiled:
+        last, slow = len(estimators) - 1, tuple(0 for _ in shape)
+        _spoil(result, estimate, std, half_width, slow[:-1] + (0,), {1: "at_bound", 3: "nonfinite_trajectory"})
+        _spoil(result, estimate, std, half_width, slow[:6] + (len(scales) - 1, 0, 0, 0), {2: "max_sweeps"})
+        result[slow[:6] + (len(scales) - 1, 0, 0, 1)][5:8] = RESULTS.index("unidentifiable")
+        for scale, name in ((len(scales) - 1, "failed"), (0, "not_run")):
+            cell = slow[:6] + (scale, 0, 0, last)
+            _spoil(result, estimate, std, half_width, cell, dict.fromkeys(range(flights), name))
+            rollouts[cell], cost[cell] = 0, np.nan
+            bound[cell] = np.nan if name == "not_run" else bound[cell]
+        failures.append(
+            {
+                "cell": {"scale": scales[-1], "estimator": estimators[last]},
+                "message": "FloatingPointError: <b>the filter's covariance</b> is not positive definite",
+            }
+        )
+    per_flight, per_parameter = (*SCENARIO, "flight"), (*SCENARIO, "flight", "parameter")
+    wide = ("model", "airframe", "width", "parameter")
+    center = np.broadcast_to(TRUTH + 0.2 * HALF_WIDTH * (not drawn), (len(models), 1, 1, 8))
+    dataset = xr.Dataset(
+        {
+            "truth": ((*SCENARIO[:-1], "flight", "parameter"), truth),
+            "center": (wide, center),
+            "bracket_half_width": (wide, np.broadcast_to(HALF_WIDTH, center.shape)),
+            "estimate": (per_parameter, estimate),
+            "std": (per_parameter, std),
+            "half_width": ((*per_parameter, "level"), half_width),
+            "bound": (per_parameter, bound),
+            "result": (per_flight, result),
+            "rollouts": (per_flight, rollouts),
+            "cost": (per_flight, cost),
+            "hit": (per_flight, hit),
+            "seen": (("channels", "estimator"), seen),
+        },
+        coords={
+            **coordinates,
+            "flight": np.arange(flights),
+            "parameter": list(PARAMETERS),
+            "unit": ("parameter", list(UNITS)),
+            "level": LEVELS,
+        },
+        attrs={
+            "title": "A synthetic study",
+            "specification": 'title = "A synthetic study"\nscales = [0.1, 1.0, 10.0]\n',
+            "version": "0.1.0",
+            "precision": "float64",
+            "device": "cpu",
+            "jax": "0.9.0",
+            "seed": seed,
+            "command": "jaxos4 study synthetic.toml --out synthetic",
+            "failures": json.dumps(failures),
+        },
+    )
+    if example:
+        dataset = dataset.merge(_example(rng, estimators))
+    for name in dataset.variables:
+        dataset[name].attrs = {"long_name": str(name).replace("_", " "), "units": "1"}
+    for name in ("truth", "center", "bracket_half_width", "estimate", "std", "half_width", "bound"):
+        dataset[name].attrs["units"] = "unit"
+    dataset["result"].attrs |= {
+        "flag_values": np.arange(len(RESULTS), dtype=np.int8),
+        "flag_meanings": " ".join(RESULTS),
+    }
+    return dataset
+
+
+def _spoil(result, estimate, std, half_width, cell, flights):
+    for flight, name in flights.items():
+        result[cell][flight] = RESULTS.index(name)
+        for numbers in (estimate, std, half_width):
+            numbers[cell][flight] = np.nan
+
+
+def _example(rng, estimators):
+    time = np.arange(0, 5.001, 0.02)
+    phase = np.arange(12)[:, None]
+    true = (np.sin(2 * np.pi * (0.3 + 0.05 * phase) * time + phase) * (0.2 + 0.05 * phase)).T
+    sigma = np.array([0.005, 0.02] * 3 + [0.005, 0.01] * 3)
+    growth = 0.002 + 0.003 * np.arange(len(estimators))[:, None, None]
+    drift = growth * time[:, None] * np.cos(3 * time[:, None] + phase.T)
+    variables = {
+        "example_true": (("sample", "state"), true),
+        "example_measured": (("sample", "state"), true + sigma * rng.standard_normal(true.shape)),
+        "example_simulated": (("estimator", "sample", "state"), true + drift),
+    }
+    coordinates = {"time": ("sample", time), "state": list(STATES), "state_unit": ("state", list(STATE_UNITS))}
+    if "ibss" in estimators:
+        sweeps = np.arange(9)
+        shrink = np.maximum(0.35 ** sweeps[:, None], 2e-4) * (1 + 0.3 * rng.random((9, 8)))
+        variables["search_half_width"] = (("sweep", "parameter"), HALF_WIDTH * shrink)
+        errors = HALF_WIDTH * 0.4 * 0.3 ** sweeps[:, None] * rng.standard_normal((9, 8)) + BOUND["all"]
+        variables["search_estimate"] = (("sweep", "parameter"), TRUTH + errors)
+        coordinates["sweep"] = sweeps
+    if "network" in estimators:
+        steps = np.arange(0, 3001, 250.0)
+        loss = 0.02 + np.exp(-steps / 700)
+        pad = np.where(np.arange(13) < 10, 1.0, np.nan)
+        variables["training_step"] = (("training", "check"), np.stack([steps, steps * pad]))
+        variables["training_loss"] = (("training", "check"), np.stack([loss, 1.5 * loss * pad]))
+        variables["validation_loss"] = (("training", "check"), np.stack([1.1 * loss, 1.7 * loss * pad]))
+        coordinates["training"] = ["network, rates", "hybrid, all"]
+    return xr.Dataset(variables, coords=coordinates)

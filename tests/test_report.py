@@ -1,0 +1,332 @@
+"""The report of a study: its files, every number in its tables, what it says of trouble, and what it refuses."""
+
+import html.parser
+import io
+import json
+import math
+import re
+import sys
+
+import h5py
+import matplotlib
+import numpy as np
+import pytest
+import xarray as xr
+from rich.console import Console
+from synthetic_study import ESTIMATORS, LEVELS, RESULTS, SCENARIO, UNITS, synthetic_study
+
+from jaxos4.cli import main
+from jaxos4.report import error_table, figures, read_results, write_report, writing
+from jaxos4.report.numbers import MISSING, plain
+
+OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
+OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
+TOLD = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
+
+
+def few(study):
+    study = study.isel(parameter=[0, 1, 6])
+    return study.isel(state=[0, 2, 4, 7]) if "state" in study.dims else study
+
+
+class Page(html.parser.HTMLParser):
+    """Reads tables by id: {(group, row, column): (number, interval)}; and the page's text without scripts."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.tables, self.text, self.tags = {}, "", []
+        self.table = None
+        self.stack: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag in ("meta", "input", "br", "link", "use", "path"):
+            return
+        self.stack.append(tag)
+        if tag == "table":
+            self.table, self.headings, self.group = {}, [], ""
+            self.tables[dict(attributes)["id"]] = self.table
+        elif tag == "tr":
+            self.row = None
+        elif tag in ("th", "td"):
+            self.cell = {"": ""}
+            self.part = ""
+        elif tag in ("small", "span") and self.stack[-2] in ("th", "td"):
+            self.part = tag
+            self.cell.setdefault(tag, "")
+
+    def handle_endtag(self, tag):
+        if tag not in self.stack:
+            return
+        while self.stack.pop() != tag:
+            pass
+        if tag in ("small", "span"):
+            self.part = ""
+        elif tag == "th":
+            if "thead" in self.stack:
+                self.headings.append(self.cell[""].strip())
+            elif self.cell.get("span"):
+                self.group = self.cell["span"].strip()
+            else:
+                self.row, self.column = self.cell[""].strip(), 0
+        elif tag == "td":
+            self.column += 1
+            self.table[self.group, self.row, self.headings[self.column]] = (
+                self.cell[""].strip(),
+                self.cell.get("small", "").strip(),
+                self.cell.get("span", ""),
+            )
+
+    def handle_data(self, data):
+        if "script" in self.stack or "style" in self.stack:
+            return
+        self.text += data
+        if "th" in self.stack or "td" in self.stack:
+            self.cell[self.part] += data
+
+
+@pytest.fixture(scope="module")
+def study():
+    """With three of the parameters and four of the states: each has a panel, and panels take time."""
+    return few(synthetic_study(flights=24, estimators=("ibss", "network", "hybrid", "svsf")))
+
+
+@pytest.fixture(scope="module")
+def report(study, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    return write_report(study, folder)
+
+
+@pytest.fixture(scope="module")
+def page(report):
+    return Page(report[0].read_text(encoding="utf-8"))
+
+
+def command(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["jaxos4", *(str(a) for a in arguments)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    out, err = capsys.readouterr()
+    return stop.value.code or 0, out, err
+
+
+def rms(values):
+    values = [v for v in values if not math.isnan(v)]
+    return math.sqrt(sum(v * v for v in values) / len(values)) if values else math.nan
+
+
+def told(study, scale, estimator):
+    cell = study.isel({name: 0 for name in SCENARIO} | {"scale": scale, "estimator": estimator})
+    return cell, [f for f, code in enumerate(cell["result"].values) if code in TOLD]
+
+
+def places(study):
+    for s, scale in enumerate(study["scale"].values):
+        for e, estimator in enumerate(study["estimator"].values):
+            yield f"noise x {scale:g}", s, str(estimator), e
+
+
+def test_the_files_are_those_that_it_says(report):
+    folder = report[0].parent
+    names = {path.relative_to(folder).as_posix() for path in report}
+    assert names == {"report.html"} | {f"figures/{n}.{s}" for n in OF_SCENARIO | OF_EXAMPLE for s in ("svg", "pdf")}
+    assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == names
+    assert all(p.read_bytes().startswith(b"%PDF") for p in report if p.suffix == ".pdf")
+
+
+def test_the_command_writes_the_same_bytes_from_the_file(study, report, tmp_path, monkeypatch, capsys):
+    study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
+    (tmp_path / "figures").mkdir()
+    for name in ("error-7.svg", "error-7.pdf", "notes.svg"):
+        (tmp_path / "figures" / name).write_text("of before")
+    code, out, err = command(monkeypatch, capsys, "report", tmp_path)
+    assert (code, err) == (0, "")
+    assert "report.html" in out
+    assert "11 figures" in out
+    for path in report:
+        assert (tmp_path / path.relative_to(report[0].parent)).read_bytes() == path.read_bytes(), path.name
+    # A figure of an older report goes, what is not ours stays.
+    left = {path.name for path in (tmp_path / "figures").iterdir()} - {path.name for path in report}
+    assert left == {"notes.svg"}
+
+
+def test_the_page_needs_nothing_but_itself(report):
+    text = report[0].read_text(encoding="utf-8")
+    for tag, attributes in Page(text).tags:
+        assert tag not in ("link", "iframe", "img", "object", "embed")
+        for name in ("src", "href", "xlink:href", "action"):
+            assert attributes.get(name, "#").startswith("#"), (tag, attributes)
+    ids = [attributes["id"] for _, attributes in Page(text).tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+
+
+def test_every_error_in_the_table(study, page):
+    table, seen = page.tables["error-1"], study["seen"].values[0]
+    rows = []
+    for group, s, estimator, e in places(study):
+        cell, flights = told(study, s, e)
+        truth, bound = cell["truth"].values, cell["bound"].values
+        for p, name in enumerate(study["parameter"].values):
+            zero = (truth[:, p] == 0).any()
+            mark = "†" if zero else "‡" if (abs(truth[:, p]) < 1.96 * bound[:, p]).any() else ""
+            unit = 1 if mark else 100 / abs(truth[0, p])
+            error = rms([unit * (cell["estimate"].values[f, p] - truth[f, p]) for f in flights])
+            assert table[group, estimator, name] == (plain(error), "", mark if flights else "")
+            rows.append((group, estimator, name))
+            if (bound == bound).all():
+                assert table[group, f"bound, {seen[e]}", name] == (plain(rms(unit * bound[:, p])), "", mark)
+            if estimator == "ibss":
+                center = rms(unit * (float(cell["center"].values[p]) - truth[:, p]))
+                assert table[group, "bracket centre", name] == (plain(center), "", mark)
+    assert len(table) == len(rows) + 3 * 3 * (2 + 1)
+
+
+def test_every_efficiency_and_coverage_in_the_tables(study, page):
+    efficiency, coverage, levels = (page.tables[f"{name}-1"] for name in ("efficiency", "coverage", "levels"))
+    for group, s, estimator, e in places(study):
+        cell, flights = told(study, s, e)
+        error = abs(cell["estimate"].values - cell["truth"].values)
+        shares = np.full((3, 4), np.nan)
+        for p, name in enumerate(study["parameter"].values):
+            ratio = rms([error[f, p] / cell["bound"].values[f, p] for f in flights])
+            text, interval, _ = efficiency[group, estimator, name]
+            assert text == plain(ratio)
+            if flights:
+                low, high = (float(x) for x in interval.split(" to "))
+                assert low < ratio < high
+                assert math.log(high / low) == pytest.approx(2 * 1.96 / math.sqrt(2 * len(flights)), rel=0.1)
+                held = [error[f, p] <= cell["half_width"].values[f, p] for f in flights]
+                shares[p] = np.mean(held, axis=0)
+            at_95 = shares[p, 2]
+            assert coverage[group, estimator, name][0] == (f"{100 * at_95:.1f}" if flights else MISSING)
+        for k, level in enumerate(LEVELS):
+            expected = f"{100 * shares[:, k].mean():.1f}" if flights else MISSING
+            assert levels[group, estimator, f"{100 * level:g} %"][0] == expected
+
+
+def test_every_count_in_the_table_of_results(study, page):
+    table = page.tables["results-1"]
+    for group, s, estimator, e in places(study):
+        cell, _ = told(study, s, e)
+        codes = cell["result"].values.tolist()
+        for code, name in enumerate(RESULTS):
+            if (study["result"] == code).any():
+                assert table[group, estimator, name.replace("_", " ")][0] == str(codes.count(code))
+        ran = [f for f, code in enumerate(codes) if RESULTS[code] not in ("failed", "not_run")]
+        spent = sum(int(cell["rollouts"].values[f]) for f in ran) / len(ran) if ran else math.nan
+        assert table[group, estimator, "rollouts"][0] == plain(spent)
+        hit = f"{100 * np.mean(cell['hit'].values[ran]):.1f}" if estimator == "hybrid" and ran else MISSING
+        assert table[group, estimator, "seed hits"][0] == hit
+
+
+def test_trouble_is_named(page):
+    text = " ".join(page.text.split())
+    assert "Incomplete: 1 of 12 cells" in text
+    assert "1 of 12 cells failed" in text
+    assert "scale 10.0, estimator svsf: FloatingPointError: <b>the filter's covariance</b> is not" in text
+    for flight in (
+        "noise x 0.1, ibss, flight 1: at bound",
+        "noise x 0.1, ibss, flight 3: nonfinite trajectory",
+        "noise x 10, ibss, flight 2: max sweeps",
+    ):
+        assert flight in text
+    assert "3 flights are left out" in text
+    assert "† absolute error, in the parameter's unit: the truth is 0" in text
+    assert "‡ absolute error, in the parameter's unit: below the noise floor" in text
+    assert "jaxos4 study synthetic.toml --out synthetic" in text
+    assert all(f"[{UNITS[place]}]" in text for place in (0, 1, 6))
+
+
+def test_the_terminal_has_the_same_errors_in_80_columns():
+    study = synthetic_study(flights=8, estimators=tuple(ESTIMATORS), example=False)
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(error_table(study))
+    text = console.export_text()
+    cell, flights = told(study, 1, 0)
+    error = 100 * rms([cell["estimate"].values[f, 0] / cell["truth"].values[f, 0] - 1 for f in flights])
+    rows = re.split(r"noise x 1 *\n", text)[1].splitlines()
+    row = next(line for line in rows if line.startswith("ibss"))
+    assert row.split()[1] == plain(error, 2)
+    assert row.split()[2].endswith("‡")
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    assert "below the noise floor" in text
+
+
+def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(writing, "MOST_DRAWN", 1)
+    options = {"flights": 4, "estimators": ("ibss", "svsf"), "scales": (1.0,), "spoiled": False, "example": False}
+    written = write_report(few(synthetic_study(models=("published", "corrected"), **options)), tmp_path)
+    assert {path.stem for path in written[1:]} == {f"{name}-1" for name in OF_SCENARIO}
+    page = Page(written[0].read_text(encoding="utf-8"))
+    assert {"error-1", "error-2"} <= page.tables.keys()
+    assert "Figures are drawn of the first 1 scenarios; tables are of all 2." in " ".join(page.text.split())
+    assert "corrected model" in page.text
+
+
+def test_names_cannot_break_out_of_the_page(tmp_path):
+    evil = "</script><script>alert(1)</script>"
+    options = {"flights": 3, "estimators": ("ibss", "svsf"), "scales": (0.0, 1.0), "spoiled": False, "example": False}
+    study = few(synthetic_study(**options))
+    study = study.assign_coords(
+        estimator=["ibss", evil],
+        model=[f"{evil} {{{{ 1 }}}}"],
+        parameter=["$\\frac{<b>}$", *study["parameter"].values[1:]],
+    )
+    failures = json.dumps([{"cell": {"model": evil}, "message": evil}])
+    study.attrs |= {"title": evil, "specification": f"</pre>{evil}", "command": evil, "failures": failures}
+    text = write_report(study, tmp_path)[0].read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert text.count("<script") == text.count("</script") == 3
+    shown = Page(text).text
+    assert shown.count("alert(1)") >= 6
+    assert "{{ 1 }}" in shown
+    assert "$\\frac{<b>}$" in shown
+
+
+@pytest.mark.parametrize("kind", ["no folder", "no file", "text", "hdf5", "another netcdf", "half a study", "shapes"])
+def test_what_is_not_a_study_is_refused_and_the_older_report_kept(kind, tmp_path, monkeypatch, capsys):
+    folder, results = tmp_path, tmp_path / "results.nc"
+    (tmp_path / "report.html").write_text("of before")
+    if kind == "no folder":
+        folder = tmp_path / "missing"
+    elif kind == "text":
+        results.write_text("not a netCDF file")
+    elif kind == "hdf5":
+        with h5py.File(results, "w") as file:
+            file["truth"] = np.zeros(3)
+    elif kind == "another netcdf":
+        xr.Dataset({"truth": ("flight", np.zeros(3))}).to_netcdf(results, engine="h5netcdf")
+    elif kind == "half a study":
+        synthetic_study(flights=2, spoiled=False).drop_vars("bound").to_netcdf(results, engine="h5netcdf")
+    elif kind == "shapes":
+        synthetic_study(flights=2, spoiled=False).isel(model=0).to_netcdf(results, engine="h5netcdf")
+    code, out, err = command(monkeypatch, capsys, "report", folder)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1, err
+    assert str(folder) in err
+    assert "jaxos4 study" in err or "run the study again" in err
+    assert (tmp_path / "report.html").read_text() == "of before"
+    assert not (tmp_path / "figures").exists()
+
+
+def test_reading_gives_what_was_written(study, tmp_path):
+    study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
+    xr.testing.assert_equal(read_results(tmp_path), study)
+
+
+def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
+    study = study[["search_half_width", "search_estimate"]]
+    before = list(figures.of_example(study))
+    assert [drawn.stem for drawn in before] == ["search"]
+    with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):
+        settings = dict(matplotlib.rcParams)
+        assert list(figures.of_example(study)) == before
+        assert dict(matplotlib.rcParams) == settings
+
+
+def test_small_numbers_keep_their_digits():
+    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: MISSING}
+    assert {x: plain(x) for x in known} == known or [plain(x) for x in known] == list(known.values())
+    assert re.fullmatch(r"1\.23e300", plain(1.234e300))
