@@ -118,6 +118,7 @@
       if (entry.isIntersecting && !drawn.has(entry.target)) draw(entry.target);
     }
   }, { rootMargin: "600px" });
+  window.addEventListener("beforeprint", () => charts.forEach((box) => drawn.has(box) || draw(box)));
 
   for (const box of charts) {
     const spec = specs[box.dataset.chart];

@@ -143,6 +143,7 @@ def svg(figure: Figure) -> bytes:
     """The figure as SVG, the same bytes each time."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    figure.set_layout_engine("none")  # what it is written as next has the layout that it now has
     return buffer.getvalue()
 
 

@@ -120,6 +120,7 @@ def program_of(study: Study, cell: Cell) -> tuple:
 
 class _Flown(NamedTuple):
     truth: Float[Array, "lanes parameters"]
+    exact: Float[Array, "lanes samples 12"]
     states: Float[Array, "lanes samples 12"]
     bound: Float[Array, "lanes parameters"]
 
@@ -174,7 +175,7 @@ def _fly(study: Study, fleet: _Fleet, cell: Cell) -> _Flown:
     truth, exact, states = _flights(study, fleet, cell)
     scale = as_float(cell.scenario.scale)
     bound = scale * _bounds(_problem(study, fleet, exact[0], as_float(1.0), cell.scenario.seen), exact, truth)
-    return _Flown(truth, states, bound)
+    return _Flown(truth, exact, states, bound)
 
 
 def _flights(
@@ -278,37 +279,43 @@ def _results(study: Study, cell: Cell, flown: _Flown, found: _Found) -> dict[str
         "hit": hit.astype(np.int8),
     }
     results = {name: value[:count] for name, value in results.items()}
-    if found.brackets is not None and cell.first == 0:
-        results["brackets"] = found.brackets[0]
+    if cell.first == 0:  # its first flight is shown
+        results |= {"true": np.asarray(flown.exact[0]), "measured": np.asarray(flown.states[0])}
+        if found.brackets is not None:
+            results["brackets"] = found.brackets[0]
     return results
 
 
-def example(study: Study, cell: Cell, found: dict[str, dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The states [samples, 12] of a cell's first flight: `true`, `measured`, and as each estimator's answer flies.
+def fly_again(study: Study, cell: Cell, answers: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """The states [estimators, samples, 12] of a cell's first flight as simulated with each estimator's answer.
 
     **Arguments:**
 
-    - `found`: the results of each estimator's cell of the same flights.
+    - `answers`: the results of each estimator's cell of the same flights; NaN where one has no answer.
     """
     with jax.enable_x64(study.precision == "float64"):
         fleet = _fleet(study, cell.scenario)
-        _, true, measured = _flights(study, fleet, cell)
-        states = {"true": true[0], "measured": measured[0]}
-        for name, results in found.items():
-            parameters, start = results["estimate"][0], results["initial_state"][0]
-            if np.isfinite(parameters).all():
-                state = np.zeros(12)
-                state[CASCADE_ORDER[: start.size]] = start
-                flight = simulate(
-                    fleet.model,
-                    parameters,
-                    fleet.omega,
-                    dt=fleet.dt,
-                    initial_state=as_float(state),
-                    method=study.fit_method,
-                )
-                states[name] = flight.states
-        return {name: np.asarray(value) for name, value in states.items()}
+        parameters = np.stack([results["estimate"][0] for results in answers])
+        starts = np.zeros((len(answers), 12))
+        for start, results in zip(starts, answers, strict=True):
+            known = results["initial_state"][0]
+            start[CASCADE_ORDER[: known.size]] = known
+        return np.asarray(_simulated(fleet, as_float(parameters), as_float(starts), method=study.fit_method))
+
+
+@eqx.filter_jit
+def _simulated(
+    fleet: _Fleet,
+    parameters: Float[Array, "estimators parameters"],
+    starts: Float[Array, "estimators 12"],
+    *,
+    method: str,
+) -> Float[Array, "estimators samples 12"]:
+    def one(parameters: Parameters, start: Float[Array, "12"]) -> States:
+        flight = simulate(fleet.model, parameters, fleet.omega, dt=fleet.dt, initial_state=start, method=method)
+        return jnp.where(jnp.isfinite(parameters).all(), flight.states, jnp.nan)
+
+    return jax.vmap(one)(parameters, starts)
 
 
 def encode(results: dict[str, np.ndarray]) -> bytes:

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import msgspec
 import numpy as np
+import tomlkit
 import xarray as xr
 
 from .._files import write_atomically
@@ -15,7 +16,7 @@ from ..dynamics import MODELS
 from ..estimators import TrainedNetwork
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..training import CHECK
-from .cell import LEVELS, OUTCOMES, bracket_of, example, jobs
+from .cell import LEVELS, OUTCOMES, bracket_of, fly_again, jobs
 from .specification import AXES, Cell, Study
 from .store import RESULTS_FILE, Store
 
@@ -127,7 +128,7 @@ def _provenance(store: Store, failures: list[dict]) -> dict[str, str | int]:
     study = store.study
     return {
         "title": study.title,
-        "specification": msgspec.toml.encode(study).decode(),
+        "specification": tomlkit.dumps(msgspec.to_builtins(study)),
         "command": "jaxos4 study study.toml --out DIR",
         "version": store.version,
         "jax": jax.__version__,
@@ -172,17 +173,18 @@ def _example(store: Store) -> dict:
     found = {name: results for name, results in found.items() if results is not None and "failed" not in results}
     if not found:
         return {}
-    states = example(study, cells[next(iter(found))], found)
-    blank = np.full_like(states["true"], np.nan)
-    simulated = np.stack([states.get(name, blank) for name in study.estimators])
-    time = study.dt * np.arange(len(blank))
+    name, some = next(iter(found.items()))
+    true, measured = some["true"], some["measured"]
+    simulated = np.full((len(study.estimators), *true.shape), np.nan)
+    simulated[[study.estimators.index(name) for name in found]] = fly_again(study, cells[name], list(found.values()))
+    time = study.dt * np.arange(len(true))
     both = ("sample", "state")
     variables = {
         "time": ("sample", time, _named("time", "s")),
         "state": ("state", list(STATE_NAMES), _named("state", "1")),
         "state_unit": ("state", list(STATE_UNITS), _named("unit of the state", "1")),
-        "example_true": (both, states["true"], _named("true states of the example flight", "state_unit")),
-        "example_measured": (both, states["measured"], _named("its measured states", "state_unit")),
+        "example_true": (both, true, _named("true states of the example flight", "state_unit")),
+        "example_measured": (both, measured, _named("its measured states", "state_unit")),
         "example_simulated": (
             ("estimator", *both),
             simulated,
