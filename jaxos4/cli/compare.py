@@ -10,12 +10,13 @@ from rich.console import Console
 from ..study import ESTIMATORS, Study, Training, run_here
 from ._studies import carry_out, device_name, summary, use_all_cores
 
-# Shorter training than a network takes at its best: it costs the network, and not the hybrid.
+# Shorter training than a network takes at its best: it costs the network, and not the hybrid, which needs no more than
+# the rates' network to know where to look.
 STANDARD = Study(
     title="IBSS, network, hybrid and baselines under sensor noise",
     estimators=ESTIMATORS,
     flights=256,
-    network=Training(steps=2000, held_out=5000),
+    network=Training(steps=2000, held_out=5000, hybrid_channels="rates"),
 )
 QUICK = Study(
     title="IBSS, network and hybrid under sensor noise, body rates alone, in short",
