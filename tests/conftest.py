@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import sys
 from collections.abc import Iterator
 
 import hypothesis
@@ -37,3 +38,22 @@ def shared_flights() -> pathlib.Path:
     if not folder.is_dir():
         pytest.skip(f"no real flights at {folder}: set JAXOS4_FLIGHTS to the folder that holds them")
     return folder
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Runs one command in an empty folder; gives its exit code, output and error output."""
+    from jaxos4.cli import main  # after the hook
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")  # this process computes already, and has its devices
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["jaxos4", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        out, err = capsys.readouterr()
+        return stop.value.code or 0, out, err
+
+    return call

@@ -116,3 +116,11 @@ def euler_trajectory(derivative, alpha, omega, *, dt=DT, start=None, constants=O
     for row in np.asarray(omega)[:-1]:
         states.append(states[-1] + dt * derivative(states[-1], row, alpha, constants))
     return np.stack(states)
+
+
+def refused(result: tuple[int, str, str], *fragments: str) -> None:
+    code, _, err = result
+    assert code == 2, result
+    assert err.count("\n") == 1, err
+    for fragment in fragments:
+        assert fragment in err

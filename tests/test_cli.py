@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from helpers import refused
 
 from jaxos4.cli import main
 from jaxos4.estimators import BASELINES
@@ -14,33 +15,9 @@ from jaxos4.estimators import BASELINES
 TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alpha6": 133.33333, "alpha8": 76.923077}
 
 
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Runs one command in an empty folder; gives its exit code, output and error output."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "100")
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["jaxos4", *arguments])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        out, err = capsys.readouterr()
-        return stop.value.code or 0, out, err
-
-    return call
-
-
 def simulate(run, path="flight.csv", *options: str) -> None:
     code, _, err = run("simulate", "--duration", "2", "--out", str(path), *options)
     assert (code, err) == (0, "")
-
-
-def refused(result: tuple[int, str, str], *fragments: str) -> None:
-    code, _, err = result
-    assert code == 2, result
-    assert err.count("\n") == 1, err
-    for fragment in fragments:
-        assert fragment in err
 
 
 def test_simulate_writes_the_standard_flight(run, tmp_path):

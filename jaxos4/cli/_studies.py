@@ -14,7 +14,12 @@ from ..study import OUTCOMES, Step, Store, Study, assemble, open_store, save_dat
 
 
 def use_all_cores() -> None:
-    """Makes a device of each core that this process may use: cells run side by side. Before anything is computed."""
+    """Makes a device of each core that this process may use: cells run side by side. Before anything is computed.
+
+    Where `JAX_NUM_CPU_DEVICES` is set, that many.
+    """
+    if os.environ.get("JAX_NUM_CPU_DEVICES"):
+        return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     jax.config.update("jax_num_cpu_devices", cores)
 

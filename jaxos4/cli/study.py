@@ -26,10 +26,10 @@ def study(
     scheduler: Annotated[str | None, typer.Option(help="Address of the Dask scheduler.")] = None,
 ) -> None:
     """Run a noise study, or go on with it: cells that are there are kept."""
+    use_all_cores()  # before an airframe's table computes anything
     wanted = load_study(specification)
     if (executor is Executor["dask"]) != (scheduler is not None):
         raise InputError("--executor dask and --scheduler ADDRESS: give both, or neither.")
-    use_all_cores()
     if dry_run:
         _say_plan(wanted, out)
         return
@@ -63,7 +63,7 @@ def _connected(address: str):
     except ImportError:
         raise InputError("--executor dask: needs the package distributed; install jaxos4[dask].") from None
     try:
-        return Client(address, timeout="10s")
+        return Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:
         what = " ".join(str(error).split())[:120]
         raise InputError(f"--scheduler {address}: no Dask scheduler answers there ({what}).") from None

@@ -35,7 +35,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
 
     **Arguments:**
 
-    - `client`: of `distributed`, connected to the scheduler.
+    - `client`: of `distributed`, connected to the scheduler; not the default one (`set_as_default=False`), or the
+      Dataset would be written under a lock of the cluster.
 
     **Raises:** `InputError` where the cluster has no workers, or loses a cell more often than it allows.
     """
@@ -47,15 +48,16 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
     done = study.count - len(waiting)
     networks: dict[int, Any] = {}
     running: dict[Future, tuple[int, int | None]] = {}
-    finished = as_completed(raise_errors=False)
+    finished = as_completed(loop=client.loop, raise_errors=False)
     if waiting and not _threads(client):
         raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
 
     def network_of(number: int) -> Any:
         if number not in networks:
-            path = store.network_file(number)
-            if path.exists():
-                networks[number] = client.scatter(path.read_bytes(), hash=False)
+            if store.read_network(number) is not None:  # whole: workers need not find out
+                # A task, not scattered: a worker that is lost takes what was scattered to it along.
+                data = store.network_file(number).read_bytes()
+                networks[number] = client.submit(bytes, data, pure=False)
             else:
                 networks[number] = client.submit(remote_training, specification, number, retries=_RETRIES, pure=False)
         return networks[number]

@@ -13,6 +13,7 @@ import xarray as xr
 
 from .._files import write_atomically
 from ..dynamics import MODELS
+from ..errors import InputError
 from ..estimators import TrainedNetwork
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..training import CHECK
@@ -84,8 +85,12 @@ def assemble(store: Store) -> xr.Dataset:
             where = dict(zip(DIMS, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
-        for name in _VARIABLES:
-            arrays[name][lanes] = results[name]
+        try:
+            for name in _VARIABLES:
+                arrays[name][lanes] = results[name]
+        except (KeyError, ValueError):
+            path = store.cell_file(cell.number)
+            raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
     dataset = xr.Dataset(
         {
             name: ((*_LANES, *more), arrays[name], {"long_name": long_name, "units": unit})
@@ -108,8 +113,10 @@ def save_dataset(dataset: xr.Dataset, directory: Path) -> Path:
         for name, variable in dataset.data_vars.items()
         if variable.dtype.kind in "fi" and variable.ndim
     }
+    # In memory first: HDF5 does not end well on a disk that is full.
+    data = dataset.to_netcdf(engine="h5netcdf", encoding=encoding)
     with write_atomically(path) as beside:
-        dataset.to_netcdf(beside, engine="h5netcdf", encoding=encoding)
+        beside.write_bytes(data)
     return path
 
 

@@ -47,8 +47,10 @@ def run_here(store: Store) -> Iterator[Step]:
     """
     study, missing = store.study, store.missing()
     needed, done = jobs(study), study.count - len(missing)
-    grouped = itertools.groupby(map(study.cell, missing), key=lambda cell: program_of(study, cell))
-    programs = [_Program(list(cells), study, needed) for _, cells in grouped]
+    grouped: dict[tuple, list[Cell]] = {}
+    for cell in map(study.cell, missing):
+        grouped.setdefault(program_of(study, cell), []).append(cell)
+    programs = [_Program(cells, study, needed) for cells in grouped.values()]
     networks: dict[int, TrainedNetwork | str | None] = {}
     untrained = deque(dict.fromkeys(p.network for p in programs if p.network is not None))
     devices = deque(jax.local_devices())

@@ -5,6 +5,7 @@ random numbers in every scenario: differences between estimators, and between sc
 pairs.
 """
 
+import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,8 +52,9 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "channels": tuple(CHANNELS),
     "estimators": ESTIMATORS,
 }
-# A study of more is a mistake in its specification.
-_MOST_CELLS = 10_000_000
+# A study of more is a mistake in its specification: each cell is a file, and all estimates together must fit in memory.
+_MOST_CELLS = 1_000_000
+_MOST_ESTIMATES = 100_000_000
 _MOST_SAMPLES = 1_000_000
 
 
@@ -159,6 +161,15 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise InputError(f"`{axis}` must be finite, got {', '.join(map(str, values))}.")
         if not math.isfinite(self.dt):
             raise InputError(f"`dt` must be finite, got {self.dt}.")
+        if not self.title.isprintable():
+            raise InputError("`title` must be one line of printable characters.")
+        for name, table in self.airframe.items():
+            if not (name.isprintable() and name.strip()):
+                raise InputError(f"[airframe.{_short(name)}]: its name must be printable characters.")
+            if name not in self.airframes:
+                raise InputError(f"[airframe.{name}] is flown by nobody: name it in `airframes`.")
+            if not all(math.isfinite(value) for value in table.values() if isinstance(value, float)):
+                raise InputError(f"[airframe.{name}]: not finite; leave `max_rotor_speed` out where it is not known.")
         for name in self.airframes:
             self.vehicle(name)
         for duration in self.durations:
@@ -168,6 +179,29 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 )
         if self.count > _MOST_CELLS:
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or enlarge `batch`.")
+        estimates = math.prod(self.shape) * self.flights
+        if estimates > _MOST_ESTIMATES:
+            raise InputError(
+                f"{estimates} estimates, more than {_MOST_ESTIMATES}; take fewer `flights`, or cut an axis."
+            )
+
+    def check_computable(self) -> None:
+        """Raises `InputError` for inputs that an airframe cannot fly, or networks that cannot be trained."""
+        for name, excitation, duration in itertools.product(self.airframes, self.excitations, self.durations):
+            try:
+                EXCITATIONS[excitation](self.vehicle(name), duration=duration, dt=self.dt)
+            except ValueError as error:
+                raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
+        settings = self.network
+        try:
+            NetworkEstimator(
+                features=settings.features,
+                approximator=settings.approximator,
+                steps=settings.steps,
+                held_out=settings.held_out,
+            )
+        except ValueError as error:
+            raise InputError(f"`network`: {error}") from None
 
     def vehicle(self, name: str) -> Airframe:
         """The airframe of that name. Raises `InputError` where there is none, or its table is not usable."""
@@ -217,12 +251,13 @@ def load_study(path: Path) -> Study:
     """
     table = read_toml(path)
     try:
-        return msgspec.convert(table, Study)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except (msgspec.ValidationError, RecursionError) as error:
+        study = msgspec.convert(table, Study)
+        study.check_computable()
+    except (InputError, msgspec.ValidationError, RecursionError) as error:
+        ours = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
         what = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: {what}; correct it there.") from None
+        raise InputError(f"{path}: {what}" if ours else f"{path}: {what}; correct it there.") from None
+    return study
 
 
 def differences(ours: Study, theirs: Study) -> list[str]:

@@ -7,6 +7,7 @@ a second run out.
 import contextlib
 import importlib.metadata
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from .specification import Study, differences
 
 RESULTS_FILE = "results.nc"
 _SPECIFICATION, _LOCK, _LOG = "study.json", "lock", "log.jsonl"
+# What a kill leaves of a file that was being written.
+_LEFT = ".*.part*"
 
 
 class Store:
@@ -67,6 +70,12 @@ class Store:
         with open(self.directory / _LOG, "a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
+    def end_line(self) -> None:
+        """Ends the line that a kill, or a full disk, cut: the next is whole again."""
+        with contextlib.suppress(FileNotFoundError), open(self.directory / _LOG, "rb+") as file:
+            if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
+                file.write(b"\n")
+
     def read_log(self) -> list[dict[str, Any]]:
         """What was computed when, in its order; lines that a kill cut are left out."""
         entries = []
@@ -79,8 +88,13 @@ class Store:
     def read_network(self, number: int) -> TrainedNetwork | None:
         """A network, or `None` where it was not trained yet."""
         path = self.network_file(number)
-        with jax.enable_x64(self.study.precision == "float64"):
-            return load_network(path) if path.exists() else None
+        if not path.exists():
+            return None
+        try:
+            with jax.enable_x64(self.study.precision == "float64"):
+                return load_network(path)
+        except InputError:
+            raise InputError(f"{path}: not a whole network; delete it, and run the study again.") from None
 
 
 @contextlib.contextmanager
@@ -113,10 +127,11 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
             header = {"version": store.version, "device": device, "study": study}
             with write_atomically(specification) as beside:
                 beside.write_bytes(msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
-        for folder in ("cells", "networks"):
-            (directory / folder).mkdir(exist_ok=True)
-            for beside in (directory / folder).glob(".*.part*"):  # what a kill left
+        for folder in (directory, directory / "cells", directory / "networks"):
+            folder.mkdir(exist_ok=True)
+            for beside in folder.glob(_LEFT):
                 beside.unlink(missing_ok=True)
+        store.end_line()
         yield store
     finally:
         lock.release()
@@ -125,21 +140,26 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
 def read_store(directory: Path) -> Store:
     """The folder of a study, to be read. Raises `InputError` where it holds none, or one of another version."""
     path = directory / _SPECIFICATION
+    ours = importlib.metadata.version("jaxos4")
     try:
-        header = msgspec.json.decode(path.read_bytes(), type=_Header)
+        data = path.read_bytes()
+        version = msgspec.json.decode(data, type=_Version).version
+        if version != ours:
+            raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {ours}; give another folder.")
+        header = msgspec.json.decode(data, type=_Header)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.") from None
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         what = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not the specification of a study ({what}); give another folder.") from None
-    ours = importlib.metadata.version("jaxos4")
-    if header.version != ours:
-        raise InputError(f"{directory}: begun by jaxos4 {header.version}, and this is {ours}; give another folder.")
     return Store(directory, header.study, header.device, header.version)
 
 
-class _Header(msgspec.Struct):
+class _Version(msgspec.Struct):
     version: str
+
+
+class _Header(_Version):
     device: str
     study: Study
 
@@ -159,7 +179,7 @@ def _check_folder(directory: Path) -> None:
         return
     if not directory.is_dir():
         raise InputError(f"{directory}: a file; give a folder for the study.")
-    names = {path.name for path in directory.iterdir()}
+    names = {path.name for path in directory.iterdir()} - {path.name for path in directory.glob(_LEFT)}
     if _SPECIFICATION not in names and names - {_LOCK}:
         raise InputError(f"{directory}: holds {min(names)} and no study; give an empty or a new folder.")
 

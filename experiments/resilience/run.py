@@ -1,0 +1,111 @@
+"""A study that is killed again and again, and resumed: is it the study that ran through, and was any work done twice?
+
+    python experiments/resilience/run.py SPEC.toml --out FOLDER
+
+Writes FOLDER/whole, the study uninterrupted; FOLDER/killed, killed ten times; and FOLDER/report.json.
+"""
+
+import collections
+import importlib.metadata
+import json
+import os
+import platform
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import xarray as xr
+
+from jaxos4.study import RESULTS_FILE, load_study, read_store
+
+COMMAND = "from jaxos4.cli import main; main()"
+
+
+def main(
+    specification: Annotated[Path, typer.Argument(help="As for `jaxos4 study`; some hundred cells make good targets.")],
+    out: Annotated[Path, typer.Option(help="Folder for both studies and the report.")],
+    kills: Annotated[int, typer.Option(help="How often to kill.", min=1)] = 10,
+    seed: Annotated[int, typer.Option(help="Of the moments.")] = 0,
+) -> None:
+    """Kill a study at random moments until it was killed often enough; finish it; compare."""
+    out.mkdir(parents=True)
+    # Compiled programs are kept: a resumed run comes to its cells soon.
+    environment = {
+        "JAX_COMPILATION_CACHE_DIR": str(out / "programs"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    count = load_study(specification).count
+    begin = time.perf_counter()
+    _run(specification, out / "whole", environment)
+    seconds = time.perf_counter() - begin
+    moments, rows = random.Random(seed), []
+    while len(rows) < kills:
+        before, begin = _there(out / "killed"), time.perf_counter()
+        process = _start(specification, out / "killed", environment)
+        # Half at any moment of a run, half when it has just come to its cells.
+        end = time.perf_counter() + moments.uniform(0, seconds if len(rows) % 2 else 3600)
+        more = moments.uniform(0, 2 * (count - before) / (kills + 1 - len(rows)))
+        while process.poll() is None and time.perf_counter() < end and _there(out / "killed") < before + more:
+            time.sleep(0.002)
+        process.kill()
+        process.wait()
+        if process.returncode != -signal.SIGKILL:
+            raise SystemExit(f"{out / 'killed'}: ended by itself after {len(rows)} kills; give a longer specification.")
+        rows.append(
+            {"seconds": round(time.perf_counter() - begin, 3), "before": before, "after": _there(out / "killed")}
+        )
+        typer.echo(f"kill {len(rows)}: {rows[-1]['after']} of {count} cells")
+    _run(specification, out / "killed", environment)
+    times = collections.Counter(e["cell"] for e in read_store(out / "killed").read_log() if "cell" in e)
+    report = {
+        "identical": _results(out / "whole").identical(_results(out / "killed")),
+        "identical_files": all(_bytes(out / "whole", f) == _bytes(out / "killed", f) for f in ("cells", "networks")),
+        "cells": count,
+        "computed_twice": sum(n > 1 for n in times.values()),
+        "not_logged": count - len(times),
+        "kills": rows,
+        "provenance": {
+            "specification": specification.read_text(),
+            "seed": seed,
+            "jaxos4": importlib.metadata.version("jaxos4"),
+            "jax": importlib.metadata.version("jax"),
+            "machine": platform.machine(),
+        },
+    }
+    (out / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    typer.echo(json.dumps({name: value for name, value in report.items() if name not in ("kills", "provenance")}))
+    if not (report["identical"] and report["identical_files"]) or report["computed_twice"]:
+        raise SystemExit(1)
+
+
+def _start(specification: Path, folder: Path, environment: dict[str, str]) -> subprocess.Popen:
+    command = [sys.executable, "-c", COMMAND, "study", str(specification), "--out", str(folder)]
+    return subprocess.Popen(command, env=os.environ | environment)
+
+
+def _run(specification: Path, folder: Path, environment: dict[str, str]) -> None:
+    code = _start(specification, folder, environment).wait()
+    if code != 0:
+        raise SystemExit(f"{folder}: the study ended with exit code {code}.")
+
+
+def _there(folder: Path) -> int:
+    return len(list(folder.glob("cells/[0-9]*.npz")))
+
+
+def _bytes(folder: Path, kind: str) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (folder / kind).iterdir()}
+
+
+def _results(folder: Path) -> xr.Dataset:
+    with xr.open_dataset(folder / RESULTS_FILE) as dataset:
+        return dataset.load()
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,452 @@
+"""Studies: what a specification may say, its grid, its draws, and the Dataset, against the library called directly."""
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from helpers import refused
+from hypothesis import given, settings, strategies as st
+from small_study import COMMAND, environment, run_study, specification
+
+import jaxos4
+from jaxos4.estimators import BASELINES
+from jaxos4.flight import STATE_NAMES
+from jaxos4.study import OUTCOMES, Study, cell as cells_module, load_study, open_store, run as run_module
+from jaxos4.study.cell import run_cell
+
+SPECIFICATION = """
+durations = [1.0]
+scales = [1.0, 0.1]
+channels = ["rates"]
+estimators = ["ibss", "equation-error"]
+truth = "drawn"
+flights = 10
+batch = 4
+seed = 5
+"""
+AIRFRAME = """
+[airframe.mine]
+mass = 0.6
+inertia = [7e-3, 7e-3, 1.2e-2]
+arm = 0.2
+thrust_coefficient = 3e-5
+drag_coefficient = 7e-7
+rotor_inertia = 6e-5
+"""
+MINE = 'airframes = ["mine"]\n' + AIRFRAME
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return run_study(tmp_path_factory.mktemp("study"), SPECIFICATION)
+
+
+@pytest.fixture(scope="module")
+def dataset(whole):
+    with xr.open_dataset(whole / "results.nc") as dataset:
+        return dataset.load()
+
+
+# The specification.
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("flites = 3", "flites"),
+        ('flights = "many"', "flights"),
+        ("flights = 1.5", "flights"),
+        ("flights = 0", "flights"),
+        ('models = "published"', "models"),
+        ('models = ["newton"]', "`models` knows no 'newton'"),
+        ('airframes = ["boeing"]', "`airframes` knows no 'boeing'"),
+        ('excitations = ["wobble"]', "excitations"),
+        ('methods = ["rk5"]', "methods"),
+        ('fit_method = "diffrax"', "fit_method"),
+        ('noises = ["pink"]', "noises"),
+        ('channels = ["smell"]', "channels"),
+        ('estimators = ["oracle"]', "estimators"),
+        ('truth = "guess"', "truth"),
+        ('initial_state = "hidden"', "initial_state"),
+        ('precision = "float16"', "precision"),
+        ("scales = []", "`scales` is empty"),
+        ("scales = [1, 1.0]", "`scales` names something twice"),
+        ('estimators = ["ibss", "ibss"]', "`estimators` names something twice"),
+        ("scales = [-1.0]", "scales"),
+        ("scales = [nan]", "scales"),
+        ("scales = [inf]", "scales"),
+        ("widths = [0.0]", "widths"),
+        ("durations = [-1.0]", "durations"),
+        ("durations = [inf]", "durations"),
+        ("durations = [0.01]", "durations"),
+        ("durations = [1e300]", "durations"),
+        ("dt = nan", "dt"),
+        ("dt = inf", "dt"),
+        ("dt = 0", "dt"),
+        ("seed = -1", "seed"),
+        ("seed = 9223372036854775808", "seed"),
+        ("batch = 0", "batch"),
+        ("flights = 1_000_000_000", "cells"),
+        ("flights = 1_000_000_000\nbatch = 1_000_000", "estimates"),
+        ('durations = [0.5]\nexcitations = ["chirp"]', "`excitations`: chirp of 0.5 s by os4: `duration`"),
+        ('durations = [0.5]\nexcitations = ["multisine", "3211"]', "`excitations`: 3211 of 0.5 s"),
+        ("dt = 0.5", "`excitations`: multisine of 5 s by os4: `tones`"),
+        (MINE + "max_rotor_speed = 230", "`excitations`: multisine of 5 s by mine: `amplitude`"),
+        ("[network]\nsteps = 0", "network.steps"),
+        ("[network]\nsteps = 100_000_000", "`network`: `steps`"),
+        ("[network]\nheld_out = 10", "network.held_out"),
+        ("[network]\nlayers = 3", "layers"),
+        ('[network]\nfeatures = "raw"\napproximator = "cmac"', "`network`: `approximator`"),
+        (MINE + "wheels = 4", "[airframe.mine]: knows no key `wheels`"),
+        (MINE.replace("mass = 0.6", ""), "[airframe.mine]: lacks `mass`"),
+        (MINE.replace("mass = 0.6", "mass = -0.6"), "[airframe.mine]: `mass`"),
+        (MINE.replace("mass = 0.6", "mass = 1979-05-27"), "[airframe.mine]: `mass`"),
+        (MINE + "max_rotor_speed = inf", "[airframe.mine]: not finite"),
+        (MINE.replace("7e-3, 7e-3", "7e-3"), "[airframe.mine]: `inertia`"),
+        (AIRFRAME, "[airframe.mine] is flown by nobody"),
+        ("airframe = 3", "airframe"),
+        ('title = "two\\nlines"', "title"),
+        ('title = "\\u0000"', "title"),
+        ("flights = ", "not a TOML file"),
+        ("flights = 1\nflights = 2", "not a TOML file"),
+        ("a = " + "[" * 5000, "spec.toml"),
+    ],
+)
+def test_a_specification_that_cannot_be_is_one_line(run, tmp_path, text, key):
+    specification(tmp_path, text)
+    for option in ((), ("--dry-run",)):
+        refused(run("study", "spec.toml", "--out", "out", *option), "spec.toml: ", key)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_specification_that_is_not_there_or_not_text_is_one_line(run, tmp_path):
+    refused(run("study", "spec.toml", "--out", "out", "--dry-run"), "spec.toml", "No such file")
+    (tmp_path / "spec.toml").write_bytes(b"\xff\xfe\x00")
+    refused(run("study", "spec.toml", "--out", "out", "--dry-run"), "spec.toml", "not a TOML file")
+
+
+_NAMES = st.sampled_from(
+    ["ibss", "published", "os4", "chirp", "rk4", "white", "all", "float32", "mine", "", "\x00", "é"]
+)
+_NUMBERS = st.one_of(
+    st.integers(-2, 3), st.integers(-(2**70), 2**70), st.floats(), st.sampled_from([0.01, 0.5, 5.0, 1e-320, 1e308])
+)
+_SCALARS = st.one_of(_NAMES, _NUMBERS, st.booleans())
+_KEYS = st.one_of(st.sampled_from([*Study.__struct_fields__, "steps", "mass", "inertia", "mine"]), st.text(max_size=3))
+_VALUES = st.recursive(
+    _SCALARS, lambda of: st.one_of(st.lists(of, max_size=4), st.dictionaries(_KEYS, of, max_size=4)), max_leaves=8
+)
+
+
+def toml(value) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return str(value).lower()
+
+
+@settings(max_examples=400)
+@given(st.dictionaries(_KEYS, _VALUES, max_size=5))
+def test_any_specification_is_a_study_or_an_input_error_of_one_line(table):
+    with tempfile.TemporaryDirectory() as folder:
+        text = "".join(f"{json.dumps(key, ensure_ascii=False)} = {toml(value)}\n" for key, value in table.items())
+        path = specification(Path(folder), text)
+        try:
+            study = load_study(path)
+        except jaxos4.InputError as error:
+            told = str(error)
+        else:
+            told = f"{path}: {study.cell(study.count - 1)}"
+        assert told.startswith(f"{path}: ")
+        assert "\n" not in told
+
+
+def test_another_specification_or_version_is_refused_with_what_changed(run, tmp_path):
+    (tmp_path / "other.toml").write_text(SPECIFICATION.replace("seed = 5", "seed = 6\ndt = 0.02"))
+    study = load_study(specification(tmp_path, SPECIFICATION))
+    with open_store(tmp_path / "out", study, "these tests"):
+        pass
+    for option in ((), ("--dry-run",)):
+        result = run("study", "other.toml", "--out", "out", *option)
+        refused(result, "out: holds another study", "`seed` was 5, now 6", "`dt` was 0.01, now 0.02")
+        assert "`flights`" not in result[2]
+    code, told, _ = run("study", "spec.toml", "--out", "out", "--dry-run")
+    assert (code, "12 of 12 cells" in told) == (0, True)
+    header = json.loads((tmp_path / "out" / "study.json").read_text())
+    (tmp_path / "out" / "study.json").write_text(json.dumps(header | {"version": "9.9"}))
+    for option in ((), ("--dry-run",)):
+        refused(run("study", "spec.toml", "--out", "out", *option), "out: begun by jaxos4 9.9, and this is")
+
+
+def test_a_dry_run_writes_nothing_and_counts(tmp_path):
+    text = MINE.replace("\n", "\ntruth = 'drawn'\nflights = 1000\nbatch = 100\nestimators = ['ibss', 'kalman']\n", 1)
+    specification(tmp_path, text)
+    command = [sys.executable, "-c", COMMAND, "study", "spec.toml", "--out", "out", "--dry-run"]
+    # In a process of its own: an airframe's table is computed with before the devices are chosen, or it would fail.
+    env = {name: value for name, value in environment().items() if name != "JAX_NUM_CPU_DEVICES"} | {"COLUMNS": "100"}
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [path.name for path in tmp_path.iterdir()] == ["spec.toml"]
+    rows = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines() if line.split()}
+    for name in ("ibss", "kalman"):
+        cells, flights, memory, minutes = rows[name]
+        assert (cells, flights) == ("30", "3000")
+        assert 700 < float(memory) < 10_000
+        assert 0 < float(minutes) < 60
+    devices = len(os.sched_getaffinity(0))
+    assert f"60 of 60 cells to be run, 6000 flights identified, on {devices} devices" in done.stdout
+
+
+# The grid.
+
+
+@settings(max_examples=50)
+@given(
+    st.lists(st.integers(1, 3), min_size=6, max_size=6),
+    st.integers(1, 40),
+    st.integers(1, 12),
+)
+def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
+    few = iter(lengths)
+    study = Study(
+        models=("published", "corrected")[: next(few)],
+        durations=(1.0, 2.0, 3.0)[: next(few)],
+        noises=("white", "lossy", "biased")[: next(few)],
+        scales=(0.0, 1.0, 2.0)[: next(few)],
+        channels=("rates", "attitude", "all")[: next(few)],
+        estimators=("ibss", "network", "kalman")[: next(few)],
+        flights=flights,
+        batch=batch,
+    )
+    cells = list(study.cells())
+    assert [cell.number for cell in cells] == list(range(study.count))
+    axes = [getattr(study, axis) for axis in cells_module_axes()]
+    wanted = set(itertools.product(itertools.product(*axes), range(0, flights, batch)))
+    assert {(tuple(cell.scenario), cell.first) for cell in cells} == wanted
+    assert len(cells) == len(wanted) == study.count
+    for cell in cells:
+        assert tuple(axis[i] for axis, i in zip(axes, cell.place, strict=True)) == tuple(cell.scenario)
+
+
+def cells_module_axes() -> list[str]:
+    plural = {"channels": "channels"}
+    return [plural.get(field, f"{field}s") for field in Study().cell(0).scenario._fields]
+
+
+def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
+    study = Study(
+        durations=(1.0,),
+        scales=(0.0, 0.1, 1.0, 10.0),
+        widths=(1.0, 0.5),
+        channels=("rates", "all"),
+        estimators=("ibss", "kalman"),
+        truth="drawn",
+        flights=8,
+        batch=4,
+    )
+    truths, noises, draws = {}, {}, {}
+    for cell in study.cells():
+        fleet = cells_module._fleet(study, cell.scenario)
+        truth, true, measured = (np.asarray(x) for x in cells_module._flights(study, fleet, cell))
+        scenario, first = cell.scenario, cell.first
+        for known, key, value in (
+            (truths, (scenario.width, first), truth),
+            (noises, (scenario.width, scenario.scale, first), measured),
+        ):
+            np.testing.assert_array_equal(known.setdefault(key, value), value)
+        # The same uniform numbers for every width, and the same normal ones for every scale.
+        u = (truth - fleet.bracket.center) / fleet.bracket.half_width
+        np.testing.assert_allclose(draws.setdefault(first, u), u, rtol=1e-9, atol=1e-9)
+        if scenario.scale:
+            normal = (measured - true) / (scenario.scale * jaxos4.SENSOR_SIGMA)
+            np.testing.assert_allclose(draws.setdefault(("noise", first), normal), normal, rtol=0, atol=1e-8)
+        else:
+            np.testing.assert_array_equal(measured, true)
+    assert len(truths) == 4
+    assert len(noises) == 16
+    assert not np.allclose(draws[0], draws[4], atol=0.1)
+    assert np.std(draws["noise", 0]) == pytest.approx(1, abs=4 / np.sqrt(2 * 4 * 101 * 12))
+
+
+# The Dataset.
+
+
+@pytest.mark.parametrize("number", [0, 3, 9])
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_the_dataset_is_what_the_library_computes(dataset, number, scale):
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    omega = jaxos4.multisine(jaxos4.OS4, duration=1.0, dt=0.01)
+    bracket = jaxos4.Bracket.default(model)
+    truth_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.fold_in(jax.random.key(5), 1), number))
+    u = jax.random.uniform(truth_key, (8,), minval=-1, maxval=1)
+    truth = bracket.center + u * bracket.half_width
+    flight = jaxos4.simulate(model, truth, omega, dt=0.01)
+    noise = jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
+    problem = jaxos4.ShootingProblem(
+        model,
+        noise(flight, key=noise_key),
+        sigma=scale * jaxos4.SENSOR_SIGMA,
+        initial_state=jnp.zeros(12),
+        channels="rates",
+    )
+    bound = jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(problem, truth)))
+    where = {"flight": number, "scale": scale}
+    for estimator in (jaxos4.IBSS(), BASELINES["equation-error"]()):
+        name = "ibss" if isinstance(estimator, jaxos4.IBSS) else "equation-error"
+        found = estimator(problem, bracket)
+        of = dataset.sel(where | {"estimator": name}).squeeze()
+        same(of["truth"], truth, bracket.half_width)
+        same(of["bound"], bound)
+        same(of["estimate"], found.parameters, found.std)
+        same(of["std"], found.std)
+        same(of["half_width"].sel(level=0.95), found.half_width(0.95))
+        same(of["cost"], found.cost)
+        assert int(of["rollouts"]) == int(found.rollouts)
+        assert OUTCOMES[int(of["result"])] == jaxos4.result_names(found.result)
+        assert int(of["hit"]) == -1
+    same(dataset["center"].squeeze(), bracket.center, bracket.half_width)
+    same(dataset["bracket_half_width"].squeeze(), bracket.half_width)
+    if number == 0 and scale == 1.0:
+        same(dataset["example_true"], flight.states, jaxos4.SENSOR_SIGMA)
+        same(dataset["example_measured"], problem.flight.states, jaxos4.SENSOR_SIGMA)
+        found = jaxos4.IBSS()(problem, bracket)
+        flown = jaxos4.simulate(model, found.parameters, omega, dt=0.01).states
+        same(dataset["example_simulated"].sel(estimator="ibss"), flown, jaxos4.SENSOR_SIGMA)
+        assert dataset["state"].to_numpy().tolist() == list(STATE_NAMES)
+        middle = dataset["search_estimate"].isel(sweep=0)
+        assert np.all(np.abs(middle - truth) <= dataset["search_half_width"].isel(sweep=0) + 2 * bracket.half_width)
+
+
+def same(ours, theirs, scale=0.0) -> None:
+    """Equal to 1e-9 of their size, or of `scale` where they may be zero."""
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
+    assert ours.shape == theirs.shape
+    assert np.isfinite(theirs).all()
+    assert np.all(np.abs(ours - theirs) <= 1e-9 * np.maximum(np.abs(theirs), scale))
+
+
+def test_all_brackets_are_off_the_airframe_by_one_draw():
+    study = Study(widths=(1.0, 3.0), seed=7)
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    u = jax.random.uniform(jax.random.fold_in(jax.random.key(7), 0), (8,), minval=-0.8, maxval=0.8)
+    for width in study.widths:
+        bracket = cells_module.bracket_of(study, "published", "os4", width)
+        same(bracket.center, model.alpha + u * width * model.half_width, model.half_width)
+        same(bracket.half_width, width * model.half_width)
+        assert np.all((bracket.lower < model.alpha) & (model.alpha < bracket.upper))
+
+
+def test_every_variable_tells_what_it_is(dataset):
+    for name, variable in dataset.variables.items():
+        assert variable.attrs["long_name"], name
+        assert variable.attrs["units"], name
+    result = dataset["result"]
+    assert result.dtype.kind == "i"
+    assert result.attrs["flag_values"].tolist() == list(range(len(OUTCOMES)))
+    assert result.attrs["flag_meanings"].split() == list(OUTCOMES)
+    assert set(np.unique(result)) <= set(result.attrs["flag_values"].tolist())
+    assert result.dims[-2:] == ("estimator", "flight")
+    assert dataset["unit"].sel(parameter="alpha3").item() == "1/(kg m^2)"
+
+
+def test_the_attributes_are_the_studys_and_not_the_runs(whole, dataset, tmp_path):
+    study = load_study(specification(tmp_path, SPECIFICATION))
+    attributes = dict(dataset.attrs)
+    assert attributes.pop("device") == "these tests"
+    assert attributes.pop("version") == jaxos4.__version__
+    assert attributes.pop("jax") == jax.__version__
+    assert attributes.pop("command") == "jaxos4 study study.toml --out DIR"
+    (tmp_path / "again.toml").write_text(attributes.pop("specification"))
+    assert load_study(tmp_path / "again.toml") == study
+    assert attributes == {"title": study.title, "precision": "float64", "seed": 5, "failures": "[]"}
+
+
+# Flights and cells that fail.
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+@pytest.mark.parametrize("estimator", ["ibss", "equation-error"])
+def test_a_poisoned_flight_leaves_its_neighbours_alone(tmp_path, monkeypatch, estimator, poison):
+    study = load_study(specification(tmp_path, SPECIFICATION))
+    cell = next(cell for cell in study.cells() if cell.scenario.estimator == estimator)
+    clean, flights = run_cell(study, cell, None), cells_module._flights
+
+    def poisoned(*arguments):
+        truth, true, measured = flights(*arguments)
+        return truth, true, measured.at[2, 50:].set(poison).at[2, 0].set(poison)
+
+    monkeypatch.setattr(cells_module, "_flights", poisoned)
+    found = run_cell(study, cell, None)
+    assert clean.keys() == found.keys()
+    others = [0, 1, 3]
+    for name, value in clean.items():
+        if len(value) == 4:
+            np.testing.assert_array_equal(found[name][others], value[others])
+    if np.isinf(poison):  # missing samples are borne
+        assert OUTCOMES[found["result"][2]] == "nonfinite_trajectory"
+        assert np.isnan(found["estimate"][2]).all()
+        assert np.isnan(found["std"][2]).all()
+    assert not np.array_equal(found["cost"][2], clean["cost"][2])
+
+
+def test_a_diverging_cell_is_counted_and_the_study_ends(run, tmp_path, dataset):
+    specification(tmp_path, SPECIFICATION.replace("[1.0, 0.1]", "[1.0, 1e300]"))
+    code, told, err = run("study", "spec.toml", "--out", "out")
+    assert (code, err) == (0, "")
+    with xr.open_dataset("out/results.nc") as found:
+        diverged = found["result"].sel(scale=1e300)
+        assert (diverged != OUTCOMES.index("successful")).all()
+        assert (diverged < OUTCOMES.index("failed")).all()
+        # The other scale is as it was.
+        for name in ("estimate", "std", "result", "cost"):
+            ours, theirs = (d[name].sel(scale=1.0) for d in (found, dataset))
+            np.testing.assert_array_equal(ours, theirs)
+        codes, counts = np.unique(found["result"], return_counts=True)
+    assert "40 estimates" in told
+    for result, count in zip(codes, counts, strict=True):
+        assert f"{count} {OUTCOMES[result]}" in told
+
+
+def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path, monkeypatch, dataset):
+    specification(tmp_path, SPECIFICATION)
+
+    def raises(study, cell, network):
+        if cell.number in (1, 10):
+            raise ValueError("the moon was in\nthe way")
+        return run_cell(study, cell, network)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "run_cell", raises)
+        code, told, err = run("study", "spec.toml", "--out", "out")
+    assert (code, err) == (0, "")
+    assert "8 failed" in told
+    assert "8 failed" in run("study", "spec.toml", "--out", "out")[1]  # and stays so
+    with xr.open_dataset("out/results.nc") as found:
+        failures = json.loads(found.attrs["failures"])
+        lost = found["result"].to_numpy() == OUTCOMES.index("failed")
+        assert np.isnan(found["estimate"].to_numpy()[lost]).all()
+        np.testing.assert_array_equal(found["result"].to_numpy()[~lost], dataset["result"].to_numpy()[~lost])
+        np.testing.assert_array_equal(found["truth"], dataset["truth"])
+    assert [(f["cell"], f["first"], f["estimator"], f["scale"]) for f in failures] == [
+        (1, 4, "ibss", 1.0),
+        (10, 4, "equation-error", 0.1),
+    ]
+    assert {f["message"] for f in failures} == {"the moon was in the way"}
+    for index in (1, 10):
+        (tmp_path / "out" / "cells" / f"{index:08d}.npz").unlink()
+    code, told, _ = run("study", "spec.toml", "--out", "out")
+    assert (code, "failed" in told) == (0, False)
+    with xr.open_dataset("out/results.nc") as found:
+        assert found.drop_attrs(deep=False).identical(dataset.drop_attrs(deep=False))

@@ -1,0 +1,104 @@
+"""A study on a Dask cluster whose workers die: the same study, bit for bit."""
+
+import os
+import shutil
+import signal
+
+import pytest
+import xarray as xr
+from distributed import Client, LocalCluster
+from helpers import refused
+from small_study import NETWORKED, cells, environment, results, run_study, specification
+
+from jaxos4.study import assemble, load_study, open_store, run_on_cluster, save_dataset
+
+# A worker that is killed leaves sockets to the garbage collector.
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The study, in this process."""
+    return run_study(tmp_path_factory.mktemp("study"), NETWORKED)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Two workers, each a process of one thread, that share this process's compiled programs."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment().items():
+            patch.setenv(name, value)
+        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
+            yield cluster
+
+
+@pytest.fixture
+def client(cluster):
+    with Client(cluster, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=60)
+        yield client
+
+
+def kill_a_worker(client: Client) -> None:
+    process, *_ = client.run(os.getpid).values()
+    os.kill(process, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_a_study_is_the_same_on_a_cluster_that_loses_workers(whole, client, tmp_path, trained):
+    study, out = load_study(specification(tmp_path, NETWORKED)), tmp_path / "out"
+    if trained:  # a run that ended after the training, and some cells
+        (out / "cells").mkdir(parents=True)
+        shutil.copy(whole / "study.json", out)
+        shutil.copytree(whole / "networks", out / "networks")
+        for index in (0, 5, 20):
+            shutil.copy(whole / "cells" / f"{index:08d}.npz", out / "cells")
+    done = []
+    with open_store(out, study, "a cluster") as store:
+        there = study.count - len(store.missing())
+        for step in run_on_cluster(store, client):
+            done.append(step.done)
+            if step.done in (there + 2, there + 9):
+                kill_a_worker(client)
+        save_dataset(assemble(store), out)
+        entries = store.read_log()
+    assert done[-1] == study.count
+    assert cells(out) == cells(whole)
+    assert (out / "networks" / "0000.net").read_bytes() == (whole / "networks" / "0000.net").read_bytes()
+    xr.testing.assert_identical(results(out), results(whole))
+    computed = [entry["cell"] for entry in entries if "cell" in entry]
+    assert sorted(computed) == [i for i in range(study.count) if not (trained and i in (0, 5, 20))]
+    assert sum("network" in entry for entry in entries) == (not trained)
+
+
+def test_a_damaged_network_is_named(whole, client, tmp_path, run):
+    specification(tmp_path, NETWORKED)
+    shutil.copytree(whole, tmp_path / "out")
+    network, cell = tmp_path / "out" / "networks" / "0000.net", tmp_path / "out" / "cells" / "00000003.npz"
+    whole_network, address = network.read_bytes(), client.scheduler.address
+    network.write_bytes(whole_network[: len(whole_network) // 2])
+    cell.unlink()
+    for options in ((), ("--executor", "dask", "--scheduler", address)):
+        refused(run("study", "spec.toml", "--out", "out", *options), "0000.net", "delete it")
+    network.unlink()
+    code, told, err = run("study", "spec.toml", "--out", "out", "--executor", "dask", "--scheduler", address)
+    assert (code, err) == (0, "")
+    assert "95 estimates" in told
+    assert network.read_bytes() == whole_network
+    assert cells(tmp_path / "out") == cells(whole)
+
+
+def test_a_cluster_that_is_not_there_is_refused(run, tmp_path):
+    specification(tmp_path, NETWORKED)
+    study = ("study", "spec.toml", "--out", "out")
+    refused(run(*study, "--executor", "dask"), "--scheduler")
+    refused(run(*study, "--scheduler", "tcp://127.0.0.1:1"), "--executor dask")
+    refused(run(*study, "--executor", "dask", "--scheduler", "nonsense://x"), "--scheduler nonsense://x")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cluster_without_workers_is_refused(run, tmp_path):
+    specification(tmp_path, NETWORKED)
+    with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
+        options = ("--executor", "dask", "--scheduler", empty.scheduler_address)
+        refused(run("study", "spec.toml", "--out", "out", *options), "no workers")

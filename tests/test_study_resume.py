@@ -1,0 +1,208 @@
+"""A study that is killed, meets a full disk or damaged files, or is run twice at once: nothing is lost or altered."""
+
+import collections
+import errno
+import os
+import pathlib
+import random
+import resource
+import shutil
+import signal
+import time
+
+import pytest
+import xarray as xr
+from helpers import refused
+from small_study import cells, finish, results, run_study, specification, start
+
+from jaxos4.study import Store, load_study, open_store, read_store
+
+SHUFFLED = """
+import pathlib, random, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+from jaxos4.study import load_study
+from jaxos4.study.run import compute
+study, out = load_study(pathlib.Path(sys.argv[1])), pathlib.Path(sys.argv[2])
+for index in random.Random(0).sample(range(study.count), study.count):
+    (out / f"{index:08d}.npz").write_bytes(compute(study, study.cell(index), None)[0])
+"""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The study, uninterrupted."""
+    return run_study(tmp_path_factory.mktemp("study"))
+
+
+@pytest.fixture
+def copy(whole, tmp_path):
+    """The finished study, to be damaged; `spec.toml` beside it."""
+    specification(tmp_path)
+    return pathlib.Path(shutil.copytree(whole, tmp_path / "out"))
+
+
+def logged(out: pathlib.Path) -> list[int]:
+    study = load_study(out.parent / "spec.toml")
+    return [entry["cell"] for entry in Store(out, study, "", "").read_log() if "cell" in entry]
+
+
+def test_a_study_is_the_same_after_any_number_of_kills(whole, tmp_path):
+    out, moments, kills = tmp_path / "out", random.Random(1), 0
+    command = ("study", specification(tmp_path), "--out", out)
+    count, before = load_study(tmp_path / "spec.toml").count, 0
+    while kills < 4:
+        process = start(*command)
+        # One while it starts; the others when it has done some more cells.
+        deadline = time.monotonic() + (moments.uniform(0, 2) if kills == 0 else 120)
+        wanted = before + moments.randint(1, 12)
+        while process.poll() is None and time.monotonic() < deadline and len(list(out.glob("cells/*.npz"))) < wanted:
+            time.sleep(moments.uniform(0, 0.004))
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL  # it was at work
+        kills, before = kills + 1, len(list(out.glob("cells/*.npz")))
+        assert before < count
+    assert before > 0
+    there = cells(out)
+    assert "190 estimates" in finish(start(*command))
+    xr.testing.assert_identical(results(out), results(whole))
+    assert cells(out) == cells(whole)
+    assert there.items() <= cells(out).items()
+    # What was kept was never computed again; a kill may come between a cell and its line.
+    times = collections.Counter(logged(out))
+    assert set(times.values()) == {1}
+    assert count - kills <= len(times) <= count
+
+
+def test_cells_are_the_same_in_any_order_in_another_process(whole, tmp_path):
+    finish(start(specification(tmp_path), tmp_path, code=SHUFFLED))
+    ours = {path.name: path.read_bytes() for path in tmp_path.glob("*.npz")}
+    assert ours == cells(whole)
+
+
+def test_a_study_is_the_same_on_any_number_of_devices(whole, tmp_path):
+    out = tmp_path / "out"
+    finish(start("study", specification(tmp_path), "--out", out, devices=2))
+    assert read_store(out).device.startswith("2 x")
+    assert cells(out) == cells(whole)
+    xr.testing.assert_identical(results(out), results(whole))
+
+
+@pytest.mark.parametrize(("after", "name"), [(0, "study.json"), (20, "00000019.npz"), (49, "results.nc")])
+def test_a_full_disk_is_one_line_and_the_study_goes_on_later(whole, run, tmp_path, monkeypatch, after, name):
+    specification(tmp_path)
+    write, written = pathlib.Path.write_bytes, []
+
+    def until_full(path: pathlib.Path, data: bytes) -> int:
+        if len(written) == after:
+            write(path, bytes(data)[:100])
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        written.append(path)
+        return write(path, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pathlib.Path, "write_bytes", until_full)
+        refused(run("study", "spec.toml", "--out", "out"), name, "No space left on device")
+    assert len(list((tmp_path / "out").rglob("*.npz"))) == max(after - 1, 0)
+    assert not list((tmp_path / "out").rglob(".*"))
+    assert run("study", "spec.toml", "--out", "out")[0] == 0
+    assert cells(tmp_path / "out") == cells(whole)
+    xr.testing.assert_identical(results(tmp_path / "out"), results(whole))
+
+
+def test_a_disk_that_is_full_for_the_dataset_keeps_the_older_one(copy, run):
+    older, (soft, hard) = (copy / "results.nc").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(older) // 2, hard))
+    try:
+        result = run("study", "spec.toml", "--out", "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    refused(result, "results.nc", "File too large")
+    assert (copy / "results.nc").read_bytes() == older
+    assert not list(copy.glob(".*"))
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused(run, tmp_path, monkeypatch):
+    specification(tmp_path)
+    (tmp_path / "out").mkdir()
+    # Root may write anywhere: what others are told is told here.
+    monkeypatch.setattr("os.access", lambda path, mode, **options: mode != os.W_OK)
+    refused(run("study", "spec.toml", "--out", "out"), "study.json", "not writable")
+
+
+def test_a_second_run_is_kept_out_while_the_first_lasts(copy, run):
+    with open_store(copy, load_study(copy.parent / "spec.toml"), "the first"):
+        refused(run("study", "spec.toml", "--out", "out"), "out", "another run is at work")
+        code, told, _ = run("study", "spec.toml", "--out", "out", "--dry-run")
+        assert (code, "0 of 48 cells" in told) == (0, True)
+    assert run("study", "spec.toml", "--out", "out")[0] == 0
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "array", "other"])
+def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole, run, damage):
+    cell = copy / "cells" / "00000030.npz"
+    data = cell.read_bytes()
+    other = whole / "cells" / "00000023.npz"  # three flights, where four belong
+    array = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (0,), }".ljust(128, b" ")
+    damaged = {"cut": data[: len(data) // 2], "garbage": b"\0" * 99, "empty": b"", "array": array}
+    cell.write_bytes(damaged.get(damage, other.read_bytes()))
+    older = (copy / "results.nc").read_bytes()
+    refused(run("study", "spec.toml", "--out", "out"), str(cell.relative_to(copy.parent)), "delete it")
+    assert (copy / "results.nc").read_bytes() == older
+    cell.unlink()
+    assert run("study", "spec.toml", "--out", "out")[0] == 0
+    assert cells(copy) == cells(whole)
+    assert collections.Counter(logged(copy))[30] == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "fragment"),
+    [
+        ("", "not the specification of a study"),
+        ("\x00\x01", "not the specification of a study"),
+        ("[1, 2]", "not the specification of a study"),
+        ("[" * 100_000, "not the specification of a study"),
+        ('{"version": "0.0.1", "device": "d", "study": {"of": "old"}}', "begun by jaxos4 0.0.1"),
+    ],
+)
+def test_a_folder_whose_specification_is_damaged_is_refused(copy, run, content, fragment):
+    (copy / "study.json").write_text(content)
+    for option in ((), ("--dry-run",)):
+        refused(run("study", "spec.toml", "--out", "out", *option), "out", fragment)
+    assert (copy / "study.json").read_text() == content
+
+
+def test_a_folder_of_something_else_is_refused_and_left_alone(run, tmp_path):
+    specification(tmp_path)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    for option in ((), ("--dry-run",)):
+        refused(run("study", "spec.toml", "--out", "out", *option), "out", "thesis.tex")
+        refused(run("study", "spec.toml", "--out", "file", *option), "file", "a file")
+        refused(run("study", "spec.toml", "--out", ".", *option), "holds file and no study")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+
+
+def test_what_a_kill_left_half_written_is_no_obstacle(copy, whole, run):
+    for place in (".study.0123abcd.part.json", ".results.0123abcd.part.nc", "cells/.00000003.0123abcd.part.npz"):
+        (copy / place).write_bytes(b"half")
+    with open(copy / "log.jsonl", "a") as log:
+        log.write('{"cell": 3, "sec')
+    (copy / "cells" / "00000003.npz").unlink()
+    # So early a kill that the specification was not there yet, and so late that all but the Dataset was.
+    (copy / "results.nc").unlink()
+    assert run("study", "spec.toml", "--out", "out")[0] == 0
+    assert not list(copy.rglob(".*"))
+    assert logged(copy)[-1] == 3
+    xr.testing.assert_identical(results(copy), results(whole))
+    early = copy.parent / "early"
+    early.mkdir()
+    (early / ".study.0123abcd.part.json").write_bytes(b"half")
+    (early / "lock").touch()
+    code, told, _ = run("study", "spec.toml", "--out", "early", "--dry-run")
+    assert (code, "48 of 48 cells" in told) == (0, True)
+    with open_store(early, load_study(copy.parent / "spec.toml"), "d") as store:
+        assert len(store.missing()) == 48
+    assert not list(early.glob(".*"))
