@@ -42,6 +42,7 @@ def compare(
     from ..report import error_table, write_report  # here: drawing takes seconds to import
 
     Console(highlight=False).print(error_table(dataset))
-    page, *_ = write_report(dataset, directory)
+    with Console(stderr=True).status("drawing the report"):
+        page, *_ = write_report(dataset, directory)
     typer.echo(f"{summary(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 
 def report(
@@ -12,7 +13,8 @@ def report(
     """Write the report of a study: report.html, which needs no network, and figures/ as SVG and PDF."""
     from ..report import read_results, write_report  # here: drawing takes seconds to import, other commands do not draw
 
-    written = write_report(read_results(directory), directory)
+    with Console(stderr=True).status("drawing"):
+        written = write_report(read_results(directory), directory)
     figures = {path.stem for path in written[1:]}
     typer.echo(f"{written[0]}: {written[0].stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:

@@ -1,0 +1,53 @@
+"""`jaxos4 compare`: from simulation to report in one command, here of a comparison cut to seconds."""
+
+import msgspec
+import pytest
+import xarray as xr
+from helpers import refused
+
+from jaxos4.cli import compare as command
+from jaxos4.study import OUTCOMES
+
+SMALL = {
+    "durations": (0.5,),
+    "flights": 16,
+    "batch": 16,
+    "channels": ("rates",),
+    "estimators": ("ibss", "network", "hybrid"),
+    "network": msgspec.structs.replace(command.QUICK.network, steps=20),
+}
+
+
+@pytest.fixture(autouse=True)
+def cut(monkeypatch):
+    for name in ("QUICK", "STANDARD"):
+        monkeypatch.setattr(command, name, msgspec.structs.replace(getattr(command, name), **SMALL))
+
+
+def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path):
+    code, out, err = run("compare", "--quick", "--out", "here")
+    assert (code, err) == (0, "")
+    for told in (
+        "noise x 0.1",
+        "noise x 10",
+        "bound, rates",
+        "ibss",
+        "network",
+        "hybrid",
+        "bracket centre",
+        "144 estimates",
+    ):
+        assert told in out
+    assert (tmp_path / "here/report.html").stat().st_size > 1e6
+    assert {path.stem for path in (tmp_path / "here/figures").iterdir()} >= {"error", "efficiency", "search", "path"}
+    with xr.open_dataset(tmp_path / "here/results.nc") as results:
+        assert (results["result"] != OUTCOMES.index("not_run")).all()
+        assert dict(results.sizes)["scale"] == 3
+
+    log = (tmp_path / "here/log.jsonl").read_bytes()
+    code, again, _ = run("compare", "--quick", "--out", "here")  # goes on from where it was: the end
+    assert code == 0
+    assert (tmp_path / "here/log.jsonl").read_bytes() == log
+    assert again.splitlines()[:-2] == out.splitlines()[:-2]
+
+    refused(run("compare", "--out", "here"), "here", "another study", "`title`")
