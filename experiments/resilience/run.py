@@ -55,11 +55,10 @@ def main(
         process.kill()
         process.wait()
         if process.returncode != -signal.SIGKILL:
-            raise SystemExit(f"{out / 'killed'}: ended by itself after {len(rows)} kills; give a longer specification.")
-        rows.append(
-            {"seconds": round(time.perf_counter() - begin, 3), "before": before, "after": _there(out / "killed")}
-        )
-        typer.echo(f"kill {len(rows)}: {rows[-1]['after']} of {count} cells")
+            raise SystemExit(f"{specification}: ended by itself after {len(rows)} kills; give a longer one.")
+        there, lasted = _there(out / "killed"), round(time.perf_counter() - begin, 3)
+        rows.append({"seconds": lasted, "before": before, "after": there})
+        typer.echo(f"kill {len(rows)}: {there} of {count} cells")
     _run(specification, out / "killed", environment)
     times = collections.Counter(e["cell"] for e in read_store(out / "killed").read_log() if "cell" in e)
     report = {

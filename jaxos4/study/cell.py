@@ -72,7 +72,10 @@ def job_of(study: Study, scenario: Scenario) -> Job:
 
 
 def train(study: Study, job: Job, *, progress: bool = False) -> TrainedNetwork:
-    """A network for all noises and scales of a study. Raises as `NetworkEstimator.fit` does."""
+    """A network for all noises and scales of a study. Raises as `NetworkEstimator.fit` does.
+
+    The same bit for bit only on as many cores: training divides its products of matrices among them.
+    """
     with jax.enable_x64(study.precision == "float64"):
         settings = study.network
         scales = [scale or 1.0 for scale in study.scales]
