@@ -134,6 +134,10 @@ def compute(study: Study, cell: Cell, network: TrainedNetwork | str | None) -> t
     try:
         results = failed(network) if isinstance(network, str) else run_cell(study, cell, network)
     except FAILURES as error:
+        if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
+            raise InputError(
+                "out of memory: free some and run the study again, or give it a smaller `batch`."
+            ) from None
         results = failed(str(error))
     return encode(results), round(time.perf_counter() - begin, 3)
 
