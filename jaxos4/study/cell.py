@@ -18,6 +18,7 @@ from .._custom_types import Key, Parameters, Scalar, States, as_float
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
 from ..estimators import BASELINES, IBSS, AbstractEstimator, Estimate, Hybrid, NetworkEstimator, TrainedNetwork
+from ..estimators.network import untrained
 from ..excitation import EXCITATIONS
 from ..flight import Flight
 from ..information import cramer_rao_bound
@@ -77,21 +78,32 @@ def train(study: Study, job: Job, *, progress: bool = False) -> TrainedNetwork:
     The same bit for bit only on as many cores: training divides its products of matrices among them.
     """
     with jax.enable_x64(study.precision == "float64"):
-        settings = study.network
-        scales = [scale or 1.0 for scale in study.scales]
-        training = NetworkEstimator(
-            features=settings.features,
-            approximator=settings.approximator,
-            channels=job.channels,
-            noise=(min(scales), max(scales)),
-            steps=settings.steps,
-            held_out=settings.held_out,
-        )
-        fleet = _fleet(study, job)
-        exact = simulate(fleet.model, fleet.bracket.center, fleet.omega, dt=fleet.dt, method=study.fit_method)
-        problem = _problem(study, fleet, exact.states, as_float(1.0), job.channels)
+        training, problem, bracket = _training(study, job)
         key = jax.random.fold_in(jax.random.key(study.network.seed), jobs(study).index(job))
-        return training.fit(problem, fleet.bracket, key=key, progress=progress)
+        return training.fit(problem, bracket, key=key, progress=progress)
+
+
+def blank_network(study: Study, job: Job) -> TrainedNetwork:
+    """Of the shape of a trained network, with ones for numbers: to compile with, while that is trained."""
+    with jax.enable_x64(study.precision == "float64"):
+        shapes = eqx.filter_eval_shape(untrained, *_training(study, job), jax.random.key(0))
+        arrays, others = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
+        return eqx.combine(jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), arrays), others)
+
+
+def _training(study: Study, job: Job) -> tuple[NetworkEstimator, ShootingProblem, Bracket]:
+    settings, scales = study.network, [scale or 1.0 for scale in study.scales]
+    training = NetworkEstimator(
+        features=settings.features,
+        approximator=settings.approximator,
+        channels=job.channels,
+        noise=(min(scales), max(scales)),
+        steps=settings.steps,
+        held_out=settings.held_out,
+    )
+    fleet = _fleet(study, job)
+    exact = simulate(fleet.model, fleet.bracket.center, fleet.omega, dt=fleet.dt, method=study.fit_method)
+    return training, _problem(study, fleet, exact.states, as_float(1.0), job.channels), fleet.bracket
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
@@ -258,7 +270,9 @@ def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:
         return IBSS(record=_RECORD)
     if network is None:
         raise ValueError(f"`network` must be given for {name!r}.")
-    return network if name == "network" else Hybrid(network)
+    # How long it was trained is no part of the program.
+    timeless: TrainedNetwork = eqx.tree_at(lambda n: n.history, network, jnp.zeros((0, 2)))
+    return timeless if name == "network" else Hybrid(timeless)
 
 
 def _results(study: Study, cell: Cell, flown: _Flown, found: _Found) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import InputError, TrainingError
 from ..estimators import TrainedNetwork, save_network
-from .cell import Job, encode, job_of, jobs, program_of, run_cell, train
+from .cell import Job, blank_network, encode, job_of, jobs, program_of, run_cell, train
 from .specification import NETWORKED, Cell, Study
 from .store import Store
 
@@ -44,7 +44,8 @@ def run_here(store: Store) -> Iterator[Step]:
     """Computes the cells that are missing, each device at its own.
 
     A device compiles and runs programs by itself: a program that was divided among devices would be another program,
-    and differ in the last digits. First each device takes a program that no other has; then it helps with the longest.
+    and differ in the last digits. First each device takes a program that no other has; then it helps with the longest;
+    while a network is trained, what waits for it is compiled.
     A cell that cannot be computed is kept as failed, and stays so: delete its file to try it again.
     """
     study, missing = store.study, store.missing()
@@ -56,7 +57,7 @@ def run_here(store: Store) -> Iterator[Step]:
     networks: dict[int, TrainedNetwork | str | None] = {}
     untrained = deque(dict.fromkeys(p.network for p in programs if p.network is not None))
     devices = deque(jax.local_devices())
-    running: dict[concurrent.futures.Future, tuple[Any, str, Cell | int]] = {}
+    running: dict[concurrent.futures.Future, tuple[Any, str, Cell | int | None]] = {}
     with concurrent.futures.ThreadPoolExecutor(len(devices)) as pool:
         try:
             while True:
@@ -72,6 +73,11 @@ def run_here(store: Store) -> Iterator[Step]:
                         network = None if program.network is None else networks[program.network]
                         task = pool.submit(_compute, study, cell, network, device)
                         running[task] = device, label_of(study, cell), cell
+                    elif (program := _untried(programs)) is not None:
+                        program.devices.add(device)
+                        cell = program.waiting[0]
+                        task = pool.submit(_compile, study, cell, device)
+                        running[task] = device, f"compiling {cell.scenario.estimator}", None
                     else:
                         devices.append(device)
                 yield Step(done, ", ".join(dict.fromkeys(label for _, label, _ in running.values())))
@@ -84,7 +90,7 @@ def run_here(store: Store) -> Iterator[Step]:
                     _give_memory_back()
                     if isinstance(what, int):
                         networks[what] = task.result()
-                    else:
+                    elif what is not None:
                         data, seconds = task.result()
                         store.write(store.cell_file(what.number), data, cell=what.number, seconds=seconds)
                         done += 1
@@ -99,6 +105,16 @@ def _next(programs: list[_Program], networks: dict[int, TrainedNetwork | str | N
     new = [p for p in ready if not p.devices]
     long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
     return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
+
+
+def _untried(programs: list[_Program]) -> _Program | None:
+    """What waits for its network, and can be compiled meanwhile."""
+    return next((p for p in programs if p.waiting and not p.devices), None)
+
+
+def _compile(study: Study, cell: Cell, device: Any) -> None:
+    with jax.default_device(device), contextlib.suppress(*FAILURES):  # the cell itself will say what is wrong
+        run_cell(study, cell, blank_network(study, job_of(study, cell.scenario)))
 
 
 def _give_memory_back() -> None:
