@@ -151,13 +151,14 @@ def _brackets(study: Study) -> dict:
     shape = [len(study.models), len(study.airframes), len(study.widths)]
     brackets = [bracket_of(study, *which) for which in itertools.product(study.models, study.airframes, study.widths)]
     dims = ("model", "airframe", "width", "parameter")
-    return {
-        name: (dims, np.stack([getattr(b, part) for b in brackets]).reshape(*shape, -1), _named(what, "unit"))
-        for name, part, what in (
-            ("center", "center", "middle of the bracket"),
-            ("bracket_half_width", "half_width", "half the width of the bracket"),
-        )
-    }
+    with jax.enable_x64(study.precision == "float64"):  # middle and half-width are computed when they are asked for
+        return {
+            name: (dims, np.stack([getattr(b, part) for b in brackets]).reshape(*shape, -1), _named(what, "unit"))
+            for name, part, what in (
+                ("center", "center", "middle of the bracket"),
+                ("bracket_half_width", "half_width", "half the width of the bracket"),
+            )
+        }
 
 
 def _seen(study: Study) -> dict:
