@@ -1,0 +1,58 @@
+"""The comparison as a table in colours: estimators against parameters, a panel a noise scale."""
+
+from pathlib import Path
+
+import numpy as np
+import typer
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from jaxos4 import metrics
+from jaxos4.cli.experiment import write_figure
+from jaxos4.report import read_results
+from jaxos4.report.figures_noise import error_unit
+from jaxos4.report.numbers import plain
+from jaxos4.report.style import INK, PAPER, grid
+
+WORST = 30.0
+
+
+def draw(data: xr.Dataset) -> Figure:
+    """Numbers: RMS errors, in percent where that means something. Colour: over the least bound of any estimator."""
+    data = data.squeeze([d for d in metrics.SCENARIO if d not in ("scale", "estimator")])
+    found, least = metrics.estimator_error(data), metrics.bound_error(data)["absolute"].min("estimator")
+    ratio = (found["absolute"] / least).transpose("scale", "estimator", "parameter").values
+    kinds = [error_unit(data, place)[:2] for place in range(data.sizes["parameter"])]
+    labels = [f"{name}\n[{unit}]" for name, (_, unit) in zip(data["parameter"].values, kinds, strict=True)]
+    rows = data.sizes["estimator"]
+    figure, axes = grid(data.sizes["scale"], columns=1, width=8.0, height=0.26 * rows + 0.55)
+    norm, colors = LogNorm(0.8, WORST), colormaps["Blues"]
+    for place, panel in enumerate(axes):
+        image = panel.imshow(np.ma.masked_invalid(ratio[place]), norm=norm, cmap=colors, aspect="auto")
+        for row in range(rows):
+            for column, (kind, _) in enumerate(kinds):
+                value = float(found[kind].isel(scale=place, estimator=row, parameter=column))
+                dark = np.isfinite(ratio[place, row, column]) and norm(ratio[place, row, column]) > 0.65
+                color = PAPER if dark else INK
+                panel.text(column, row, plain(value, 2), ha="center", va="center", fontsize=7.5, color=color)
+        panel.set_yticks(range(rows), data["estimator"].values)
+        panel.set_xticks(range(len(labels)), labels if place == len(axes) - 1 else [])
+        panel.tick_params(length=0)
+        panel.grid(visible=False)
+        panel.set_title(f"noise scale {data['scale'].values[place]:g}")
+    ticks = [1, 2, 5, 10, WORST]
+    bar = figure.colorbar(image, ax=axes, shrink=0.6, extend="max", label="RMS error / least bound")
+    bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    bar.ax.set_yticks([], minor=True)
+    return figure
+
+
+def main(results: Path, figures: Path) -> None:
+    """Draws what `jaxos4 study` wrote."""
+    write_figure(lambda: draw(read_results(results)), figures, "comparison")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,52 @@
+"""The noise below which each parameter is told from 0: by model, input, duration and channels.
+
+Nothing is drawn at random: it is |alpha| / (1.96 Cramer-Rao bound) of the airframe's parameters, initial state known.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+import xarray as xr
+
+import jaxos4
+from jaxos4.cli.experiment import save_results
+from jaxos4.dynamics import MODELS
+from jaxos4.excitation import EXCITATIONS
+from jaxos4.study import Study, load_study
+
+jax.config.update("jax_enable_x64", True)
+
+DIMS = ("model", "excitation", "duration", "channels", "parameter")
+
+
+def limits(study: Study, model_name: str, excitation: str, duration: float, channels: str) -> np.ndarray:
+    """Multiples of the standard noise below which each parameter is told; 0: its truth is 0; NaN: not excited."""
+    model = MODELS[model_name](study.vehicle(study.airframes[0]))
+    omega = EXCITATIONS[excitation](model.airframe, duration=duration, dt=study.dt)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=study.dt)
+    problem = jaxos4.ShootingProblem(
+        model, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=jnp.zeros(12), channels=channels
+    )
+    found = jaxos4.identifiability(problem, jaxos4.Bracket.default(model), model.alpha)
+    return np.where(found.excited | (model.alpha == 0), found.noise_limit, np.nan)
+
+
+def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for the Dataset.")]) -> None:
+    """Frontiers of every combination of a specification's models, excitations, durations and channels."""
+    study = load_study(specification)
+    axes = (study.models, study.excitations, study.durations, study.channels)
+    values = np.stack([limits(study, *which) for which in itertools.product(*axes)])
+    names = MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_names
+    coordinates = dict(zip(DIMS, (*map(list, axes), list(names)), strict=True))
+    shape = [len(axis) for axis in coordinates.values()]
+    frontier = xr.DataArray(values.reshape(shape), coordinates, DIMS, attrs={"units": "1"})
+    save_results(xr.Dataset({"frontier": frontier}), study, out)
+
+
+if __name__ == "__main__":
+    typer.run(main)

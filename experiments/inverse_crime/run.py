@@ -1,0 +1,34 @@
+"""What is lost where true flights are not made by the estimator's own steps: Euler and Runge-Kutta, at two rates.
+
+A folder for each way to fit; in it, flights made by each way to simulate.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from jaxos4.cli.experiment import run_studies, use_all_cores
+from jaxos4.study import load_study
+
+
+def main(
+    specification: Path,
+    out: Annotated[Path, typer.Option(help="Folder for the studies: new, or to be resumed.")],
+    fit_methods: Annotated[list[str], typer.Option(help="Steps of the fit.")] = ("euler", "rk4"),
+    dts: Annotated[list[float], typer.Option(help="Sample times [s].")] = (0.01, 0.002),
+) -> None:
+    """Runs the study once for each way to fit and each sample time."""
+    study = load_study(specification)
+    variants = {
+        f"{method} {dt:g} s": msgspec.structs.replace(study, fit_method=method, dt=dt)
+        for dt in dts
+        for method in fit_methods
+    }
+    run_studies(variants, out)
+
+
+if __name__ == "__main__":
+    use_all_cores()
+    typer.run(main)

@@ -1,0 +1,49 @@
+"""RMSE / bound of white noise, and coverage of 95 % intervals, by kind of noise."""
+
+from pathlib import Path
+
+import numpy as np
+import typer
+import xarray as xr
+from matplotlib.figure import Figure
+
+from jaxos4 import metrics
+from jaxos4.cli.experiment import draw_spread, write_figure
+from jaxos4.report import read_results
+from jaxos4.report.style import INK, grid, log_axis, styles
+
+LEVEL = 0.95
+
+
+def draw(data: xr.Dataset) -> Figure:
+    """At each kind: the mean over the parameters, and from the least to the largest of them."""
+    data = data.squeeze([d for d in metrics.SCENARIO if d not in ("noise", "estimator")])
+    figure, (left, right) = grid(2, columns=2, height=2.9)
+    style = styles(list(data["estimator"].values))
+    kinds = data["noise"].values
+    covered = metrics.coverage(data).sel(level=LEVEL)["coverage"]
+    left.axhline(1, color=INK, linewidth=1.0)
+    right.axhline(100 * LEVEL, color=INK, linewidth=1.0)
+    for place, (name, look) in enumerate(style.items()):
+        x = np.arange(len(kinds)) + 0.5 * (place / max(len(style) - 1, 1) - 0.5)
+        look = look._replace(dash="none")
+        draw_spread(left, x, metrics.efficiency(data.sel(estimator=name))["efficiency"], look, name)
+        draw_spread(right, x, 100 * covered.sel(estimator=name), look, name)
+    left.set_yscale("log")
+    log_axis(left, "y")
+    left.set_title("RMSE / bound of white noise")
+    right.set_title(f"{100 * LEVEL:g} % intervals that hold the truth [%]")
+    for panel in (left, right):
+        panel.set_xticks(range(len(kinds)), kinds)
+        panel.grid(axis="x", visible=False)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=len(style))
+    return figure
+
+
+def main(results: Path, figures: Path) -> None:
+    """Draws what `jaxos4 study` wrote."""
+    write_figure(lambda: draw(read_results(results)), figures, "noise_kinds")
+
+
+if __name__ == "__main__":
+    typer.run(main)

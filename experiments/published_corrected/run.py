@@ -1,0 +1,105 @@
+"""What the published and the corrected model tell of their own flights, and of each other's.
+
+Rotor speeds are the same; flights are made by one model with its airframe's parameters, and fitted by IBSS with the
+published or the corrected model. Errors are against the fitted model's own parameters.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+import xarray as xr
+
+import jaxos4
+from jaxos4.cli.experiment import save_results
+from jaxos4.dynamics import MODELS
+from jaxos4.excitation import EXCITATIONS
+from jaxos4.study import Study, load_study
+
+jax.config.update("jax_enable_x64", True)
+
+
+class Fits(NamedTuple):
+    """Of each flight: the estimate, the half-width of its 95 % interval, how it ended, and the diagnostics.
+
+    The least p-value over the channels, times their number (Bonferroni): of white residuals, of residuals that have
+    nothing to do with the inputs, and of residuals as large as the noise.
+    """
+
+    estimate: jax.Array
+    half_width: jax.Array
+    result: jaxos4.RESULTS
+    white_p: jax.Array
+    input_p: jax.Array
+    level_p: jax.Array
+
+
+def model_of(study: Study, name: str) -> jaxos4.AbstractModel:
+    """The model of that name and of the study's airframe."""
+    return MODELS[name](study.vehicle(study.airframes[0]))
+
+
+@eqx.filter_jit
+def identify(exact: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, states: jax.Array) -> Fits:
+    """Fits to noisy flights: those of `exact` but for their measured states."""
+
+    def one(states: jax.Array) -> Fits:
+        problem = eqx.tree_at(lambda p: p.flight.states, exact, states)
+        found = jaxos4.IBSS()(problem, bracket)
+        said = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+        least = [jnp.minimum(p.size * p.min(), 1.0) for p in (said.white_p, said.input_p, said.level_p)]
+        return Fits(found.parameters, found.half_width(0.95), found.result, *least)
+
+    return jax.vmap(one)(states)
+
+
+def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
+    """All flights that `flown` made, as `fitted` explains them."""
+    truth, model = model_of(study, flown), model_of(study, fitted)
+    omega = EXCITATIONS[study.excitations[0]](model.airframe, duration=study.durations[0], dt=study.dt)
+    sigma = study.scales[0] * jaxos4.SENSOR_SIGMA
+    own = jaxos4.simulate(model, model.alpha, omega, dt=study.dt)
+    exact = jaxos4.ShootingProblem(model, own, sigma=sigma, initial_state=jnp.zeros(12), channels=channels)
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(exact, model.alpha)))
+
+    flight, noise = jaxos4.simulate(truth, truth.alpha, omega, dt=study.dt), jaxos4.WhiteNoise(sigma)
+    keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(study.seed), i))(jnp.arange(study.flights))
+    bracket = jaxos4.Bracket.around(model.alpha + 0.3 * model.half_width, model.half_width)
+    found = identify(exact, bracket, jax.vmap(lambda key: noise(flight, key=key).states)(keys))
+    told = np.isin(jaxos4.result_names(found.result), ["successful", "unidentifiable"])
+    error = np.asarray(found.estimate - model.alpha)
+    return xr.Dataset(
+        {
+            "error": (("flight", "parameter"), error / bound, {"units": "bounds of the fitted model's own flight"}),
+            "covered": (("flight", "parameter"), np.abs(error) < found.half_width),
+            "told": ("flight", told),
+            "white_p": ("flight", np.asarray(found.white_p)),
+            "input_p": ("flight", np.asarray(found.input_p)),
+            "level_p": ("flight", np.asarray(found.level_p)),
+            "truth": ("parameter", np.asarray(model.alpha)),
+            "bound": ("parameter", bound),
+        },
+        {"parameter": list(model.parameter_names)},
+    )
+
+
+def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for the Dataset.")]) -> None:
+    """Every model fitted to flights of every model."""
+    study = load_study(specification)
+    cases = [study.channels, study.models, study.models]
+    parts = [
+        fits(study, *case).expand_dims(
+            {dim: [value] for dim, value in zip(("channels", "flown", "fitted"), case, strict=True)}
+        )
+        for case in itertools.product(*cases)
+    ]
+    save_results(xr.combine_by_coords(parts), study, out)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,51 @@
+"""RMS error in bounds, all parameters together, against rollouts: a panel for what is seen, a line a search."""
+
+from pathlib import Path
+
+import numpy as np
+import typer
+import xarray as xr
+from matplotlib.figure import Figure
+
+from jaxos4.cli.experiment import load_results, write_figure
+from jaxos4.report.style import INK, grid, log_axis, styles
+
+SEARCHES = ("IBSS, whitened", "IBSS, coordinate", "output error", "hybrid")
+LOOKS = dict(zip(SEARCHES, styles(["ibss", "kalman", "output-error", "hybrid"]).values(), strict=True))
+
+
+def accuracy(data: xr.Dataset) -> xr.DataArray:
+    """RMSE / bound, the geometric mean over the parameters."""
+    return np.exp(np.log((data["error"] ** 2).mean("flight") ** 0.5).mean("parameter"))
+
+
+def draw(data: xr.Dataset) -> Figure:
+    """A marker for each limit of sweeps, or steps."""
+    figure, axes = grid(data.sizes["channels"], columns=2, height=3.2, width=4.2 * data.sizes["channels"] + 0.6)
+    reached, spent = accuracy(data), data["rollouts"].mean("flight")
+    for panel, channels in zip(axes, data["channels"].values, strict=True):
+        panel.axhline(1, color=INK, linewidth=1.0)
+        for name in data["search"].values:
+            look = LOOKS[name]
+            one = {"channels": channels, "search": name}
+            x, y = spent.sel(one), reached.sel(one)
+            panel.plot(x, y, color=look.color, marker=look.marker, linestyle=look.dash, label=name, alpha=0.9)
+        panel.set_xscale("log")
+        panel.set_yscale("log")
+        log_axis(panel, "x")
+        log_axis(panel, "y")
+        panel.set_title({"rates": "body rates", "all": "all channels"}.get(str(channels), str(channels)))
+        panel.set_xlabel("rollouts for one flight")
+    axes[0].set_ylabel("RMSE / bound, mean of the parameters")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def main(results: Path, figures: Path) -> None:
+    """Draws what run.py wrote."""
+    data = load_results(results)
+    write_figure(lambda: draw(data), figures, "rollout_budget")
+
+
+if __name__ == "__main__":
+    typer.run(main)

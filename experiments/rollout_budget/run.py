@@ -1,0 +1,100 @@
+"""What accuracy costs: each search is stopped after so many sweeps, or steps, of each of its stages.
+
+The flights are those of one truth; each search begins anywhere within 80 % of the default bracket. Estimates count
+whether the search had come to its end or not.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+import xarray as xr
+
+import jaxos4
+from jaxos4.cli.experiment import save_results
+from jaxos4.dynamics import MODELS
+from jaxos4.excitation import EXCITATIONS
+from jaxos4.study import Study, load_study
+
+jax.config.update("jax_enable_x64", True)
+
+
+SEARCHES: dict[str, Callable[[int], jaxos4.AbstractEstimator]] = {
+    "IBSS, whitened": lambda most: jaxos4.IBSS(max_sweeps=most),
+    "IBSS, coordinate": lambda most: jaxos4.IBSS(max_sweeps=most, directions="coordinate"),
+    "output error": lambda most: jaxos4.OutputError(max_steps=most),
+}
+HYBRID = "hybrid"
+
+
+def identify(study: Study, channels: str, names: list[str], limits: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors in bounds [searches, limits, flights, parameters], and rollouts [searches, limits, flights]."""
+    model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
+    omega = EXCITATIONS[study.excitations[0]](model.airframe, duration=study.durations[0], dt=study.dt)
+    exact = jaxos4.simulate(model, model.alpha, omega, dt=study.dt)
+    sigma = study.scales[0] * jaxos4.SENSOR_SIGMA
+    noise = jaxos4.WhiteNoise(sigma)
+
+    def problem(flight: jaxos4.Flight) -> jaxos4.ShootingProblem:
+        return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=jnp.zeros(12), channels=channels)
+
+    @eqx.filter_jit
+    def run(estimator: jaxos4.AbstractEstimator, numbers: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def one(number: jax.Array) -> tuple[jax.Array, jax.Array]:
+            noise_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(study.seed), number))
+            offset = jax.random.uniform(start_key, model.alpha.shape, minval=-0.8, maxval=0.8)
+            bracket = jaxos4.Bracket.around(model.alpha + offset * model.half_width, model.half_width)
+            found = estimator(problem(noise(exact, key=noise_key)), bracket)
+            return found.parameters, found.rollouts
+
+        return jax.vmap(one)(numbers)
+
+    def train() -> jaxos4.TrainedNetwork:
+        """For twice the bracket, so that it knows all flights of searches that begin off their truth."""
+        return jaxos4.NetworkEstimator(
+            channels=channels, steps=study.network.steps, held_out=study.network.held_out, noise=(study.scales[0],) * 2
+        ).fit(
+            problem(exact),
+            jaxos4.Bracket.around(model.alpha, 2 * model.half_width),
+            key=jax.random.key(study.network.seed),
+        )
+
+    network = train() if HYBRID in names else None
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(exact), model.alpha)))
+    found = []
+    for name in names:
+        for most in limits:
+            hybrid = jaxos4.Hybrid(network, jaxos4.IBSS(halvings=3, max_sweeps=most)) if name == HYBRID else None
+            found.append(run(hybrid or SEARCHES[name](most), jnp.arange(study.flights)))
+    shape = (len(names), len(limits), study.flights)
+    errors = np.stack([(parameters - model.alpha) / bound for parameters, _ in found]).reshape(*shape, -1)
+    return errors, np.stack([rollouts for _, rollouts in found]).reshape(shape)
+
+
+def main(
+    specification: Path,
+    out: Annotated[Path, typer.Option(help="Folder for the Dataset.")],
+    limits: Annotated[list[int], typer.Option(help="Sweeps, or steps, of each stage.")] = (1, 2, 3, 4, 6, 10),
+    names: Annotated[list[str], typer.Option(help="Which searches.")] = (*SEARCHES, HYBRID),
+) -> None:
+    """Errors and rollouts of every search, by channels and limit."""
+    study = load_study(specification)
+    found = [identify(study, channels, list(names), list(limits)) for channels in study.channels]
+    dims = ("channels", "search", "limit", "flight")
+    results = xr.Dataset(
+        {
+            "error": ((*dims, "parameter"), np.stack([errors for errors, _ in found]), {"units": "bounds"}),
+            "rollouts": (dims, np.stack([rollouts for _, rollouts in found]), {"units": "1"}),
+        },
+        {"channels": list(study.channels), "search": list(names), "limit": list(limits)},
+    )
+    save_results(results, study, out)
+
+
+if __name__ == "__main__":
+    typer.run(main)
