@@ -6,9 +6,7 @@ import xarray as xr
 
 from .. import metrics
 from ..errors import InputError
-
-RESULTS_FILE = "results.nc"
-"""The file of a study's folder that holds its Dataset."""
+from ..study import RESULTS_FILE
 
 _DIMENSIONS = (*metrics.SCENARIO, "flight", "parameter")
 _VARIABLES = {

@@ -16,14 +16,13 @@ from ..dynamics import MODELS
 from ..errors import InputError
 from ..estimators import TrainedNetwork
 from ..flight import STATE_NAMES, STATE_UNITS
+from ..metrics import SCENARIO
 from ..training import CHECK
 from .cell import LEVELS, OUTCOMES, bracket_of, fly_again, jobs
 from .specification import AXES, Cell, Study
 from .store import RESULTS_FILE, Store
 
-# The dimensions of the axes, in their order: an axis is a plural.
-DIMS = tuple("channels" if axis == "channels" else axis.removesuffix("s") for axis in AXES)
-_LANES = (*DIMS, "flight")
+_LANES = (*SCENARIO, "flight")
 # Of what is kept for each flight: dimensions beyond the flight, type, unit, and what it is.
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "truth": (("parameter",), "f8", "unit", "true parameter"),
@@ -63,7 +62,7 @@ def assemble(store: Store) -> xr.Dataset:
     """
     study = store.study
     names = MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_names
-    sizes = dict(zip(DIMS, study.shape, strict=True)) | {
+    sizes = dict(zip(SCENARIO, study.shape, strict=True)) | {
         "flight": study.flights,
         "parameter": len(names),
         "level": len(LEVELS),
@@ -82,7 +81,7 @@ def assemble(store: Store) -> xr.Dataset:
         lanes = (*cell.place, slice(cell.first, min(cell.first + study.batch, study.flights)))
         if "failed" in results:
             arrays["result"][lanes] = OUTCOMES.index("failed")
-            where = dict(zip(DIMS, cell.scenario, strict=True))
+            where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
         try:
@@ -121,7 +120,7 @@ def save_dataset(dataset: xr.Dataset, directory: Path) -> Path:
 
 
 def _coordinates(study: Study, names: tuple[str, ...]) -> dict:
-    values = {dim: list(getattr(study, axis)) for dim, axis in zip(DIMS, AXES, strict=True)}
+    values = {dim: list(getattr(study, axis)) for dim, axis in zip(SCENARIO, AXES, strict=True)}
     values |= {"flight": np.arange(study.flights), "parameter": list(names), "level": list(LEVELS)}
     coordinates = {
         dim: (dim, values[dim], {"long_name": long_name, "units": unit})
