@@ -48,7 +48,9 @@ from .excitation import (
     multisine as multisine,
     step3211 as step3211,
 )
-from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
+from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight, join as join
+from .flight_model import TERMS as TERMS, FlightModel as FlightModel
+from .held import HeldParameters as HeldParameters, hold as hold
 from .identifiability import Identifiability as Identifiability, identifiability as identifiability
 from .inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia
 from .information import (
@@ -68,7 +70,9 @@ from .noise import (
     WhiteNoise as WhiteNoise,
 )
 from .results import RESULTS as RESULTS, result_names as result_names
+from .robust import winsorised as winsorised
 from .shooting import ShootingProblem as ShootingProblem
 from .simulate import simulate as simulate
+from .validation import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
 
 __version__ = _version("jaxos4")

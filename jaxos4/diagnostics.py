@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar, as_float
-from .dynamics import CASCADE_ORDER
 from .shooting import ROUNDING, ShootingProblem
 
 # Residuals below this share of a channel's largest value are rounding, whatever their correlation; in single precision
@@ -93,7 +92,7 @@ def _diagnostics(
     fitted: bool,
     lags: int,
 ) -> Diagnostics:
-    sigma, measured = problem.sigma[CASCADE_ORDER[: problem.size]], problem.measured()
+    sigma, measured = problem.sigma[problem.columns], problem.measured()
     there = ~jnp.isnan(measured)
     errors = problem.residuals(parameters, initial_state).reshape(measured.shape)
     # A trajectory that diverges leaves nothing to judge.
@@ -125,7 +124,7 @@ def _diagnostics(
     colour = jnp.take_along_axis(after, jnp.argmax(told, axis=1)[:, None], axis=1)[:, 0]
     # Nothing to test is nothing against it.
     whitish = jax.scipy.special.gammaincc(jnp.maximum(told.sum(axis=1), 1) / 2, box / 2)
-    torques = jnp.stack(problem.model.forcing(problem.flight.omega)[:3], axis=1)
+    torques = jnp.stack(problem.forcing(parameters)[:3], axis=1)
     # The last row of rotor speeds drives nothing.
     driving = jnp.arange(torques.shape[0]) < torques.shape[0] - 1
     moves = jnp.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector
 from .airframe import OS4, Airframe, alpha_from_inertia, alpha_scalars
@@ -64,6 +64,23 @@ class Forcing(NamedTuple):
     residual_speed: Float[Array, "*samples"]
 
 
+class Inputs(NamedTuple):
+    """What drives a vehicle, on the time grid of its flight.
+
+    - `omega`: rotor speeds, measured or commanded [rad/s].
+    - `dt`: the sample time [s].
+    - `velocity`: along the body's axes [m/s], where that is known.
+    - `force`: the measured specific force along the body's axes [m/s^2], where a model takes it as an input.
+    - `stretch`: which uninterrupted stretch each sample belongs to, counted from 0; `None`: all to one.
+    """
+
+    omega: RotorSpeeds
+    dt: Scalar
+    velocity: Float[Array, "samples 3"] | None = None
+    force: Float[Array, "samples 3"] | None = None
+    stretch: Int[Array, " samples"] | None = None
+
+
 # Where the leaves of a `State` stand in the paper's order, Eq. (14).
 CASCADE_ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])
 # How many of them each choice of channels needs.
@@ -108,6 +125,21 @@ class AbstractModel(eqx.Module):
         return True
 
     @property
+    def driving(self) -> tuple[int, ...]:
+        """Which parameters the forcing depends on. On none for an OS4: its forcing is prepared once for all shots."""
+        return ()
+
+    @property
+    def force_axes(self) -> tuple[int, ...]:
+        """Which axes of the measured specific force the model predicts."""
+        return ()
+
+    @property
+    def observes_states(self) -> bool:
+        """Whether what is measured are the states themselves, with nothing added, and no specific force."""
+        return True
+
+    @property
     @abc.abstractmethod
     def parameter_units(self) -> tuple[str, ...]:
         """The unit of each parameter."""
@@ -130,6 +162,16 @@ class AbstractModel(eqx.Module):
         """What rotor speeds `omega` [rad/s] do, row by row: Eqs. (10)-(13) and Omega_r = sum s_i omega_i."""
         roll, pitch, yaw, thrust = (jnp.square(omega) @ self.airframe.mixer.T).T
         return Forcing(roll, pitch, yaw, thrust / self.airframe.mass, omega @ jnp.asarray(self.airframe.rotor_spins))
+
+    def drive(self, inputs: Inputs, parameters) -> Forcing:
+        """The forcing of a whole flight, a row from each sample to the next, with `parameters`."""
+        del parameters
+        return self.forcing(inputs.omega)
+
+    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
+        """What sensors without noise show: the states in cascade order, then specific force along `force_axes`."""
+        del forcing, parameters
+        return tuple(jax.tree.leaves(state))
 
     @abc.abstractmethod
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:

@@ -104,7 +104,7 @@ class AbstractFeatures(eqx.Module):
     def _weighted(
         self, problem: ShootingProblem, trajectory: Float[Array, "samples size"]
     ) -> Float[Array, "samples size"]:
-        weight = 1 / self.problem.sigma[CASCADE_ORDER[: self.problem.size]]
+        weight = 1 / self.problem.sigma[self.problem.columns]
         return jnp.where(_measured(problem), weight * (trajectory - self.reference), 0.0)
 
 

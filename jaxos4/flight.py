@@ -1,14 +1,30 @@
 """What a flight recorded: rotor speeds in, rates, attitude, velocity and position out."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._custom_types import RotorSpeeds, Scalar, States, as_float
+from .dynamics import Inputs
 from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
 STATE_UNITS = ("m", "m/s", "m", "m/s", "m", "m/s", "rad", "rad/s", "rad", "rad/s", "rad", "rad/s")
+FORCE_NAMES = ("ax", "ay", "az")
+CHANNEL_NAMES = (*STATE_NAMES, *FORCE_NAMES)
+CHANNEL_UNITS = (*STATE_UNITS, *("m/s^2",) * 3)
+"""All that a flight can have measured: the states, then the specific force."""
+
+# Sample times that differ by less than this share are one.
+_SAME_STEP = 1e-6
+
+
+def _optional_float(x: ArrayLike | None) -> Array | None:
+    return None if x is None else as_float(x)
 
 
 def _success() -> RESULTS:
@@ -25,15 +41,18 @@ class Flight(eqx.Module):
     - `states`: in the order of `STATE_NAMES` (Eq. (14)) and the units of `STATE_UNITS`. NaN: not measured.
     - `specific_force`: what an accelerometer measures along the body axes [m/s^2]. `None` or NaN: not measured.
     - `result`: how a simulation ended; rows from a failure on are NaN.
+    - `body_velocity`: along the body's axes [m/s], where a model takes it as an input; no NaN. `None`: not known.
+    - `stretch`: which uninterrupted stretch each sample belongs to, counted from 0, where several are joined
+      (`jaxos4.join`): time then is a count of samples. `None`: all belong to one.
     """
 
     time: Float[Array, " samples"] = eqx.field(converter=as_float)
     omega: RotorSpeeds = eqx.field(converter=as_float)
     states: States = eqx.field(converter=as_float)
-    specific_force: Float[Array, "samples 3"] | None = eqx.field(
-        converter=lambda x: None if x is None else as_float(x), default=None
-    )
+    specific_force: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
     result: RESULTS = eqx.field(default_factory=_success)
+    body_velocity: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
+    stretch: Int[Array, " samples"] | None = None
 
     def __check_init__(self):
         samples = self.time.shape
@@ -42,8 +61,14 @@ class Flight(eqx.Module):
                 "`time`, `omega` and `states` must have shapes (samples,), (samples, 4) and (samples, 12), got "
                 f"{samples}, {self.omega.shape} and {self.states.shape}; a batch of flights is made by `vmap`."
             )
-        if self.specific_force is not None and self.specific_force.shape != (*samples, 3):
-            raise ValueError(f"`specific_force` must have shape {(*samples, 3)}, got {self.specific_force.shape}.")
+        for name, shape in (
+            ("specific_force", (*samples, 3)),
+            ("body_velocity", (*samples, 3)),
+            ("stretch", samples),
+        ):
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"`{name}` must have shape {shape}, got {value.shape}.")
         if samples[0] < 2:
             raise ValueError(f"A flight needs at least two samples, got {samples[0]}.")
 
@@ -52,7 +77,63 @@ class Flight(eqx.Module):
         """The sample time [s]."""
         return (self.time[-1] - self.time[0]) / (self.time.shape[0] - 1)
 
+    @property
+    def inputs(self) -> Inputs:
+        """What drives the vehicle."""
+        force = None if self.specific_force is None else _held(self.specific_force)
+        return Inputs(self.omega, self.dt, self.body_velocity, force, self.stretch)
+
+    @property
+    def channels(self) -> Float[Array, "samples 15"]:
+        """All that was measured, in the order of `CHANNEL_NAMES`; NaN where not."""
+        force = self.specific_force
+        nothing = jnp.full((*self.states.shape[:-1], len(FORCE_NAMES)), jnp.nan, self.states.dtype)
+        return jnp.concatenate([self.states, nothing if force is None else force], axis=-1)
+
 
 def channel_indices(*names: str) -> Array:
     """Columns of `Flight.states` of the states `names`."""
     return jnp.array([STATE_NAMES.index(name) for name in names])
+
+
+def _held(values: Float[Array, "samples columns"]) -> Float[Array, "samples columns"]:
+    """Each column with what was not measured at the value before it, or at its first; 0 where there is none."""
+    index, measured = jnp.arange(values.shape[0])[:, None], ~jnp.isnan(values)
+    last = jax.lax.cummax(jnp.where(measured, index, -1))
+    first = jnp.argmax(measured, axis=0)
+    return jnp.nan_to_num(jnp.take_along_axis(values, jnp.where(last < 0, first, last), axis=0))
+
+
+def join(flights: Sequence[Flight], *, length: int) -> Flight:
+    """Stretches of flights one after the other, as one flight of so many windows of `length` samples.
+
+    What is left over at the end of each is dropped, so that no window reaches from one into the next. Time becomes a
+    count of samples from 0. The twelve states and what else was measured are kept as they are.
+
+    **Raises:** `ValueError` for flights of different sample times, or none that is long enough.
+    """
+    steps = np.array([float(flight.dt) for flight in flights])
+    if steps.size and np.ptp(steps) > _SAME_STEP * steps[0]:
+        raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
+    counts = [flight.time.shape[0] // length * length for flight in flights]
+    if not any(counts):
+        raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
+    kept = [jax.tree.map(lambda leaf, n=n: leaf[:n], _rows_of(f)) for f, n in zip(flights, counts, strict=True) if n]
+    with_velocity = all(rows[3] is not None for rows in kept)
+    omega, states, force = (np.concatenate([rows[i] for rows in kept]) for i in range(3))
+    velocity = np.concatenate([rows[3] for rows in kept if rows[3] is not None]) if with_velocity else None
+    lengths = [n for n in counts if n]
+    return Flight(
+        time=steps[0] * np.arange(sum(counts)),
+        omega=omega,
+        states=states,
+        specific_force=None if np.isnan(force).all() else force,
+        body_velocity=velocity,
+        stretch=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths)),
+    )
+
+
+def _rows_of(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    force = np.asarray(flight.channels[:, len(STATE_NAMES) :])
+    velocity = None if flight.body_velocity is None else np.asarray(flight.body_velocity)
+    return np.asarray(flight.omega), np.asarray(flight.states), force, velocity

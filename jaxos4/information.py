@@ -57,10 +57,10 @@ def robust_covariance(
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     count, free = parameters.shape[0], problem.free_size
 
-    def together(steps: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
+    def together(steps: Float[Array, " unknowns"]) -> Float[Array, "samples columns"]:
         """Residuals where all windows' initial states take the same step: no sample feels more than one of them."""
         moved = problem.split(start) + (steps[count:] if free else 0.0)
-        return problem.residuals(parameters + steps[:count], moved.ravel()).reshape(-1, problem.size)
+        return problem.residuals(parameters + steps[:count], moved.ravel()).reshape(-1, problem.columns.size)
 
     # How far each residual moves each parameter of the estimate.
     still = jnp.zeros(count + free)
@@ -70,7 +70,7 @@ def robust_covariance(
     measured = (~jnp.isnan(problem.measured())).astype(errors.dtype)
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
-    def products(x: Float[Array, "samples size"]) -> Float[Array, "lags size size"]:
+    def products(x: Float[Array, "samples columns"]) -> Float[Array, "lags columns columns"]:
         """Sums over all pairs of samples so many lags apart."""
         transform = jnp.fft.rfft(x, length, axis=0)
         return jnp.fft.irfft(transform[:, :, None] * jnp.conj(transform[:, None, :]), length, axis=0)

@@ -23,6 +23,8 @@ _SIGMA_OF_UNIT = {"m": 0.005, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01}
 SENSOR_SIGMA = np.array([_SIGMA_OF_UNIT[unit] for unit in STATE_UNITS])
 """Standard deviations of the standard flight's sensors in the order and units of `STATE_NAMES`, `STATE_UNITS`."""
 SENSOR_SIGMA.flags.writeable = False
+# Of an accelerometer in flight [m/s^2]: vibration, more than the sensor.
+FORCE_SIGMA = 0.3
 
 
 def _per_channel(

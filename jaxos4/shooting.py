@@ -15,8 +15,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar, StateVector, as_float
-from .dynamics import CASCADE_ORDER, CHANNELS, AbstractModel, Forcing, State, stack, unstack
-from .flight import Flight
+from .dynamics import CASCADE_ORDER, CHANNELS, AbstractModel, Forcing, State, unstack
+from .flight import CHANNEL_NAMES, STATE_NAMES, Flight
+from .noise import FORCE_SIGMA
 from .simulate import STEPPERS
 
 # A body rate [rad/s] that no quadrotor reaches, and no gyro measures: beyond it a trial trajectory has diverged.
@@ -30,10 +31,14 @@ _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2
 
 
 class Rows(NamedTuple):
-    """A window as the scan reads it, or a batch of them: a leaf a channel. `measured` is NaN where it says nothing."""
+    """A window as the scan reads it, or a batch of them: a leaf a channel. `measured` is NaN where it says nothing.
+
+    `push` is the forcing's derivative in the parameters that it depends on, of a model in which it does.
+    """
 
     forcing: Forcing
     measured: tuple[Float[Array, "*windows rows"], ...]
+    push: Forcing | None = None
 
 
 class Shot(NamedTuple):
@@ -61,7 +66,8 @@ class ShootingProblem(eqx.Module):
     **Arguments:**
 
     - `model`, `flight`: what is fitted to what; NaN in `flight.states` means not measured.
-    - `sigma`: standard deviation of each channel's noise, in the order of `STATE_NAMES`; its reciprocal is the weight.
+    - `sigma`: standard deviation of each channel's noise, in the order of `CHANNEL_NAMES`; its reciprocal is the
+      weight. Of a model that predicts specific force, that may be left out: it is then 0.3 m/s^2.
     - `initial_state`: X at the first sample. `None`: free, estimated with the parameters.
     - `channels`: `"rates"`, `"attitude"` (with the rates), or `"all"`: what is compared, and how much is simulated.
     - `method`: the stepper, `"euler"` or `"rk4"`.
@@ -77,7 +83,7 @@ class ShootingProblem(eqx.Module):
 
     model: AbstractModel
     flight: Flight
-    sigma: StateVector = eqx.field(converter=as_float)
+    sigma: Float[Array, "12"] | Float[Array, "15"] = eqx.field(converter=as_float)
     initial_state: StateVector | None = None
     channels: str = eqx.field(static=True, default="all")
     method: str = eqx.field(static=True, default="euler")
@@ -88,7 +94,7 @@ class ShootingProblem(eqx.Module):
         model: AbstractModel,
         flight: Flight,
         *,
-        sigma: Float[Array | np.ndarray, "12"],
+        sigma: Float[Array | np.ndarray, "12"] | Float[Array | np.ndarray, "15"],
         initial_state: Float[Array | np.ndarray, "12"] | None = None,
         channels: str = "all",
         method: str = "euler",
@@ -98,8 +104,11 @@ class ShootingProblem(eqx.Module):
             raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
         if method not in STEPPERS:
             raise ValueError(f"`method` must be one of {', '.join(STEPPERS)}, got {method!r}.")
-        if np.shape(sigma) != (12,):
-            raise ValueError(f"`sigma` must hold one value for each of the 12 states, got shape {np.shape(sigma)}.")
+        if np.shape(sigma) not in ((len(STATE_NAMES),), (len(CHANNEL_NAMES),)):
+            raise ValueError(
+                "`sigma` must hold one value for each of the 12 states, and may hold three more for specific force, "
+                f"got shape {np.shape(sigma)}."
+            )
         if not isinstance(sigma, Tracer) and not np.all((np.asarray(sigma) > 0) & np.isfinite(sigma)):
             raise ValueError(f"`sigma` must be positive and finite, got {np.asarray(sigma).tolist()}.")
         if initial_state is not None and np.shape(initial_state) != (12,):
@@ -109,6 +118,8 @@ class ShootingProblem(eqx.Module):
             raise ValueError(f"`windows` must be an integer from 1 to {most}, two samples each, got {windows!r}.")
         if windows > 1 and initial_state is not None:
             raise ValueError("`initial_state` must be `None` where there are several windows: each has its own.")
+        if model.force_axes and np.shape(sigma) == (len(STATE_NAMES),):
+            sigma = jnp.concatenate([as_float(sigma), jnp.full(3, FORCE_SIGMA)])
         self.model, self.flight, self.sigma = model, flight, as_float(sigma)
         self.initial_state = None if initial_state is None else as_float(initial_state)
         self.channels, self.method, self.windows = channels, method, windows
@@ -123,6 +134,12 @@ class ShootingProblem(eqx.Module):
         """How many unknowns an initial state adds to a window's parameters: `size`, or 0 where it is known."""
         return 0 if self.initial_state is not None else self.size
 
+    @property
+    def columns(self) -> Int[np.ndarray, " columns"]:
+        """Which of `CHANNEL_NAMES` are compared: the states in cascade order, then the specific force."""
+        forces = np.asarray(self.model.force_axes, dtype=int)
+        return np.concatenate([CASCADE_ORDER[: self.size], len(STATE_NAMES) + forces])
+
     def restrict(self, channels: str) -> "ShootingProblem":
         """The same problem on fewer channels."""
         return ShootingProblem(
@@ -135,16 +152,37 @@ class ShootingProblem(eqx.Module):
             windows=self.windows,
         )
 
-    def measured(self) -> Float[Array, "samples size"]:
-        """What is compared, in cascade order. Where the initial state is known, the first sample is no data."""
-        measured = self.flight.states[:, CASCADE_ORDER[: self.size]]
+    def measured(self) -> Float[Array, "samples columns"]:
+        """What is compared, in the order of `columns`; without the first sample where the initial state is known."""
+        measured = (self.flight.channels if self.model.force_axes else self.flight.states)[:, self.columns]
         return measured if self.initial_state is None else measured.at[0].set(jnp.nan)
 
-    def rows(self) -> Rows:
-        """All windows as the scan reads them, with nothing measured beyond the end of one that is shorter."""
+    def rows(self, parameters: Parameters | None = None) -> Rows:
+        """All windows as the scan reads them, with nothing measured beyond the end of one that is shorter.
+
+        `parameters`: of the forcing, where it depends on some; what the airframe implies by default.
+        """
         index, within = self._cut()
-        forcing = jax.tree.map(lambda leaf: leaf[index], self.model.forcing(self.flight.omega))
-        return Rows(forcing, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
+        forcing = self.forcing(self.model.alpha if parameters is None else parameters)
+        windows = jax.tree.map(lambda leaf: leaf[index], forcing)
+        return Rows(windows, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
+
+    def forcing(self, parameters: Parameters) -> Forcing:
+        """What the rotors do in the whole flight, sample by sample."""
+        return self.model.drive(self.flight.inputs, parameters)
+
+    def driven(self, rows: Rows, parameters: Parameters, *, tangents: bool = False) -> Rows:
+        """`rows` with the forcing of these parameters, and its tangents if wanted; untouched where it has none."""
+        driving = np.asarray(self.model.driving, dtype=int)
+        if not driving.size:
+            return rows
+        index, _ = self._cut()
+
+        def forcing(values: Float[Array, " driving"]) -> Forcing:
+            return jax.tree.map(lambda leaf: leaf[index], self.forcing(parameters.at[driving].set(values)))
+
+        values = parameters[driving]
+        return rows._replace(forcing=forcing(values), push=jax.jacfwd(forcing)(values) if tangents else None)
 
     def split(self, initial_state: Float[Array, " starts"]) -> Float[Array, "windows size"]:
         """The initial state of each window."""
@@ -158,7 +196,7 @@ class ShootingProblem(eqx.Module):
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
-        states, sigma = jnp.stack(self.rows().measured, axis=-1), self.sigma[order]
+        states, sigma = jnp.stack(self.rows().measured[: self.size], axis=-1), self.sigma[order]
         first = jnp.argmin(jnp.isnan(states), axis=1)
         value = jnp.take_along_axis(states, first[:, None], axis=1)[:, 0]
         off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
@@ -179,33 +217,36 @@ class ShootingProblem(eqx.Module):
     def residuals(
         self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
     ) -> Float[Array, " residuals"]:
-        """W (y - x), sample by sample with the channels in cascade order; 0 where nothing was measured."""
+        """W (y - x), sample by sample with the channels in the order of `columns`; 0 where nothing was measured."""
         start = self.first_state()[0] if initial_state is None else initial_state
         predicted, measured = self.predict(parameters, start), self.measured()
-        weight = 1 / self.sigma[CASCADE_ORDER[: self.size]]
-        return jnp.where(jnp.isnan(measured), 0.0, weight * (measured - predicted)).ravel()
+        return jnp.where(jnp.isnan(measured), 0.0, (measured - predicted) / self.sigma[self.columns]).ravel()
 
     @eqx.filter_jit
-    def predict(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Float[Array, "samples size"]:
-        """The trajectory of the simulated channels, in cascade order."""
+    def predict(
+        self, parameters: Parameters, initial_state: Float[Array, " starts"]
+    ) -> Float[Array, "samples columns"]:
+        """What would be measured without noise, in the order of `columns`."""
+        scalars = tuple(parameters)
 
-        def step(state: State, forcing: Forcing) -> tuple[State, State]:
-            return self.step(state, forcing, tuple(parameters)), state
+        def step(state: State, forcing: Forcing) -> tuple[State, tuple[Scalar, ...]]:
+            return self.step(state, forcing, scalars), self.model.observe(state, forcing, scalars)
 
-        def window(start: Float[Array, " size"], forcing: Forcing) -> Float[Array, "length size"]:
-            return stack(jax.lax.scan(step, unstack(start), forcing)[1])
+        def window(start: Float[Array, " size"], forcing: Forcing) -> Float[Array, "length columns"]:
+            return jnp.stack(jax.lax.scan(step, unstack(start), forcing)[1], axis=-1)
 
         _, within = self._cut()
-        return jax.vmap(window)(self.split(initial_state), self.rows().forcing)[within]
+        return jax.vmap(window)(self.split(initial_state), self.rows(parameters).forcing)[within]
 
     def shots(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Shot:
         """All windows, as one."""
-        each = jax.vmap(self.shot, in_axes=(0, None, 0))(self.rows(), parameters, self.split(initial_state))
+        each = jax.vmap(self.shot, in_axes=(0, None, 0))(self.rows(parameters), parameters, self.split(initial_state))
         return Shot(each.cost.sum(), each.sound.all())
 
     def curvatures(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Curvature:
         """Of each window, in the parameters and its own initial state."""
-        return jax.vmap(self.curvature, in_axes=(0, None, 0))(self.rows(), parameters, self.split(initial_state))
+        rows = self.driven(self.rows(), parameters, tangents=True)
+        return jax.vmap(self.curvature, in_axes=(0, None, 0))(rows, parameters, self.split(initial_state))
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
         """The cost of one window of `rows`, prepared once: what a shooting method calls in its inner loop."""
@@ -214,7 +255,8 @@ class ShootingProblem(eqx.Module):
         def step(carry: tuple[State, Shot], row: Rows) -> tuple[tuple[State, Shot], None]:
             state, shot = carry
             sound = shot.sound & _sound(state)
-            shot = Shot(shot.cost + _half_square(_errors(row, state, weights, sound)), sound)
+            seen = self.model.observe(state, row.forcing, scalars)
+            shot = Shot(shot.cost + _half_square(_errors(row, seen, weights, sound)), sound)
             return (self.step(state, row.forcing, scalars), shot), None
 
         return jax.lax.scan(step, (unstack(initial_state), _unfired()), rows)[0][1]
@@ -231,21 +273,33 @@ class ShootingProblem(eqx.Module):
         parameter_tangents = tuple(identity[:, :count].T)
         start_tangents = jnp.zeros((unknowns, self.size), dtype=float).at[:, : self.free_size].set(identity[:, count:])
 
+        def advance(state: State, forcing: Forcing, scalars) -> tuple[State, tuple[Scalar, ...]]:
+            return self.step(state, forcing, scalars), self.model.observe(state, forcing, scalars)
+
+        def linearised(state: State, tangent: State, row: Rows):
+            if row.push is None:
+                at, push = jax.linearize(lambda x, a: advance(x, row.forcing, a), state, scalars)
+                return at, jax.vmap(push)(tangent, parameter_tangents)
+            at, push = jax.linearize(advance, state, row.forcing, scalars)
+            driving = np.asarray(self.model.driving)
+            forcing = jax.tree.map(lambda slope: jnp.zeros(unknowns, dtype=float).at[driving].set(slope), row.push)
+            return at, jax.vmap(push)(tangent, forcing, parameter_tangents)
+
         def step(carry: tuple[State, State, Curvature], row: Rows):
             state, tangent, total = carry
             sound = total.shot.sound & _sound(state)
-            errors = _errors(row, state, weights, sound)
+            (following, seen), (moved, slope) = linearised(state, tangent, row)
+            errors = _errors(row, seen, weights, sound)
             slopes = [
                 jnp.where(jnp.isnan(y) | ~sound, 0.0, -w * dx)
-                for y, w, dx in zip(row.measured, weights, jax.tree.leaves(tangent), strict=True)
+                for y, w, dx in zip(row.measured, weights, slope, strict=True)
             ]
             total = Curvature(
                 Shot(total.shot.cost + _half_square(errors), sound),
                 total.gradient + sum(e * s for e, s in zip(errors, slopes, strict=True)),
                 total.information + sum(s[:, None] * s[None, :] for s in slopes),
             )
-            following, push = jax.linearize(lambda x, a: self.step(x, row.forcing, a), state, scalars)
-            return (following, jax.vmap(push)(tangent, parameter_tangents), total), None
+            return (following, moved, total), None
 
         zero = Curvature(_unfired(), jnp.zeros(unknowns, dtype=float), 0 * identity)
         tangents = jax.vmap(unstack)(start_tangents)
@@ -258,17 +312,17 @@ class ShootingProblem(eqx.Module):
         freedom that the unknowns took. A channel with fewer than two measurements keeps its sigma, and none falls
         below what rounding adds up to over a flight: residuals can be rounding alone.
         """
-        order = CASCADE_ORDER[: self.size]
+        columns = self.columns
         measured = self.measured()
         count = (~jnp.isnan(measured)).sum(axis=0)
         unknowns = len(self.model.parameter_names) + self.windows * self.free_size
         left = jnp.maximum(1 - unknowns / jnp.maximum(count.sum(), 1), 1e-3)
-        squares = jnp.square(residuals.reshape(-1, self.size)).sum(axis=0)
-        sigma = self.sigma[order] * jnp.sqrt(squares / jnp.maximum(count * left, 1))
+        squares = jnp.square(residuals.reshape(-1, columns.size)).sum(axis=0)
+        sigma = self.sigma[columns] * jnp.sqrt(squares / jnp.maximum(count * left, 1))
         rounding = ROUNDING * jnp.finfo(sigma.dtype).eps * jnp.nan_to_num(jnp.nanmax(jnp.abs(measured), axis=0))
-        sigma = jnp.where((count > 1) & jnp.isfinite(sigma), jnp.maximum(sigma, rounding), self.sigma[order])
-        sigma = jnp.where(sigma > 0, sigma, self.sigma[order])
-        return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[order].set(sigma))
+        sigma = jnp.where((count > 1) & jnp.isfinite(sigma), jnp.maximum(sigma, rounding), self.sigma[columns])
+        sigma = jnp.where(sigma > 0, sigma, self.sigma[columns])
+        return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[columns].set(sigma))
 
     def step(self, state: State, forcing: Forcing, parameters) -> State:
         """The state one sample later, as far down the cascade as `state` goes."""
@@ -287,7 +341,7 @@ class ShootingProblem(eqx.Module):
         return np.where(within, index, ends[1:, None] - 1), within
 
     def _weights(self) -> tuple[Scalar, ...]:
-        return tuple(1 / self.sigma[CASCADE_ORDER[: self.size]])
+        return tuple(1 / self.sigma[self.columns])
 
 
 def _unfired() -> Shot:
@@ -300,10 +354,9 @@ def _sound(state: State) -> Bool[Array, ""]:
     return sound if state.attitude is None else sound & (jnp.abs(state.attitude.theta) < jnp.pi / 2)
 
 
-def _errors(row: Rows, state: State, weights: tuple[Scalar, ...], sound: Bool[Array, ""]) -> list[Scalar]:
+def _errors(row: Rows, seen: tuple[Scalar, ...], weights: tuple[Scalar, ...], sound: Bool[Array, ""]) -> list[Scalar]:
     return [
-        jnp.where(jnp.isnan(y) | ~sound, 0.0, w * (y - x))
-        for y, w, x in zip(row.measured, weights, jax.tree.leaves(state), strict=True)
+        jnp.where(jnp.isnan(y) | ~sound, 0.0, w * (y - x)) for y, w, x in zip(row.measured, weights, seen, strict=True)
     ]
 
 

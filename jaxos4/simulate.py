@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float
-from .dynamics import CASCADE_ORDER, AbstractModel, Forcing, State, stack, unstack
+from .dynamics import CASCADE_ORDER, AbstractModel, Forcing, Inputs, State, stack, unstack
 from .flight import STATE_NAMES, Flight
 from .results import RESULTS
 
@@ -110,7 +110,8 @@ def _fly(
         return following, following
 
     first = unstack(start[CASCADE_ORDER])
-    _, rest = jax.lax.scan(step, first, model.forcing(omega[:-1]))
+    forcing = jax.tree.map(lambda leaf: leaf[:-1], model.drive(Inputs(omega, dt), parameters))
+    _, rest = jax.lax.scan(step, first, forcing)
     trajectory = jnp.concatenate([stack(first)[None], stack(rest)])
     states, result = _until_failure(trajectory[:, CASCADE_ORDER.argsort()])
     return Flight(time=dt * jnp.arange(omega.shape[0]), omega=omega, states=states, result=result)

@@ -173,9 +173,11 @@ def fit_start(
 
 
 def check_one_window(problem: ShootingProblem) -> None:
-    """Raises `ValueError` for a flight that is cut into windows, where an algorithm walks through it as a whole."""
+    """Raises `ValueError` for a problem that a filter cannot walk through: windows, or sensors with their own terms."""
     if problem.windows > 1:
         raise ValueError(f"`problem.windows` must be 1 for this estimator, got {problem.windows}: it shoots none.")
+    if problem.model.driving or not problem.model.observes_states:
+        raise ValueError("`problem.model` must be one without rotor lag, delay, thrust curve or sensor terms: shoot.")
 
 
 def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:

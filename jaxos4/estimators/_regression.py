@@ -20,7 +20,7 @@ from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, Rates
 from ..information import invert
 from ..shooting import ShootingProblem
-from ._estimate import Estimate, check_one_window, conclude, fit_start
+from ._estimate import Estimate, conclude, fit_start
 
 # The standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It decides
 # what a flight says nothing about, and nothing else.
@@ -52,6 +52,8 @@ class Regression(NamedTuple):
         measured, (filled, known) = ~jnp.isnan(self.rates), self._fill(rates)
         increments = self._increments(filled)
         usable = ~jnp.isnan(self._increments(jnp.where(known, filled, jnp.nan))).any(axis=-1)
+        if self.problem.flight.stretch is not None:
+            usable &= (jnp.diff(self.problem.flight.stretch, append=-1) == 0)[:, None]
         increments = jnp.where(usable[..., None], increments, 0.0)
         output = filled / self.problem.sigma[CASCADE_ORDER[:3]]
         kept = self.memory * self.forgetting
@@ -110,7 +112,7 @@ class Regression(NamedTuple):
             regressors = jax.jacfwd(acceleration)(zero, rates, forcing)
             return jnp.concatenate([regressors, -acceleration(zero, rates, forcing)[:, None]], axis=-1) / sigma[:, None]
 
-        forcing = model.forcing(self.problem.flight.omega[:-1])
+        forcing = jax.tree.map(lambda leaf: leaf[:-1], self.problem.forcing(center))
         increments = jax.vmap(at)(rates[:-1], forcing)
         if self.problem.method != "euler":
             increments = (increments + jax.vmap(at)(rates[1:], forcing)) / 2
@@ -126,11 +128,10 @@ def regression(
             "regression needs a model whose rate equations are linear in its parameters: identify alpha_1..8, then "
             "`fit_inertia`, or shoot."
         )
-    check_one_window(problem)
     rates = problem.restrict("rates")
     anchored = problem.initial_state is not None
     anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
-    measured = rates.measured()
+    measured = rates.measured()[:, :3]
     decay = jnp.asarray(forgetting, dtype=float)
     return Regression(problem, bracket, measured, anchor, anchored, memory, decay, bridge)
 

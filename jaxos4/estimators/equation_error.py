@@ -74,8 +74,8 @@ class EquationError(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model that is not linear
-        in them, or a flight that is cut into windows.
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
+        linear in them.
         """
         check_bracket(problem, bracket)
         usable = bracket.usable

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar, as_float
 from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, CHANNELS
+from ..dynamics import CHANNELS
 from ..information import covariance_of_shared, covariances, inverse_transpose, joint_factor
 from ..results import RESULTS
 from ..shooting import ROUNDING, Curvature, Rows, ShootingProblem, Shot
@@ -292,8 +292,9 @@ class IBSS(AbstractEstimator):
             """A slope along a direction that all windows share is the sum of theirs."""
             return jnp.where(shared, slopes.sum(), slopes)
 
-        def fly(function, u):
-            return jax.vmap(function)(rows, u[:, :count], u[:, count:] if problem.free_size else starts)
+        def fly(function, u, *, tangents: bool = False):
+            driven = problem.driven(rows, u[0, :count], tangents=tangents)
+            return jax.vmap(function)(driven, u[:, :count], u[:, count:] if problem.free_size else starts)
 
         def slope(u, direction, shared) -> Callable[[Float[Array, " windows"]], Float[Array, " windows"]]:
             def at(step: Float[Array, " windows"]) -> Float[Array, " windows"]:
@@ -306,7 +307,7 @@ class IBSS(AbstractEstimator):
             return at
 
         def look(u) -> _Quadratic:
-            curvature = fly(problem.curvature, u)
+            curvature = fly(problem.curvature, u, tangents=True)
             factor, basis = self._directions(curvature.information + regular, count)
             slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
             ahead = jnp.maximum(jnp.abs(slopes[:, own:].sum(axis=0)).max(), jnp.abs(slopes[:, :own]).max(initial=0.0))
@@ -413,14 +414,14 @@ def _until(share: Scalar, rows: Rows) -> Rows:
     """The rows with nothing measured after a share of each window."""
     samples = rows.measured[0].shape[-1]
     within = jnp.arange(samples) < jnp.ceil(share * samples)
-    return Rows(rows.forcing, tuple(jnp.where(within, y, jnp.nan) for y in rows.measured))
+    return rows._replace(measured=tuple(jnp.where(within, y, jnp.nan) for y in rows.measured))
 
 
 def _finest(problem: ShootingProblem, rows: Rows) -> Scalar:
     """The move, in standard deviations, below which the sign of a slope is rounding."""
     eps = jnp.finfo(problem.sigma.dtype).eps
     squares = [jnp.nanmean(jnp.square(y)) for y in rows.measured]
-    weighted = jnp.sqrt(jnp.nan_to_num(jnp.stack(squares))) / problem.sigma[CASCADE_ORDER[: problem.size]]
+    weighted = jnp.sqrt(jnp.nan_to_num(jnp.stack(squares))) / problem.sigma[problem.columns]
     return jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * weighted.max())
 
 

@@ -4,13 +4,11 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, RotorSpeeds, Scalar, as_float
-from ..airframe import Airframe
+from .._custom_types import Scalar, as_float
 from ..bracket import Bracket
-from ..dynamics import AbstractModel, Attitude, Forcing, Rates
+from ..held import HeldParameters
 from ..shooting import ShootingProblem
 from ._estimate import AbstractEstimator, Estimate
 
@@ -69,78 +67,8 @@ def _held(
     values: Float[Array, " values"],
 ) -> Estimate:
     def at(value: Scalar) -> Estimate:
-        model = FixedParameter(problem.model, index, value)
+        model = HeldParameters(problem.model, held=(index,), values=value[None])
         others = Bracket(model.without(bracket.lower), model.without(bracket.upper))
         return estimator(eqx.tree_at(lambda p: p.model, problem, model), others)
 
     return eqx.filter_vmap(at)(values)
-
-
-class FixedParameter(AbstractModel):
-    """A model with one of its parameters held at a value: what is left is estimated as ever.
-
-    **Arguments:**
-
-    - `model`: the whole model.
-    - `index`: of the parameter.
-    - `value`: where it is held.
-    """
-
-    model: AbstractModel
-    index: int = eqx.field(static=True)
-    value: Scalar
-
-    def __init__(self, model: AbstractModel, index: int, value: Scalar):
-        self.model, self.index, self.value = model, index, as_float(value)
-
-    @property
-    def airframe(self) -> Airframe:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The inner model's."""
-        return self.model.airframe
-
-    @property
-    def gyroscopic_factor(self) -> Scalar:
-        """The inner model's."""
-        return self.model.gyroscopic_factor
-
-    @property
-    def is_linear(self) -> bool:
-        """The inner model's."""
-        return self.model.is_linear
-
-    @property
-    def alpha(self) -> Parameters:
-        """The inner model's, without the one that is held."""
-        return self.without(self.model.alpha)
-
-    @property
-    def half_width(self) -> Parameters:
-        """The inner model's, without the one that is held."""
-        return self.without(self.model.half_width)
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """The inner model's, without the one that is held."""
-        return self.model.parameter_names[: self.index] + self.model.parameter_names[self.index + 1 :]
-
-    @property
-    def parameter_units(self) -> tuple[str, ...]:
-        """The inner model's, without the one that is held."""
-        return self.model.parameter_units[: self.index] + self.model.parameter_units[self.index + 1 :]
-
-    def without(self, values: Parameters) -> Float[Array, " others"]:
-        """Of one value for each parameter of the inner model, those that are not held."""
-        return values[np.delete(np.arange(values.shape[0]), self.index)]
-
-    def forcing(self, omega: RotorSpeeds) -> Forcing:
-        """The inner model's."""
-        return self.model.forcing(omega)
-
-    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
-        """The inner model's, with the value in its place."""
-        given = tuple(parameters)
-        return self.model.angular_acceleration(rates, forcing, (*given[: self.index], self.value, *given[self.index :]))
-
-    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """The inner model's."""
-        return self.model.acceleration(attitude, forcing)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 UNIFORM = 0.01  # of dt: rows no further from a grid stand as they were recorded
 REACH = 1.5  # times dt: measured samples further apart have a gap between them
+_HALF = 0.45  # of a coarser sample: less of it measured is not measured; the first and the last have half of theirs
 ROUNDING = 1e-6  # of dt: times no further from a grid are the grid, rounded
 
 
@@ -68,6 +69,32 @@ def resample(
     grid = t[0] + dt * np.arange(samples)
     even = np.column_stack([_interpolate(t, channel, grid, dt) for channel in channels.T])
     return grid, _root_mean_square(t, omega, grid, dt), even, _figures(t, grid, dt)
+
+
+def average(
+    t: Float[np.ndarray, " rows"],
+    omega: Float[np.ndarray, "rows 4"],
+    channels: Float[np.ndarray, "rows channels"],
+    dt: float,
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 4"], Float[np.ndarray, "samples channels"]]:
+    """Rows on a uniform grid on a coarser one, of step `dt` [s], from their first time on.
+
+    Each measurement becomes the mean over `dt` around its time, so that vibration above the new rate does not fold down
+    and no phase is lost; NaN where less than half of that was measured. Rotor speeds become root mean squares over the
+    sample that follows, as in `resample`.
+    """
+    own = (t[-1] - t[0]) / (t.size - 1)
+    grid = t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + UNIFORM) + 1)
+    edges = np.append(t - own / 2, t[-1] + own / 2)
+    ends = np.append(grid - dt / 2, grid[-1] + dt / 2)
+    even = np.empty((grid.size, channels.shape[1]))
+    for i, channel in enumerate(channels.T):
+        measured = np.isfinite(channel)
+        sums = np.append(0.0, np.cumsum(np.where(measured, channel, 0.0)))
+        total, share = (np.diff(np.interp(ends, edges, x)) for x in (sums, np.append(0.0, np.cumsum(measured))))
+        told = share > _HALF * dt / own
+        even[:, i] = np.where(told, total / np.where(told, share, 1.0), np.nan)
+    return grid, _root_mean_square(t, omega, grid, dt), even
 
 
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:

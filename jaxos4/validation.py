@@ -1,0 +1,144 @@
+"""Predictions some tenths of a second ahead, over a flight that was not fitted, and what they are worth."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ._custom_types import Parameters
+from .dynamics import CASCADE_ORDER, State, unstack
+from .shooting import ShootingProblem
+
+HORIZONS = (0.1, 0.25, 0.5)
+RATES = CASCADE_ORDER[:3]
+# Seconds from one start to the next, and around a start over which the measured rates are averaged.
+_EVERY, _AROUND = 0.05, 0.02
+# Parts of the flight, one of which at a time is left out, to tell how certain a skill is.
+_PARTS = 10
+
+
+class Predictions(NamedTuple):
+    """Body rates p, q, r [rad/s], predicted from many starts.
+
+    - `start`: the sample at which each begins.
+    - `horizons`: how far ahead [s].
+    - `initial`: the rates at the start, measured around it.
+    - `predicted`, `measured`: at each horizon; NaN where not measured.
+    """
+
+    start: Int[np.ndarray, " starts"]
+    horizons: Float[np.ndarray, " horizons"]
+    initial: Float[np.ndarray, "starts 3"]
+    predicted: Float[np.ndarray, "starts horizons 3"]
+    measured: Float[np.ndarray, "starts horizons 3"]
+
+
+class Skill(NamedTuple):
+    """What predictions are worth.
+
+    - `rmse`: of the predictions [rad/s], by horizon and rate.
+    - `persistence`: that of "the rates stay as they are".
+    - `skill`: 1 - (rmse / persistence)^2: 1 is perfect, 0 as good as persistence, below 0 worse.
+    - `std`: of the skill: the jackknife's, over ten parts of the flight, so that neighbours may be alike.
+    - `starts`: how many.
+    """
+
+    rmse: Float[np.ndarray, "horizons 3"]
+    persistence: Float[np.ndarray, "horizons 3"]
+    skill: Float[np.ndarray, "horizons 3"]
+    std: Float[np.ndarray, "horizons 3"]
+    starts: int
+
+
+def predictions(
+    problem: ShootingProblem, parameters: Parameters, *, horizons: tuple[float, ...] = HORIZONS
+) -> Predictions:
+    """The rates that a model predicts from each start, 0.05 s apart, with the rotor speeds that were recorded.
+
+    A start is the mean of the rates measured within 0.01 s of it; none lies where that or the longest horizon leaves
+    its stretch, or where a rate was not measured.
+
+    **Arguments:**
+
+    - `problem`: its model, flight and method; windows and channels do not matter.
+    - `horizons`: [s], positive.
+
+    **Raises:** `ValueError` for a flight that is shorter than the longest horizon, or measured no rates.
+    """
+    flight = problem.flight
+    dt, samples = float(flight.dt), flight.time.shape[0]
+    ahead = np.maximum(np.rint(np.asarray(horizons) / dt).astype(int), 1)
+    around = int(_AROUND / 2 / dt)
+    stretch = np.zeros(samples, dtype=int) if flight.stretch is None else np.asarray(flight.stretch)
+    rates = np.asarray(flight.states)[:, RATES]
+    start = np.arange(around, samples - ahead.max() - around, max(int(round(_EVERY / dt)), 1))
+    start = start[stretch[start - around] == stretch[np.minimum(start + ahead.max(), samples - 1)]]
+    near = start[:, None] + np.arange(-around, around + 1)
+    initial = rates[near].mean(axis=1)
+    start, initial = start[np.isfinite(initial).all(axis=1)], initial[np.isfinite(initial).all(axis=1)]
+    if not start.size:
+        raise ValueError(
+            f"`problem.flight` holds no stretch with measured rates that is longer than {max(horizons)} s."
+        )
+    rate_problem = problem.restrict("rates")
+    predicted = _predict(rate_problem, parameters, jnp.asarray(start), jnp.asarray(initial), int(ahead.max()))
+    at = start[:, None] + ahead
+    return Predictions(start, ahead * dt, initial, np.asarray(predicted)[:, ahead], rates[at])
+
+
+@eqx.filter_jit
+def _predict(
+    problem: ShootingProblem,
+    parameters: Parameters,
+    start: Int[Array, " starts"],
+    initial: Float[Array, "starts 3"],
+    steps: int,
+) -> Float[Array, "starts steps_and_one 3"]:
+    model, scalars, forcing = problem.model, tuple(parameters), problem.forcing(parameters)
+
+    def fly(first: Int[Array, ""], measured: Float[Array, "3"]) -> Float[Array, "steps_and_one 3"]:
+        rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
+        row = jax.tree.map(lambda leaf: leaf[0], rows)
+        # What the gyro adds to the rates is not part of the state.
+        added = jnp.stack(model.observe(unstack(measured), row, scalars)[:3]) - measured
+
+        def step(state: State, row) -> tuple[State, Float[Array, "3"]]:
+            return problem.step(state, row, scalars), jnp.stack(model.observe(state, row, scalars)[:3])
+
+        return jax.lax.scan(step, unstack(measured - added), rows)[1]
+
+    return jax.vmap(fly)(start, initial)
+
+
+def skill(predicted: Predictions) -> Skill:
+    """What predictions are worth against "the rates stay as they are"."""
+    told = np.isfinite(predicted.measured)
+    errors = np.where(told, predicted.predicted - predicted.measured, 0.0)
+    changes = np.where(told, predicted.initial[:, None] - predicted.measured, 0.0)
+    finite = np.isfinite(errors)
+    squares = np.where(finite, np.square(np.where(finite, errors, 0.0)), np.inf)
+    parts = np.array_split(np.arange(errors.shape[0]), min(_PARTS, errors.shape[0]))
+
+    def worth(kept: np.ndarray) -> np.ndarray:
+        reference = np.square(changes[kept]).sum(axis=0)
+        return 1 - squares[kept].sum(axis=0) / np.where(reference > 0, reference, 1.0)
+
+    everything = np.arange(errors.shape[0])
+    without = (
+        np.stack([worth(np.setdiff1d(everything, part)) for part in parts])
+        if len(parts) > 1
+        else worth(everything)[None]
+    )
+    count = np.maximum(told.sum(axis=0), 1)
+    with np.errstate(invalid="ignore"):
+        spread = np.sqrt((len(parts) - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
+    return Skill(
+        rmse=np.sqrt(squares.sum(axis=0) / count),
+        persistence=np.sqrt(np.square(changes).sum(axis=0) / count),
+        skill=worth(everything),
+        std=spread,
+        starts=errors.shape[0],
+    )
