@@ -146,7 +146,8 @@ def _times(path: str, topic: str, fields: Fields, notes: list[str]) -> tuple[np.
 def _columns(fields: Fields, names: tuple[str, ...], index: np.ndarray) -> np.ndarray | None:
     if not all(name in fields for name in names):
         return None
-    values = np.column_stack([np.asarray(fields[name], dtype=float)[index] for name in names])
+    with np.errstate(all="ignore"):  # a damaged number need not be one
+        values = np.column_stack([np.asarray(fields[name], dtype=float)[index] for name in names])
     return np.where(np.isfinite(values), values, np.nan)
 
 
