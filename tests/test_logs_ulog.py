@@ -179,6 +179,20 @@ def test_a_log_cut_by_a_loss_of_power_is_read_to_there(save):
         check(flight, seconds=1.9)
 
 
+def test_what_was_appended_after_a_restart_does_not_break_it(save):
+    whole = everything()
+    content = bytearray(whole[: len(whole) * 2 // 3 - 5])
+    at = len(content)
+    content[19 + 8] = 1  # data appended
+    content[19 + 16 : 19 + 24] = struct.pack("<Q", at)
+    assert content[18:19] == b"B"
+    flight, notes = read_log(save(bytes(content) + message("L", b"6" + bytes(8) + b"hard fault")))
+    check(flight, seconds=1.9)
+    assert not any("cut" in note for note in notes)
+    content[19 + 8] = 0
+    assert isinstance(outcome(read_log, save(bytes(content) + message("L", b"6" + bytes(8) + b"hard fault") * 9)), str)
+
+
 BAD = {
     "other magic": (b"ULog\x02" + bytes(40), "is no ULog"),
     "header": (everything()[:12], "ends within its header"),

@@ -6,6 +6,7 @@ the end, costs it all memory or an endless search. Here a file is walked once, m
 Reference: the ULog file format of the PX4 user guide.
 """
 
+import math
 import os
 import re
 import struct
@@ -54,6 +55,7 @@ class _Walk:
         self.formats: dict[bytes, bytes] = {}
         self.used: set[bytes] = set()
         self.definitions, self.data = bytearray(), bytearray()
+        self.appended: tuple[int, ...] = ()
         self.wanted: set[int] = set()
         self.others: set[int] = set()
 
@@ -67,6 +69,10 @@ class _Walk:
         left_out = 0
         while header := file.read(3):
             length, kind = _HEADER.unpack(header) if len(header) == 3 else (0, 0)
+            appended = min((each for each in self.appended if each > self.position), default=math.inf)
+            if self.position + 3 + length > appended:  # cut there, and continued after a restart
+                self.position = file.seek(int(appended))
+                continue
             body = file.read(length)
             if len(header) < 3 or len(body) < length:
                 left_out = len(header) + len(body)
@@ -92,6 +98,8 @@ class _Walk:
         elif kind == ord("B"):
             if len(body) >= 16 and (body[8] & 0xFE or any(body[9:16])):
                 refuse(self.path, "is of a newer ULog format than this reader knows; update jaxos4")
+            if len(body) >= 40 and body[8] & 1:
+                self.appended = struct.unpack_from("<QQQ", body, 16)
         elif not ord("A") <= kind <= ord("Z"):
             self._corrupt("no message begins there")
 
