@@ -6,13 +6,11 @@ from .csv import (
     read_flight_and_notes as read_flight_and_notes,
     write_flight as write_flight,
 )
+from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
 from .stretches import (
-    Excitation as Excitation,
     Stretch as Stretch,
     chosen_part as chosen_part,
     cut as cut,
-    excitation as excitation,
-    gyro_noise as gyro_noise,
     stretches as stretches,
     usable_stretches as usable_stretches,
 )

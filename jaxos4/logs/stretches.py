@@ -1,4 +1,4 @@
-"""Which parts of a flight can be used for identification, why not the others, and what excites the vehicle in them.
+"""Which parts of a flight can be used for identification, and why not the others.
 
 Usable is what was flown: the rotors carry the vehicle, none of them rests or is at its limit for longer than a moment,
 the gyro is not clipped, nothing was lost, and it is no crash. A part is cut out of a flight with its time kept.
@@ -8,11 +8,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from ..airframe import Airframe
 from ..errors import InputError
-from ..flight import STATE_NAMES, Flight
+from ..flight import Flight
+from .excited import RATE_COLUMNS
 
 SHORTEST = 1.0  # [s] of a stretch
 MOMENT = 0.1  # [s] that a rotor may rest or be at its limit: about the lag of a rotor
@@ -27,10 +28,6 @@ _SLOWEST_CLIP = 3.0  # [rad/s]: no gyro's range ends below 4.3 (250 deg/s)
 _IMPACT_FORCE, _IMPACT_RATE = 50.0, 15.0  # [m/s^2], and [rad/s] within `_IMPACT_TIME`
 _IMPACT_TIME = 0.02  # [s]
 _AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s] to rotors that stand, and from flight that can be trusted
-_RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
-_ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi"))
-_GOOD, _WEAK = 0.3, 0.1  # [rad/s] of a body rate's standard deviation
-_OVER_NOISE = 5.0  # times the gyro's noise, below which a rate tells nothing
 
 _USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last that applies is the reason
 
@@ -46,23 +43,6 @@ class Stretch(NamedTuple):
     def length(self) -> float:
         """Its duration [s]."""
         return self.end - self.begin
-
-
-class Excitation(NamedTuple):
-    """What moves a vehicle about one axis.
-
-    - `axis`: roll, pitch or yaw.
-    - `torque`: standard deviation of the rotors' torque [N m]; NaN without an airframe.
-    - `rate`: of the body rate [rad/s]; NaN where neither it nor its angle was measured.
-    - `noise`: of the gyro [rad/s], from second differences: white noise up to half the sampling frequency.
-    - `verdict`: "good", "weak", "none" or "not measured".
-    """
-
-    axis: str
-    torque: float
-    rate: float
-    noise: float
-    verdict: str
 
 
 class _Saturation(NamedTuple):
@@ -88,7 +68,7 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
     saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
     for label, where in (
-        (_CLIPPING, _clipped(states[:, _RATE_COLUMNS])),
+        (_CLIPPING, _clipped(states[:, RATE_COLUMNS])),
         (_SATURATED, _anywhere(saturations, time.size)),
         (_LOST, _lost(states, dt)),
         (_CRASHED, _crashed(flight, share, ground, dt)),
@@ -157,33 +137,6 @@ def chosen_part(
     )
 
 
-def excitation(flight: Flight, airframe: Airframe | None = None) -> tuple[Excitation, Excitation, Excitation]:
-    """What moves the vehicle about roll, pitch and yaw, over all of `flight`."""
-    omega, states = np.asarray(flight.omega, dtype=float), np.asarray(flight.states, dtype=float)
-    torque = np.full(3, math.nan)
-    if airframe is not None:
-        torque = (omega[:-1] ** 2 @ np.asarray(airframe.mixer, dtype=float).T)[:, :3].std(axis=0)
-    found = []
-    for i, axis in enumerate(("roll", "pitch", "yaw")):
-        rate = states[:, _RATE_COLUMNS[i]]
-        noise = gyro_noise(rate)
-        if np.count_nonzero(np.isfinite(rate)) < 3:
-            rate = _slope(np.asarray(flight.time, dtype=float), states[:, _ANGLE_COLUMNS[i]])
-        size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
-        found.append(Excitation(axis, float(torque[i]), size, noise, _verdict(size, noise)))
-    return found[0], found[1], found[2]
-
-
-def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
-    """The standard deviation of white noise on a body rate [rad/s]; NaN where too little was measured.
-
-    From the median size of second differences, which motion hardly touches: it is smooth from sample to sample.
-    """
-    second = np.diff(rate, 2)
-    second = np.abs(second[np.isfinite(second)])
-    return float(np.median(second)) / 0.6745 / math.sqrt(6) if second.size else math.nan
-
-
 def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
     squares = (omega**2).sum(axis=1)
     usual = squares[squares > 0.1 * squares.max(initial=0.0)]
@@ -250,7 +203,7 @@ def _lost(states: np.ndarray, dt: float) -> np.ndarray:
     """Where nothing was measured for longer than a moment, of the rates or of whatever else was measured."""
     out = np.zeros(states.shape[0], dtype=bool)
     seen = np.isfinite(states)
-    columns = [c for c in _RATE_COLUMNS if seen[:, c].any()]
+    columns = [c for c in RATE_COLUMNS if seen[:, c].any()]
     groups = [seen[:, c] for c in columns] or [seen.any(axis=1)]
     for there in groups:
         at = np.flatnonzero(there)
@@ -267,9 +220,9 @@ def _crashed(flight: Flight, share: np.ndarray, ground: np.ndarray, dt: float) -
     impact = np.zeros(share.size, dtype=bool)
     if flight.specific_force is not None:
         impact = np.nan_to_num(np.linalg.norm(np.asarray(flight.specific_force), axis=1)) > _IMPACT_FORCE
-    rates = np.nan_to_num(np.asarray(flight.states)[:, _RATE_COLUMNS])
+    rates = np.nan_to_num(np.asarray(flight.states)[:, RATE_COLUMNS])
     lag = min(max(_samples(_IMPACT_TIME, dt), 1), share.size - 1)
-    measured: np.ndarray = np.asarray(np.isfinite(np.asarray(flight.states)[:, _RATE_COLUMNS]).all(axis=1))
+    measured: np.ndarray = np.asarray(np.isfinite(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=1))
     jump = np.abs(rates[lag:] - rates[:-lag]).max(axis=1) > _IMPACT_RATE * max(lag * dt / _IMPACT_TIME, 1.0)
     impact[lag:] |= jump & measured[lag:] & measured[:-lag]
     after, before = _samples(_AFTER_IMPACT, dt), _samples(_BEFORE_IMPACT, dt)
@@ -279,21 +232,6 @@ def _crashed(flight: Flight, share: np.ndarray, ground: np.ndarray, dt: float) -
             stop = begin + int(np.argmax(following)) if following.any() else share.size
             out[max(begin - before, 0) : max(stop, begin + 1)] = True
     return out
-
-
-def _verdict(size: float, noise: float) -> str:
-    if math.isnan(size):
-        return "not measured"
-    if size < _WEAK or (not math.isnan(noise) and size < _OVER_NOISE * noise):
-        return "none"
-    return "good" if size >= _GOOD else "weak"
-
-
-def _slope(time: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    measured = np.isfinite(angle)
-    if np.count_nonzero(measured) < 3:
-        return np.full(1, math.nan)
-    return np.gradient(angle[measured], time[measured])
 
 
 def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) -> str:
