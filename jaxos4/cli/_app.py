@@ -9,6 +9,7 @@ from ..errors import InputError, TrainingError
 from .compare import compare
 from .estimate import estimate
 from .identifiability import identifiability
+from .inspect import inspect
 from .report import report
 from .simulate import simulate
 from .study import study
@@ -23,6 +24,7 @@ app = typer.Typer(
 app.command()(simulate)
 app.command()(estimate)
 app.command()(train)
+app.command()(inspect)
 app.command()(identifiability)
 app.command()(compare)
 app.command()(study)

@@ -1,7 +1,16 @@
 """Flight files to `Flight` and back."""
 
+from ._formats import log_format as log_format, read_log as read_log
 from .csv import (
     read_flight as read_flight,
     read_flight_and_notes as read_flight_and_notes,
     write_flight as write_flight,
+)
+from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
+from .stretches import (
+    Stretch as Stretch,
+    chosen_part as chosen_part,
+    cut as cut,
+    stretches as stretches,
+    usable_stretches as usable_stretches,
 )

@@ -67,11 +67,11 @@ def check_units(table: Table) -> None:
     for name, rate in _ANGLES:
         ratio = ratios.get(name)
         if ratio is not None and 1 / _SPREAD < ratio / DEGREES < _SPREAD:
-            table.refuse(
-                f"changes {ratio:.3g} times as fast as {rate} says: it looks like degrees, divide by 57.3", column=name
-            )
+            what = table.remedy or "it looks like degrees, divide by 57.3"
+            table.refuse(f"changes {ratio:.3g} times as fast as {rate} says: {what}", column=name)
         if ratio is not None and 1 / _SPREAD < ratio * DEGREES < _SPREAD:
-            table.refuse(f"is {1 / ratio:.3g} times what {name} does: it looks like deg/s, divide by 57.3", column=rate)
+            what = table.remedy or "it looks like deg/s, divide by 57.3"
+            table.refuse(f"is {1 / ratio:.3g} times what {name} does: {what}", column=rate)
     flips = ratios.get("phi") is not None and 1 / 3 < (ratios["phi"] or 0) < 3
     for name, values in columns.items():
         limit = LIMITS.get(name)
@@ -81,7 +81,8 @@ def check_units(table: Table) -> None:
         largest = _YAW.largest if name == "phi" and flips else limit.largest
         index = _first(np.abs(values) > largest)
         if index is not None:
-            what = f"is {values[index]:g} {limit.unit}, beyond {largest:.4g} {limit.unit}; {limit.advice}"
+            advice = table.remedy or limit.advice
+            what = f"is {values[index]:g} {limit.unit}, beyond {largest:.4g} {limit.unit}; {advice}"
             table.refuse(what, index=index, column=name)
         if limit is _SPEED and (index := _first(values < 0)) is not None:
             what = f"is {values[index]:g} rad/s; rotor speeds are magnitudes: drop the sign, rotor_spins hold the sense"
@@ -106,7 +107,8 @@ def check_time(table: Table) -> float:
     index = _first(step <= 0)
     if index is not None:
         if step[index] == 0:
-            what = f"repeats {t[index]:.9g} s of row {index + 2}; time must increase: delete one of the two rows"
+            row = index + (table.first_row or 0)
+            what = f"repeats {t[index]:.9g} s of row {row}; time must increase: delete one of the two rows"
         else:
             what = f"runs backward, from {t[index]:.9g} s to {t[index + 1]:.9g} s; sort or cut the rows"
         table.refuse(what, index=index + 1, column="t")

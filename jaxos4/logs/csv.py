@@ -12,42 +12,17 @@ A column that is missing and a cell that is empty were not measured.
 
 import csv
 import os
-import re
 import warnings
 
-import jax.numpy as jnp
 import numpy as np
 
-from .._custom_types import as_float
 from .._files import write_atomically
 from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
-from ._table import MAX_ROWS, Table, printable, quoted, read_table
-from ._units import check_time, check_units, force_note, thrust_note
-from .resample import UNIFORM, resample, uniform_grid, unwrap, widest_gap
+from ._assemble import COLUMN_NAMES as COLUMN_NAMES, FORCE_NAMES, SPEED_NAMES, flight_of
+from ._table import printable, read_table
 
-SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
-COMMAND_NAMES = ("command1", "command2", "command3", "command4")
-FORCE_NAMES = ("ax", "ay", "az")
-CHANNEL_NAMES = STATE_NAMES + FORCE_NAMES
-COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES)
-
-_OTHER_NAMES = {  # what other loggers call them, for a hint
-    "time": "t",
-    "timestamp": "t",
-    "times": "t",
-    "roll": "phi",
-    "pitch": "theta",
-    "yaw": "psi",
-    "gyrox": "p",
-    "gyroy": "q",
-    "gyroz": "r",
-    "accx": "ax",
-    "accy": "ay",
-    "accz": "az",
-}
-MOST_SAMPLES = 10_000  # and ten for each row: a flight that is mostly gap is two flights
 _ROWS_AT_ONCE = 8192
 
 
@@ -74,29 +49,13 @@ def read_flight(path: str | os.PathLike[str], airframe: Airframe | None = None) 
 
 
 def read_flight_and_notes(
-    path: str | os.PathLike[str], airframe: Airframe | None = None
+    path: str | os.PathLike[str], airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
-    """`read_flight` with its warnings as values: one line each, without the file's name."""
-    table = read_table(path, COLUMN_NAMES)
-    notes = [_unknown_note(table.unknown)] if table.unknown else []
-    table = _measured(table)
-    dt = check_time(table)
-    check_units(table)
-    omega = _rotor_speeds(table, airframe, notes)
-    if airframe is not None:
-        carried = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient / (airframe.mass * airframe.gravity)
-        _add(notes, thrust_note(float(carried)))
-    channels = _channels(table, notes)
-    with_force = any(name in table.columns for name in FORCE_NAMES)
-    time, omega, channels = _evenly(table._replace(columns={"t": table.columns["t"]}), dt, omega, channels, notes)
-    del table  # a long log's memory
-    dt = float(time[-1] - time[0]) / (time.size - 1)
-    if np.finfo(jnp.result_type(float)).eps * abs(time[0]) > UNIFORM * dt:
-        late = f"t starts at {time[0]:.10g} s, too late for this precision to tell samples apart"
-        notes.append(f"{late}: it starts at 0 now")
-        time = dt * np.arange(time.size)
-    force = as_float(channels[:, 12:]) if with_force else None
-    return Flight(as_float(time), as_float(omega), as_float(channels[:, :12]), force), tuple(notes)
+    """`read_flight` with its warnings as values: one line each, without the file's name.
+
+    `full_scale`: as `jaxos4.logs.read_log` has it.
+    """
+    return flight_of(read_table(path, COLUMN_NAMES), airframe, full_scale=full_scale)
 
 
 def write_flight(flight: Flight, path: str | os.PathLike[str]) -> None:
@@ -137,117 +96,3 @@ def _refuse_to_write(path: str | os.PathLike[str], name: str, column: np.ndarray
             f"{printable(os.fspath(path))}: sample {index}, column {name}: is {column[index]}, "
             "which a flight file cannot hold; cut the flight before it."
         )
-
-
-def _measured(table: Table) -> Table:
-    """The table without columns that hold nothing, after a look at what a flight cannot do without."""
-    columns = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    table = table._replace(columns=columns)
-    if "t" not in columns:
-        table.refuse(_missing("there is no time", ("t",), table) + "; each row needs its time [s]", column="t")
-    if not any(name in columns for name in STATE_NAMES):
-        table.refuse(
-            _missing("no state was measured", STATE_NAMES, table)
-            + f"; a flight needs at least one of the columns {', '.join(STATE_NAMES)}"
-        )
-    return table
-
-
-def _missing(what: str, wanted: tuple[str, ...], table: Table) -> str:
-    hints = [f"{quoted(name)} be {_meant(name)}" for name in table.unknown if _meant(name) in wanted]
-    return f"{what} (should {hints[0]}?)" if hints else what
-
-
-def _meant(name: str) -> str | None:
-    """The column that an unknown name may stand for: another case, other separators, or another logger's word."""
-    plain = re.sub(r"[\W_]", "", name).lower()
-    return _OTHER_NAMES.get(plain, plain if plain in COLUMN_NAMES else None)
-
-
-def _unknown_note(unknown: tuple[str, ...]) -> str:
-    shown = [quoted(name) + (f" (did you mean {_meant(name)}?)" if _meant(name) else "") for name in unknown[:8]]
-    more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
-    return f"unknown columns are left out: {', '.join(shown)}{more}"
-
-
-def _rotor_speeds(table: Table, airframe: Airframe | None, notes: list[str]) -> np.ndarray:
-    speeds = [name for name in SPEED_NAMES if name in table.columns]
-    commands = [name for name in COMMAND_NAMES if name in table.columns]
-    names = speeds or commands
-    if len(names) < 4:
-        wanted = COMMAND_NAMES if commands and not speeds else SPEED_NAMES
-        lacking = next(name for name in wanted if name not in names)
-        what = _missing(f"there is no {lacking} in it", wanted, table)
-        table.refuse(f"{what}; a flight needs omega1..4 [rad/s] or command1..4 [0..1], all four", column=lacking)
-    if speeds and commands:
-        notes.append(f"measured {speeds[0]}..{speeds[-1]} are used, {', '.join(commands)} are not")
-    omega = np.column_stack([_held(table, name, notes) for name in names])
-    if speeds:
-        return omega
-    full_scale = np.inf if airframe is None else float(airframe.max_rotor_speed)
-    if not np.isfinite(full_scale):
-        table.refuse(
-            "commands say nothing without the rotor speed of full scale; "
-            "set max_rotor_speed [rad/s] in the airframe's TOML file",
-            column=names[0],
-        )
-    return omega * full_scale
-
-
-def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
-    """A rotor's column, with each empty cell at the value before it."""
-    column = table.columns[name]
-    empty = np.isnan(column)
-    if not empty.any():
-        return column
-    if empty[0]:
-        table.refuse(
-            "is empty, and no value before it could be held; cut the rows before the first one", index=0, column=name
-        )
-    last = np.maximum.accumulate(np.where(empty, 0, np.arange(column.size)))
-    t = table.columns["t"]
-    longest = (t - t[last]).max()
-    notes.append(f"{name}: {np.count_nonzero(empty)} empty cells hold the value before them, for up to {longest:.3g} s")
-    return column[last]
-
-
-def _channels(table: Table, notes: list[str]) -> np.ndarray:
-    """States and specific force, shape (rows, 15); NaN where not measured, angles without jumps of a turn."""
-    channels = np.full((table.columns["t"].size, len(CHANNEL_NAMES)), np.nan)
-    for i, name in enumerate(CHANNEL_NAMES):
-        if name not in table.columns:
-            continue
-        channels[:, i] = table.columns[name]
-        if name in ("phi", "psi"):
-            channels[:, i], jumps = unwrap(table.columns[name])
-            if jumps:
-                notes.append(f"{name}: {jumps} {'jump' if jumps == 1 else 'jumps'} of a turn taken out")
-    _add(notes, force_note(channels[:, 12:]))
-    return channels
-
-
-def _evenly(
-    table: Table, dt: float, omega: np.ndarray, channels: np.ndarray, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, rotor speeds and channels on a uniform grid: the rows themselves wherever they may stand."""
-    t = table.columns["t"]
-    time = uniform_grid(t)
-    if time is not None:
-        return time, omega, channels
-    gap = widest_gap(t, dt)
-    if gap.samples > min(MAX_ROWS, MOST_SAMPLES + 10 * t.size):
-        what = (
-            f"leaves a gap of {gap.length:.6g} s before it: at the median step of {dt:.3g} s the flight would have "
-            f"{gap.samples:.3g} samples; cut the file there"
-        )
-        table.refuse(what, index=gap.row + 1, column="t")
-    time, omega, channels, figures = resample(t, omega, channels, dt)
-    notes.append(figures)
-    if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
-        table.refuse("no measured sample has a neighbour within 1.5 steps or lies on the grid; record time evenly")
-    return time, omega, channels
-
-
-def _add(notes: list[str], note: str | None) -> None:
-    if note is not None:
-        notes.append(note)

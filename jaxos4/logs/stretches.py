@@ -1,0 +1,280 @@
+"""Which parts of a flight can be used for identification, and why not the others.
+
+Usable is what was flown: the rotors carry the vehicle, none of them rests or is at its limit for longer than a moment,
+the gyro is not clipped, nothing was lost, and it is no crash. A part is cut out of a flight with its time kept.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from ..airframe import Airframe
+from ..errors import InputError
+from ..flight import Flight
+from .excited import RATE_COLUMNS
+
+SHORTEST = 1.0  # [s] of a stretch
+MOMENT = 0.1  # [s] that a rotor may rest or be at its limit: about the lag of a rotor
+_CARRIES = 0.3  # of the weight: with less thrust for `_SUSTAINED`, the vehicle stands on the ground
+_SUSTAINED = 0.5  # [s] below which thrust may be missing in flight, and there on the ground
+_MARGIN = 0.3  # [s] from the ground to free flight
+_GAP = 0.05  # [s] without a measurement
+_LIMIT = 1e-3  # of a rotor's largest speed: what counts as the same value
+_FULL = 0.995  # of the airframe's `max_rotor_speed`
+_CLIPPED = 5  # samples in a row at a gyro's largest value
+_SLOWEST_CLIP = 3.0  # [rad/s]: no gyro's range ends below 4.3 (250 deg/s)
+_IMPACT_FORCE, _IMPACT_RATE = 50.0, 15.0  # [m/s^2], and [rad/s] within `_IMPACT_TIME`
+_IMPACT_TIME = 0.02  # [s]
+_AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s] to rotors that stand, and from flight that can be trusted
+
+_USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last that applies is the reason
+
+
+class Stretch(NamedTuple):
+    """A part of a flight, from `begin` to `end` [s], both samples of it; `reason`: why it is not usable, or empty."""
+
+    begin: float
+    end: float
+    reason: str = ""
+
+    @property
+    def length(self) -> float:
+        """Its duration [s]."""
+        return self.end - self.begin
+
+
+class _Saturation(NamedTuple):
+    rotor: int
+    what: str
+    begin: int
+    end: int
+
+
+def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
+    """All of a flight, in order: what is usable and what is not, with the reason.
+
+    **Arguments:**
+
+    - `flight`: one flight, not a batch.
+    - `airframe`: what weighs how much, and how fast rotors turn. Without it, or where it is another vehicle's (its
+      rotors would carry less than a third or more than three times the weight), a rotor's usual speed is what carries.
+    """
+    time, omega = np.asarray(flight.time, dtype=float), np.asarray(flight.omega, dtype=float)
+    states, dt = np.asarray(flight.states, dtype=float), float(flight.dt)
+    share = _thrust_share(omega, airframe)
+    ground = _ground(share, dt)
+    saturations = _saturations(omega, airframe, dt)
+    labels = np.zeros(time.size, dtype=int)
+    for label, where in (
+        (_CLIPPING, _clipped(states[:, RATE_COLUMNS])),
+        (_SATURATED, _anywhere(saturations, time.size)),
+        (_LOST, _lost(states, dt)),
+        (_CRASHED, _crashed(flight, share, ground, dt)),
+        (_GROUND, ground),
+    ):
+        labels[where] = label
+    for begin, end in _runs(labels == _USABLE):
+        if time[end - 1] - time[begin] < SHORTEST - dt / 2:
+            labels[begin:end] = _SHORT
+    return tuple(
+        Stretch(float(time[begin]), float(time[end - 1]), _reason(int(labels[begin]), begin, end, saturations))
+        for begin, end in _equal_runs(labels)
+    )
+
+
+def usable_stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
+    """The usable ones of `stretches`, in order; none is shorter than a second."""
+    return tuple(stretch for stretch in stretches(flight, airframe) if not stretch.reason)
+
+
+def cut(flight: Flight, stretch: Stretch) -> Flight:
+    """The part of a flight from `stretch.begin` to `stretch.end`, with its time kept.
+
+    **Raises:** `InputError` where fewer than two samples lie there.
+    """
+    time, half = np.asarray(flight.time), float(flight.dt) / 2
+    inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
+    if inside.size < 2:
+        raise InputError(
+            f"from {stretch.begin:g} s to {stretch.end:g} s: fewer than two samples; the flight lasts from "
+            f"{time[0]:.6g} s to {time[-1]:.6g} s."
+        )
+    part = slice(int(inside[0]), int(inside[-1]) + 1)
+    force = None if flight.specific_force is None else np.asarray(flight.specific_force)[part]
+    omega, states = np.asarray(flight.omega)[part], np.asarray(flight.states)[part]
+    return Flight(time[part], omega, states, force, flight.result)
+
+
+def chosen_part(
+    flight: Flight, airframe: Airframe | None = None, *, begin: float | None = None, end: float | None = None
+) -> tuple[Flight, str | None]:
+    """What an identification should use of a flight, and a note for the user; `None` where that is all of it.
+
+    It is the part from `begin` to `end` [s], where either is given; otherwise the longest usable stretch, or all of
+    the flight where none is usable.
+
+    **Raises:** `InputError` where fewer than two samples lie between `begin` and `end`.
+    """
+    first, last = float(flight.time[0]), float(flight.time[-1])
+    if begin is not None or end is not None:
+        asked = Stretch(first if begin is None else begin, last if end is None else end)
+        return cut(flight, asked), None
+    parts = stretches(flight, airframe)
+    usable = [part for part in parts if not part.reason]
+    if not usable:
+        why = max(parts, key=lambda part: part.length)
+        return flight, f"no stretch of the flight looks usable (mostly: {why.reason}); all of it is used"
+    if len(parts) == 1:
+        return flight, None
+    longest = max(usable, key=lambda part: part.length)
+    others = len(usable) - 1
+    more = "" if others == 0 else f"; {others} other usable {'stretch is' if others == 1 else 'stretches are'} left out"
+    return cut(flight, longest), (
+        f"used is {longest.begin:.2f} to {longest.end:.2f} s of {first:.2f} to {last:.2f} s, the longest stretch in "
+        f"undisturbed flight{more}"
+    )
+
+
+def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
+    squares = (omega**2).sum(axis=1)
+    usual = squares[squares > 0.1 * squares.max(initial=0.0)]
+    usual = float(np.median(usual)) if usual.size else 1.0
+    if airframe is not None:
+        carries = float(airframe.mass * airframe.gravity / airframe.thrust_coefficient)
+        if 1 / 3 < usual / carries < 3:
+            usual = carries
+    return squares / max(usual, 1e-300)
+
+
+def _ground(share: np.ndarray, dt: float) -> np.ndarray:
+    """Where the rotors do not carry the vehicle, with a margin toward flight."""
+    carried = share >= _CARRIES
+    for value in (True, False):  # short pauses in flight first, then short bursts on the ground
+        for begin, end in _runs(carried != value):
+            inside = begin > 0 and end < carried.size
+            if (end - begin) * dt < _SUSTAINED and inside:
+                carried[begin:end] = value
+    return _widened(~carried, _samples(_MARGIN, dt), _samples(_MARGIN, dt))
+
+
+def _clipped(rates: np.ndarray) -> np.ndarray:
+    out = np.zeros(rates.shape[0], dtype=bool)
+    for rate in np.abs(rates.T):
+        largest = np.nanmax(rate) if np.isfinite(rate).any() else 0.0
+        if largest < _SLOWEST_CLIP:
+            continue
+        for begin, end in _runs(rate >= (1 - _LIMIT) * largest):
+            if end - begin >= _CLIPPED and np.ptp(rate[begin:end]) <= 1e-6 * largest:
+                out[begin:end] = True
+    return out
+
+
+def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> list[_Saturation]:
+    """Where a rotor rests, or is at its limit, for longer than a moment."""
+    found = []
+    full_scale = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    for i, speed in enumerate(omega.T):
+        largest, least, usual = float(speed.max()), float(speed.min()), float(np.median(speed))
+        same = _LIMIT * largest
+        if largest <= 0:
+            continue
+        full = np.asarray(speed >= _FULL * full_scale)
+        if largest > 1.3 * usual > 0:
+            full |= _steady(speed, same) & (speed >= largest - same)
+        rest = np.asarray(speed <= same)
+        if least < 0.5 * usual:
+            rest |= _steady(speed, same) & (speed <= least + same)
+        for where, what in ((full, "at full speed"), (rest, "at rest or idle")):
+            found += [
+                _Saturation(i + 1, what, begin, end) for begin, end in _runs(where) if (end - begin) * dt > MOMENT
+            ]
+    return found
+
+
+def _steady(speed: np.ndarray, same: float) -> np.ndarray:
+    """Samples that are as the one before or after them."""
+    equal = np.abs(np.diff(speed)) <= same
+    return np.append(equal, False) | np.insert(equal, 0, False)
+
+
+def _lost(states: np.ndarray, dt: float) -> np.ndarray:
+    """Where nothing was measured for longer than a moment, of the rates or of whatever else was measured."""
+    out = np.zeros(states.shape[0], dtype=bool)
+    seen = np.isfinite(states)
+    columns = [c for c in RATE_COLUMNS if seen[:, c].any()]
+    groups = [seen[:, c] for c in columns] or [seen.any(axis=1)]
+    for there in groups:
+        at = np.flatnonzero(there)
+        usual = float(np.median(np.diff(at))) * dt if at.size > 1 else 0.0
+        for begin, end in _runs(np.asarray(~there)):
+            if (end - begin + 1) * dt > max(_GAP, 5 * usual):
+                out[begin:end] = True
+    return out
+
+
+def _crashed(flight: Flight, share: np.ndarray, ground: np.ndarray, dt: float) -> np.ndarray:
+    """From shortly before an impact to rotors that stand soon after, or to a record that ends."""
+    out = np.zeros(share.size, dtype=bool)
+    impact = np.zeros(share.size, dtype=bool)
+    if flight.specific_force is not None:
+        impact = np.nan_to_num(np.linalg.norm(np.asarray(flight.specific_force), axis=1)) > _IMPACT_FORCE
+    rates = np.nan_to_num(np.asarray(flight.states)[:, RATE_COLUMNS])
+    lag = min(max(_samples(_IMPACT_TIME, dt), 1), share.size - 1)
+    measured: np.ndarray = np.asarray(np.isfinite(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=1))
+    jump = np.abs(rates[lag:] - rates[:-lag]).max(axis=1) > _IMPACT_RATE * max(lag * dt / _IMPACT_TIME, 1.0)
+    impact[lag:] |= jump & measured[lag:] & measured[:-lag]
+    after, before = _samples(_AFTER_IMPACT, dt), _samples(_BEFORE_IMPACT, dt)
+    for begin in np.flatnonzero(impact):
+        following = ground[begin : begin + after]
+        if following.any() or begin + after >= share.size:
+            stop = begin + int(np.argmax(following)) if following.any() else share.size
+            out[max(begin - before, 0) : max(stop, begin + 1)] = True
+    return out
+
+
+def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) -> str:
+    if label == _SATURATED:
+        rotors: dict[str, set[int]] = {}
+        for each in saturations:
+            if each.begin < end and each.end > begin:
+                rotors.setdefault(each.what, set()).add(each.rotor)
+        return "; ".join(f"rotor {', '.join(map(str, sorted(which)))} {what}" for what, which in rotors.items())
+    return {
+        _USABLE: "",
+        _SHORT: f"less than {SHORTEST:g} s between others",
+        _CLIPPING: "the gyro is clipped",
+        _LOST: "nothing was measured",
+        _CRASHED: "an impact",
+        _GROUND: "on the ground",
+    }[label]
+
+
+def _samples(seconds: float, dt: float) -> int:
+    return math.ceil(seconds / dt - 1e-6)
+
+
+def _runs(where: Bool[np.ndarray, " samples"]) -> list[tuple[int, int]]:
+    """Begin and end (exclusive) of each run of true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
+
+
+def _anywhere(saturations: list[_Saturation], size: int) -> np.ndarray:
+    out = np.zeros(size, dtype=bool)
+    for each in saturations:
+        out[each.begin : each.end] = True
+    return out
+
+
+def _equal_runs(labels: np.ndarray) -> list[tuple[int, int]]:
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(labels)) + 1, [labels.size]])
+    return [(int(begin), int(end)) for begin, end in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _widened(where: np.ndarray, before: int, after: int) -> np.ndarray:
+    out = where.copy()
+    for begin, end in _runs(where):
+        out[max(begin - before, 0) : end + after] = True
+    return out

@@ -1,0 +1,99 @@
+"""`jaxos4 inspect` as a user types it: logs of each format, good and bad."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers import refused
+from recorded_logs import blackbox_csv, crazyflie
+from test_logs_blackbox import T as BLACKBOX_TIME, recorded
+from test_logs_crazyflie import one_event
+from test_logs_ulog import everything
+
+VEHICLE = """
+mass = 0.65
+inertia = [7.5e-3, 7.5e-3, 1.3e-2]
+arm = 0.23
+thrust_coefficient = 4.0e-6
+drag_coefficient = 1e-7
+rotor_inertia = 6e-5
+max_rotor_speed = 1200
+"""
+LOGS = {
+    "ULog": everything(),
+    "blackbox": blackbox_csv(recorded(BLACKBOX_TIME)).encode(),
+    "Crazyflie": one_event(0.004 * np.arange(750)),
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_each_format_is_inspected(kind, run, tmp_path):
+    (tmp_path / "log").write_bytes(LOGS[kind])
+    (tmp_path / "vehicle.toml").write_text(VEHICLE)
+    code, out, err = run("inspect", "log", "--airframe", "vehicle.toml", "--out", "log.json")
+    assert (code, err) == (0, "")
+    assert len(out.splitlines()) < 40  # a screen
+    for words in ("p q r: ", "rad/s", "usable", "good (", "identifiable: alpha1 to"):
+        assert words in out
+    report = json.loads((tmp_path / "log.json").read_text())
+    assert report["format"] == kind
+    assert report["measured"]["p"]["rate"] == pytest.approx(1 / report["sample_time"], rel=0.02)
+    (part,) = report["parts"]
+    assert part["usable"]
+    assert part["excitation"]["roll"]["verdict"] == "good"
+    assert list(report["identifiable"]["parameters"]) == [f"alpha{i}" for i in range(1, 9)]
+    code, out, err = run("inspect", "log")
+    assert (code, err) == (0, "")
+    assert "told with --airframe" in out
+
+
+def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):
+    assert run("simulate", "--duration", "3", "--noise", "1", "--out", "flight.csv")[0] == 0
+    code, out, err = run("inspect", "flight.csv", "--airframe", "os4", "--out", "f.json")
+    assert (code, err) == (0, "")
+    assert "flight CSV, 0.00 to 3.00 s, 301 samples, one every 10 ms" in out
+    found = json.loads((tmp_path / "f.json").read_text())["identifiable"]["parameters"]
+    assert found["alpha3"]["bound"] < 0.01 * found["alpha3"]["airframe"]
+    rows = [f"{0.01 * k:.2f},226,226,226,226,0,0,0" for k in range(200)]
+    (tmp_path / "hover.csv").write_text("\n".join(["t,omega1,omega2,omega3,omega4,p,q,r", *rows]))
+    code, out, err = run("inspect", "hover.csv", "--airframe", "os4")
+    assert (code, err) == (0, "")
+    for words in ("none (0)", "identifiable: nothing", "alpha3: not told: not excited"):
+        assert words in out
+
+
+def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
+    rows = [f"{0.01 * k:.2f},0.5,0.5,0.5,{0.5 + 0.1 * np.sin(k):.3f},0.1" for k in range(200)]
+    (tmp_path / "c.csv").write_text("\n".join(["t,command1,command2,command3,command4,p", *rows]))
+    code, out, err = run("inspect", "c.csv")
+    assert (code, err) == (0, "")
+    assert "up to 0.6 of full scale (commands)" in out
+    assert "usable" in out
+
+
+BAD = {
+    "missing": (None, "there is no such file"),
+    "empty": (b"", "is empty"),
+    "text": (b"hello world\n", "row 1"),
+    "bytes": (bytes(range(256)), "not text in UTF-8"),
+    "ulog": (LOGS["ULog"][:14], "ends within its header"),
+    "raw blackbox": (b"H Product:Blackbox flight data recorder\n", "blackbox_decode"),
+    "blackbox": (LOGS["blackbox"][:-9], "row 1501"),
+    "crazyflie": (LOGS["Crazyflie"][:40], "ends within its header"),
+    "nothing flown": (crazyflie([("e", ["a.b(f)"], [0.0, 1.0], np.zeros((2, 1)))]), "no body rates"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_used_exits_with_2_and_one_line(name, run, tmp_path):
+    content, words = BAD[name]
+    if content is not None:
+        (tmp_path / "log").write_bytes(content)
+    refused(run("inspect", "log"), "jaxos4: log: ", words)
+
+
+def test_an_output_that_would_overwrite_the_log_is_refused(run, tmp_path):
+    (tmp_path / "log").write_bytes(LOGS["Crazyflie"])
+    refused(run("inspect", "log", "--out", "log"), "would overwrite an input")
+    assert (tmp_path / "log").read_bytes() == LOGS["Crazyflie"]
+    refused(run("inspect", "log", "--airframe", "nothing.toml"), "nothing.toml")

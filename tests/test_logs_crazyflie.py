@@ -1,0 +1,202 @@
+"""The Crazyflie's micro-SD logs: versions, types, the legacy pitch, and whatever a card may hold."""
+
+import struct
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings, strategies as st
+from recorded_logs import (
+    GRAVITY,
+    RPM,
+    attitude,
+    check,
+    crazyflie,
+    damaged,
+    force,
+    outcome,
+    position,
+    rates,
+    speeds,
+    velocity,
+)
+from scipy.spatial.transform import Rotation
+from test_flight_csv import CRAZYFLIE
+
+from jaxos4.errors import InputError
+from jaxos4.logs import log_format, read_log
+
+GYRO = ["gyro.x(f)", "gyro.y(f)", "gyro.z(f)", "acc.x(f)", "acc.y(f)", "acc.z(f)"]
+STATE = [f"stateEstimate.{name}(f)" for name in ("roll", "pitch", "yaw", "x", "y", "z", "vx", "vy", "vz")]
+MOTORS = [f"motor.m{i}(H)" for i in range(1, 5)]
+RPMS = [f"rpm.m{i}(H)" for i in range(1, 5)]
+
+
+def sensors(t):
+    return np.column_stack([np.rad2deg(rates(t)), force(t) / GRAVITY])
+
+
+def angles(t):
+    """The firmware's angles in degrees, from where the nose and the left wing point: pitch is the nose's, upward."""
+    nose, left = attitude(t)[:, :, 0], attitude(t)[:, :, 1]
+    up = np.arcsin(nose[:, 2])
+    right = np.arctan2(left[:, 2], np.sqrt(1 - nose[:, 2] ** 2 - left[:, 2] ** 2))
+    return np.rad2deg(np.column_stack([right, up, np.arctan2(nose[:, 1], nose[:, 0])]))
+
+
+def state(t):
+    return np.column_stack([angles(t), position(t), velocity(t)])
+
+
+def ratios(t):
+    return np.rint(65535 * (0.3 + 0.1 * np.arange(4) + 0.05 * np.sin(2 * t)[:, None]))
+
+
+def one_event(t, **options):
+    values = np.column_stack([sensors(t), state(t), np.rint(speeds(t) / RPM)])
+    return crazyflie([("fixedFrequency", GYRO + STATE + RPMS, t, values)], **options)
+
+
+T = 0.004 * np.arange(750) + 3.0
+
+
+@pytest.fixture
+def save(tmp_path):
+    def write(content):
+        path = tmp_path / "log00"
+        path.write_bytes(content)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_flight_comes_back_in_our_frame_and_units(version, save):
+    path = save(one_event(T, version=version))
+    assert log_format(path) == "Crazyflie"
+    flight, _ = read_log(path)
+    assert check(flight, start=3.0) == T.size
+    np.testing.assert_allclose(flight.omega[:-1], speeds(np.asarray(flight.time)[:-1] + 3.002), atol=0.6 * RPM)
+
+
+def test_pitch_is_the_legacys(save):
+    flight, _ = read_log(save(one_event(T)))
+    states = np.asarray(flight.states).copy()
+    states[:, 8] *= -1
+    with pytest.raises(AssertionError):
+        check(type(flight)(flight.time, flight.omega, states, flight.specific_force), start=3.0)
+
+
+def test_events_of_other_rates_and_a_quaternion(save):
+    slow, commands = T[::5] + 0.001, T[::2] - 0.003
+    q = Rotation.from_matrix(attitude(slow)).as_quat()
+    events = [
+        ("gyros", GYRO, T, sensors(T)),
+        ("estimate", [f"stateEstimate.q{axis}(f)" for axis in "xyzw"] + ["stateEstimate.z(e)"], slow,
+         np.column_stack([q, position(slow)[:, 2]])),
+        ("motors", MOTORS + ["pm.vbat(f)"], commands, np.column_stack([ratios(commands), np.full(commands.size, 4.0)])),
+        ("never", ["a.b(B)"], np.zeros(0), np.zeros((0, 1))),
+    ]  # fmt: skip
+    flight, notes = read_log(save(crazyflie(events)), CRAZYFLIE)
+    fewest = check(flight, names=("p", "q", "r", "phi", "theta", "psi", "z"), start=3.0, atol=4e-3)
+    assert fewest == pytest.approx(slow.size, abs=2)
+    np.testing.assert_allclose(
+        flight.omega, 2500 * ratios(np.asarray(flight.time) + 3.0) / 65535, atol=2500 * 0.05 * 2 * 0.008
+    )
+    assert any("motor.m1" in note for note in notes)
+    with pytest.raises(InputError, match=r"field motor\.m1: commands say nothing without"):
+        read_log(save(crazyflie(events)))
+
+
+def test_a_log_cut_by_a_loss_of_power_is_read_to_there(save):
+    content = one_event(T)
+    for cut in (content[:-4], content[: len(content) * 2 // 3]):
+        flight, notes = read_log(save(cut))
+        assert any("no valid checksum" in note for note in notes)
+        check(flight, start=3.0, seconds=1.9)
+    assert not any("checksum" in note for note in read_log(save(content))[1])
+
+
+HEADER = struct.pack("<BHH", 0xBC, 2, 1) + b"\0\0fixedFrequency\0"
+BAD = {
+    "one byte": (b"\xbc", "ends within its header"),
+    "other version": (b"\xbc\x07\0\x01\0", "is of version 7"),
+    "no types": (b"\xbc\x02\0\0\0", "announces 0 event types"),
+    "many types": (b"\xbc\x02\0\xff\xff", "announces 65535 event types"),
+    "many variables": (HEADER + b"\xff\xff", "announces 65535 variables"),
+    "no type": (HEADER + b"\x01\0gyro.x\0" + bytes(60), "'gyro.x' that is none"),
+    "no name": (HEADER + b"\x01\0" + b"g" * 500, "ends within its header, or is corrupt"),
+    "twice": (HEADER + b"\x02\0a.b(f)\0a.b(f)\0", "twice"),
+    "no event": (HEADER + b"\x01\0a.b(f)\0" + b"\x07\0" + bytes(60), "no event begins there"),
+    "nothing": (crazyflie([("e", GYRO, np.zeros(0), np.zeros((0, 6)))]), "holds no events"),
+    "no gyro": (crazyflie([("e", MOTORS, T, ratios(T))]), "holds no body rates"),
+    "no motors": (crazyflie([("e", GYRO, T, sensors(T))]), "holds no rotor speeds or commands"),
+    "apart": (
+        crazyflie([("e", GYRO, T, sensors(T)), ("m", MOTORS, T + 60, ratios(T))]),
+        "not logged at the same time",
+    ),
+    "too fast": (
+        crazyflie([("e", GYRO + MOTORS, T, np.column_stack([99 * sensors(T), ratios(T)]))]),
+        "rad/s, beyond 60 rad/s; the log is corrupt there",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_a_log_may_not_be(name, save):
+    content, words = BAD[name]
+    result = outcome(lambda path: read_log(path, CRAZYFLIE), save(content))
+    assert isinstance(result, str)
+    assert words in result
+
+
+def test_time_that_runs_backward_is_told(save):
+    t = T.copy()
+    content = bytearray(crazyflie([("e", GYRO + MOTORS, t, np.column_stack([sensors(t), ratios(t)]))], checksum=False))
+    size, begin = 2 + 8 + 4 * 6 + 2 * 4, len(content) - T.size * 42
+    for row in range(100):
+        content[begin + size * row + 2 : begin + size * row + 10] = struct.pack("<Q", 99_000_000 - row)
+    assert "time runs backward" in str(outcome(lambda path: read_log(path, CRAZYFLIE), save(bytes(content))))
+
+
+def test_many_empty_events_cost_little(save):
+    path = save(HEADER + b"\0\0" + bytes(10) * 200_000)
+    tracemalloc.start()
+    begin = time.perf_counter()
+    assert isinstance(outcome(read_log, path), str)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6
+    assert time.perf_counter() - begin < 10
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return tmp_path_factory.mktemp("crazyflie") / "log00"
+
+
+SMALL = one_event(T[:25])
+ACCIDENTS = st.lists(
+    st.tuples(
+        st.sampled_from(["cut", "flip", "flip", "insert", "drop", "zeros"]), st.floats(0, 1), st.integers(0, 999)
+    ),
+    max_size=4,
+)
+
+
+@given(accidents=ACCIDENTS)
+@settings(max_examples=150)
+@example(accidents=[])
+def test_damaged_logs(accidents, path):
+    path.write_bytes(damaged(SMALL, accidents))
+    result = outcome(read_log, path)
+    if not accidents:
+        assert not isinstance(result, str)
+
+
+@given(junk=st.binary(max_size=300), keep=st.integers(1, 60))
+@settings(max_examples=80)
+def test_arbitrary_bytes_after_the_magic(junk, keep, path):
+    path.write_bytes(SMALL[:keep] + junk)
+    assert isinstance(outcome(read_log, path), str)
