@@ -74,5 +74,6 @@ from .robust import winsorised as winsorised
 from .shooting import ShootingProblem as ShootingProblem
 from .simulate import simulate as simulate
 from .validation import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
+from .vehicle import VehicleFit as VehicleFit, fit_vehicle as fit_vehicle
 
 __version__ = _version("jaxos4")

@@ -390,12 +390,22 @@ def _known(values: tuple[Scalar, ...] | None, what: str) -> tuple[Scalar, ...]:
 
 
 def _delayed(omega: RotorSpeeds, samples: Scalar, first: Int[Array, "..."], last: Int[Array, "..."]) -> RotorSpeeds:
-    """Held commands `samples` later, as means over each sample; before the first of a stretch, that one holds."""
+    """Commands `samples` later, between samples by cubics that join smoothly (Catmull and Rom 1974).
+
+    A delay of whole samples is exact, and the derivative in the delay has no jumps that a search could end at. What a
+    stretch does not hold is its first command, or its last.
+    """
     whole = jnp.floor(jax.lax.stop_gradient(samples))
-    share = samples - whole
+    f = samples - whole
     index = jnp.arange(omega.shape[0]) - whole.astype(int)
-    newer, older = (omega[jnp.clip(i, first, last)] for i in (index, index - 1))
-    return newer + share * (older - newer)
+    weights = (
+        f * (-0.5 + f - f * f / 2),
+        1 + f * f * (1.5 * f - 2.5),
+        f * (0.5 + 2 * f - 1.5 * f * f),
+        f * f * (f - 1) / 2,
+    )
+    taps = [omega[jnp.clip(index + ahead, first, last)] for ahead in (1, 0, -1, -2)]
+    return sum((weight * tap for weight, tap in zip(weights, taps, strict=True)), jnp.zeros_like(omega))
 
 
 def _filtered(omega: RotorSpeeds, decay: Scalar, first: Int[Array, "..."]) -> tuple[RotorSpeeds, RotorSpeeds]:

@@ -209,7 +209,8 @@ class IBSS(AbstractEstimator):
         whole = as_float(1.0)
         if self.directions == "coordinate":
             return fit(problem.channels, progress, whole)
-        shares = jnp.asarray((*_HORIZONS, 1.0), dtype=float)
+        # A flight cut into windows is short enough as it is.
+        shares = jnp.asarray((*_HORIZONS, 1.0) if problem.windows == 1 else (1.0,), dtype=float)
         # One scan, so that the search against the rates is compiled once.
         progress, curvatures = jax.lax.scan(lambda p, share: fit("rates", p, share), progress, shares)
         curvature = jax.tree.map(lambda c: c[-1], curvatures)
