@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._custom_types import Key, Parameters, Scalar, States, as_float
+from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
 from ..estimators import BASELINES, IBSS, AbstractEstimator, Estimate, Hybrid, NetworkEstimator, TrainedNetwork
@@ -133,6 +133,13 @@ def program_of(study: Study, cell: Cell) -> tuple:
     return scenario, job_of(study, scenario) if scenario.estimator in NETWORKED else None
 
 
+def truth_of(study: Study, cell: Cell) -> np.ndarray:
+    """The true parameters of a cell's flights: known even where no estimator could be run."""
+    with jax.enable_x64(study.precision == "float64"):
+        truths = _truths(_fleet(study, cell.scenario), *_draws(study, cell), drawn=study.truth == "drawn")
+        return np.asarray(truths)[: study.flights - cell.first]
+
+
 class _Flown(NamedTuple):
     truth: Float[Array, "lanes parameters"]
     exact: Float[Array, "lanes samples 12"]
@@ -199,32 +206,49 @@ def _flights(
     """True parameters, true states and measured states of a cell."""
     return _measured(
         fleet,
-        cell.first + jnp.arange(study.batch),
+        *_draws(study, cell),
         as_float(cell.scenario.scale),
-        jax.random.fold_in(jax.random.key(study.seed), 1),
         method=cell.scenario.method,
         kind=cell.scenario.noise,
         drawn=study.truth == "drawn",
     )
 
 
+def _draws(study: Study, cell: Cell) -> tuple[Int[np.ndarray, " lanes"], Key]:
+    """The numbers of a cell's flights, and the key that each folds its own into."""
+    return cell.first + np.arange(study.batch), jax.random.fold_in(jax.random.key(study.seed), 1)
+
+
+def _truth(fleet: _Fleet, key: Key, drawn: bool) -> Parameters:
+    truth = fleet.model.alpha
+    if not drawn:
+        return truth
+    u = jax.random.uniform(key, truth.shape, minval=-1, maxval=1, dtype=float)
+    return fleet.bracket.center + u * fleet.bracket.half_width
+
+
+@eqx.filter_jit
+def _truths(
+    fleet: _Fleet, numbers: Int[Numeric, " lanes"], key: Key, *, drawn: bool
+) -> Float[Array, "lanes parameters"]:
+    """True parameters alone, from the draws that `_measured` makes."""
+    return jax.vmap(lambda number: _truth(fleet, jax.random.split(jax.random.fold_in(key, number))[0], drawn))(numbers)
+
+
 @eqx.filter_jit
 def _measured(
-    fleet: _Fleet, numbers: Int[Array, " lanes"], scale: Scalar, key: Key, *, method: str, kind: str, drawn: bool
+    fleet: _Fleet, numbers: Int[Numeric, " lanes"], key: Key, scale: Scalar, *, method: str, kind: str, drawn: bool
 ) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes samples 12"], Float[Array, "lanes samples 12"]]:
     """True parameters, true states and measured states."""
 
     def one(number: Int[Array, ""]) -> tuple[Parameters, States, States]:
         truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
-        truth = fleet.model.alpha
-        if drawn:
-            u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
-            truth = fleet.bracket.center + u * fleet.bracket.half_width
+        truth = _truth(fleet, truth_key, drawn)
         exact = simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method)
         noisy = NOISES[kind](scale * SENSOR_SIGMA)(exact, key=noise_key)
         return truth, exact.states, noisy.states
 
-    return jax.vmap(one)(numbers)
+    return jax.vmap(one)(jnp.asarray(numbers))
 
 
 @eqx.filter_jit
