@@ -56,7 +56,7 @@ def table_of(title: str, headings: Iterable[str]) -> Table:
 @eqx.filter_jit
 def measure(noise: AbstractNoise, exact: Flight, keys: Keys[Array, " flights"]) -> Float[Array, "flights samples 12"]:
     """What noisy sensors make of a flight, for each key."""
-    return jax.vmap(lambda key: noise(exact, key=key).states)(keys)
+    return jax.lax.map(lambda key: noise(exact, key=key).states, keys)
 
 
 @eqx.filter_jit

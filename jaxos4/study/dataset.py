@@ -157,15 +157,12 @@ def _brackets(study: Study) -> dict:
     """The bracket that all searches and networks of a model, an airframe and a width get."""
     shape = [len(study.models), len(study.airframes), len(study.widths)]
     brackets = [bracket_of(study, *which) for which in itertools.product(study.models, study.airframes, study.widths)]
+    lower, upper = (np.stack([getattr(b, end) for b in brackets]).reshape(*shape, -1) for end in ("lower", "upper"))
     dims = ("model", "airframe", "width", "parameter")
-    with jax.enable_x64(study.precision == "float64"):  # middle and half-width are computed when they are asked for
-        return {
-            name: (dims, np.stack([getattr(b, part) for b in brackets]).reshape(*shape, -1), _named(what, "unit"))
-            for name, part, what in (
-                ("center", "center", "middle of the bracket"),
-                ("bracket_half_width", "half_width", "half the width of the bracket"),
-            )
-        }
+    return {
+        "center": (dims, (lower + upper) / 2, _named("middle of the bracket", "unit")),
+        "bracket_half_width": (dims, (upper - lower) / 2, _named("half the width of the bracket", "unit")),
+    }
 
 
 def _seen(study: Study) -> dict:
