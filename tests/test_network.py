@@ -71,6 +71,7 @@ def names(estimates):
 # Features.
 
 
+@eqx.filter_jit
 def features_of(kind, free=False):
     problem = problem_of(free=free)
     return FEATURES[kind].of(problem, Coordinates.of(problem, BRACKET, jnp.asarray(1.0)))
@@ -98,9 +99,10 @@ def test_simulated_noise_is_that_of_noisy_flights(kind):
     noise = jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
     keys = jax.random.split(jax.random.key(3), count)
     exact = standard_flight(duration=DURATION)
-    measured = jax.vmap(lambda k: features(problem_of(noise(exact, key=k).states)).values)(keys)
+    see = eqx.filter_jit(lambda features, k: features(problem_of(noise(exact, key=k).states)).values)
+    draw = eqx.filter_jit(lambda features, k: features.simulated(u, jnp.asarray(scale), key=k))
     u = jnp.zeros(features.coordinates.center.shape)
-    drawn = jax.vmap(lambda k: features.simulated(u, jnp.asarray(scale), key=k))(keys)
+    measured, drawn = (jax.lax.map(lambda k, one=one: one(features, k), keys) for one in (see, draw))
     picked = slice(None) if kind == "score" else slice(300, 308)
     measured, drawn = np.asarray(measured)[:, picked], np.asarray(drawn)[:, picked]
     unit = np.sqrt(np.diagonal(np.cov(drawn.T)))
