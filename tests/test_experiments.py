@@ -14,7 +14,7 @@ from jaxos4.study import load_study
 
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 # Of which a study is all there is to run.
-STUDIES = ("comparison", "noise_study", "noise_kinds")
+STUDIES = ("comparison", "noise_study", "noise_kinds", "scale")
 WITH_FIGURES = (*STUDIES, "frontier", "rollout_budget", "published_corrected", "inverse_crime", "bracket_and_seeds")
 
 
@@ -178,6 +178,14 @@ def test_noise_kinds(tmp_path):
     assert (covered["coverage"].sel(noise=["coloured", "biased"]) < covered["low"].sel(noise="white")).all()
     # A tenth of the samples lost costs about a twentieth of the precision, and is told.
     assert float(covered["high"].sel(noise="lossy")) > 0.95
+
+
+def test_scale(tmp_path):
+    data = study("scale", tmp_path)
+    efficiency, covered = metrics.efficiency(data), metrics.mean_coverage(data).sel(level=0.95)["coverage"]
+    # Of 128 flights, each of eight parameters within five Monte-Carlo errors of the bound.
+    assert (abs(efficiency["efficiency"] - 1) < 5 / np.sqrt(2 * 128)).all()
+    assert (abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 128)).all()
 
 
 def test_frontier(tmp_path):
