@@ -62,8 +62,11 @@ def dataset(whole):
 @pytest.mark.parametrize(
     ("text", "key"),
     [
-        ("flites = 3", "flites"),
-        ('flights = "many"', "flights"),
+        ("flites = 3", "knows no key `flites`; there are title, models,"),
+        ('flights = "many"', "`flights`: expected a whole number, got a string; correct it there."),
+        ("network = 3", "`network`: expected a table, got a whole number"),
+        ("network = { layers = 3 }", "[network]: knows no key `layers`; there are features,"),
+        ('network = { features = "all" }', "`network.features` knows no 'all'; choose from score, raw"),
         ("flights = 1.5", "flights"),
         ("flights = 0", "flights"),
         ('models = "published"', "models"),
@@ -75,7 +78,7 @@ def dataset(whole):
         ('noises = ["pink"]', "noises"),
         ('channels = ["smell"]', "channels"),
         ('estimators = ["oracle"]', "estimators"),
-        ('truth = "guess"', "truth"),
+        ('truth = "guess"', "`truth` knows no 'guess'; choose from airframe, drawn"),
         ('initial_state = "hidden"', "initial_state"),
         ('precision = "float16"', "precision"),
         ("scales = []", "`scales` is empty"),
