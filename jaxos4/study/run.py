@@ -121,24 +121,25 @@ def run_here(store: Store) -> Iterator[Step]:
     """
     work, free = _Work(store), deque(jax.local_devices())
     running: dict[concurrent.futures.Future, tuple[Any, _Task]] = {}
-    with concurrent.futures.ThreadPoolExecutor(len(free)) as pool:
-        try:
-            while True:
-                for device in tuple(free):
-                    if (task := work.task(device)) is not None:
-                        free.remove(device)
-                        running[pool.submit(task.call, device)] = device, task
-                yield Step(work.done, ", ".join(dict.fromkeys(task.label for _, task in running.values())))
-                if not running:
-                    return
-                finished, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
-                for future in finished:
-                    device, task = running.pop(future)
-                    free.append(device)
-                    _give_memory_back()
-                    task.keep(future.result())
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    pool = concurrent.futures.ThreadPoolExecutor(len(free))
+    try:
+        while True:
+            for device in tuple(free):
+                if (task := work.task(device)) is not None:
+                    free.remove(device)
+                    running[pool.submit(task.call, device)] = device, task
+            yield Step(work.done, ", ".join(dict.fromkeys(task.label for _, task in running.values())))
+            if not running:
+                return
+            finished, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+            for future in finished:
+                device, task = running.pop(future)
+                free.append(device)
+                _give_memory_back()
+                task.keep(future.result())
+    finally:
+        # Who ends it early does not wait for what is at work, a training of minutes maybe: nothing of that is kept.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _compile(study: Study, cell: Cell, device: Any) -> None:
