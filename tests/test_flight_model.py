@@ -1,4 +1,4 @@
-"""`FlightModel`: each term against its equation written a second time, the filter and the delay, derivatives, estimates.
+"""`FlightModel`: each term against its equation written a second time, filter and delay, derivatives, estimates.
 
 The reference is plain NumPy in continuous time: commands held, rotors and body integrated together in small steps.
 """
@@ -64,9 +64,7 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
     v["thrust_gain"] = values["thrust_gain"] if "accelerometer" in terms else 1.0
     v["ax_bias"], v["ay_bias"] = ((values[n] if {"accelerometer", "drag"} <= set(terms) else 0.0) for n in NAMES_XY)
     a1, a2, a3, a4, a5, a6, a7, a8 = np.asarray(jaxos4.CorrectedOS4(airframe).alpha)
-    b, d, m, g = (
-        float(getattr(airframe, n)) for n in ("thrust_coefficient", "drag_coefficient", "mass", "gravity")
-    )
+    b, d, m, g = (float(getattr(airframe, n)) for n in ("thrust_coefficient", "drag_coefficient", "mass", "gravity"))
     (x, y), spin = np.asarray(airframe.rotor_positions).T, np.asarray(airframe.rotor_spins)
     curve = values["thrust_curve"] if "curve" in terms else 1.0
     full = float(airframe.max_rotor_speed)
@@ -411,7 +409,9 @@ def test_the_truth_is_found_without_noise(estimator):
     problem = two_flights(jaxos4.FlightModel(FULL, terms=terms, recordings=(0, 1)), seconds=4.0)
     model, values = problem.model, truth(problem.model)
     # The bracket reaches from the truth to 60 % of its half-width.
-    bracket = jaxos4.Bracket.around(values + 0.4 * jnp.cos(jnp.arange(values.size)) * model.half_width, model.half_width)
+    bracket = jaxos4.Bracket.around(
+        values + 0.4 * jnp.cos(jnp.arange(values.size)) * model.half_width, model.half_width
+    )
     found = estimator(problem, bracket)
     assert np.all(np.abs(found.parameters - values) < 1e-5 * model.half_width)
     # Which holds the offsets of two recordings that differ.

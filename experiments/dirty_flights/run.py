@@ -1,9 +1,10 @@
 """How often 95 % intervals hold the truth where flights are dirty: rotors that lag, commands late, vibration, colour.
 
 Each flight is flown at 1 kHz by Runge-Kutta with a truth of its own: rotors that follow their commands with a lag of
-60 ms, 8 ms late, offsets and damping. Its gyro and accelerometer show coloured noise, the rotors' vibration and rounding,
-and lose samples, alone and in bursts. What was recorded is averaged to 4 ms, cut into windows of a quarter of a second,
-and fitted by `fit_vehicle`, whose intervals are asked for the truth. Parameters that a fit holds are not counted.
+60 ms, 8 ms late, offsets and damping. Its gyro and accelerometer show coloured noise, the rotors' vibration and
+rounding, and lose samples, alone and in bursts. What was recorded is averaged to 4 ms, cut into windows of a quarter of
+a second, and fitted by `fit_vehicle`, whose intervals are asked for the truth. Parameters that a fit holds are not
+counted.
 """
 
 import json
@@ -173,9 +174,7 @@ def summary(flights: list[dict]) -> dict[str, dict]:
                 "bias": float(scaled.mean()),
                 "spread": float(scaled.std(ddof=1)) if len(told) > 1 else None,
                 "mean_error": float(errors.mean()),
-                "claimed_over_bound": float(
-                    np.median([f["half_width"][name] / 1.96 / f["bound"][name] for f in told])
-                ),
+                "claimed_over_bound": float(np.median([f["half_width"][name] / 1.96 / f["bound"][name] for f in told])),
             }
     return rows
 
@@ -205,7 +204,16 @@ def main(
                 out.write_text(json.dumps(report, indent=2) + "\n")
         seconds = float(np.median([flight["seconds"] for flight in found]))
         table = Table(title=f"95 % intervals of {flights} flights of {duration:g} s, {name}, {seconds:.1f} s a fit")
-        for heading in ("parameter", "told by", "covered [%]", "+-", "bias [std]", "spread [std]", "mean error", "/ CRB"):
+        for heading in (
+            "parameter",
+            "told by",
+            "covered [%]",
+            "+-",
+            "bias [std]",
+            "spread [std]",
+            "mean error",
+            "/ CRB",
+        ):
             table.add_column(heading)
         for parameter, row in rows[name]["summary"].items():
             table.add_row(
