@@ -34,11 +34,11 @@ class HeldParameters(AbstractModel):
         """Which of the whole model's parameters are left."""
         return np.delete(np.arange(len(self.model.parameter_names)), list(self.held))
 
-    def without(self, values: Parameters) -> Parameters:
+    def without(self, values: Float[Array, " whole"]) -> Float[Array, " free"]:
         """Of one value for each parameter of the whole model, those of the ones that are left."""
         return values[self.free]
 
-    def complete(self, parameters: Parameters) -> Parameters:
+    def complete(self, parameters: Float[Array, " free"]) -> Float[Array, " whole"]:
         """The whole model's parameters."""
         whole = jnp.zeros(len(self.model.parameter_names), dtype=float)
         return whole.at[self.free].set(parameters).at[np.asarray(self.held, dtype=int)].set(self.values)
