@@ -134,4 +134,5 @@ def hold(model: AbstractModel, values: Mapping[str, Float[Array, ""] | float]) -
         wrong = f"knows no {unknown[0]}" if unknown else "leaves no parameter to estimate"
         raise ValueError(f"`values` {wrong}; the parameters are {', '.join(names)}.")
     held = tuple(i for i, name in enumerate(names) if name in values)
-    return HeldParameters(model, held=held, values=jnp.stack([as_float(values[names[i]]) for i in held]))
+    known = [as_float(values[names[i]]) for i in held]
+    return HeldParameters(model, held=held, values=jnp.stack(known) if known else jnp.zeros(0))
