@@ -20,7 +20,7 @@ RATES = "pqr"
 AHEAD = 0.25
 NINETY_FIVE = 1.96
 # What the skill's bars are of: the name in the results, and in the legend.
-REGRESSION = "memory 1, lag of shooting", "memory 0, own lag"
+REGRESSION = "memory 0, alone", "memory 0.9, lag of shooting, holds what shooting held"
 SHOOTING = ("ibss", "output-error", "hybrid")
 
 

@@ -163,9 +163,9 @@ def hybrid_for(fit: jaxos4.VehicleFit, steps: int) -> jaxos4.Hybrid:
 
 
 def estimators(parts: tuple[list, list], steps: int, names: list[str]) -> Iterator[tuple[str, dict, tuple]]:
-    """IBSS in stages, output error and the hybrid on its last one; and IBSS without `flapping`."""
+    """IBSS in stages; the others, and IBSS with nothing held, on its last problem; IBSS without `flapping`."""
     fit, seconds = fitted(problem_of(parts[0], TERMS))
-    for name in ("ibss", *names, "ibss without flapping"):
+    for name in ("ibss", *names, "ibss, nothing held", "ibss without flapping"):
         terms, extra, used = TERMS, {}, fit
         if name == "output-error":
             used, seconds = again(fit, jaxos4.OutputError())
@@ -176,7 +176,10 @@ def estimators(parts: tuple[list, list], steps: int, names: list[str]) -> Iterat
             used, seconds = again(fit, hybrid)
             at, seed = used.estimate.parameters, used.estimate.seed
             extra["seed_held_the_answer"] = bool(((at > seed.lower) & (at < seed.upper)).all())
-        elif name != "ibss":
+        elif name == "ibss, nothing held":
+            free = eqx.tree_at(lambda p: p.model, fit.problem, problem_of(parts[0], TERMS).model)
+            used, seconds = again(fit._replace(problem=free, held={}), jaxos4.IBSS())
+        elif name == "ibss without flapping":
             terms = without(TERMS, "flapping")
             used, seconds = fitted(problem_of(parts[0], terms))
         values, table = described(used, seconds)
@@ -202,46 +205,52 @@ def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
 
 
 def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predictions, parts: tuple[list, list]) -> dict:
-    """Equation error with the same terms: with the lag and delay of shooting, and with those that it would choose."""
+    """Equation error with the same terms: alone, and with what shooting found out about lag, delay and what to hold.
+
+    Alone it takes the lag and the delay that leave least of each sample's change of the rates, and holds nothing.
+    """
     whole = problem_of(parts[0], without(TERMS, "accelerometer"))
     bare = eqx.tree_at(lambda p: p.sigma, whole, fit.problem.sigma[:12])
+    of_shooting = {name: value for name, (value, _) in fit.held.items() if name in whole.model.parameter_names}
 
-    def regress(memory: float, lag: float, delay: float, *, bare: jaxos4.ShootingProblem = bare):
-        held = {name: value for name, (value, _) in fit.held.items() if name in whole.model.parameter_names}
-        held |= {"rotor_lag": lag, "rotor_delay": delay}
+    def regress(memory: float, held: Values, *, bare: jaxos4.ShootingProblem = bare):
         model = jaxos4.hold(whole.model, held)
         problem = eqx.tree_at(lambda p: p.model, bare, model)
         found = jaxos4.EquationError(memory=memory)(problem, jaxos4.Bracket.default(model))
         return problem, found, dict(zip(model.parameter_names, found.parameters.tolist(), strict=True)) | held
 
-    def left_out(memory: float, lag: float, delay: float) -> dict[str, float]:
+    def left_out(memory: float, held: Values) -> Values:
         """Standard deviations by leaving out a tenth of the flight at a time: what the model lacks is in them."""
         some = []
         for part in np.array_split(np.arange(bare.flight.time.shape[0]), PARTS):
             states = bare.flight.states.at[part].set(jnp.nan)
-            some.append(regress(memory, lag, delay, bare=eqx.tree_at(lambda p: p.flight.states, bare, states))[2])
-        return {
-            name: float(np.sqrt((PARTS - 1) * np.var([values[name] for values in some]))) for name in INERTIAS.values()
-        }
+            some.append(regress(memory, held, bare=eqx.tree_at(lambda p: p.flight.states, bare, states))[2])
+        return {alpha: float(np.sqrt((PARTS - 1) * np.var([x[alpha] for x in some]))) for alpha in INERTIAS.values()}
 
     grid = []
     for lag in (0.01, *LAGS):
         for delay in DELAYS:
-            problem, found, values = regress(0.0, lag, delay)
+            problem, found, values = regress(0.0, {"rotor_lag": lag, "rotor_delay": delay})
             row = {"lag": lag, "delay": delay, "one_step": one_step(problem, found.parameters)}
             grid.append(row | {name: 1 / values[alpha] for name, alpha in INERTIAS.items()})
     best = min(grid, key=lambda row: row["one_step"])
-    choices = {"lag of shooting": (shot["rotor_lag"], shot["rotor_delay"]), "own lag": (best["lag"], best["delay"])}
+    own = {"rotor_lag": best["lag"], "rotor_delay": best["delay"]}
+    its = {name: shot[name] for name in own}
+    choices = {
+        "alone": own,
+        "own lag, holds what shooting held": own | of_shooting,
+        "lag of shooting": its,
+        "lag of shooting, holds what shooting held": its | of_shooting,
+    }
     rows = {}
-    for choice, (lag, delay) in choices.items():
+    for choice, held in choices.items():
         for memory in MEMORIES:
-            values = regress(memory, lag, delay)[2]
+            values = regress(memory, held)[2]
             predicted = predict(values, parts[1])
             rows[f"memory {memory:g}, {choice}"] = {
-                "lag": lag,
-                "delay": delay,
                 "values": values,
-                "inertias": inertias(values, left_out(memory, lag, delay)),
+                "held": sorted(held),
+                "inertias": inertias(values, left_out(memory, held)),
                 "skill": worth(predicted),
                 "ibss_minus_this": difference(reference, predicted),
             }
