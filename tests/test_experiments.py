@@ -257,3 +257,38 @@ def test_bracket_and_seeds(tmp_path):
     # The rates are nearly linear in the parameters: the network loses little, and less in a narrower bracket.
     network = accuracy.sel(estimator="network")
     assert float(network.sel(width=0.5)) < min(1.5, float(network.sel(width=2.0)))
+
+
+def test_real_flight(shared_flights, tmp_path):
+    load("real_flight").main(
+        flights=shared_flights,
+        out=tmp_path / "out",
+        seconds=11.0,
+        names=[],
+        lags=[0.03, 0.06],
+        sections=["lag"],
+    )
+    plot("real_flight", tmp_path / "out", tmp_path / "figures")
+    report = json.loads((tmp_path / "out" / "results.json").read_text())
+    shot = report["estimators"]["ibss"]
+    # 5 s are fitted, the next 5 s predicted. A quarter of a second ahead that is better than no change in roll and
+    # pitch, and without the moment that goes with the air's flow it is worse.
+    at = int(np.argmin(np.abs(np.array(shot["skill"]["horizons"]) - 0.25)))
+    without = report["estimators"]["ibss without flapping"]["skill"]
+    for rate in "pq":
+        assert shot["skill"][rate]["skill"][at] > 0
+        assert shot["skill"][rate]["skill"][at] > without[rate]["skill"][at]
+    # The inertias lie between the authors' figures and twice regression's, and depend on the lag that is held.
+    for name, value in report["authors"].items():
+        assert value < shot["inertias"][name]["estimate"] < 4.4e-5
+        low, high = (row["inertias"][name] for row in report["lag"])
+        assert abs(low["estimate"] - high["estimate"]) > np.ptp(low["ci95"]) / 4
+
+
+def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
+    monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
+    with pytest.raises(SystemExit, match="--flights: no arpl_crazyflie_rollpitch.csv in None: give"):
+        load("real_flight").main(out=tmp_path / "out")
+    with pytest.raises(SystemExit, match="--flights"):
+        load("real_flight").main(flights=tmp_path, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()

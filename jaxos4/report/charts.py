@@ -37,7 +37,7 @@ def charts(data: xr.Dataset) -> Iterator[tuple[str, dict[str, Any]]]:
     ):
         chart = make(data)
         if chart is not None:
-            yield name, _without_nan(chart)
+            yield name, without_nan(chart)
 
 
 def _error(data: xr.Dataset) -> dict[str, Any] | None:
@@ -184,14 +184,14 @@ def _log(values: xr.DataArray) -> dict[str, Any]:
     return {"type": "log", "dense": bool(span < _DENSE)}
 
 
-def _without_nan(x: Any) -> Any:
+def without_nan(x: Any) -> Any:
     """For JSON: lists and numbers, with null for what is not finite."""
     if isinstance(x, dict):
-        return {key: _without_nan(value) for key, value in x.items()}
+        return {key: without_nan(value) for key, value in x.items()}
     if isinstance(x, np.ndarray):
-        return _without_nan(x.tolist())
+        return without_nan(x.tolist())
     if isinstance(x, list | tuple):
-        return [_without_nan(value) for value in x]
+        return [without_nan(value) for value in x]
     if isinstance(x, float):
         return float(f"{x:.6g}") if math.isfinite(x) else None
     return x.item() if isinstance(x, np.generic) else x

@@ -68,12 +68,12 @@
     const spec = specs[box.dataset.chart];
     const panels = spec.choices[Number(box.dataset.choice || spec.chosen)].panels;
     const width = box.clientWidth;
-    const columns = Math.min(panels.length, width >= 900 ? 4 : width >= 560 ? 2 : 1);
+    const columns = Math.min(panels.length, spec.columns || 4, width >= 900 ? 4 : width >= 560 ? 2 : 1);
     const rows = Math.ceil(panels.length / columns);
     const above = 24;
     // Room for the axis' title and for the legend, which takes more lines where there is less width.
     const legend = panels.some((panel) => panel.traces.some((trace) => trace.type !== "box"));
-    const below = 52 + (legend ? 22 * Math.ceil((145 * (toggles.length + 2)) / width) : 0);
+    const below = 52 + (legend ? 22 * Math.ceil((145 * (spec.entries || toggles.length + 2)) / width) : 0);
     const layout = {
       height: spec.height * rows + above + below,
       margin: { l: 48, r: 8, t: above, b: below },

@@ -36,7 +36,7 @@ def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once
     shown = [_section(scenario, drawn, interactive) for scenario, drawn in sections]
     missing, cells = tables.cells_not_run(dataset)
     return (
-        _environment()
+        environment()
         .get_template("template.html.j2")
         .render(
             title=attributes.get("title", "") or "A study",
@@ -51,7 +51,7 @@ def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once
             cells=cells,
             drawn=sum(bool(drawn) for _, drawn in sections),
             zero_scale=bool((dataset["scale"] == 0).any()),
-            charts=_script_json(interactive),
+            charts=script_json(interactive),
             plotly=Markup(get_plotlyjs().replace("</script", "<\\/script")),  # noqa: S704, the package's own script
         )
     )
@@ -103,13 +103,14 @@ def _indented(specification: str) -> str:
     return "{\n" + ",\n".join(lines) + "\n}"
 
 
-def _script_json(x: Any) -> Markup:
+def script_json(x: Any) -> Markup:
     """JSON that cannot end the script that it stands in."""
     text = json.dumps(x, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))  # noqa: S704
 
 
-def _environment() -> jinja2.Environment:
+def environment() -> jinja2.Environment:
+    """Of the templates beside this file."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("jaxos4.report", "."),
         autoescape=True,

@@ -1,0 +1,360 @@
+"""A real Crazyflie: fitted on one part of a flight, tested on another, beside regression and its authors' figures.
+
+Blocks of 5 s of the roll and pitch flight, from 1 s on: the 1st, 3rd, ... are fitted, the 2nd, 4th, ... tested, the
+same for all estimators. Predictions use the recorded commands, and with `flapping` the recorded specific force along x
+and y as well, as inputs: they say what the vehicle does next, given these, not what a simulator would do without them.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+
+import jaxos4
+from jaxos4.flight import STATE_NAMES
+from jaxos4.logs import Stretch, cut, read_log, usable_stretches
+from jaxos4.logs.resample import average
+
+jax.config.update("jax_enable_x64", True)
+
+AIRFRAME = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
+AUTHORS = {"Ix": 1.03e-5, "Iy": 1.11e-5}
+TERMS = ("offset", "damping", "flapping", "lag", "delay", "reaction", "accelerometer")
+FLIGHTS = ("rollpitch", "yaw_a", "yaw_b", "hover")
+HORIZONS = (0.05, 0.1, 0.25, 0.5)
+MEMORIES = (0.0, 0.9, 1.0)
+LAGS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09)
+DELAYS = (0.0, 0.004, 0.008, 0.012, 0.016, 0.02)
+# Sample time, window, the first block's begin, and the blocks' length [s].
+DT, WINDOW, BEGIN, BLOCK = 0.004, 0.25, 1.0, 5.0
+# Of the flight, one of which at a time is left out for errors of differences and of regressions: as in `jaxos4.skill`.
+PARTS = 10
+SECTIONS = ("regression", "lag", "joint")
+NINETY_FIVE = 1.96
+INERTIAS = {"Ix": "alpha3", "Iy": "alpha6"}
+
+Values = dict[str, float]
+
+
+def read(folder: Path, name: str) -> jaxos4.Flight:
+    """A flight, averaged to samples of 4 ms: vibration is above what these can hold."""
+    flight, _ = read_log(folder / f"arpl_crazyflie_{name}.csv", AIRFRAME)
+    rows = (np.asarray(values) for values in (flight.time, flight.omega, flight.channels))
+    t, omega, channels = average(*rows, DT)
+    return jaxos4.Flight(t, omega, channels[:, : len(STATE_NAMES)], channels[:, len(STATE_NAMES) :])
+
+
+def blocks(flight: jaxos4.Flight, seconds: float) -> tuple[list[jaxos4.Flight], list[jaxos4.Flight]]:
+    """What is fitted, and what is tested."""
+    count = int((min(float(flight.time[-1]), seconds) - BEGIN) / BLOCK)
+    begins = BEGIN + BLOCK * np.arange(count)
+    parts = [cut(flight, Stretch(float(begin), float(begin) + BLOCK - DT)) for begin in begins]
+    return parts[::2], parts[1::2]
+
+
+def problem_of(
+    parts: list[jaxos4.Flight], terms: tuple[str, ...], recordings: tuple[int, ...] | None = None
+) -> jaxos4.ShootingProblem:
+    """Parts of flights, cut into windows."""
+    length = round(WINDOW / DT)
+    flight = jaxos4.join(parts, length=length)
+    model = jaxos4.FlightModel(AIRFRAME, terms=terms, recordings=recordings or (0,) * len(parts))
+    windows, sigma = flight.time.shape[0] // length, np.full(12, 0.5)
+    return jaxos4.ShootingProblem(model, flight, sigma=sigma, channels="rates", method="rk4", windows=windows)
+
+
+def without(terms: tuple[str, ...], *left_out: str) -> tuple[str, ...]:
+    """The terms that remain."""
+    return tuple(term for term in terms if term not in left_out)
+
+
+def predict(values: Values, parts: list[jaxos4.Flight], terms: tuple[str, ...] = TERMS) -> jaxos4.Predictions:
+    """Of a vehicle with these parameters, over parts of flights."""
+    problem = problem_of(parts, without(terms, "accelerometer"))
+    parameters = jnp.asarray([values[name] for name in problem.model.parameter_names])
+    return jaxos4.predictions(problem, parameters, horizons=HORIZONS)
+
+
+def difference(one: jaxos4.Predictions, other: jaxos4.Predictions) -> dict[str, Any]:
+    """By how much the skill of `one` exceeds that of `other`, start by start, with a jackknife's error."""
+    squares = [np.nan_to_num(np.square(x.predicted - x.measured)) for x in (one, other)]
+    change = np.nan_to_num(np.square(one.initial[:, None] - one.measured))
+    parts = np.array_split(np.arange(change.shape[0]), PARTS)
+
+    def worth(kept: np.ndarray) -> np.ndarray:
+        return (squares[1][kept] - squares[0][kept]).sum(axis=0) / change[kept].sum(axis=0)
+
+    everything = np.arange(change.shape[0])
+    left = np.stack([worth(np.setdiff1d(everything, part)) for part in parts])
+    spread = np.sqrt((PARTS - 1) * np.square(left - left.mean(axis=0)).mean(axis=0))
+    return {
+        rate: {"difference": worth(everything)[:, i].tolist(), "std": spread[:, i].tolist()}
+        for i, rate in enumerate("pqr")
+    }
+
+
+def worth(predicted: jaxos4.Predictions) -> dict[str, Any]:
+    """The skill, for JSON."""
+    found = jaxos4.skill(predicted)
+    names = ("skill", "std", "rmse", "persistence")
+    table = {rate: {name: getattr(found, name)[:, i].tolist() for name in names} for i, rate in enumerate("pqr")}
+    return {"horizons": predicted.horizons.tolist(), "starts": found.starts, **table}
+
+
+def inertias(values: Values, std: Values) -> dict[str, Any]:
+    """Ix and Iy [kg m^2] with 95 % intervals, from alpha3 and alpha6."""
+    table = {}
+    for name, alpha in INERTIAS.items():
+        off = NINETY_FIVE * std[alpha]
+        table[name] = {"estimate": 1 / values[alpha], "ci95": [1 / (values[alpha] + off), 1 / (values[alpha] - off)]}
+    return table
+
+
+def described(fit: jaxos4.VehicleFit, seconds: float) -> tuple[Values, dict[str, Any]]:
+    """A value for each parameter, estimated or held; and what is written of the fit."""
+    model, found = fit.problem.model, fit.estimate
+    values = dict(zip(model.parameter_names, found.parameters.tolist(), strict=True))
+    std = dict(zip(model.parameter_names, found.std.tolist(), strict=True))
+    units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
+    report = {
+        "result": str(jaxos4.result_names(found.result)),
+        "cost": float(found.cost),
+        "rollouts": fit.rollouts,
+        "cut": fit.cut,
+        "seconds": seconds,
+        "parameters": {name: {"estimate": values[name], "std": std[name], "unit": units[name]} for name in values},
+        "held": {name: {"value": value, "note": note} for name, (value, note) in fit.held.items()},
+    }
+    if all(alpha in values for alpha in INERTIAS.values()):
+        report["inertias"] = inertias(values, std)
+    return values | {name: value for name, (value, _) in fit.held.items()}, report
+
+
+def fitted(problem: jaxos4.ShootingProblem) -> tuple[jaxos4.VehicleFit, float]:
+    """The fit in stages, and how long it took [s]."""
+    begin = time.perf_counter()
+    fit = jaxos4.fit_vehicle(problem, jaxos4.Bracket.default(problem.model))
+    return fit, time.perf_counter() - begin
+
+
+def again(fit: jaxos4.VehicleFit, method: Callable[..., jaxos4.Estimate]) -> tuple[jaxos4.VehicleFit, float]:
+    """Another estimator on the problem of the last stage: same noise levels, same cut outliers."""
+    bracket, begin = jaxos4.Bracket.default(fit.problem.model), time.perf_counter()
+    found = jax.block_until_ready(method(fit.problem, bracket))
+    spent = time.perf_counter() - begin
+    covariance = jaxos4.robust_covariance(fit.problem, found.parameters, found.initial_state) / (1 - fit.cut) ** 2
+    found = eqx.tree_at(lambda e: e.covariance, found, covariance)
+    return fit._replace(estimate=found, rollouts=int(found.rollouts)), spent
+
+
+def hybrid_for(fit: jaxos4.VehicleFit, steps: int) -> jaxos4.Hybrid:
+    """A hybrid whose network was trained for this flight, at the noise found."""
+    training = jaxos4.NetworkEstimator(steps=steps, batch=32, noise=(1.0, 1.0), held_out=1000, width=32, depth=1)
+    bracket = jaxos4.Bracket.default(fit.problem.model)
+    return jaxos4.Hybrid(training.fit(fit.problem, bracket, key=jax.random.key(0)))
+
+
+def estimators(parts: tuple[list, list], steps: int, names: list[str]) -> Iterator[tuple[str, dict, tuple]]:
+    """IBSS in stages; the others, and IBSS with nothing held, on its last problem; IBSS without `flapping`."""
+    fit, seconds = fitted(problem_of(parts[0], TERMS))
+    for name in ("ibss", *names, "ibss, nothing held", "ibss without flapping"):
+        terms, extra, used = TERMS, {}, fit
+        if name == "output-error":
+            used, seconds = again(fit, jaxos4.OutputError())
+        elif name == "hybrid":
+            begin = time.perf_counter()
+            hybrid = hybrid_for(fit, steps)
+            extra["training_seconds"] = time.perf_counter() - begin
+            used, seconds = again(fit, hybrid)
+            at, seed = used.estimate.parameters, used.estimate.seed
+            extra["seed_held_the_answer"] = bool(((at > seed.lower) & (at < seed.upper)).all())
+        elif name == "ibss, nothing held":
+            free = eqx.tree_at(lambda p: p.model, fit.problem, problem_of(parts[0], TERMS).model)
+            used, seconds = again(fit._replace(problem=free, held={}), jaxos4.IBSS())
+        elif name == "ibss without flapping":
+            terms = without(TERMS, "flapping")
+            used, seconds = fitted(problem_of(parts[0], terms))
+        values, table = described(used, seconds)
+        predicted = predict(values, parts[1], terms)
+        print(f"{name}: {seconds:.0f} s", flush=True)
+        yield name, {**table, **extra, "skill": worth(predicted)}, (used, values, predicted)
+
+
+def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
+    """The root mean square of what the rate equations leave of each sample's change of the rates, over sigma."""
+    model, flight = problem.model, problem.flight
+    columns = np.array([STATE_NAMES.index(rate) for rate in "pqr"])
+    rates, forcing, scalars = flight.states[:, columns], problem.forcing(parameters), tuple(parameters)
+
+    def change(rates: jax.Array, forcing) -> jax.Array:
+        return flight.dt * jnp.stack(model.angular_acceleration(jaxos4.dynamics.Rates(*rates), forcing, scalars))
+
+    rows = jax.tree.map(lambda leaf: leaf[:-1], forcing)
+    predicted = (jax.vmap(change)(rates[:-1], rows) + jax.vmap(change)(rates[1:], rows)) / 2
+    within = np.diff(np.asarray(flight.stretch)) == 0
+    off = (jnp.diff(rates, axis=0) - predicted)[within] / problem.sigma[columns]
+    return float(jnp.sqrt(jnp.nanmean(off**2)))
+
+
+def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predictions, parts: tuple[list, list]) -> dict:
+    """Equation error with the same terms: alone, and with what shooting found out about lag, delay and what to hold.
+
+    Alone it takes the lag and the delay that leave least of each sample's change of the rates, and holds nothing.
+    """
+    whole = problem_of(parts[0], without(TERMS, "accelerometer"))
+    bare = eqx.tree_at(lambda p: p.sigma, whole, fit.problem.sigma[:12])
+    of_shooting = {name: value for name, (value, _) in fit.held.items() if name in whole.model.parameter_names}
+
+    def regress(memory: float, held: Values, *, bare: jaxos4.ShootingProblem = bare):
+        model = jaxos4.hold(whole.model, held)
+        problem = eqx.tree_at(lambda p: p.model, bare, model)
+        found = jaxos4.EquationError(memory=memory)(problem, jaxos4.Bracket.default(model))
+        return problem, found, dict(zip(model.parameter_names, found.parameters.tolist(), strict=True)) | held
+
+    def left_out(memory: float, held: Values) -> Values:
+        """Standard deviations by leaving out a tenth of the flight at a time: what the model lacks is in them."""
+        some = []
+        for part in np.array_split(np.arange(bare.flight.time.shape[0]), PARTS):
+            states = bare.flight.states.at[part].set(jnp.nan)
+            some.append(regress(memory, held, bare=eqx.tree_at(lambda p: p.flight.states, bare, states))[2])
+        return {alpha: float(np.sqrt((PARTS - 1) * np.var([x[alpha] for x in some]))) for alpha in INERTIAS.values()}
+
+    grid = []
+    for lag in (0.01, *LAGS):
+        for delay in DELAYS:
+            problem, found, values = regress(0.0, {"rotor_lag": lag, "rotor_delay": delay})
+            row = {"lag": lag, "delay": delay, "one_step": one_step(problem, found.parameters)}
+            grid.append(row | {name: 1 / values[alpha] for name, alpha in INERTIAS.items()})
+    best = min(grid, key=lambda row: row["one_step"])
+    own = {"rotor_lag": best["lag"], "rotor_delay": best["delay"]}
+    its = {name: shot[name] for name in own}
+    choices = {
+        "alone": own,
+        "own lag, holds what shooting held": own | of_shooting,
+        "lag of shooting": its,
+        "lag of shooting, holds what shooting held": its | of_shooting,
+    }
+    rows = {}
+    for choice, held in choices.items():
+        for memory in MEMORIES:
+            values = regress(memory, held)[2]
+            predicted = predict(values, parts[1])
+            rows[f"memory {memory:g}, {choice}"] = {
+                "values": values,
+                "held": sorted(held),
+                "inertias": inertias(values, left_out(memory, held)),
+                "skill": worth(predicted),
+                "ibss_minus_this": difference(reference, predicted),
+            }
+    return {"grid": grid, "chosen": best, "rows": rows}
+
+
+def lag_sensitivity(fit: jaxos4.VehicleFit, parts: tuple[list, list], lags: list[float]) -> list[dict[str, Any]]:
+    """The last stage again with the lag held: same noise levels, same cut outliers; the delay stays free."""
+    whole, rows = problem_of(parts[0], TERMS).model, []
+    held = {name: value for name, (value, _) in fit.held.items()}
+    for lag in lags:
+        model = jaxos4.hold(whole, held | {"rotor_lag": lag})
+        problem = eqx.tree_at(lambda p: p.model, fit.problem, model)
+        found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(model))
+        covariance = jaxos4.robust_covariance(problem, found.parameters, found.initial_state)
+        values = dict(zip(model.parameter_names, found.parameters.tolist(), strict=True))
+        std = dict(zip(model.parameter_names, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
+        at_quarter = worth(predict(values | held | {"rotor_lag": lag}, parts[1]))
+        rows.append(
+            {
+                "lag": lag,
+                "delay": values.get("rotor_delay"),
+                "result": str(jaxos4.result_names(found.result)),
+                "cost": float(found.cost),
+                "inertias": inertias(values, std),
+                "skill": at_quarter,
+            }
+        )
+        print(f"lag {lag:g} s: {rows[-1]['inertias']}", flush=True)
+    return rows
+
+
+def joint(folder: Path, seconds: float) -> dict[str, Any]:
+    """All flights at once, each with offsets of its own: what yaw needs."""
+    parts, recordings = [], []
+    for number, name in enumerate(FLIGHTS):
+        flight = read(folder, name)
+        for part in usable_stretches(flight, AIRFRAME):
+            if part.begin < seconds:
+                parts.append(cut(flight, part._replace(end=min(part.end, seconds))))
+                recordings.append(number)
+    kept = sorted(set(recordings))
+    problem = problem_of(parts, TERMS, tuple(kept.index(number) for number in recordings))
+    fit, spent = fitted(problem)
+    stretches = [
+        [FLIGHTS[number], float(part.time[0]), float(part.time[-1])]
+        for number, part in zip(recordings, parts, strict=True)
+    ]
+    return {**described(fit, spent)[1], "stretches": stretches}
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
+    seconds: Annotated[float, typer.Option(help="How much of each flight.")] = np.inf,
+    steps: Annotated[int, typer.Option(help="Training of the hybrid's network.")] = 500,
+    names: Annotated[list[str], typer.Option(help="Beside IBSS.")] = ("output-error", "hybrid"),
+    lags: Annotated[list[float], typer.Option(help="At which the lag is held [s].")] = LAGS,
+    sections: Annotated[list[str], typer.Option(help="Of regression, lag, joint.")] = SECTIONS,
+) -> None:
+    """Fits, tests and compares."""
+    folder = flights or (Path(os.environ["JAXOS4_FLIGHTS"]) if os.environ.get("JAXOS4_FLIGHTS") else None)
+    if folder is None or not (folder / f"arpl_crazyflie_{FLIGHTS[0]}.csv").is_file():
+        raise SystemExit(f"--flights: no arpl_crazyflie_{FLIGHTS[0]}.csv in {folder}: give the folder of the flights.")
+    out.mkdir(parents=True, exist_ok=True)
+    begin, parts = time.perf_counter(), blocks(read(folder, FLIGHTS[0]), seconds)
+    report: dict[str, Any] = {
+        "version": jaxos4.__version__,
+        "jax": jax.__version__,
+        "precision": "float64",
+        "seed": 0,
+        "fitted": [[float(part.time[0]), float(part.time[-1])] for part in parts[0]],
+        "tested": [[float(part.time[0]), float(part.time[-1])] for part in parts[1]],
+        "sample_time": DT,
+        "window": WINDOW,
+        "authors": AUTHORS,
+    }
+
+    def save() -> None:
+        report["seconds"] = time.perf_counter() - begin
+        (out / "results.json").write_text(json.dumps(report, indent=1) + "\n")
+
+    report["estimators"], found = {}, {}
+    for name, table, found[name] in estimators(parts, steps, list(names)):
+        report["estimators"][name] = table
+        save()
+    fit, values, predicted = found["ibss"]
+    np.savez(out / "predictions.npz", block=_block_of(predicted), **predicted._asdict())
+    if "regression" in sections:
+        report["regression"] = regressions(fit, values, predicted, parts)
+        save()
+    if "lag" in sections:
+        report["lag"] = lag_sensitivity(fit, parts, list(lags))
+        save()
+    if "joint" in sections:
+        report["joint"] = joint(folder, seconds)
+        save()
+
+
+def _block_of(predicted: jaxos4.Predictions) -> np.ndarray:
+    """The tested block in which each start lies."""
+    length = round(WINDOW / DT)
+    return predicted.start // (int(BLOCK / DT) // length * length)
+
+
+if __name__ == "__main__":
+    typer.run(main)
