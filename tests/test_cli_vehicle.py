@@ -60,6 +60,7 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
     code, told, err = run(
         *("estimate", str(vehicle / "flight1.csv"), str(vehicle / "flight2.csv"), "--model", "flight"),
         *("--airframe", str(vehicle / "airframe.toml"), "--terms", ",".join(TERMS), "--out", str(out)),
+        *("--report", str(tmp_path / "found.html")),
     )
     assert code == 0, err
     report = json.loads(out.read_text(encoding="utf-8"))
@@ -71,6 +72,8 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
     # The equations are the truth's: what was held out is predicted to the noise.
     assert min(report["skill"][rate]["skill"][1] for rate in "pq") > 0.9
     assert "inertias" in told
+    page = (tmp_path / "found.html").read_text(encoding="utf-8")
+    assert all(name in page for name in TRUTH)
     assert report["provenance"]["terms"] == list(TERMS)
 
 

@@ -1,6 +1,8 @@
 """`jaxos4 estimate`: the parameters that a flight tells, with their intervals."""
 
 import dataclasses
+import shlex
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,6 +35,7 @@ from ..identifiability import Identifiability, identifiability
 from ..inertia import fit_inertia
 from ..information import robust_covariance
 from ..logs import read_flight_and_notes
+from ..report.flight_page import write_flight_page
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem
 from ._check_output import check_output
@@ -104,13 +107,18 @@ def estimate(
     loss: Annotated[
         Loss | None, typer.Option(help="With --model flight: whether outliers are cut; huber without it.")
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="With --model flight: a page to write.")
+    ] = None,
     out: OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
     console = Console()
     if model != "flight":
         only = {"--terms": terms, "--from": begin, "--to": end, "--sample-time": sample_time}
-        _refuse(only | {"--holdout": holdout, "--loss": loss}, f"is for --model flight, not {model}")
+        _refuse(
+            only | {"--holdout": holdout, "--loss": loss, "--report": report}, f"is for --model flight, not {model}"
+        )
         if len(flights) > 1:
             raise InputError(f"{flights[1]}: --model {model} explains one flight; use --model flight for several.")
         _estimate_flight(
@@ -134,9 +142,12 @@ def estimate(
         raise InputError("--initial-state known: each window begins in a state of its own; leave it out.")
     kept_back = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
     part = Part(begin, end, WINDOW if window is None else window, sample_time, kept_back)
-    if out is not None:
-        check_output(out, *flights, Path(airframe), bracket, validate)
-    report, fit, _ = identify_vehicle(
+    for target in (out, report):
+        if target is not None:
+            check_output(target, *flights, Path(airframe), bracket, validate)
+    if out is not None and report is not None and out.absolute() == report.absolute():
+        raise InputError(f"{out}: --out and --report name one file; give them two.")
+    found, fit, predicted = identify_vehicle(
         console,
         flights,
         estimator=estimator.value,
@@ -147,13 +158,16 @@ def estimate(
         validate=validate,
         huber=loss != "squares",
     )
-    report["provenance"] |= _provenance()
+    found["provenance"] |= _provenance() | {"command": shlex.join(["jaxos4", *sys.argv[1:]])}
     if out is not None:
-        write_json(report, out)
+        write_json(found, out)
     if fit.answered:
-        print_vehicle(console, report)
-    if report["result"] != "successful":
-        typer.echo(f"jaxos4: {report['result']}: {RESULTS[fit.estimate.result]}", err=True)
+        print_vehicle(console, found)
+    if report is not None:
+        write_flight_page(report, report=found, predicted=predicted, title=", ".join(path.name for path in flights))
+        console.print(f"report: {report}", markup=False, highlight=False)
+    if found["result"] != "successful":
+        typer.echo(f"jaxos4: {found['result']}: {RESULTS[fit.estimate.result]}", err=True)
         raise typer.Exit(1)
 
 
