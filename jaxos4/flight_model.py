@@ -299,8 +299,7 @@ class FlightModel(AbstractModel):
         """
         t, attitude = state.translation, state.attitude
         turn = None if attitude is None or t is None else _rotation(attitude)
-        if turn is not None and t is not None and forcing.velocity is None:
-            forcing = forcing._replace(velocity=_turned_back(turn, (t.vx, t.vy, t.vz)))
+        forcing = _with_velocity(forcing, state)
         rates = self.angular_acceleration(state.rates, forcing, parameters)
         angles = None if attitude is None else attitude_rates(state.rates, attitude)
         translation = None
@@ -324,6 +323,7 @@ class FlightModel(AbstractModel):
         seen = tuple(jax.tree.leaves(state._replace(rates=Rates(p, q, r))))
         if not self.force_axes:
             return seen
+        forcing = _with_velocity(forcing, state) if "drag" in self.terms else forcing
         force = self.specific_force(forcing, _own(forcing.specific_thrust), parameters)
         return (*seen, *(force[i] + self._value(parameters, f"a{'xyz'[i]}_bias") for i in self.force_axes))
 
@@ -441,6 +441,14 @@ def _filtered(omega: RotorSpeeds, decay: Scalar, first: Int[Array, "..."]) -> tu
 def _rotation(attitude: Attitude) -> tuple[Scalar, ...]:
     """Sines and cosines of roll, pitch and yaw."""
     return (*sincos(attitude.phi), *sincos(attitude.theta), *sincos(attitude.psi))
+
+
+def _with_velocity(forcing: Forcing, state: State) -> Forcing:
+    """The body velocity that was measured, else that of the state where it holds one."""
+    t, attitude = state.translation, state.attitude
+    if forcing.velocity is not None or attitude is None or t is None:
+        return forcing
+    return forcing._replace(velocity=_turned_back(_rotation(attitude), (t.vx, t.vy, t.vz)))
 
 
 def _turned(turn: tuple[Scalar, ...], body: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:

@@ -41,7 +41,8 @@ class Skill(NamedTuple):
 
     - `rmse`: of the predictions [rad/s], by horizon and rate.
     - `persistence`: that of "the rates stay as they are".
-    - `skill`: 1 - (rmse / persistence)^2: 1 is perfect, 0 as good as persistence, below 0 worse.
+    - `skill`: 1 - (rmse / persistence)^2: 1 is perfect, 0 as good as persistence, below 0 worse; NaN where nothing was
+      measured, or neither errs.
     - `std`: of the skill: the jackknife's, over ten parts of the flight, so that neighbours may be alike.
     - `starts`: how many.
     """
@@ -124,7 +125,8 @@ def skill(predicted: Predictions) -> Skill:
 
     def worth(kept: np.ndarray) -> np.ndarray:
         reference = np.square(changes[kept]).sum(axis=0)
-        return 1 - squares[kept].sum(axis=0) / np.where(reference > 0, reference, 1.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 1 - squares[kept].sum(axis=0) / reference
 
     everything = np.arange(errors.shape[0])
     without = (

@@ -131,6 +131,21 @@ def test_coverage(tmp_path):
         assert np.all(np.abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 100))
 
 
+def test_dirty_flights(tmp_path):
+    out = tmp_path / "out.json"
+    load("dirty_flights").main(flights=2, duration=6.0, seed=17, airframes=["os4"], out=out)
+    plot("dirty_flights", out, tmp_path / "figures")
+    found = json.loads(out.read_text())["airframes"]["os4"]
+    assert {flight["result"] for flight in found["flights"]} == {"successful"}
+    assert max(flight["fastest"] for flight in found["flights"]) < 5
+    # The lag of 60 ms and the delay of 8 ms come back, to a few of the errors that are claimed.
+    for name in ("rotor_lag", "rotor_delay", "alpha3", "alpha6", "roll_damping", "thrust_gain"):
+        assert found["summary"][name]["told"] == 2
+        assert abs(found["summary"][name]["bias"]) < 4
+    assert abs(found["summary"]["rotor_lag"]["mean_error"]) < 3e-3
+    assert abs(found["summary"]["rotor_delay"]["mean_error"]) < 2e-3
+
+
 def test_long_flight(tmp_path):
     load("long_flight").main(
         duration=10.0,

@@ -136,13 +136,17 @@ def test_a_prediction_that_diverges_is_worth_less_than_any():
     assert np.all(np.isinf(skill.rmse))
 
 
-def test_where_nothing_moves_or_nothing_was_measured_there_is_no_division_by_it():
+def test_where_nothing_moves_any_error_is_worse_than_persistence():
     skill = jaxos4.skill(made(np.full((30, 1, 3), 0.1), 0.0))
-    assert np.isfinite(skill.skill).all()
-    assert np.all(skill.skill < 0)
+    assert np.all(np.isneginf(skill.skill))
+
+
+def test_what_was_never_measured_has_no_skill():
     nothing = made(np.zeros((30, 1, 3)), 1.0)
-    skill = jaxos4.skill(nothing._replace(measured=np.full((30, 1, 3), np.nan)))
-    np.testing.assert_array_equal(skill.rmse, 0.0)
+    measured = np.ones((30, 1, 3))
+    measured[:, :, 2] = np.nan
+    skill = jaxos4.skill(nothing._replace(measured=measured))
+    np.testing.assert_array_equal(skill.skill, [[1.0, 1.0, np.nan]])
 
 
 def test_the_jackknife_is_the_spread_of_the_skill():

@@ -19,7 +19,7 @@ BRACKET = jaxos4.Bracket.default(MODEL)
 GENTLE = {"roll_offset": 0.2, "pitch_offset": -0.1, "roll_damping": 1.2, "pitch_damping": 0.8, "yaw_damping": 0.5}
 
 
-def problem_of(values, *, amplitude=2.0, seed=0, outliers=0.0, excitation=jaxos4.multisine):
+def problem_of(values, *, amplitude=(1.5, 1.5, 0.5), seed=0, outliers=0.0, excitation=jaxos4.multisine):
     """A flight with a gyro's noise, cut into windows; `values`: where it is not as the airframe says."""
     truth = jnp.array([values.get(name, float(x)) for name, x in zip(NAMES, MODEL.alpha, strict=True)])
     omega = np.asarray(excitation(jaxos4.OS4, duration=SECONDS, dt=DT, amplitude=amplitude))[:-1]

@@ -1,0 +1,45 @@
+"""A row a parameter: the share of 95 % intervals that hold the truth, with two Monte-Carlo errors, of each airframe."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import typer
+from matplotlib.figure import Figure
+
+from jaxos4.cli.experiment import write_figure
+from jaxos4.report.style import INK, grid, styles
+
+
+def draw(report: dict) -> Figure:
+    """A panel an airframe."""
+    airframes = report["airframes"]
+    figure, axes = grid(len(airframes), columns=len(airframes), height=4.2)
+    look = styles(["ibss"])["ibss"]
+    for panel, (name, of) in zip(axes, airframes.items(), strict=True):
+        rows = of["summary"]
+        y = np.arange(len(rows))
+        panel.axvline(95, color=INK, linewidth=1.0)
+        panel.errorbar(
+            [100 * row["covered"] for row in rows.values()],
+            y,
+            xerr=[200 * row["monte_carlo_error"] for row in rows.values()],
+            color=look.color,
+            marker=look.marker,
+            linestyle="none",
+        )
+        panel.set_ylim(len(rows) - 0.5, -0.5)
+        panel.set_yticks(y, list(rows))
+        panel.set_title(f"{name}, {len(of['flights'])} flights")
+        panel.set_xlabel("intervals that hold the truth [%]")
+    return figure
+
+
+def main(results: Path, figures: Path) -> None:
+    """Draws what run.py wrote: a JSON file."""
+    report = json.loads(results.read_text())
+    write_figure(lambda: draw(report), figures, "dirty_flights")
+
+
+if __name__ == "__main__":
+    typer.run(main)
