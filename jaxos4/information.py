@@ -78,9 +78,9 @@ def robust_covariance(
     sound = jnp.isfinite(problem.cost(parameters, start)) & (measured.sum() > 0)
     index, within = problem.cut()
     if problem.windows >= _MANY_WINDOWS and index.shape[1] * problem.columns.size <= _LARGEST_WINDOW:
-        each = (leaf[index] * within[:, :, None].astype(errors.dtype) for leaf in (errors, measured))
-        here = moves[index] * within[:, :, None, None]
-        return jnp.where(sound, _by_window(*each, here), jnp.inf)
+        own = within[:, :, None]
+        by_window = _by_window(errors[index] * own, measured[index] * own, moves[index] * own[..., None])
+        return jnp.where(sound, by_window, jnp.inf)
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
     def products(x: Float[Array, "samples columns"]) -> Float[Array, "lags columns columns"]:
