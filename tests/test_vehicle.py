@@ -37,7 +37,7 @@ def fitted(kind):
     values, arguments = {
         "rich": (GENTLE, {}),
         "hover": (GENTLE, {"amplitude": 0.15}),
-        "negative": ({**GENTLE, "roll_damping": -1.5}, {}),
+        "negative": ({**GENTLE, "roll_damping": -0.3}, {}),
     }[kind]
     problem, truth = problem_of(values, **arguments)
     stages = []
