@@ -204,11 +204,12 @@ def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
     return float(jnp.sqrt(jnp.nanmean(off**2)))
 
 
-def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predictions, parts: tuple[list, list]) -> dict:
+def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
     """Equation error with the same terms: alone, and with what shooting found out about lag, delay and what to hold.
 
     Alone it takes the lag and the delay that leave least of each sample's change of the rates, and holds nothing.
     """
+    fit, shot, _ = found["ibss"]
     whole = problem_of(parts[0], without(TERMS, "accelerometer"))
     bare = eqx.tree_at(lambda p: p.sigma, whole, fit.problem.sigma[:12])
     of_shooting = {name: value for name, (value, _) in fit.held.items() if name in whole.model.parameter_names}
@@ -216,8 +217,8 @@ def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predicti
     def regress(memory: float, held: Values, *, bare: jaxos4.ShootingProblem = bare):
         model = jaxos4.hold(whole.model, held)
         problem = eqx.tree_at(lambda p: p.model, bare, model)
-        found = jaxos4.EquationError(memory=memory)(problem, jaxos4.Bracket.default(model))
-        return problem, found, dict(zip(model.parameter_names, found.parameters.tolist(), strict=True)) | held
+        estimate = jaxos4.EquationError(memory=memory)(problem, jaxos4.Bracket.default(model))
+        return problem, estimate, dict(zip(model.parameter_names, estimate.parameters.tolist(), strict=True)) | held
 
     def left_out(memory: float, held: Values) -> Values:
         """Standard deviations by leaving out a tenth of the flight at a time: what the model lacks is in them."""
@@ -230,8 +231,8 @@ def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predicti
     grid = []
     for lag in (0.01, *LAGS):
         for delay in DELAYS:
-            problem, found, values = regress(0.0, {"rotor_lag": lag, "rotor_delay": delay})
-            row = {"lag": lag, "delay": delay, "one_step": one_step(problem, found.parameters)}
+            problem, best_fit, values = regress(0.0, {"rotor_lag": lag, "rotor_delay": delay})
+            row = {"lag": lag, "delay": delay, "one_step": one_step(problem, best_fit.parameters)}
             grid.append(row | {name: 1 / values[alpha] for name, alpha in INERTIAS.items()})
     best = min(grid, key=lambda row: row["one_step"])
     own = {"rotor_lag": best["lag"], "rotor_delay": best["delay"]}
@@ -252,7 +253,7 @@ def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predicti
                 "held": sorted(held),
                 "inertias": inertias(values, left_out(memory, held)),
                 "skill": worth(predicted),
-                "ibss_minus_this": difference(reference, predicted),
+                "minus_this": {name: difference(found[name][2], predicted) for name in ("ibss", "ibss, nothing held")},
             }
     return {"grid": grid, "chosen": best, "rows": rows}
 
@@ -337,10 +338,10 @@ def main(
     for name, table, found[name] in estimators(parts, steps, list(names)):
         report["estimators"][name] = table
         save()
-    fit, values, predicted = found["ibss"]
+    fit, _, predicted = found["ibss"]
     np.savez(out / "predictions.npz", block=_block_of(predicted), **predicted._asdict())
     if "regression" in sections:
-        report["regression"] = regressions(fit, values, predicted, parts)
+        report["regression"] = regressions(found, parts)
         save()
     if "lag" in sections:
         report["lag"] = lag_sensitivity(fit, parts, list(lags))
