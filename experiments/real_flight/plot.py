@@ -112,7 +112,7 @@ def draw_inertias(column: SubFigure, report: dict[str, Any]) -> None:
 
 def _scaled(rows: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """Estimates and their intervals' arms [1e-5 kg m^2]."""
-    y, ends = np.array([row["estimate"] for row in rows]), np.array([row["ci95"] for row in rows]).T
+    y, ends = np.array([row["estimate"] for row in rows]), np.array([row["ci95"] for row in rows], dtype=float).T
     return 1e5 * y, 1e5 * np.abs(ends - y)
 
 

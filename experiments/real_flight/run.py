@@ -3,6 +3,7 @@
 Blocks of 5 s of the roll and pitch flight, from 1 s on: the 1st, 3rd, ... are fitted, the 2nd, 4th, ... tested, the
 same for all estimators. Predictions use the recorded commands, and with `flapping` the recorded specific force along x
 and y as well, as inputs: they say what the vehicle does next, given these, not what a simulator would do without them.
+Torques, and so inertias, are in proportion to the documented thrust, which the accelerometer checks: `thrust_gain`.
 """
 
 import json
@@ -113,8 +114,9 @@ def inertias(values: Values, std: Values) -> dict[str, Any]:
     """Ix and Iy [kg m^2] with 95 % intervals, from alpha3 and alpha6."""
     table = {}
     for name, alpha in INERTIAS.items():
-        off = NINETY_FIVE * std[alpha]
-        table[name] = {"estimate": 1 / values[alpha], "ci95": [1 / (values[alpha] + off), 1 / (values[alpha] - off)]}
+        low, high = (values[alpha] + sign * NINETY_FIVE * std[alpha] for sign in (-1, 1))
+        # Where the interval of alpha reaches 0, that of the inertia has no upper end.
+        table[name] = {"estimate": 1 / values[alpha], "ci95": [1 / high, 1 / low if low > 0 else None]}
     return table
 
 
@@ -135,7 +137,26 @@ def described(fit: jaxos4.VehicleFit, seconds: float) -> tuple[Values, dict[str,
     }
     if all(alpha in values for alpha in INERTIAS.values()):
         report["inertias"] = inertias(values, std)
+        report["cross_checks"] = cross_checks(values, std)
     return values | {name: value for name, (value, _) in fit.held.items()}, report
+
+
+def cross_checks(values: Values, std: Values) -> dict[str, Any]:
+    """Parameters that hardly show, beside what those that are told imply of them: far apart, neither is to be believed.
+
+    J_R should be alpha2 Ix and alpha5 Iy alike; alpha7 should be (Ix - Iy) / Iz.
+    """
+    checks: dict[str, Any] = {}
+    for gyroscopic, alpha in (("alpha2", "alpha3"), ("alpha5", "alpha6")):
+        if gyroscopic in std:
+            checks[f"J_R from {gyroscopic}"] = {
+                "estimate": values[gyroscopic] / values[alpha],
+                "std": std[gyroscopic] / values[alpha],
+            }
+    if "alpha7" in std and "alpha8" in values:
+        implied = values["alpha8"] * (1 / values["alpha3"] - 1 / values["alpha6"])
+        checks["alpha7"] = {"estimate": values["alpha7"], "std": std["alpha7"], "of the inertias": implied}
+    return checks
 
 
 def fitted(problem: jaxos4.ShootingProblem) -> tuple[jaxos4.VehicleFit, float]:
