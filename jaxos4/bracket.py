@@ -30,7 +30,7 @@ class Bracket(eqx.Module):
     @classmethod
     def default(cls, model: AbstractModel) -> "Bracket":
         """The model's own half-widths around the parameters that its airframe implies."""
-        return cls.around(model.alpha, model.half_width)
+        return _default(model)
 
     @property
     def center(self) -> Parameters:
@@ -52,3 +52,8 @@ class Bracket(eqx.Module):
     def usable(self) -> "Bracket":
         """Itself where it is valid, else 0 +- 1: what a computation that must stay finite goes on with."""
         return Bracket.around(jnp.where(self.valid, self.center, 0.0), jnp.where(self.valid, self.half_width, 1.0))
+
+
+@eqx.filter_jit  # one program, where its operations by themselves would each be one
+def _default(model: AbstractModel) -> Bracket:
+    return Bracket.around(model.alpha, model.half_width)

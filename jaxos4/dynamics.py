@@ -55,13 +55,27 @@ class State(NamedTuple):
 
 
 class Forcing(NamedTuple):
-    """What the rotors do: torques [N m], specific thrust U_c/m [m/s^2], residual rotor speed Omega_r [rad/s]."""
+    """What the rotors do: torques [N m], specific thrust U_c/m [m/s^2], residual rotor speed Omega_r [rad/s].
+
+    Of a `FlightModel`, and nothing of others:
+
+    - `spin_up`: Omega_r' [rad/s^2].
+    - `specific_thrust`: U_c / m at the sample itself [m/s^2], as an accelerometer there feels it.
+    - `recording`: for each recording, 1 where the sample belongs to it and 0 where not.
+    - `velocity`: along the body's axes [m/s], where that is an input.
+    - `lateral`: the measured specific force along x and y [m/s^2], where that is an input.
+    """
 
     roll: Float[Array, "*samples"]
     pitch: Float[Array, "*samples"]
     yaw: Float[Array, "*samples"]
     thrust: Float[Array, "*samples"]
     residual_speed: Float[Array, "*samples"]
+    spin_up: Float[Array, "*samples"] | None = None
+    specific_thrust: Float[Array, "*samples"] | None = None
+    recording: tuple[Float[Array, "*samples"], ...] = ()
+    velocity: tuple[Float[Array, "*samples"], ...] | None = None
+    lateral: tuple[Float[Array, "*samples"], ...] | None = None
 
 
 class Inputs(NamedTuple):
@@ -202,7 +216,8 @@ class AbstractModel(eqx.Module):
         - `omega`: rotor speeds [rad/s].
         - `parameters`: as named in `parameter_names`.
         """
-        forcing = Forcing(*(leaf[0] for leaf in self.forcing(omega[None])))
+        one = self.drive(Inputs(omega[None], jnp.ones(())), parameters)
+        forcing = jax.tree.map(lambda leaf: leaf[0], one)
         derivative = stack(self.cascade(unstack(state[CASCADE_ORDER]), forcing, parameters))
         return jnp.zeros_like(derivative).at[CASCADE_ORDER].set(derivative)
 

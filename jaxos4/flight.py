@@ -44,6 +44,7 @@ class Flight(eqx.Module):
     - `body_velocity`: along the body's axes [m/s], where a model takes it as an input; no NaN. `None`: not known.
     - `stretch`: which uninterrupted stretch each sample belongs to, counted from 0, where several are joined
       (`jaxos4.join`): time then is a count of samples. `None`: all belong to one.
+    - `commanded`: whether the rotor speeds are commands, which rotors follow with a lag, and were not measured.
     """
 
     time: Float[Array, " samples"] = eqx.field(converter=as_float)
@@ -53,6 +54,7 @@ class Flight(eqx.Module):
     result: RESULTS = eqx.field(default_factory=_success)
     body_velocity: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
     stretch: Int[Array, " samples"] | None = None
+    commanded: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         samples = self.time.shape
@@ -80,7 +82,7 @@ class Flight(eqx.Module):
     @property
     def inputs(self) -> Inputs:
         """What drives the vehicle."""
-        force = None if self.specific_force is None else _held(self.specific_force)
+        force = None if self.specific_force is None else held_values(self.specific_force)
         return Inputs(self.omega, self.dt, self.body_velocity, force, self.stretch)
 
     @property
@@ -96,7 +98,7 @@ def channel_indices(*names: str) -> Array:
     return jnp.array([STATE_NAMES.index(name) for name in names])
 
 
-def _held(values: Float[Array, "samples columns"]) -> Float[Array, "samples columns"]:
+def held_values(values: Float[Array, "samples columns"]) -> Float[Array, "samples columns"]:
     """Each column with what was not measured at the value before it, or at its first; 0 where there is none."""
     index, measured = jnp.arange(values.shape[0])[:, None], ~jnp.isnan(values)
     last = jax.lax.cummax(jnp.where(measured, index, -1))
@@ -109,6 +111,8 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
 
     What is left over at the end of each is dropped, so that no window reaches from one into the next. Time becomes a
     count of samples from 0. The twelve states and what else was measured are kept as they are.
+
+    Those that are shorter than one window are left out.
 
     **Raises:** `ValueError` for flights of different sample times, or none that is long enough.
     """
@@ -130,6 +134,7 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
         specific_force=None if np.isnan(force).all() else force,
         body_velocity=velocity,
         stretch=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths)),
+        commanded=any(flight.commanded for flight in flights),
     )
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, as_float
 from .airframe import OS4, Airframe
@@ -24,6 +24,7 @@ from .dynamics import (
     Translation,
     attitude_rates,
 )
+from .flight import STATE_NAMES, Flight, held_values
 from .trigonometry import sincos
 
 # The share of the torque that one pair of rotors makes in hover that an offset may be, and that 5 m/s may make.
@@ -37,28 +38,6 @@ _SHORTEST = 0.05
 _YAW = 0.2
 _VELOCITY = "velocity and drag need `Flight.body_velocity`"
 _AXES = ("roll", "pitch", "yaw")
-
-
-class FlightForcing(NamedTuple):
-    """What the rotors and the air do from each sample to the next; the first five as in `Forcing`.
-
-    - `spin_up`: Omega_r' [rad/s^2].
-    - `specific_thrust`: U_c / m at the sample itself [m/s^2], as an accelerometer there feels it.
-    - `recording`: for each recording, 1 where the sample belongs to it and 0 where not.
-    - `velocity`: along the body's axes [m/s], where that is an input.
-    - `lateral`: the measured specific force along x and y [m/s^2], where that is an input.
-    """
-
-    roll: Float[Array, "*samples"]
-    pitch: Float[Array, "*samples"]
-    yaw: Float[Array, "*samples"]
-    thrust: Float[Array, "*samples"]
-    residual_speed: Float[Array, "*samples"]
-    spin_up: Float[Array, "*samples"]
-    specific_thrust: Float[Array, "*samples"]
-    recording: tuple[Float[Array, "*samples"], ...]
-    velocity: tuple[Float[Array, "*samples"], ...] | None
-    lateral: tuple[Float[Array, "*samples"], ...] | None
 
 
 class Parameter(NamedTuple):
@@ -224,14 +203,14 @@ class FlightModel(AbstractModel):
         positions = self._positions
         return parameters[positions[name]] if name in positions else as_float(otherwise)
 
-    def _of_recording(self, parameters, name: str, forcing: FlightForcing) -> Scalar:
+    def _of_recording(self, parameters, name: str, forcing: Forcing) -> Scalar:
         """A parameter of which each recording has its own, of the recording that a sample belongs to."""
         if max(self.recordings) == 0:
             return self._value(parameters, name)
         values = [self._value(parameters, f"{name}_{i + 1}") for i in range(len(forcing.recording))]
         return sum((share * value for share, value in zip(forcing.recording, values, strict=True)), as_float(0.0))
 
-    def drive(self, inputs: Inputs, parameters) -> FlightForcing:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def drive(self, inputs: Inputs, parameters) -> Forcing:
         """What rotors make of their commands: delayed, filtered, and turned into torque and thrust.
 
         Over a sample the filter's speed is taken as a straight line, whose mean square makes the mean torque.
@@ -259,7 +238,7 @@ class FlightModel(AbstractModel):
         roll, pitch, yaw, thrust = (squares @ self.airframe.mixer.T).T
         spins, mass = jnp.asarray(self.airframe.rotor_spins), self.airframe.mass
         recording = jnp.asarray(self.recordings)[jnp.zeros(omega.shape[0], dtype=int) if stretch is None else stretch]
-        return FlightForcing(
+        return Forcing(
             roll=roll,
             pitch=pitch,
             yaw=yaw,
@@ -276,7 +255,7 @@ class FlightModel(AbstractModel):
         """Of speeds that the rotors have: see `drive`, which is what commands need."""
         return CorrectedOS4(self.airframe).forcing(omega)
 
-    def angular_acceleration(self, rates: Rates, forcing: FlightForcing, parameters) -> Rates:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """The first three equations of the class."""
         plain = Forcing(forcing.roll, forcing.pitch, forcing.yaw, forcing.thrust, forcing.residual_speed)
         rigid = CorrectedOS4(self.airframe).angular_acceleration(rates, plain, tuple(parameters[:8]))
@@ -300,10 +279,10 @@ class FlightModel(AbstractModel):
             p = p + self._value(parameters, "roll_flapping") * ay
             q = q + self._value(parameters, "pitch_flapping") * ax
         if "reaction" in self.terms:
-            r = r - self._value(parameters, "rotor_reaction") * forcing.spin_up
+            r = r - self._value(parameters, "rotor_reaction") * _own(forcing.spin_up)
         return Rates(p, q, r)
 
-    def specific_force(self, forcing: FlightForcing, thrust: Scalar, parameters) -> tuple[Scalar, Scalar, Scalar]:
+    def specific_force(self, forcing: Forcing, thrust: Scalar, parameters) -> tuple[Scalar, Scalar, Scalar]:
         """Along the body's axes [m/s^2], of a specific thrust; without the accelerometer's biases."""
         vx, vy, _ = _known(forcing.velocity, _VELOCITY) if "drag" in self.terms else (jnp.zeros_like(thrust),) * 3
         gain = self._value(parameters, "thrust_gain", 1.0)
@@ -313,7 +292,7 @@ class FlightModel(AbstractModel):
             gain * thrust,
         )
 
-    def cascade(self, state: State, forcing: FlightForcing, parameters) -> State:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def cascade(self, state: State, forcing: Forcing, parameters) -> State:
         """The time derivative of as much of the cascade as `state` holds.
 
         The body velocity is the one that was measured, where it was, else that of the state.
@@ -334,7 +313,7 @@ class FlightModel(AbstractModel):
         """Of the thrust alone; `cascade` has the whole."""
         return CorrectedOS4(self.airframe).acceleration(attitude, forcing)
 
-    def observe(self, state: State, forcing: FlightForcing, parameters) -> tuple[Scalar, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
         """The states, the rates with the gyro's bias; then the specific force with the accelerometer's."""
         p, q, r = state.rates
         if "gyro_bias" in self.terms:
@@ -345,8 +324,21 @@ class FlightModel(AbstractModel):
         seen = tuple(jax.tree.leaves(state._replace(rates=Rates(p, q, r))))
         if not self.force_axes:
             return seen
-        force = self.specific_force(forcing, forcing.specific_thrust, parameters)
+        force = self.specific_force(forcing, _own(forcing.specific_thrust), parameters)
         return (*seen, *(force[i] + self._value(parameters, f"a{'xyz'[i]}_bias") for i in self.force_axes))
+
+
+def with_body_velocity(flight: Flight) -> Flight:
+    """The flight with `body_velocity`, where velocity and attitude were measured; untouched where they were not.
+
+    What is missing between measurements is the one before.
+    """
+    columns = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "vx", "vy", "vz")]
+    if bool(jnp.isnan(flight.states[:, columns]).all(axis=0).any()):
+        return flight
+    *angles, vx, vy, vz = held_values(flight.states[:, columns]).T
+    velocity = _turned_back(_rotation(Attitude(*angles)), (vx, vy, vz))
+    return eqx.tree_at(lambda f: f.body_velocity, flight, jnp.stack(velocity, axis=1), is_leaf=lambda x: x is None)
 
 
 MODELS = {"published": PublishedOS4, "corrected": CorrectedOS4, "flight": FlightModel}
@@ -387,6 +379,12 @@ def _known(values: tuple[Scalar, ...] | None, what: str) -> tuple[Scalar, ...]:
     if values is None:
         raise ValueError(f"`terms`: {what}, which this flight lacks: leave the term out.")
     return values
+
+
+def _own(value: Scalar | None) -> Scalar:
+    if value is None:
+        raise ValueError("`forcing` must be what this model's `drive` makes of a flight.")
+    return value
 
 
 def _delayed(omega: RotorSpeeds, samples: Scalar, first: Int[Array, "..."], last: Int[Array, "..."]) -> RotorSpeeds:

@@ -34,11 +34,11 @@ class HeldParameters(AbstractModel):
         """Which of the whole model's parameters are left."""
         return np.delete(np.arange(len(self.model.parameter_names)), list(self.held))
 
-    def without(self, values: Parameters) -> Parameters:
+    def without(self, values: Float[Array, " whole"]) -> Float[Array, " free"]:
         """Of one value for each parameter of the whole model, those of the ones that are left."""
         return values[self.free]
 
-    def complete(self, parameters: Parameters) -> Parameters:
+    def complete(self, parameters: Float[Array, " free"]) -> Float[Array, " whole"]:
         """The whole model's parameters."""
         whole = jnp.zeros(len(self.model.parameter_names), dtype=float)
         return whole.at[self.free].set(parameters).at[np.asarray(self.held, dtype=int)].set(self.values)
@@ -134,4 +134,5 @@ def hold(model: AbstractModel, values: Mapping[str, Float[Array, ""] | float]) -
         wrong = f"knows no {unknown[0]}" if unknown else "leaves no parameter to estimate"
         raise ValueError(f"`values` {wrong}; the parameters are {', '.join(names)}.")
     held = tuple(i for i, name in enumerate(names) if name in values)
-    return HeldParameters(model, held=held, values=jnp.stack([as_float(values[names[i]]) for i in held]))
+    known = [as_float(values[names[i]]) for i in held]
+    return HeldParameters(model, held=held, values=jnp.stack(known) if known else jnp.zeros(0))

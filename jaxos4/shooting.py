@@ -162,7 +162,7 @@ class ShootingProblem(eqx.Module):
 
         `parameters`: of the forcing, where it depends on some; what the airframe implies by default.
         """
-        index, within = self._cut()
+        index, within = self.cut()
         forcing = self.forcing(self.model.alpha if parameters is None else parameters)
         windows = jax.tree.map(lambda leaf: leaf[index], forcing)
         return Rows(windows, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
@@ -176,7 +176,7 @@ class ShootingProblem(eqx.Module):
         driving = np.asarray(self.model.driving, dtype=int)
         if not driving.size:
             return rows
-        index, _ = self._cut()
+        index, _ = self.cut()
 
         def forcing(values: Float[Array, " driving"]) -> Forcing:
             return jax.tree.map(lambda leaf: leaf[index], self.forcing(parameters.at[driving].set(values)))
@@ -235,7 +235,7 @@ class ShootingProblem(eqx.Module):
         def window(start: Float[Array, " size"], forcing: Forcing) -> Float[Array, "length columns"]:
             return jnp.stack(jax.lax.scan(step, unstack(start), forcing)[1], axis=-1)
 
-        _, within = self._cut()
+        _, within = self.cut()
         return jax.vmap(window)(self.split(initial_state), self.rows(parameters).forcing)[within]
 
     def shots(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Shot:
@@ -330,9 +330,9 @@ class ShootingProblem(eqx.Module):
 
     def window_of_samples(self) -> Int[np.ndarray, " samples"]:
         """The window in which each sample lies."""
-        return np.nonzero(self._cut()[1])[0]
+        return np.nonzero(self.cut()[1])[0]
 
-    def _cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+    def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
         """The samples of each window, and which of them are its own: some are a sample shorter than others."""
         samples = self.flight.states.shape[-2]
         ends = np.arange(self.windows + 1) * samples // self.windows

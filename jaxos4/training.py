@@ -4,6 +4,7 @@ Nothing is stored: every batch is simulated inside the jitted step from fresh dr
 level and noise.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
@@ -55,6 +56,12 @@ def draw_many(features: AbstractFeatures, scales: Float[Array, "2"], count: int,
     return jax.vmap(lambda k: draw(features, scales, key=k))(keys)
 
 
+@functools.partial(jax.jit, static_argnums=1)
+def split_key(key: Key, count: int) -> tuple[Key, ...]:
+    """As many keys, by one program: taking an array of keys apart would need some more."""
+    return tuple(jax.random.split(key, count))
+
+
 def train(
     network: Network,
     loss: Callable[[Network, Pair], Scalar],
@@ -79,9 +86,9 @@ def train(
 
     **Raises:** `TrainingError` where the loss diverges, or hardly any flight of the bracket can be flown.
     """
-    train_key, validation_key = jax.random.split(key)
+    train_key, validation_key = split_key(key, 2)
     held_out = eqx.filter_jit(draw_many)(features, scales, validation, key=validation_key)
-    flyable = float(jnp.isfinite(held_out.features).all(axis=1).mean())
+    flyable = np.isfinite(np.asarray(held_out.features)).all(axis=1).mean()
     if not flyable > _FLYABLE:
         raise TrainingError(
             f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end: narrow the "
@@ -89,7 +96,7 @@ def train(
         )
 
     weights, structure = eqx.partition(network, eqx.is_inexact_array)
-    if not all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(weights)):
+    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(weights)):
         raise TrainingError(
             "the network has no finite start: the flight at the bracket's center diverges, or measures too little."
         )
@@ -102,13 +109,14 @@ def train(
         return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
 
     @eqx.filter_jit
-    def advance(features, held_out, weights, state, keys):
+    def advance(features, held_out, weights, state, key, indices):
         def step(carry, key):
             weights, state = carry
             value, gradient = jax.value_and_grad(mean_loss)(weights, draw_many(features, scales, batch, key=key))
             updates, state = optimiser.update(gradient, state, weights)
             return (optax.apply_updates(weights, updates), state), value
 
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(indices)
         (weights, state), values = jax.lax.scan(step, (weights, state), keys)
         return weights, state, values.mean(), mean_loss(weights, held_out)
 
@@ -124,9 +132,8 @@ def train(
     with Progress(*columns, console=console, transient=True, disable=not (progress and console.is_terminal)) as bar:
         task = bar.add_task("", total=steps, loss="-")
         for first in range(0, steps, CHECK):
-            indices = jnp.arange(first, min(first + CHECK, steps))
-            keys = jax.vmap(lambda i: jax.random.fold_in(train_key, i))(indices)
-            weights, state, *losses = advance(features, held_out, weights, state, keys)
+            indices = np.arange(first, min(first + CHECK, steps))
+            weights, state, *losses = advance(features, held_out, weights, state, train_key, indices)
             history.append([float(value) for value in losses])
             if not np.less(history[-1], _DIVERGED).all():
                 raise TrainingError(

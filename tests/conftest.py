@@ -14,13 +14,34 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS") or "cpu")
 # Compiled programs are shared by the workers and with later runs.
 jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).resolve().parents[1] / ".pytest_cache/jax"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
 # Before the first import of jaxos4: every annotated function and module in it is checked from here on.
 jaxtyping.install_import_hook("jaxos4", "typechecker.check")
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
+
+
+# The modules that take longest begin first, so that workers end together.
+LONGEST = ("network", "experiments", "equation_error", "ibss", "kalman", "study_resume", "cli", "svsf", "study_cluster")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sorts the modules; the tests of each stay as they are."""
+    places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log):
+    """A module stays with one worker: its fixtures are made, and its programs traced and compiled, once."""
+    if config.getvalue("dist") != "load":  # the default of `-n`
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False
+    return LoadFileScheduling(config, log)
 
 
 @pytest.fixture(scope="module", autouse=True)

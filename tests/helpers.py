@@ -49,8 +49,19 @@ def standard_problem(
 def noisy_states(count, model_class=jaxos4.PublishedOS4, *, seed=0, scale=1.0, duration=5.0):
     """States of `count` standard flights as measured; flight i draws from `fold_in(key, i)`."""
     flight, noise = standard_flight(model_class, duration), jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
-    keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(seed), i))(jnp.arange(count))
-    return jax.vmap(lambda key: noise(flight, key=key).states)(keys)
+    return measured(noise, flight, folded(jax.random.key(seed), jnp.arange(count)))
+
+
+@jax.jit
+def folded(key, numbers):
+    """`fold_in(key, i)` for each number i."""
+    return jax.vmap(lambda i: jax.random.fold_in(key, i))(numbers)
+
+
+@eqx.filter_jit
+def measured(noise, flight, keys):
+    """States of a flight as measured, for each key; one after the other, as XLA takes seconds to compile a batch."""
+    return jax.lax.map(lambda key: noise(flight, key=key).states, keys)
 
 
 def random_starts(model, count, *, seed=0, share=0.8):

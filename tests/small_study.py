@@ -61,7 +61,7 @@ def environment(devices: int = 1) -> dict[str, str]:
         "JAX_NUM_CPU_DEVICES": str(devices),
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(jax.config.values["jax_compilation_cache_dir"]),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
         "PYTHONPATH": os.pathsep.join([str(pathlib.Path(__file__).resolve().parents[1]), *sys.path[1:]]),
     }
 

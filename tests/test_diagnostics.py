@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from helpers import noisy_states, standard_flight, standard_problem
+from helpers import measured, noisy_states, standard_flight, standard_problem
 
 import jaxos4
 
@@ -23,8 +23,7 @@ def judged(states):
 
 
 def coloured_states(count, noise):
-    flight, keys = standard_flight(), jax.random.split(jax.random.key(5), count)
-    return jax.vmap(lambda key: noise(flight, key=key).states)(keys)
+    return measured(noise, standard_flight(), jax.random.split(jax.random.key(5), count))
 
 
 def test_figures_are_those_of_plain_numpy():

@@ -14,7 +14,7 @@ from jaxos4.study import load_study
 
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 # Of which a study is all there is to run.
-STUDIES = ("comparison", "noise_study", "noise_kinds")
+STUDIES = ("comparison", "noise_study", "noise_kinds", "scale")
 WITH_FIGURES = (*STUDIES, "frontier", "rollout_budget", "published_corrected", "inverse_crime", "bracket_and_seeds")
 
 
@@ -54,7 +54,15 @@ def test_efficiency(tmp_path):
 
 
 def test_speed(tmp_path):
-    load("speed").main(batch=64, steps=40, flights=[2], repeats=2, out=tmp_path / "out.json")
+    load("speed").main(
+        batch=64,
+        steps=40,
+        flights=[2],
+        repeats=2,
+        channels=["rates"],
+        methods=["euler", "rk4"],
+        out=tmp_path / "out.json",
+    )
     report = json.loads((tmp_path / "out.json").read_text())
     assert report["provenance"]["precision"] == "float64"
     assert all(row["rate"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
@@ -67,14 +75,15 @@ def test_networks(tmp_path):
         cases=["standard"],
         networks=["score, mlp"],
         noises=[1.0],
+        channels="rates",
         steps=250,
-        many=50,
+        many=100,
         separate=False,
         out=tmp_path / "out.json",
     )
     report = json.loads((tmp_path / "out.json").read_text())
     rows = {row["estimator"]: row for row in report["rows"]}
-    assert report["one_call"]["flights"] == 50
+    assert report["one_call"]["flights"] == 100
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
     # Of 100 flights, each of eight parameters within five Monte-Carlo errors of the bound.
     for name in ("hybrid", "ibss"):
@@ -85,7 +94,7 @@ def test_networks(tmp_path):
 
 def test_baselines(tmp_path):
     load("baselines").main(
-        flights=32,
+        flights=100,
         seed=5,
         channels="rates",
         estimators=["equation-error", "output-error"],
@@ -95,7 +104,7 @@ def test_baselines(tmp_path):
     )
     rows = json.loads((tmp_path / "out.json").read_text())["rows"]
     exact, noisy = rows[:2], rows[2:]
-    assert all(row["answers"] == 32 for row in rows)
+    assert all(row["answers"] == 100 for row in rows)
     assert all(max(row["efficiency"]) < 1e-6 for row in exact)
     # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
     assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
@@ -169,6 +178,14 @@ def test_noise_kinds(tmp_path):
     assert (covered["coverage"].sel(noise=["coloured", "biased"]) < covered["low"].sel(noise="white")).all()
     # A tenth of the samples lost costs about a twentieth of the precision, and is told.
     assert float(covered["high"].sel(noise="lossy")) > 0.95
+
+
+def test_scale(tmp_path):
+    data = study("scale", tmp_path)
+    efficiency, covered = metrics.efficiency(data), metrics.mean_coverage(data).sel(level=0.95)["coverage"]
+    # Of 128 flights, each of eight parameters within five Monte-Carlo errors of the bound.
+    assert (abs(efficiency["efficiency"] - 1) < 5 / np.sqrt(2 * 128)).all()
+    assert (abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 128)).all()
 
 
 def test_frontier(tmp_path):
@@ -247,7 +264,7 @@ def test_real_flight(shared_flights, tmp_path):
         flights=shared_flights,
         out=tmp_path / "out",
         seconds=11.0,
-        names=[],
+        names=["ibss without flapping"],
         lags=[0.03, 0.06],
         sections=["lag"],
     )

@@ -13,6 +13,8 @@ from helpers import DT, standard_flight
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
+from jaxos4.estimators._regressor import Regressor
+from jaxos4.estimators.network import _regressor
 from jaxos4.features import FEATURES, Coordinates
 from jaxos4.training import draw_many
 
@@ -46,17 +48,24 @@ def flights(count, *, seed=0, noise=1.0, bracket=BRACKET, start_width=(0.0, 0.0,
     """Parameters drawn over the bracket, initial rates over +-`start_width`, and the noisy states of their flights."""
     width = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(jnp.asarray(start_width))
 
-    @jax.vmap
-    def fly(i):
-        alpha_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), i))
+    return fly(jnp.arange(count), jax.random.key(seed), jnp.asarray(noise), bracket, width)
+
+
+@eqx.filter_jit
+def fly(numbers, key, noise, bracket, width):
+    def one(i):
+        alpha_key, noise_key = jax.random.split(jax.random.fold_in(key, i))
         start = width * jax.random.uniform(jax.random.fold_in(alpha_key, 1), (12,), minval=-1, maxval=1)
         u = jax.random.uniform(alpha_key, (8,), minval=-1, maxval=1)
         alpha = bracket.center + u * bracket.half_width
         omega = standard_flight(duration=DURATION).omega
-        truth = jaxos4.simulate(PUBLISHED(), alpha, omega, dt=DT, initial_state=start)
-        return alpha, jaxos4.WhiteNoise(noise * jaxos4.SENSOR_SIGMA)(truth, key=noise_key).states
+        return alpha, jaxos4.simulate(PUBLISHED(), alpha, omega, dt=DT, initial_state=start), noise_key
 
-    return fly(jnp.arange(count))
+    sensors = jaxos4.WhiteNoise(noise * jaxos4.SENSOR_SIGMA)
+    alpha, exact, keys = jax.vmap(one)(numbers)
+    return alpha, jax.lax.map(
+        lambda flight_and_key: sensors(flight_and_key[0], key=flight_and_key[1]).states, (exact, keys)
+    )
 
 
 @eqx.filter_jit
@@ -71,6 +80,7 @@ def names(estimates):
 # Features.
 
 
+@eqx.filter_jit
 def features_of(kind, free=False):
     problem = problem_of(free=free)
     return FEATURES[kind].of(problem, Coordinates.of(problem, BRACKET, jnp.asarray(1.0)))
@@ -98,9 +108,10 @@ def test_simulated_noise_is_that_of_noisy_flights(kind):
     noise = jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
     keys = jax.random.split(jax.random.key(3), count)
     exact = standard_flight(duration=DURATION)
-    measured = jax.vmap(lambda k: features(problem_of(noise(exact, key=k).states)).values)(keys)
+    see = eqx.filter_jit(lambda features, k: features(problem_of(noise(exact, key=k).states)).values)
+    draw = eqx.filter_jit(lambda features, k: features.simulated(u, jnp.asarray(scale), key=k))
     u = jnp.zeros(features.coordinates.center.shape)
-    drawn = jax.vmap(lambda k: features.simulated(u, jnp.asarray(scale), key=k))(keys)
+    measured, drawn = (jax.lax.map(lambda k, one=one: one(features, k), keys) for one in (see, draw))
     picked = slice(None) if kind == "score" else slice(300, 308)
     measured, drawn = np.asarray(measured)[:, picked], np.asarray(drawn)[:, picked]
     unit = np.sqrt(np.diagonal(np.cov(drawn.T)))
@@ -125,6 +136,29 @@ def test_flights_that_cannot_be_flown_are_not_a_number_and_are_left_out():
 
 
 # Training.
+
+
+def test_first_weights_are_uniform_as_those_of_equinox():
+    settings, skip = jaxos4.NetworkEstimator(), jnp.ones((8, 9))
+    first, second = (eqx.filter_jit(_regressor)(settings, skip, jax.random.key(seed)) for seed in (0, 1))
+    theirs = eqx.filter_eval_shape(
+        lambda key: Regressor(skip, "mlp", width=settings.width, depth=settings.depth, key=key), jax.random.key(0)
+    )
+    assert jax.tree.structure(first) == jax.tree.structure(theirs)
+    shapes = [[getattr(leaf, "shape", None) for leaf in jax.tree.leaves(regressor)] for regressor in (first, theirs)]
+    assert shapes[0] == shapes[1]
+    np.testing.assert_array_equal(first.skip, skip)
+    seen = set()
+    for perceptron, other in ((first.approximator, second.approximator), (first.spread, second.spread)):
+        for layer, elsewhere in zip(perceptron.layers, other.layers, strict=True):
+            for x, y in ((layer.weight, elsewhere.weight), (layer.bias, elsewhere.bias)):
+                u = np.asarray(x).ravel() * np.sqrt(layer.in_features)
+                assert np.abs(u).max() <= 1
+                assert abs(u.mean()) < 4.5 * np.sqrt(1 / 3 / u.size)
+                assert abs(np.mean(u**2) - 1 / 3) < 4.5 * np.sqrt(4 / 45 / u.size)
+                assert not np.isclose(x, y).any()
+                assert seen.isdisjoint(u.tolist())  # no number is used twice
+                seen.update(u.tolist())
 
 
 def test_training_learns_and_comes_near_the_bound():

@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import folded, measured
 
 from jaxos4.flight import STATE_NAMES, Flight
 from jaxos4.noise import (
@@ -48,8 +49,7 @@ def errors(noise, samples, *, trials=None, seed=0):
     key, flight = jax.random.key(seed), still(samples)
     if trials is None:
         return np.asarray(noise(flight, key=key).states)
-    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(trials))
-    return np.asarray(jax.vmap(lambda k: noise(flight, key=k).states)(keys))
+    return np.asarray(measured(noise, flight, folded(key, jnp.arange(trials))))
 
 
 def assert_within(estimate, truth, standard_error, limit=4.0):

@@ -8,7 +8,7 @@ import re
 import sys
 
 import h5py
-import matplotlib
+import matplotlib.figure
 import numpy as np
 import pytest
 import xarray as xr
@@ -18,6 +18,7 @@ from synthetic_study import ESTIMATORS, LEVELS, RESULTS, SCENARIO, UNITS, synthe
 from jaxos4.cli import main
 from jaxos4.report import error_table, figures, read_results, write_report, writing
 from jaxos4.report.numbers import MISSING, plain
+from jaxos4.report.style import drawing, log_axis
 
 OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
 OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
@@ -324,6 +325,19 @@ def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
         settings = dict(matplotlib.rcParams)
         assert list(figures.of_example(study)) == before
         assert dict(matplotlib.rcParams) == settings
+
+
+@pytest.mark.parametrize("low", [0.04, 0.3, 0.62, 0.84, 0.95, 0.99])
+@pytest.mark.parametrize("high", [1.01, 1.2, 1.6, 2.03, 3.4, 4.7, 12.0, 29.0, 5e3])
+def test_a_logarithmic_axis_has_a_tick_at_1_where_that_is_in_sight(low, high):
+    with drawing():
+        panel = matplotlib.figure.Figure(figsize=(2.2, 2.2)).add_subplot()
+        panel.set_ylim(low, high)
+        log_axis(panel, "y")
+        ticks = panel.get_yticks()
+    seen = ticks[(ticks >= low) & (ticks <= high)]
+    assert np.isclose(seen, 1).any()
+    assert 1 < len(seen) < 10
 
 
 def test_small_numbers_keep_their_digits():

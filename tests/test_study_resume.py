@@ -13,7 +13,7 @@ import time
 import pytest
 import xarray as xr
 from helpers import refused
-from small_study import cells, finish, results, run_study, specification, start
+from small_study import SPECIFICATION, cells, finish, results, run_study, specification, start
 
 from jaxos4.study import Store, load_study, open_store, read_store
 
@@ -73,6 +73,23 @@ def test_a_study_is_the_same_after_any_number_of_kills(whole, tmp_path):
     times = collections.Counter(logged(out))
     assert set(times.values()) == {1}
     assert count - kills <= len(times) <= count
+
+
+def test_an_interrupt_ends_it_at_once_with_one_line_and_the_same_command_goes_on(whole, tmp_path):
+    # Training of hours is at work, in a thread that cannot be interrupted.
+    text = (
+        SPECIFICATION.replace('["equation-error"]', '["equation-error", "network"]') + "[network]\nsteps = 1_000_000\n"
+    )
+    out, command = tmp_path / "out", ("study", specification(tmp_path, text), "--out", tmp_path / "out")
+    process, deadline = start(*command, devices=2), time.monotonic() + 120
+    while not list(out.glob("cells/*.npz")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, f"jaxos4: {out}: interrupted; the same command goes on where it was.\n")
+    there = cells(out)
+    assert there.items() <= cells(whole).items()
+    assert len(read_store(out).missing()) == 96 - len(there)
 
 
 def test_cells_are_the_same_in_any_order_in_another_process(whole, tmp_path):

@@ -11,14 +11,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
-import equinox as eqx
 import jax
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
 import jaxos4
+from jaxos4.cli.experiment import (
+    PARAMETERS,
+    brackets_around,
+    count_results,
+    identify,
+    in_words,
+    measure,
+    table_of,
+)
 from jaxos4.estimators import BASELINES
 from jaxos4.noise import NOISES
 
@@ -27,7 +34,7 @@ jax.config.update("jax_enable_x64", True)
 ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {"ibss": jaxos4.IBSS, **BASELINES}
 
 
-def identify(
+def row_of(
     estimator: jaxos4.AbstractEstimator,
     noise: jaxos4.AbstractNoise,
     scale: float,
@@ -38,34 +45,24 @@ def identify(
     """One row of the table."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     exact = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
-    sigma = (scale or 1.0) * jaxos4.SENSOR_SIGMA
-
-    def problem(flight: jaxos4.Flight) -> jaxos4.ShootingProblem:
-        return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=exact.states[0], channels=channels)
-
-    @eqx.filter_jit
-    @eqx.filter_vmap
-    def one(key: jax.Array) -> jaxos4.Estimate:
-        noise_key, start_key = jax.random.split(key)
-        flight = noise(exact, key=noise_key) if scale else exact
-        center = model.alpha + jax.random.uniform(start_key, (8,), minval=-0.8, maxval=0.8) * model.half_width
-        return estimator(problem(flight), jaxos4.Bracket.around(center, model.half_width))
-
-    keys = jax.random.split(jax.random.key(seed), flights)
-    jax.block_until_ready(one(keys))
+    problem = jaxos4.ShootingProblem(
+        model, exact, sigma=(scale or 1.0) * jaxos4.SENSOR_SIGMA, initial_state=exact.states[0], channels=channels
+    )
+    noise_keys, start_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+    states, brackets = measure(noise, exact, noise_keys), brackets_around(model, start_keys)
+    jax.block_until_ready(identify(estimator, problem, brackets, states))
     begin = time.perf_counter()
-    found = jax.block_until_ready(one(keys))
+    found = jax.block_until_ready(identify(estimator, problem, brackets, states))
     seconds = (time.perf_counter() - begin) / flights
-    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(exact), model.alpha)))
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
     results = jaxos4.result_names(found.result)
     told = np.isin(results, ["successful", "unidentifiable"])
     errors = np.asarray(found.parameters - model.alpha)[told] / bound
-    names, counts = np.unique(results, return_counts=True)
     inside = np.abs(np.asarray(found.parameters - model.alpha)) < np.asarray(found.half_width(0.95))
     return {
         "flights": flights,
         "answers": int(told.sum()),
-        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "results": count_results(results),
         "efficiency": np.sqrt(np.mean(errors**2, axis=0)).tolist() if told.any() else None,
         "bias": np.mean(errors, axis=0).tolist() if told.any() else None,
         "monte_carlo_error": float(1 / np.sqrt(2 * max(told.sum(), 1))),
@@ -90,26 +87,16 @@ def main(
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
     """Every estimator at its documented settings on the standard flight."""
-    rows, table = [], Table(title=f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights")
-    for heading in (
-        "noise",
-        "scale",
-        "estimator",
-        *(f"a{i}" for i in range(1, 9)),
-        "bias",
-        "95 %",
-        "rollouts",
-        "ms",
-        "results",
-    ):
-        table.add_column(heading, no_wrap=heading != "results")
+    headings = "noise", "scale", "estimator", *PARAMETERS, "bias", "95 %", "rollouts", "ms", "results"
+    table = table_of(f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights", headings)
+    rows = []
     for kind in noises:
         for scale in scales:
             if scale == 0 and kind != noises[0]:
                 continue
             for name in estimators:
-                noise = NOISES[kind](scale * jaxos4.SENSOR_SIGMA)
-                row = identify(ESTIMATORS[name](), noise, scale, channels, flights, seed)
+                noise = NOISES[kind if scale else "white"](scale * jaxos4.SENSOR_SIGMA)
+                row = row_of(ESTIMATORS[name](), noise, scale, channels, flights, seed)
                 rows.append({"noise": kind, "scale": scale, "estimator": name, **row})
                 table.add_row(
                     kind if scale else "none",
@@ -120,7 +107,7 @@ def main(
                     f"{100 * np.mean(row['covered']):.0f}" if row["covered"] else "",
                     f"{row['rollouts']:.0f}",
                     f"{1000 * row['seconds']:.3g}",
-                    ", ".join(f"{count} {what}" for what, count in row["results"].items()),
+                    in_words(row["results"]),
                 )
                 if out is not None:
                     report = {"version": jaxos4.__version__, "seed": seed, "channels": channels, "rows": rows}

@@ -6,7 +6,6 @@ Iy, Iz, J_R come from each flight's alphas and their covariance.
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -17,9 +16,17 @@ import numpy as np
 import scipy.stats
 import typer
 from rich.console import Console
-from rich.table import Table
 
 import jaxos4
+from jaxos4.cli.experiment import (
+    PARAMETERS,
+    brackets_around,
+    count_results,
+    identify,
+    in_words,
+    measure,
+    table_of,
+)
 from jaxos4.dynamics import MODELS
 
 jax.config.update("jax_enable_x64", True)
@@ -30,39 +37,38 @@ CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
 CHUNK = 250
 
 
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, 0, 0))
+def constants(model: jaxos4.AbstractModel, parameters: jax.Array, covariance: jax.Array) -> jaxos4.InertiaFit:
+    """Those of the rigid body, of each flight."""
+    return jaxos4.fit_inertia(model, parameters, covariance)
+
+
 def cover(
-    estimator: jaxos4.AbstractEstimator,
-    problem: Callable[[jax.Array], jaxos4.ShootingProblem],
-    exact: jaxos4.Flight,
-    scale: float,
-    flights: int,
-    seed: int,
+    estimator: jaxos4.AbstractEstimator, problem: jaxos4.ShootingProblem, scale: float, flights: int, seed: int
 ) -> dict:
-    """One row of the table."""
-    model, noise = problem(exact.states).model, jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
+    """One row of the table; `problem` holds the exact flight."""
+    model, exact, noise = problem.model, problem.flight, jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
+    noise_keys, start_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
+    brackets, begin = brackets_around(model, start_keys), time.perf_counter()
 
-    @eqx.filter_jit
-    @eqx.filter_vmap
-    def one(key: jax.Array) -> tuple[jaxos4.Estimate, jaxos4.InertiaFit]:
-        noise_key, start_key = jax.random.split(key)
-        center = model.alpha + jax.random.uniform(start_key, (8,), minval=-0.8, maxval=0.8) * model.half_width
-        bracket = jaxos4.Bracket.around(center, model.half_width)
-        found = estimator(problem(noise(exact, key=noise_key).states), bracket)
-        return found, jaxos4.fit_inertia(model, found.parameters, found.covariance)
+    def part(first: int) -> jaxos4.Estimate:
+        some = slice(first, first + CHUNK)
+        states = measure(noise, exact, noise_keys[some])
+        return jax.block_until_ready(identify(estimator, problem, jax.tree.map(lambda x: x[some], brackets), states))
 
-    keys, begin = jax.random.split(jax.random.key(seed), flights), time.perf_counter()
-    parts = [jax.block_until_ready(one(keys[i : i + CHUNK])) for i in range(0, flights, CHUNK)]
+    found = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(part, range(0, flights, CHUNK)))
     seconds = time.perf_counter() - begin
-    found, rigid = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    names, counts = np.unique(jaxos4.result_names(found.result), return_counts=True)
+    rigid = constants(model, found.parameters, found.covariance)
+    results = count_results(jaxos4.result_names(found.result))
     # A flight without an estimate has an infinite interval: it counts as not covered.
     errors, half_width = np.abs(found.parameters - model.alpha), np.asarray(found.half_width(0.95))
-    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(exact.states), model.alpha)))
+    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
     truth = np.append(np.asarray(model.airframe.inertia), model.airframe.rotor_inertia)
     outside = np.abs(rigid.constants - truth) > scipy.stats.norm.ppf(0.975) * np.asarray(rigid.std)
     told = np.isfinite(half_width)
     return {
-        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "results": results,
         "std": np.median(found.std / bound, axis=0).tolist(),
         "covered": (told & (errors < half_width)).mean(axis=0).tolist(),
         "constants_covered": (np.isfinite(rigid.std) & ~outside).mean(axis=0).tolist(),
@@ -86,29 +92,20 @@ def main(
     exact = jaxos4.simulate(vehicle, vehicle.alpha, jaxos4.multisine(vehicle.airframe), dt=0.01)
     rows, network = [], None
     error = np.sqrt(0.95 * 0.05 / flights)
-    table = Table(title=f"95 % intervals that hold the truth [%], {flights} flights, {model}, {channels}")
-    for heading in ("scale", "estimator", *(f"a{i}" for i in range(1, 9)), *CONSTANTS, "p < 5 %", "s", "results"):
-        table.add_column(heading, no_wrap=heading != "results")
+    headings = "scale", "estimator", *PARAMETERS, *CONSTANTS, "p < 5 %", "s", "results"
+    table = table_of(f"95 % intervals that hold the truth [%], {flights} flights, {model}, {channels}", headings)
+
+    def problem(scale: float) -> jaxos4.ShootingProblem:
+        sigma = scale * jaxos4.SENSOR_SIGMA
+        return jaxos4.ShootingProblem(vehicle, exact, sigma=sigma, initial_state=exact.states[0], channels=channels)
+
     for scale in scales:
-
-        def problem(states: jax.Array, scale: float = scale) -> jaxos4.ShootingProblem:
-            return jaxos4.ShootingProblem(
-                vehicle,
-                eqx.tree_at(lambda f: f.states, exact, states),
-                sigma=scale * jaxos4.SENSOR_SIGMA,
-                initial_state=exact.states[0],
-                channels=channels,
-            )
-
         for name in estimators:
             if name == "hybrid" and network is None:
                 training = jaxos4.NetworkEstimator(channels=channels, steps=steps)
-                standard = jaxos4.ShootingProblem(
-                    vehicle, exact, sigma=jaxos4.SENSOR_SIGMA, initial_state=exact.states[0], channels=channels
-                )
-                network = training.fit(standard, jaxos4.Bracket.default(vehicle), key=jax.random.key(0))
+                network = training.fit(problem(1.0), jaxos4.Bracket.default(vehicle), key=jax.random.key(0))
             estimator = jaxos4.Hybrid(network) if name == "hybrid" else ESTIMATORS[name]()
-            row = cover(estimator, problem, exact, scale, flights, seed)
+            row = cover(estimator, problem(scale), scale, flights, seed)
             rows.append({"scale": scale, "estimator": name, **row})
             table.add_row(
                 f"{scale:g}",
@@ -116,7 +113,7 @@ def main(
                 *(f"{100 * x:.1f}" for x in row["covered"] + row["constants_covered"]),
                 f"{100 * row['inconsistent']:.1f}",
                 f"{row['seconds']:.0f}",
-                ", ".join(f"{count} {what}" for what, count in row["results"].items()),
+                in_words(row["results"]),
             )
             if out is not None:
                 report = {"version": jaxos4.__version__, "seed": seed, "monte_carlo_error": error, "rows": rows}

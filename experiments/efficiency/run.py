@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
 import jaxos4
+from jaxos4.cli.experiment import PARAMETERS, count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -56,13 +56,12 @@ def study(model: jaxos4.AbstractModel, channels: str, flights: int, seed: int, *
 
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(flight), model.alpha)))
     error = np.asarray(estimates.parameters - model.alpha) / bound
-    names, counts = np.unique(jaxos4.result_names(estimates.result), return_counts=True)
     return {
         "efficiency": np.sqrt(np.mean(error**2, axis=0)).tolist(),
         "bias": error.mean(axis=0).tolist(),
         "monte_carlo_error": 1 / np.sqrt(2 * flights),
         "covered": float(np.mean(np.abs(error * bound) < 1.96 * np.asarray(estimates.std))),
-        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "results": count_results(jaxos4.result_names(estimates.result)),
         "rollouts": float(np.mean(estimates.rollouts)),
         "compile_seconds": built - begin,
         "seconds": done - built,
@@ -78,19 +77,20 @@ def main(
 ) -> None:
     """RMSE / Cramer-Rao bound of IBSS, parameter by parameter."""
     report = {"flights": flights, "seed": seed, "scale": scale, "version": jaxos4.__version__, "cases": {}}
-    table = Table(
-        title=f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
-    )
-    for heading in ("case", *(f"a{i}" for i in range(1, 9)), "covered", "results", "rollouts", "s"):
-        table.add_column(heading)
+    title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
+    table = table_of(title, ("case", *PARAMETERS, "covered", "results", "rollouts", "s"))
     for case in cases:
         model, channels, known = CASES[case]
         row = study(model(jaxos4.OS4), channels, flights, seed, scale=scale, known=known)
         report["cases"][case] = row
-        results = ", ".join(f"{count} {name}" for name, count in row["results"].items())
         figures = [f"{x:.2f}" for x in row["efficiency"]]
         table.add_row(
-            case, *figures, f"{row['covered']:.3f}", results, f"{row['rollouts']:.0f}", f"{row['seconds']:.1f}"
+            case,
+            *figures,
+            f"{row['covered']:.3f}",
+            in_words(row["results"]),
+            f"{row['rollouts']:.0f}",
+            f"{row['seconds']:.1f}",
         )
     Console(width=150).print(table)
     if out is not None:

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
 import jaxos4
+from jaxos4.cli.experiment import PARAMETERS, count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -68,13 +68,13 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
         begin = time.perf_counter()
         found = jax.block_until_ready(one(states))
         seconds = (time.perf_counter() - begin) / flights
-    names, counts = np.unique(jaxos4.result_names(found.result), return_counts=True)
-    answered = jaxos4.result_names(found.result) == "successful"
+    results = jaxos4.result_names(found.result)
+    answered = results == "successful"
     errors = np.asarray(found.parameters / model.alpha - 1)[:, TOLD]
     return {
         "windows": windows,
         "estimator": name,
-        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "results": count_results(results),
         "successful": int(answered.sum()),
         "percent": (100 * np.sqrt(np.mean(errors[answered] ** 2, axis=0))).tolist() if answered.any() else None,
         "rollouts": float(np.mean(found.rollouts)),
@@ -93,17 +93,8 @@ def main(
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
     """One shot against windows."""
-    rows, table = [], Table(title=f"RMS error [%] on {flights} flights of {duration:g} s, rates")
-    for heading in (
-        "drift",
-        "windows",
-        "estimator",
-        *(f"a{i + 1}" for i in TOLD),
-        "rollouts",
-        "s",
-        "results",
-    ):
-        table.add_column(heading, no_wrap=heading != "results")
+    headings = "drift", "windows", "estimator", *(PARAMETERS[i] for i in TOLD), "rollouts", "s", "results"
+    rows, table = [], table_of(f"RMS error [%] on {flights} flights of {duration:g} s, rates", headings)
     for drift in drifts:
         recorded, states = drifting(duration, drift, flights, seed)
         for count in windows:
@@ -117,7 +108,7 @@ def main(
                     *((f"{x:.2g}" for x in row["percent"]) if row["percent"] else "-" * len(TOLD)),
                     f"{row['rollouts']:.0f}",
                     f"{row['seconds']:.2g}",
-                    ", ".join(f"{number} {what}" for what, number in row["results"].items()),
+                    in_words(row["results"]),
                 )
                 if out is not None:
                     report = {"version": jaxos4.__version__, "seed": seed, "duration": duration, "rows": rows}

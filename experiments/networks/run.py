@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
 import jaxos4
+from jaxos4.cli.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -73,11 +73,22 @@ NETWORKS = {
 }
 
 
+def many_times(bracket: jaxos4.Bracket, flights: int) -> jaxos4.Bracket:
+    """The same bracket for each flight."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), bracket)
+
+
 def unseen(
-    case: Case, estimator: jaxos4.AbstractEstimator, bound_channels: str, noises: list[float], flights: int, seed: int
+    case: Case,
+    estimator: jaxos4.AbstractEstimator,
+    channels: str,
+    bound_channels: str,
+    noises: list[float],
+    flights: int,
+    seed: int,
 ) -> Iterator[tuple[float, dict]]:
     """For each noise, identifies `flights` flights that can be flown, of parameters drawn over the bracket."""
-    bracket, exact = case.bracket, case.flight
+    bracket, exact, at_once = case.bracket, case.flight, min(CHUNK, flights)
 
     @eqx.filter_jit
     @eqx.filter_vmap(in_axes=(0, None))
@@ -91,18 +102,13 @@ def unseen(
         flown = (truth.result == jaxos4.RESULTS.successful) & jnp.isfinite(bound).all()
         return alpha, flight.states, bound, flown
 
-    @eqx.filter_jit
-    @eqx.filter_vmap(in_axes=(0, None, None))
-    def identify(states, noise, estimator):
-        return estimator(case.problem(eqx.tree_at(lambda f: f.states, exact, states), noise), bracket)
-
     for noise in noises:
-        level, rows, seconds, chunk = jnp.asarray(noise), [], [], 0
-        while sum(len(r["alpha"]) for r in rows) < flights and chunk < 20 + 20 * flights / CHUNK:
-            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), chunk), CHUNK)
-            alpha, states, bound, flown = fly(keys, level)
+        problem, rows, seconds, chunk = case.problem(exact, noise, channels), [], [], 0
+        while sum(len(r["alpha"]) for r in rows) < flights and chunk < 20 + 20 * flights / at_once:
+            keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), chunk), at_once)
+            alpha, states, bound, flown = fly(keys, jnp.asarray(noise))
             begin, chunk = time.perf_counter(), chunk + 1
-            found = jax.block_until_ready(identify(states, level, estimator))
+            found = jax.block_until_ready(identify(estimator, problem, many_times(bracket, at_once), states))
             seconds.append(time.perf_counter() - begin)
             error = found.parameters - alpha
             row = {
@@ -117,7 +123,7 @@ def unseen(
                 row["hit"] = ((alpha >= found.seed.lower) & (alpha <= found.seed.upper)).all(axis=1)
             rows.append({name: np.asarray(value)[np.asarray(flown)] for name, value in row.items()})
         data = {name: np.concatenate([r[name] for r in rows])[:flights] for name in rows[0]}
-        yield noise, summary(data) | {"flights_per_second": CHUNK / float(np.median(seconds))}
+        yield noise, summary(data) | {"flights_per_second": at_once / float(np.median(seconds))}
 
 
 def summary(data: dict[str, np.ndarray]) -> dict:
@@ -127,11 +133,10 @@ def summary(data: dict[str, np.ndarray]) -> dict:
     """
     told = np.isin(data["result"], ["successful", "unidentifiable"])
     error, bound = data["error"][told], data["bound"][told]
-    names, counts = np.unique(data["result"], return_counts=True)
     return {
         "flights": len(told),
         "answers": int(told.sum()),
-        "results": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "results": count_results(data["result"]),
         "efficiency": np.sqrt(np.mean((error / bound) ** 2, axis=0)).tolist(),
         "rms_ratio": np.sqrt(np.mean(error**2, axis=0) / np.mean(bound**2, axis=0)).tolist(),
         "monte_carlo_error": float(1 / np.sqrt(2 * max(told.sum(), 1))),
@@ -141,24 +146,19 @@ def summary(data: dict[str, np.ndarray]) -> dict:
     }
 
 
-def amortised(case: Case, network: jaxos4.TrainedNetwork, flights: int) -> dict:
+def amortised(case: Case, network: jaxos4.TrainedNetwork, channels: str, flights: int) -> dict:
     """Identifies many noisy flights in one call: time, and what it adds to the memory of the process."""
     keys = jax.random.split(jax.random.key(3), flights)
-    exact, bracket, noise = case.flight, case.bracket, jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)
-    noisy = eqx.filter_jit(jax.vmap(lambda key: noise(exact, key=key).states))(keys)
-
-    @eqx.filter_jit
-    @eqx.filter_vmap(in_axes=(0, None))
-    def identify(states, network):
-        return network(case.problem(eqx.tree_at(lambda f: f.states, exact, states), 1.0), bracket)
+    noisy = measure(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), case.flight, keys)
+    arguments = network, case.problem(case.flight, 1.0, channels), many_times(case.bracket, flights), noisy
 
     def peak() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
     begin = time.perf_counter()
-    compiled = identify.lower(noisy, network).compile()
+    compiled = identify.lower(*arguments).compile()
     built, before = time.perf_counter(), peak()
-    jax.block_until_ready(compiled(noisy, network))
+    jax.block_until_ready(compiled(*arguments))
     seconds = time.perf_counter() - built
     return {
         "flights": flights,
@@ -176,6 +176,7 @@ def main(
     cases: Annotated[list[str], typer.Option(help="Which cases.")] = tuple(CASES),
     networks: Annotated[list[str], typer.Option(help="Which networks, in the standard case.")] = tuple(NETWORKS),
     noises: Annotated[list[float], typer.Option(help="Noise scales.")] = NOISES,
+    channels: Annotated[str, typer.Option(help="What was measured, and hybrid and IBSS look at.")] = "all",
     steps: Annotated[int | None, typer.Option(help="Of training, in place of each network's own.")] = None,
     many: Annotated[int, typer.Option(help="Flights identified by one call.")] = 10_000,
     separate: Annotated[bool, typer.Option(help="Also one network for each noise scale.")] = True,
@@ -185,10 +186,10 @@ def main(
     report: dict = {"flights": flights, "seed": seed, "version": jaxos4.__version__, "load": os.getloadavg()}
     report |= {"rows": [], "training_seconds": {}}
     console = Console(width=170)
-    table = Table(title="RMSE / Cramer-Rao bound: of the rates for a network alone, of all channels for the others")
-    parameters = [f"a{i}" for i in range(1, 9)]
-    for heading in ("case", "estimator", "noise", *parameters, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"):
-        table.add_column(heading, no_wrap=heading != "results")
+    headings = "case", "estimator", "noise", *PARAMETERS, "50, 90, 99 %", "hit", "rollouts", "1/s", "results"
+    table = table_of(
+        f"RMSE / Cramer-Rao bound: of the rates for a network alone, of {channels} for the others", headings
+    )
 
     def add(name: str, label: str, noise: float, row: dict) -> None:
         report["rows"].append({"case": name, "estimator": label, "noise": noise, **row})
@@ -201,7 +202,7 @@ def main(
             "" if row["hit_rate"] is None else f"{100 * row['hit_rate']:.1f}",
             f"{row['rollouts']:.0f}",
             f"{row['flights_per_second'] or 0:.0f}",
-            ", ".join(f"{count} {what}" for what, count in row["results"].items()),
+            in_words(row["results"]),
         )
         if out is not None:
             out.write_text(json.dumps(report, indent=2) + "\n")
@@ -220,23 +221,25 @@ def main(
             trained, seconds = fit(case, NETWORKS[label])
             console.print(f"{name}: {label} trained in {seconds:.0f} s", highlight=False)
             report["training_seconds"][f"{name}: {label}"] = seconds
-            for noise, row in unseen(case, trained, "rates", noises, flights, seed):
+            for noise, row in unseen(case, trained, channels, "rates", noises, flights, seed):
                 add(name, label, noise, row)
             if label != networks[0]:
                 continue
             if name == "standard":
-                report["one_call"] = amortised(case, trained, many)
+                report["one_call"] = amortised(case, trained, channels, many)
                 console.print(f"one call: {report['one_call']}", highlight=False)
-            seeds, seconds = fit(case, {**NETWORKS[label], "channels": "all"})
-            report["training_seconds"][f"{name}: {label} of all channels, for the hybrid"] = seconds
+            seeds = trained
+            if channels != trained.channels:
+                seeds, seconds = fit(case, {**NETWORKS[label], "channels": channels})
+                report["training_seconds"][f"{name}: {label} of {channels} channels, for the hybrid"] = seconds
             for other, estimator in (("hybrid", jaxos4.Hybrid(seeds)), ("ibss", jaxos4.IBSS())):
-                for noise, row in unseen(case, estimator, "all", noises, flights, seed):
+                for noise, row in unseen(case, estimator, channels, channels, noises, flights, seed):
                     add(name, other, noise, row)
         for noise in noises if name == "standard" and separate else ():
             trained, seconds = fit(case, {**NETWORKS[networks[0]], "noise": (noise, noise)})
             label = f"{networks[0]}, this noise only"
             report["training_seconds"][f"{name}: {label} {noise:g}"] = seconds
-            for _, row in unseen(case, trained, "rates", [noise], flights, seed):
+            for _, row in unseen(case, trained, channels, "rates", [noise], flights, seed):
                 add(name, label, noise, row)
     console.print(table)
     if out is not None:

@@ -38,6 +38,7 @@ DELAYS = (0.0, 0.004, 0.008, 0.012, 0.016, 0.02)
 DT, WINDOW, BEGIN, BLOCK = 0.004, 0.25, 1.0, 5.0
 # Of the flight, one of which at a time is left out for errors of differences and of regressions: as in `jaxos4.skill`.
 PARTS = 10
+NAMES = ("output-error", "hybrid", "ibss, nothing held", "ibss without flapping")
 SECTIONS = ("regression", "lag", "joint")
 NINETY_FIVE = 1.96
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6"}
@@ -186,7 +187,7 @@ def hybrid_for(fit: jaxos4.VehicleFit, steps: int) -> jaxos4.Hybrid:
 def estimators(parts: tuple[list, list], steps: int, names: list[str]) -> Iterator[tuple[str, dict, tuple]]:
     """IBSS in stages; the others, and IBSS with nothing held, on its last problem; IBSS without `flapping`."""
     fit, seconds = fitted(problem_of(parts[0], TERMS))
-    for name in ("ibss", *names, "ibss, nothing held", "ibss without flapping"):
+    for name in ("ibss", *names):
         terms, extra, used = TERMS, {}, fit
         if name == "output-error":
             used, seconds = again(fit, jaxos4.OutputError())
@@ -274,7 +275,11 @@ def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
                 "held": sorted(held),
                 "inertias": inertias(values, left_out(memory, held)),
                 "skill": worth(predicted),
-                "minus_this": {name: difference(found[name][2], predicted) for name in ("ibss", "ibss, nothing held")},
+                "minus_this": {
+                    name: difference(found[name][2], predicted)
+                    for name in ("ibss", "ibss, nothing held")
+                    if name in found
+                },
             }
     return {"grid": grid, "chosen": best, "rows": rows}
 
@@ -329,7 +334,7 @@ def main(
     flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
     seconds: Annotated[float, typer.Option(help="How much of each flight.")] = np.inf,
     steps: Annotated[int, typer.Option(help="Training of the hybrid's network.")] = 500,
-    names: Annotated[list[str], typer.Option(help="Beside IBSS.")] = ("output-error", "hybrid"),
+    names: Annotated[list[str], typer.Option(help="Beside IBSS.")] = NAMES,
     lags: Annotated[list[float], typer.Option(help="At which the lag is held [s].")] = LAGS,
     sections: Annotated[list[str], typer.Option(help="Of regression, lag, joint.")] = SECTIONS,
 ) -> None:

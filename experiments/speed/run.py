@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxos4
+from jaxos4.simulate import METHODS
 
 jax.config.update("jax_enable_x64", True)
 
@@ -63,6 +64,11 @@ def main(
     steps: Annotated[int, typer.Option(help="Steps of a flight.")] = 500,
     flights: Annotated[list[int], typer.Option(help="Flights identified at once.")] = (64, 256, 1024),
     repeats: Annotated[int, typer.Option()] = 7,
+    channels: Annotated[list[str], typer.Option(help="Which; of the first, the growth with the steps.")] = (
+        "all",
+        "rates",
+    ),
+    methods: Annotated[list[str], typer.Option(help="Of simulation.")] = tuple(METHODS),
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
     """Benchmarks; every row is measured afresh."""
@@ -92,25 +98,25 @@ def main(
 
     alpha = jaxos4.PublishedOS4(jaxos4.OS4).alpha
     trials = alpha * (1 + 0.1 * jax.random.normal(jax.random.key(0), (batch, 8)))
-    for channels in ("all", "rates"):
-        problem = standard_problem(channels, steps)
+    for looked_at in channels:
+        problem = standard_problem(looked_at, steps)
         add(
-            f"shot, {channels}",
+            f"shot, {looked_at}",
             timed(lambda p, a: jax.vmap(p.cost)(a), problem, trials, repeats=repeats),
             batch * steps,
             "steps/s",
         )
         add(
-            f"slope, {channels}",
+            f"slope, {looked_at}",
             timed(lambda p, a: jax.vmap(lambda x: jax.jvp(p.cost, (x,), (x,)))(a), problem, trials, repeats=repeats),
             batch * steps,
             "steps/s",
         )
     for length in (steps // 2, steps, 2 * steps, 4 * steps):
-        problem = standard_problem("all", length)
+        problem = standard_problem(channels[0], length)
         measured = timed(lambda p, a: jax.vmap(p.cost)(a), problem, trials[: batch // 4], repeats=repeats)
         add(f"shot, {length} steps, batch {batch // 4}", measured, batch // 4 * length, "steps/s")
-    for method in ("euler", "rk4", "diffrax"):
+    for method in methods:
         count = batch // 64 if method == "diffrax" else batch // 8
         problem = standard_problem("all", steps)
 
@@ -119,12 +125,12 @@ def main(
 
         measured = timed(trajectories, problem, trials[:count], repeats=repeats)
         add(f"simulate, {method}, batch {count}", measured, count * steps, "steps/s")
-    for channels in ("rates", "all"):
-        problem = standard_problem(channels, steps)
+    for looked_at in reversed(channels):
+        problem = standard_problem(looked_at, steps)
         for count in flights:
             keys = jax.random.split(jax.random.key(1), count)
             measured = timed(identify, problem, jaxos4.Bracket.default(problem.model), keys, repeats=1)
-            add(f"IBSS, {channels}, {count} flights", measured, count, "flights/s")
+            add(f"IBSS, {looked_at}, {count} flights", measured, count, "flights/s")
 
     # In chunks, the memory of a study does not depend on how many flights it holds.
     problem, chunk = standard_problem("rates", steps), min(256, flights[-1])

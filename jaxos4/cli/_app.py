@@ -1,5 +1,6 @@
 """The application: precision, and exit codes."""
 
+import os
 import sys
 
 import jax
@@ -14,6 +15,8 @@ from .report import report
 from .simulate import simulate
 from .study import study
 from .train import train
+
+_INTERRUPTED = 130
 
 app = typer.Typer(
     add_completion=False,
@@ -32,10 +35,19 @@ app.command()(report)
 
 
 def main() -> None:
-    """Runs the command line. Exit code 0: done, 1: the computation failed, 2: unusable arguments or input."""
+    """Runs the command line.
+
+    Exit code 0: done, 1: the computation failed, 2: unusable arguments or input, 130: interrupted.
+    """
     jax.config.update("jax_enable_x64", True)
     try:
         app()
+    except SystemExit as stop:
+        if stop.code != _INTERRUPTED:
+            raise
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_INTERRUPTED)  # now, and not when threads that compile or train come to their end; files are whole
     except (InputError, OSError) as error:
         if isinstance(error, BrokenPipeError):  # whoever read our output has gone: not worth a word
             sys.stderr.close()

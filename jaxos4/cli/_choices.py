@@ -21,6 +21,9 @@ Estimator = StrEnum("Estimator", list(("ibss", "network", "hybrid", *BASELINES))
 Features = StrEnum("Features", list(FEATURES))
 Approximator = StrEnum("Approximator", list(APPROXIMATORS))
 
+VehicleModel = StrEnum("VehicleModel", list((*MODELS, "flight")))
+Loss = StrEnum("Loss", ["huber", "squares"])
+
 FlightFile = Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
 ModelOption = Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")]
 AirframeOption = Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")]

@@ -15,10 +15,7 @@ NINETY_FIVE = 1.96
 
 
 def print_page(console: Console, report: dict[str, Any]) -> None:
-    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("parameter", "unit", "estimate", "95 % interval", "bound", "note"):
-        right = heading in ("estimate", "bound")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "note")
+    table = _table(("parameter", "unit", "estimate", "95 % interval", "bound", "note"))
     for name, row in report["parameters"].items():
         if row["estimate"] is None:
             table.add_row(name, row["unit"], "-", "-", "-", row["note"])
@@ -112,3 +109,68 @@ def _print_validation(console: Console, validation: dict[str, Any] | None) -> No
         highlight=False,
         markup=False,
     )
+
+
+def print_vehicle(console: Console, report: dict[str, Any]) -> None:
+    """A real vehicle: parameters, inertias, and what the fit is worth on what it did not see."""
+    table = _table(("parameter", "unit", "estimate", "95 % interval", "note"))
+    for name, row in report["parameters"].items():
+        if row["estimate"] is None:
+            table.add_row(name, row["unit"], "-", "-", row["note"])
+            continue
+        low, high = row["ci95"]
+        table.add_row(name, row["unit"], f"{row['estimate']:.4g}", f"[{low:.4g}, {high:.4g}]", row["note"])
+    console.print(table, markup=False)
+    inertias = [
+        f"{name} {row['estimate']:.4g} +- {NINETY_FIVE * row['std']:.2g}"
+        for name, row in report["constants"].items()
+        if isinstance(row, dict)
+    ]
+    if inertias:
+        console.print(
+            f"inertias [kg m^2]: {', '.join(inertias)}, if the airframe's thrust coefficient and arms are right.",
+            highlight=False,
+            markup=False,
+        )
+    noise = ", ".join(f"{name} {value:.2g}" for name, value in report["noise"].items())
+    console.print(
+        f"left unexplained in a window (rad/s, m/s^2): {noise}; the intervals allow for its colour. "
+        f"Outliers cut: {100 * report['cut']:.0f} %.",
+        highlight=False,
+    )
+    _print_skill(console, report["skill"])
+    used = report["provenance"]
+    console.print(
+        f"{report['estimator']}, flight model ({', '.join(used['terms'])}), {used['fitted_seconds']:.0f} s in windows "
+        f"of {used['window']:g} s, a sample every {1e3 * used['sample_time']:g} ms: {report['result']}, "
+        f"{report['rollouts']} rollouts, {report['seconds']:.0f} s",
+        highlight=False,
+    )
+
+
+def _print_skill(console: Console, skill: dict[str, Any] | None) -> None:
+    if skill is None:
+        return
+    console.print(
+        "Predictions of what was not fitted: 1 is perfect, 0 as good as rates that stay as they are "
+        f"({skill['starts']} starts).",
+        highlight=False,
+    )
+    table = _table(("ahead", "p", "q", "r", "equation error: p, q, r"))
+    for i, horizon in enumerate(skill["horizons"]):
+        cells = [f"{_number(skill[rate]['skill'][i])} +- {_number(skill[rate]['std'][i])}" for rate in "pqr"]
+        theirs = ", ".join(_number(skill[rate]["equation_error"][i]) for rate in "pqr")
+        table.add_row(f"{horizon:.2f} s", *cells, theirs)
+    console.print(table, markup=False)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _table(headings: tuple[str, ...]) -> Table:
+    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in headings:
+        right = heading in ("estimate", "bound")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "note")
+    return table

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import typer
 import xarray as xr
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -44,8 +45,12 @@ def carry_out(study: Study, out: Path, device: str, run: Callable[[Store], Itera
         bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         task = bar.add_task("", total=study.count)
         with bar:
-            for step in run(store):
-                bar.update(task, completed=step.done, description=step.label)
+            try:
+                for step in run(store):
+                    bar.update(task, completed=step.done, description=step.label)
+            except KeyboardInterrupt:
+                typer.echo(f"jaxos4: {out}: interrupted; the same command goes on where it was.", err=True)
+                raise
             bar.update(task, description="writing the Dataset")
             dataset = assemble(store)
             save_dataset(dataset, out)

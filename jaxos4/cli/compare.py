@@ -31,7 +31,9 @@ def compare(
     out: Annotated[
         Path | None, typer.Option(help="The folder to write; comparison, or comparison-quick, without it.")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Body rates alone, fewer flights and methods.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Body rates alone, fewer flights and methods, figures as SVG.")
+    ] = False,
 ) -> None:
     """Compare IBSS, network, hybrid and baselines on the standard flight at three noises: table, figures, report."""
     begin = time.perf_counter()
@@ -43,6 +45,6 @@ def compare(
 
     Console(highlight=False).print(error_table(dataset))
     with Console(stderr=True).status("drawing the report"):
-        page, *_ = write_report(dataset, directory)
+        page, *_ = write_report(dataset, directory, with_pdf=not quick)
     typer.echo(f"{summary(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")

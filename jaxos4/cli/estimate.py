@@ -1,6 +1,8 @@
 """`jaxos4 estimate`: the parameters that a flight tells, with their intervals."""
 
 import dataclasses
+import shlex
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,25 +35,28 @@ from ..identifiability import Identifiability, identifiability
 from ..inertia import fit_inertia
 from ..information import robust_covariance
 from ..logs import read_flight_and_notes
+from ..report.flight_page import write_flight_page
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,
     BracketOption,
+    Channels,
     ChannelsOption,
     Estimator,
-    FlightFile,
     InitialState,
     InitialStateOption,
+    Loss,
     Model,
-    ModelOption,
     OutOption,
+    VehicleModel,
     WindowOption,
 )
 from ._fitting import NO_ANSWER, fit, fit_network, load_job, problem_of, seen_channels
 from ._json import finite, write_json
-from ._page import COLOURED, print_page
+from ._page import COLOURED, print_page, print_vehicle
+from ._vehicle import HOLDOUT, WINDOW, Part, identify_vehicle
 
 # How long a network is trained that only has to say where to look.
 SEED_STEPS = 2000
@@ -66,9 +71,11 @@ LAGS = 25
 
 
 def estimate(
-    flight: FlightFile,
+    flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A recorded flight; logs of one vehicle.")],
     estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
-    model: ModelOption = Model["published"],
+    model: Annotated[
+        VehicleModel, typer.Option(help="The equations: as printed, corrected, or of a real vehicle in flight.")
+    ] = VehicleModel["published"],
     airframe: AirframeOption = "os4",
     bracket: BracketOption = None,
     channels: ChannelsOption = None,
@@ -81,10 +88,110 @@ def estimate(
     validate: Annotated[
         Path | None, typer.Option(metavar="OTHER.csv", help="A flight that is not fitted, to be predicted.")
     ] = None,
+    terms: Annotated[
+        str | None,
+        typer.Option(help="With --model flight: offset,damping,... ; those that the logs allow without it."),
+    ] = None,
+    begin: Annotated[
+        float | None, typer.Option("--from", metavar="SECONDS", help="With --model flight: use from there on.")
+    ] = None,
+    end: Annotated[
+        float | None, typer.Option("--to", metavar="SECONDS", help="With --model flight: use up to there.")
+    ] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="With --model flight: average to it; 0.004 where faster.")
+    ] = None,
+    holdout: Annotated[
+        float | None, typer.Option(metavar="SHARE", help="With --model flight: kept back to be predicted; 0.25.")
+    ] = None,
+    loss: Annotated[
+        Loss | None, typer.Option(help="With --model flight: whether outliers are cut; huber without it.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="With --model flight: a page to write.")
+    ] = None,
     out: OutOption = None,
 ) -> None:
-    """Estimate alpha_1..8 of a flight, with 95 % intervals."""
+    """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
     console = Console()
+    if model != "flight":
+        only = {"--terms": terms, "--from": begin, "--to": end, "--sample-time": sample_time}
+        _refuse(
+            only | {"--holdout": holdout, "--loss": loss, "--report": report}, f"is for --model flight, not {model}"
+        )
+        if len(flights) > 1:
+            raise InputError(f"{flights[1]}: --model {model} explains one flight; use --model flight for several.")
+        _estimate_flight(
+            console,
+            flights[0],
+            estimator,
+            Model(model.value),
+            airframe,
+            bracket=bracket,
+            channels=channels,
+            initial_state=initial_state,
+            window=window,
+            network=network,
+            validate=validate,
+            out=out,
+        )
+        return
+    refused = {"--channels": channels, "--network": network}
+    _refuse(refused, "a flight model compares the rates and the specific force, and trains its own network")
+    if initial_state == "known":
+        raise InputError("--initial-state known: each window begins in a state of its own; leave it out.")
+    kept_back = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
+    part = Part(begin, end, WINDOW if window is None else window, sample_time, kept_back)
+    for target in (out, report):
+        if target is not None:
+            check_output(target, *flights, Path(airframe), bracket, validate)
+    if out is not None and report is not None and out.absolute() == report.absolute():
+        raise InputError(f"{out}: --out and --report name one file; give them two.")
+    found, fit, predicted = identify_vehicle(
+        console,
+        flights,
+        estimator=estimator.value,
+        airframe=airframe,
+        bracket=bracket,
+        terms=terms,
+        part=part,
+        validate=validate,
+        huber=loss != "squares",
+    )
+    found["provenance"] |= _provenance() | {"command": shlex.join(["jaxos4", *sys.argv[1:]])}
+    if out is not None:
+        write_json(found, out)
+    if fit.answered:
+        print_vehicle(console, found)
+    if report is not None:
+        write_flight_page(report, report=found, predicted=predicted, title=", ".join(path.name for path in flights))
+        console.print(f"report: {report}", markup=False, highlight=False)
+    if found["result"] != "successful":
+        typer.echo(f"jaxos4: {found['result']}: {RESULTS[fit.estimate.result]}", err=True)
+        raise typer.Exit(1)
+
+
+def _refuse(options: dict[str, Any], why: str) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(f"{name}: {why}; leave it out.")
+
+
+def _estimate_flight(
+    console: Console,
+    flight: Path,
+    estimator: Estimator,
+    model: Model,
+    airframe: str,
+    *,
+    bracket: Path | None,
+    channels: Channels | None,
+    initial_state: InitialState,
+    window: float | None,
+    network: Path | None,
+    validate: Path | None,
+    out: Path | None,
+) -> None:
     learned = estimator in ("network", "hybrid")
     if network is not None and not learned:
         raise InputError(f"--network: {estimator.value} uses none; say --estimator network or hybrid, or leave it out.")

@@ -7,6 +7,7 @@ from .csv import (
     write_flight as write_flight,
 )
 from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
+from .resample import averaged as averaged
 from .stretches import (
     Stretch as Stretch,
     chosen_part as chosen_part,

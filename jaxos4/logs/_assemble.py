@@ -7,15 +7,13 @@ import numpy as np
 
 from .._custom_types import as_float
 from ..airframe import Airframe
-from ..flight import STATE_NAMES, Flight
+from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES, Flight
 from ._table import MAX_ROWS, Table, quoted
 from ._units import check_time, check_units, force_note, thrust_note
 from .resample import UNIFORM, resample, uniform_grid, unwrap, widest_gap
 
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
 COMMAND_NAMES = ("command1", "command2", "command3", "command4")
-FORCE_NAMES = ("ax", "ay", "az")
-CHANNEL_NAMES = STATE_NAMES + FORCE_NAMES
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES)
 
 _OTHER_NAMES = {  # what other loggers call them, for a hint
@@ -53,6 +51,7 @@ def flight_of(
     dt = check_time(table)
     check_units(table)
     omega = _rotor_speeds(table, airframe, full_scale, notes)
+    commanded = not any(name in table.columns for name in SPEED_NAMES)
     if airframe is not None:
         carried = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient / (airframe.mass * airframe.gravity)
         _add(notes, thrust_note(float(carried)))
@@ -66,7 +65,8 @@ def flight_of(
         notes.append(f"{late}: it starts at 0 now")
         time = dt * np.arange(time.size)
     force = as_float(channels[:, 12:]) if with_force else None
-    return Flight(as_float(time), as_float(omega), as_float(channels[:, :12]), force), tuple(notes)
+    flight = Flight(as_float(time), as_float(omega), as_float(channels[:, :12]), force, commanded=commanded)
+    return flight, tuple(notes)
 
 
 def _measured(table: Table) -> Table:

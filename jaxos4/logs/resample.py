@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..flight import Flight
+
 UNIFORM = 0.01  # of dt: rows no further from a grid stand as they were recorded
 REACH = 1.5  # times dt: measured samples further apart have a gap between them
 _HALF = 0.45  # of a coarser sample: less of it measured is not measured; the first and the last have half of theirs
@@ -69,6 +71,16 @@ def resample(
     grid = t[0] + dt * np.arange(samples)
     even = np.column_stack([_interpolate(t, channel, grid, dt) for channel in channels.T])
     return grid, _root_mean_square(t, omega, grid, dt), even, _figures(t, grid, dt)
+
+
+def averaged(flight: Flight, dt: float) -> Flight:
+    """A flight on a coarser grid of step `dt` [s]: see `average`. Itself where its own step is no finer."""
+    if dt <= float(flight.dt) * (1 + UNIFORM):
+        return flight
+    t, omega, channels = (np.asarray(x) for x in (flight.time, flight.omega, flight.channels))
+    time, omega, channels = average(t, omega, channels, dt)
+    force = None if flight.specific_force is None else channels[:, 12:]
+    return Flight(time, omega, channels[:, :12], force, commanded=flight.commanded)
 
 
 def average(

@@ -104,7 +104,7 @@ def cut(flight: Flight, stretch: Stretch) -> Flight:
     part = slice(int(inside[0]), int(inside[-1]) + 1)
     force = None if flight.specific_force is None else np.asarray(flight.specific_force)[part]
     omega, states = np.asarray(flight.omega)[part], np.asarray(flight.states)[part]
-    return Flight(time[part], omega, states, force, flight.result)
+    return Flight(time[part], omega, states, force, flight.result, commanded=flight.commanded)
 
 
 def chosen_part(

@@ -27,7 +27,7 @@ class Drawn(NamedTuple):
     stem: str
     kind: Kind
     svg: bytes
-    pdf: bytes
+    pdf: bytes | None
 
 
 OF_SCENARIOS = (
@@ -120,27 +120,27 @@ OF_EXAMPLE = (
 """The figures of the study's one example flight and of its networks."""
 
 
-def of_scenario(scenario: Scenario, *, numbered: bool) -> Iterator[Drawn]:
+def of_scenario(scenario: Scenario, *, numbered: bool, with_pdf: bool = True) -> Iterator[Drawn]:
     """The figures of one scenario; `numbered`: there are others, and the files say which one this is."""
     for kind in OF_SCENARIOS:
-        drawn = _draw(kind, scenario.data, f"{kind.name}-{scenario.number}" if numbered else kind.name)
+        drawn = _draw(kind, scenario.data, f"{kind.name}-{scenario.number}" if numbered else kind.name, with_pdf)
         if drawn is not None:
             yield drawn
 
 
-def of_example(dataset: xr.Dataset) -> Iterator[Drawn]:
+def of_example(dataset: xr.Dataset, *, with_pdf: bool = True) -> Iterator[Drawn]:
     """The figures that a study has once."""
     for kind in OF_EXAMPLE:
-        drawn = _draw(kind, dataset, kind.name)
+        drawn = _draw(kind, dataset, kind.name, with_pdf)
         if drawn is not None:
             yield drawn
 
 
-def _draw(kind: Kind, data: xr.Dataset, stem: str) -> Drawn | None:
+def _draw(kind: Kind, data: xr.Dataset, stem: str, with_pdf: bool) -> Drawn | None:
     with drawing():
         figure = kind.draw(data)
         if figure is None:
             return None
         as_svg = svg(figure)
         figure.set_layout_engine("none")  # it has its place now; to find it takes as long as to draw
-        return Drawn(stem, kind, as_svg, pdf(figure))
+        return Drawn(stem, kind, as_svg, pdf(figure) if with_pdf else None)

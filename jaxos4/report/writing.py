@@ -14,8 +14,12 @@ REPORT_FILE = "report.html"
 FIGURES_FOLDER = "figures"
 
 
-def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
+def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
     """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; gives their paths, the page first.
+
+    **Arguments:**
+
+    - `with_pdf`: or the figures as SVG alone, in half the time.
 
     Everything is drawn before anything is written, each file is written whole or not at all, and figures that an older
     report had and this one has not are removed.
@@ -26,18 +30,21 @@ def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
     sections = [
         (
             scenario,
-            list(figures.of_scenario(scenario, numbered=numbered)) if scenario.number <= MOST_DRAWN else [],
+            list(figures.of_scenario(scenario, numbered=numbered, with_pdf=with_pdf))
+            if scenario.number <= MOST_DRAWN
+            else [],
         )
         for scenario in scenarios(dataset)
     ]
-    once = list(figures.of_example(dataset))
+    once = list(figures.of_example(dataset, with_pdf=with_pdf))
     text = page(dataset, sections, once)
     folder = directory / FIGURES_FOLDER
     folder.mkdir(exist_ok=True)
     written: list[Path] = []
     for drawn in [drawn for _, of_scenario in sections for drawn in of_scenario] + once:
         for suffix, content in (("svg", drawn.svg), ("pdf", drawn.pdf)):
-            written.append(_write(folder / f"{drawn.stem}.{suffix}", content))
+            if content is not None:
+                written.append(_write(folder / f"{drawn.stem}.{suffix}", content))
     _write(target, text.encode())
     _remove_others(folder, written)
     return [target, *written]

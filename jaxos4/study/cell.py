@@ -5,7 +5,10 @@ with the length of a batch, and with the number of devices that a program is div
 same bit for bit however many cells are run side by side, in whichever process.
 """
 
+import contextlib
+import functools
 import io
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._custom_types import Key, Parameters, Scalar, States, as_float
+from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from ..bracket import Bracket
 from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
 from ..estimators import BASELINES, IBSS, AbstractEstimator, Estimate, Hybrid, NetworkEstimator, TrainedNetwork
@@ -79,7 +82,7 @@ def train(study: Study, job: Job, *, progress: bool = False) -> TrainedNetwork:
     """
     with jax.enable_x64(study.precision == "float64"):
         training, problem, bracket = _training(study, job)
-        key = jax.random.fold_in(jax.random.key(study.network.seed), jobs(study).index(job))
+        key = _key(study.network.seed, jobs(study).index(job))
         return training.fit(problem, bracket, key=key, progress=progress)
 
 
@@ -88,7 +91,7 @@ def blank_network(study: Study, job: Job) -> TrainedNetwork:
     with jax.enable_x64(study.precision == "float64"):
         shapes = eqx.filter_eval_shape(untrained, *_training(study, job), jax.random.key(0))
         arrays, others = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
-        return eqx.combine(jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), arrays), others)
+        return eqx.combine(jax.tree.map(lambda leaf: jax.device_put(np.ones(leaf.shape, leaf.dtype)), arrays), others)
 
 
 def _training(study: Study, job: Job) -> tuple[NetworkEstimator, ShootingProblem, Bracket]:
@@ -102,8 +105,7 @@ def _training(study: Study, job: Job) -> tuple[NetworkEstimator, ShootingProblem
         held_out=settings.held_out,
     )
     fleet = _fleet(study, job)
-    exact = simulate(fleet.model, fleet.bracket.center, fleet.omega, dt=fleet.dt, method=study.fit_method)
-    return training, _problem(study, fleet, exact.states, as_float(1.0), job.channels), fleet.bracket
+    return training, _blank(study, fleet, 1.0, job.channels), fleet.bracket
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
@@ -114,9 +116,11 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
     - `network`: that of `job_of`, where the estimator needs one.
     """
     with jax.enable_x64(study.precision == "float64"):
-        scenario, fleet = cell.scenario, _fleet(study, cell.scenario)
-        flown = _fly(study, fleet, cell)
-        blank = _problem(study, fleet, flown.states[0], as_float(scenario.scale or 1.0), scenario.seen)
+        scenario = cell.scenario
+        with _one_core():
+            fleet = _fleet(study, scenario)
+            flown = _fly(study, fleet, cell)
+            blank = _blank(study, fleet, scenario.scale or 1.0, scenario.seen)
         found = _identify(_estimator(scenario.estimator, network), blank, fleet.bracket, flown.states)
         return _results(study, cell, flown, jax.tree.map(np.asarray, found))
 
@@ -133,11 +137,26 @@ def program_of(study: Study, cell: Cell) -> tuple:
     return scenario, job_of(study, scenario) if scenario.estimator in NETWORKED else None
 
 
+def truth_of(study: Study, cell: Cell) -> np.ndarray:
+    """The true parameters of a cell's flights: known even where no estimator could be run."""
+    with jax.enable_x64(study.precision == "float64"):
+        truths = _truths(_fleet(study, cell.scenario), *_draws(study, cell), drawn=study.truth == "drawn")
+        return np.asarray(truths)[: study.flights - cell.first]
+
+
+@contextlib.contextmanager
+def _one_core() -> Iterator[None]:
+    """On a CPU, the first device: programs that all estimators share are compiled once, and not for each core."""
+    first = jax.local_devices()[0]
+    with jax.default_device(first) if first.platform == "cpu" else contextlib.nullcontext():
+        yield
+
+
 class _Flown(NamedTuple):
     truth: Float[Array, "lanes parameters"]
     exact: Float[Array, "lanes samples 12"]
     states: Float[Array, "lanes samples 12"]
-    bound: Float[Array, "lanes parameters"]
+    bound: Float[np.ndarray, "lanes parameters"]
 
 
 class _Found(NamedTuple):
@@ -165,21 +184,33 @@ def _fleet(study: Study, scenario: Scenario | Job) -> _Fleet:
 
 
 def _bracket(study: Study, model: AbstractModel, width: float) -> Bracket:
+    return _bracket_of(model, np.asarray(width), study.seed, off=study.truth == "airframe")
+
+
+@eqx.filter_jit
+def _bracket_of(model: AbstractModel, width: Float[Numeric, ""], seed: int, *, off: bool) -> Bracket:
     center, half_width = model.alpha, width * model.half_width
-    if study.truth == "airframe":
-        key = jax.random.fold_in(jax.random.key(study.seed), 0)
-        center = center + half_width * jax.random.uniform(key, center.shape, minval=-_OFF, maxval=_OFF, dtype=float)
+    if off:
+        u = jax.random.uniform(_key(seed, 0), center.shape, minval=-_OFF, maxval=_OFF, dtype=float)
+        center = center + half_width * u
     return Bracket.around(center, half_width)
 
 
-def _problem(study: Study, fleet: _Fleet, states: States, scale: Scalar, channels: str) -> ShootingProblem:
-    samples = fleet.omega.shape[0]
-    start = jnp.zeros(12) if study.initial_state == "known" else None
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _key(seed: int, number: int) -> Key:
+    return jax.random.fold_in(jax.random.key(seed), number)
+
+
+def _blank(study: Study, fleet: _Fleet, scale: float, channels: str) -> ShootingProblem:
+    """What the flights of a scenario, and the training for it, have in common: all measured, at rest at the start."""
+    samples, dtype = fleet.omega.shape[0], jnp.result_type(float)
+    # By NumPy: eagerly, JAX would compile a program for each operation, on each device.
+    time = np.asarray(study.dt, dtype) * np.arange(samples, dtype=dtype)
     return ShootingProblem(
         fleet.model,
-        Flight(fleet.dt * jnp.arange(samples), fleet.omega, states),
+        Flight(as_float(time), fleet.omega, as_float(np.zeros((samples, 12)))),
         sigma=scale * SENSOR_SIGMA,
-        initial_state=start,
+        initial_state=as_float(np.zeros(12)) if study.initial_state == "known" else None,
         channels=channels,
         method=study.fit_method,
     )
@@ -188,8 +219,7 @@ def _problem(study: Study, fleet: _Fleet, states: States, scale: Scalar, channel
 def _fly(study: Study, fleet: _Fleet, cell: Cell) -> _Flown:
     """The flights of a cell: those of the same number are the same, but for the scale, in all scenarios."""
     truth, exact, states = _flights(study, fleet, cell)
-    scale = as_float(cell.scenario.scale)
-    bound = scale * _bounds(_problem(study, fleet, exact[0], as_float(1.0), cell.scenario.seen), exact, truth)
+    bound = cell.scenario.scale * np.asarray(_bounds(_blank(study, fleet, 1.0, cell.scenario.seen), exact, truth))
     return _Flown(truth, exact, states, bound)
 
 
@@ -199,32 +229,54 @@ def _flights(
     """True parameters, true states and measured states of a cell."""
     return _measured(
         fleet,
-        cell.first + jnp.arange(study.batch),
+        *_draws(study, cell),
         as_float(cell.scenario.scale),
-        jax.random.fold_in(jax.random.key(study.seed), 1),
         method=cell.scenario.method,
         kind=cell.scenario.noise,
         drawn=study.truth == "drawn",
     )
 
 
+def _draws(study: Study, cell: Cell) -> tuple[Int[np.ndarray, " lanes"], Key]:
+    """The numbers of a cell's flights, and the key that each folds its own into."""
+    return cell.first + np.arange(study.batch), _key(study.seed, 1)
+
+
+def _truth(fleet: _Fleet, key: Key, drawn: bool) -> Parameters:
+    truth = fleet.model.alpha
+    if not drawn:
+        return truth
+    u = jax.random.uniform(key, truth.shape, minval=-1, maxval=1, dtype=float)
+    return fleet.bracket.center + u * fleet.bracket.half_width
+
+
+@eqx.filter_jit
+def _truths(
+    fleet: _Fleet, numbers: Int[Numeric, " lanes"], key: Key, *, drawn: bool
+) -> Float[Array, "lanes parameters"]:
+    """True parameters alone, from the draws that `_measured` makes."""
+    return jax.vmap(lambda number: _truth(fleet, jax.random.split(jax.random.fold_in(key, number))[0], drawn))(numbers)
+
+
 @eqx.filter_jit
 def _measured(
-    fleet: _Fleet, numbers: Int[Array, " lanes"], scale: Scalar, key: Key, *, method: str, kind: str, drawn: bool
+    fleet: _Fleet, numbers: Int[Numeric, " lanes"], key: Key, scale: Scalar, *, method: str, kind: str, drawn: bool
 ) -> tuple[Float[Array, "lanes parameters"], Float[Array, "lanes samples 12"], Float[Array, "lanes samples 12"]]:
     """True parameters, true states and measured states."""
 
-    def one(number: Int[Array, ""]) -> tuple[Parameters, States, States]:
+    def fly(number: Int[Array, ""]) -> tuple[Parameters, Flight, Key]:
         truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
-        truth = fleet.model.alpha
-        if drawn:
-            u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
-            truth = fleet.bracket.center + u * fleet.bracket.half_width
-        exact = simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method)
-        noisy = NOISES[kind](scale * SENSOR_SIGMA)(exact, key=noise_key)
-        return truth, exact.states, noisy.states
+        truth = _truth(fleet, truth_key, drawn)
+        return truth, simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method), noise_key
 
-    return jax.vmap(one)(numbers)
+    def measured(exact_and_key: tuple[Flight, Key]) -> States:
+        exact, noise_key = exact_and_key
+        return NOISES[kind](scale * SENSOR_SIGMA)(exact, key=noise_key).states
+
+    truth, exact, noise_keys = jax.vmap(fly)(jnp.asarray(numbers))
+    # A batch of random numbers takes XLA seconds to compile for a CPU, where one flight after the other is as fast.
+    each = jax.lax.map if jax.default_backend() == "cpu" else lambda one, flights: jax.vmap(one)(flights)
+    return truth, exact.states, each(measured, (exact, noise_keys))
 
 
 @eqx.filter_jit
@@ -288,7 +340,7 @@ def _results(study: Study, cell: Cell, flown: _Flown, found: _Found) -> dict[str
         "estimate": np.where(told[:, None], found.parameters, np.nan),
         "std": np.where(told[:, None], found.std, np.nan),
         "half_width": np.where(told[:, None, None], found.half_width, np.nan),
-        "bound": np.asarray(flown.bound),
+        "bound": flown.bound,
         "initial_state": np.where(told[:, None], found.initial_state, np.nan),
         "cost": np.where(told, found.cost, np.nan),
         "rollouts": found.rollouts.astype(np.int32),

@@ -1,5 +1,6 @@
 """The results of a study as an xarray Dataset: every finished cell in its place, with units, names and provenance."""
 
+import importlib.metadata
 import itertools
 import json
 import math
@@ -18,7 +19,7 @@ from ..estimators import TrainedNetwork
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..metrics import SCENARIO
 from ..training import CHECK
-from .cell import LEVELS, OUTCOMES, bracket_of, fly_again, jobs
+from .cell import LEVELS, OUTCOMES, bracket_of, fly_again, jobs, truth_of
 from .specification import AXES, Cell, Study
 from .store import RESULTS_FILE, Store
 
@@ -68,8 +69,8 @@ def assemble(store: Store) -> xr.Dataset:
         "level": len(LEVELS),
     }
     arrays = {
-        name: np.full([sizes[dim] for dim in (*_LANES, *more)], np.nan if kind == "f8" else -1, kind)
-        for name, (more, kind, _, _) in _VARIABLES.items()
+        name: np.full([sizes[dim] for dim in _dims(name)], np.nan if kind == "f8" else -1, kind)
+        for name, (_, kind, _, _) in _VARIABLES.items()
     }
     arrays["result"][...] = OUTCOMES.index("not_run")
     arrays["rollouts"][...] = 0
@@ -78,30 +79,39 @@ def assemble(store: Store) -> xr.Dataset:
         results = store.read(cell.number)
         if results is None:
             continue
-        lanes = (*cell.place, slice(cell.first, min(cell.first + study.batch, study.flights)))
+        flights = slice(cell.first, min(cell.first + study.batch, study.flights))
+        lanes, shared = (*cell.place, flights), (*cell.place[:-1], flights)
         if "failed" in results:
             arrays["result"][lanes] = OUTCOMES.index("failed")
+            if np.isnan(arrays["truth"][shared]).all():  # where another estimator has run, it is there bit for bit
+                arrays["truth"][shared] = truth_of(study, cell)
             where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
         try:
             for name in _VARIABLES:
-                arrays[name][lanes] = results[name]
+                arrays[name][shared if name == "truth" else lanes] = results[name]
         except (KeyError, ValueError):
             path = store.cell_file(cell.number)
             raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
     dataset = xr.Dataset(
         {
-            name: ((*_LANES, *more), arrays[name], {"long_name": long_name, "units": unit})
-            for name, (more, _, unit, long_name) in _VARIABLES.items()
+            name: (_dims(name), arrays[name], {"long_name": long_name, "units": unit})
+            for name, (_, _, unit, long_name) in _VARIABLES.items()
         },
         coords=_coordinates(study, names),
-        attrs=_provenance(store, failures),
+        attrs=provenance(study, store.device)
+        | {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)},
     )
-    dataset["truth"] = dataset["truth"].max("estimator", keep_attrs=True)  # the same for all that have run
     codes = np.arange(len(OUTCOMES), dtype=np.int8)
     dataset["result"].attrs |= {"flag_values": codes, "flag_meanings": " ".join(OUTCOMES)}
     return dataset.assign(_brackets(study) | _seen(study) | _example(store) | _training(store))
+
+
+def _dims(name: str) -> tuple[str, ...]:
+    """Of a variable; the truth is the same for all estimators."""
+    lanes = [dim for dim in _LANES if (name, dim) != ("truth", "estimator")]
+    return (*lanes, *_VARIABLES[name][0])
 
 
 def save_dataset(dataset: xr.Dataset, directory: Path) -> Path:
@@ -130,18 +140,16 @@ def _coordinates(study: Study, names: tuple[str, ...]) -> dict:
     return coordinates | {"unit": ("parameter", units, {"long_name": "unit of the parameter", "units": "1"})}
 
 
-def _provenance(store: Store, failures: list[dict]) -> dict[str, str | int]:
-    study = store.study
+def provenance(study: Study, device: str) -> dict[str, str | int]:
+    """Where results come from, for the attributes of their Dataset; `device`: what computed them, in words."""
     return {
         "title": study.title,
         "specification": tomlkit.dumps(msgspec.to_builtins(study)),
-        "command": "jaxos4 study study.toml --out DIR",
-        "version": store.version,
+        "version": importlib.metadata.version("jaxos4"),
         "jax": jax.__version__,
         "precision": study.precision,
-        "device": store.device,
+        "device": device,
         "seed": study.seed,
-        "failures": json.dumps(failures),
     }
 
 
@@ -149,15 +157,12 @@ def _brackets(study: Study) -> dict:
     """The bracket that all searches and networks of a model, an airframe and a width get."""
     shape = [len(study.models), len(study.airframes), len(study.widths)]
     brackets = [bracket_of(study, *which) for which in itertools.product(study.models, study.airframes, study.widths)]
+    lower, upper = (np.stack([getattr(b, end) for b in brackets]).reshape(*shape, -1) for end in ("lower", "upper"))
     dims = ("model", "airframe", "width", "parameter")
-    with jax.enable_x64(study.precision == "float64"):  # middle and half-width are computed when they are asked for
-        return {
-            name: (dims, np.stack([getattr(b, part) for b in brackets]).reshape(*shape, -1), _named(what, "unit"))
-            for name, part, what in (
-                ("center", "center", "middle of the bracket"),
-                ("bracket_half_width", "half_width", "half the width of the bracket"),
-            )
-        }
+    return {
+        "center": (dims, (lower + upper) / 2, _named("middle of the bracket", "unit")),
+        "bracket_half_width": (dims, (upper - lower) / 2, _named("half the width of the bracket", "unit")),
+    }
 
 
 def _seen(study: Study) -> dict:

@@ -6,7 +6,7 @@ import ctypes
 import itertools
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -32,12 +32,83 @@ class Step(NamedTuple):
     label: str
 
 
+class _Task(NamedTuple):
+    """What a device is given to do: in words, the call that does it, and what becomes of its result."""
+
+    label: str
+    call: Callable[[Any], Any]
+    keep: Callable[[Any], None]
+
+
 class _Program:
     """Cells that one compiled program can identify, and the network that they need."""
 
     def __init__(self, cells: list[Cell], study: Study, needed: list[Job]):
         self.waiting, self.network = deque(cells), network_number(study, cells[0], needed)
         self.devices: set[Any] = set()
+
+
+class _Work:
+    """What is missing of a study, and what a free device should do of it."""
+
+    def __init__(self, store: Store):
+        self.store, self.study, missing = store, store.study, store.missing()
+        self.needed, self.done = jobs(self.study), self.study.count - len(missing)
+        grouped: dict[tuple, list[Cell]] = {}
+        for cell in map(self.study.cell, missing):
+            grouped.setdefault(program_of(self.study, cell), []).append(cell)
+        self.programs = [_Program(cells, self.study, self.needed) for cells in grouped.values()]
+        self.networks: dict[int, TrainedNetwork | str | None] = {}
+        self.untrained = deque(dict.fromkeys(p.network for p in self.programs if p.network is not None))
+
+    def task(self, device: Any) -> _Task | None:
+        """The next for a device that is free, or `None` where all that is left waits for others."""
+        if self.untrained:
+            return self._training(self.untrained.popleft())
+        if (program := self._ready(device)) is not None:
+            program.devices.add(device)
+            return self._cell(program.waiting.popleft(), program)
+        if (program := self._untried()) is not None:
+            program.devices.add(device)
+            return self._compilation(program.waiting[0])
+        return None
+
+    def _ready(self, device: Any) -> _Program | None:
+        """What the device was at, what nobody is at, or what is the longest."""
+        ready = [p for p in self.programs if p.waiting and (p.network is None or p.network in self.networks)]
+        own = [p for p in ready if device in p.devices]
+        new = [p for p in ready if not p.devices]
+        long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
+        return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
+
+    def _untried(self) -> _Program | None:
+        """What waits for its network, and can be compiled meanwhile."""
+        return next((p for p in self.programs if p.waiting and not p.devices), None)
+
+    def _training(self, number: int) -> _Task:
+        job = self.needed[number]
+        return _Task(
+            f"training for {job.channels}",
+            lambda device: _train(self.store, number, job, device),
+            lambda network: self.networks.update({number: network}),
+        )
+
+    def _cell(self, cell: Cell, program: _Program) -> _Task:
+        network = None if program.network is None else self.networks[program.network]
+
+        def keep(result: tuple[bytes, float]) -> None:
+            data, seconds = result
+            self.store.write(self.store.cell_file(cell.number), data, cell=cell.number, seconds=seconds)
+            self.done += 1
+
+        return _Task(label_of(self.study, cell), lambda device: _compute(self.study, cell, network, device), keep)
+
+    def _compilation(self, cell: Cell) -> _Task:
+        return _Task(
+            f"compiling {cell.scenario.estimator}",
+            lambda device: _compile(self.study, cell, device),
+            lambda _: None,
+        )
 
 
 def run_here(store: Store) -> Iterator[Step]:
@@ -48,68 +119,27 @@ def run_here(store: Store) -> Iterator[Step]:
     while a network is trained, what waits for it is compiled.
     A cell that cannot be computed is kept as failed, and stays so: delete its file to try it again.
     """
-    study, missing = store.study, store.missing()
-    needed, done = jobs(study), study.count - len(missing)
-    grouped: dict[tuple, list[Cell]] = {}
-    for cell in map(study.cell, missing):
-        grouped.setdefault(program_of(study, cell), []).append(cell)
-    programs = [_Program(cells, study, needed) for cells in grouped.values()]
-    networks: dict[int, TrainedNetwork | str | None] = {}
-    untrained = deque(dict.fromkeys(p.network for p in programs if p.network is not None))
-    devices = deque(jax.local_devices())
-    running: dict[concurrent.futures.Future, tuple[Any, str, Cell | int | None]] = {}
-    with concurrent.futures.ThreadPoolExecutor(len(devices)) as pool:
-        try:
-            while True:
-                for _ in range(len(devices)):
-                    device = devices.popleft()
-                    if untrained:
-                        number = untrained.popleft()
-                        task = pool.submit(_train, store, number, needed[number], device)
-                        running[task] = device, f"training for {needed[number].channels}", number
-                    elif (program := _next(programs, networks, device)) is not None:
-                        program.devices.add(device)
-                        cell = program.waiting.popleft()
-                        network = None if program.network is None else networks[program.network]
-                        task = pool.submit(_compute, study, cell, network, device)
-                        running[task] = device, label_of(study, cell), cell
-                    elif (program := _untried(programs)) is not None:
-                        program.devices.add(device)
-                        cell = program.waiting[0]
-                        task = pool.submit(_compile, study, cell, device)
-                        running[task] = device, f"compiling {cell.scenario.estimator}", None
-                    else:
-                        devices.append(device)
-                yield Step(done, ", ".join(dict.fromkeys(label for _, label, _ in running.values())))
-                if not running:
-                    return
-                finished, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
-                for task in finished:
-                    device, _, what = running.pop(task)
-                    devices.append(device)
-                    _give_memory_back()
-                    if isinstance(what, int):
-                        networks[what] = task.result()
-                    elif what is not None:
-                        data, seconds = task.result()
-                        store.write(store.cell_file(what.number), data, cell=what.number, seconds=seconds)
-                        done += 1
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _next(programs: list[_Program], networks: dict[int, TrainedNetwork | str | None], device: Any) -> _Program | None:
-    """What a device that is free does: what it was at, what nobody is at, or what is the longest."""
-    ready = [p for p in programs if p.waiting and (p.network is None or p.network in networks)]
-    own = [p for p in ready if device in p.devices]
-    new = [p for p in ready if not p.devices]
-    long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
-    return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
-
-
-def _untried(programs: list[_Program]) -> _Program | None:
-    """What waits for its network, and can be compiled meanwhile."""
-    return next((p for p in programs if p.waiting and not p.devices), None)
+    work, free = _Work(store), deque(jax.local_devices())
+    running: dict[concurrent.futures.Future, tuple[Any, _Task]] = {}
+    pool = concurrent.futures.ThreadPoolExecutor(len(free))
+    try:
+        while True:
+            for device in tuple(free):
+                if (task := work.task(device)) is not None:
+                    free.remove(device)
+                    running[pool.submit(task.call, device)] = device, task
+            yield Step(work.done, ", ".join(dict.fromkeys(task.label for _, task in running.values())))
+            if not running:
+                return
+            finished, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
+            for future in finished:
+                device, task = running.pop(future)
+                free.append(device)
+                _give_memory_back()
+                task.keep(future.result())
+    finally:
+        # Who ends it early does not wait for what is at work, a training of minutes maybe: nothing of that is kept.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _compile(study: Study, cell: Cell, device: Any) -> None:

@@ -9,7 +9,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -256,8 +256,37 @@ def load_study(path: Path) -> Study:
     except (InputError, msgspec.ValidationError, RecursionError) as error:
         ours = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
         what = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: {what}" if ours else f"{path}: {what}; correct it there.") from None
+        raise InputError(f"{path}: {what}" if ours else f"{path}: {_in_words(what)}; correct it there.") from None
     return study
+
+
+# What msgspec calls a kind of value, and what TOML does.
+_WORDS = {
+    "object": "a table",
+    "array": "a list",
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a string",
+    "bool": "true or false",
+}
+
+
+def _in_words(message: str) -> str:
+    """A complaint of msgspec's with the words of TOML, the key first, and the keys or values that there are."""
+    complaint, _, place = message.partition(" - at `$")
+    key = place.strip(".`")
+    for kind, word in _WORDS.items():
+        complaint = complaint.replace(f"`{kind}`", word)
+    known = Training if key.startswith("network") else Study
+    if complaint.startswith("Object contains unknown field "):
+        where = f"[{key}]: " if key else ""
+        return f"{where}knows no key {complaint.rsplit(' ', 1)[1]}; there are {', '.join(known.__struct_fields__)}"
+    if complaint.startswith("Invalid enum value "):
+        choices = get_args(get_type_hints(known)[key.removeprefix("network.")])
+        return f"`{key}` knows no {complaint.removeprefix('Invalid enum value ')}; choose from {', '.join(choices)}"
+    if not key:
+        return complaint
+    return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}"
 
 
 def differences(ours: Study, theirs: Study) -> list[str]:

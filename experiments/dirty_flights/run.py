@@ -1,0 +1,233 @@
+"""How often 95 % intervals hold the truth where flights are dirty: rotors that lag, commands late, vibration, colour.
+
+Each flight is flown at 1 kHz by Runge-Kutta with a truth of its own: rotors that follow their commands with a lag of
+60 ms, 8 ms late, offsets and damping. Its gyro and accelerometer show coloured noise, the rotors' vibration and
+rounding, and lose samples, alone and in bursts. What was recorded is averaged to 4 ms, cut into windows of a quarter of
+a second, and fitted by `fit_vehicle`, whose intervals are asked for the truth. Parameters that a fit holds are not
+counted.
+"""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+import jaxos4
+from jaxos4.flight_model import DEFAULT_TERMS
+from jaxos4.logs.resample import average
+from jaxos4.vehicle import SECONDARY
+
+jax.config.update("jax_enable_x64", True)
+
+# As large as a Crazyflie 2.
+CRAZYFLIE = jaxos4.Airframe(
+    mass=0.032,
+    inertia=(1.66e-5, 1.66e-5, 2.93e-5),
+    rotor_positions=[(0.0325, -0.0325), (-0.0325, -0.0325), (-0.0325, 0.0325), (0.0325, 0.0325)],
+    rotor_spins=(1.0, -1.0, 1.0, -1.0),
+    thrust_coefficient=2.25e-8,
+    drag_coefficient=1.34e-10,
+    rotor_inertia=1.0e-8,
+)
+AIRFRAMES = {"os4": jaxos4.OS4, "crazyflie": CRAZYFLIE}
+TERMS = (*DEFAULT_TERMS, "accelerometer")
+LAG, DELAY = 0.06, 0.008
+# Of the truth and of what is fitted [s]; commands come every other millisecond.
+FINE, COARSE, COMMANDED = 1e-3, 4e-3, 2
+WINDOW = 0.25
+# Designed rates [rad/s] and tones [Hz] of roll, pitch and yaw; thrust goes up and down by a share of the weight.
+AMPLITUDE, TONES, HEAVE = (1.6, 1.6, 0.5), ((0.5, 5.0), (0.5, 5.0), (0.3, 2.0)), 0.15
+# Coloured noise, vibration, rounding: of the gyro [rad/s] and of the accelerometer [m/s^2].
+COLOUR, VIBRATION, STEP = (0.02, 0.2), (0.05, 0.5), (2e-3, 0.02)
+MEMORY, VIBRATING, WANDER = (0.005, 0.02), (80.0, 150.0), 5.0
+# The share of samples that is lost, bursts a second, and how long these last [s].
+LOST, BURSTS, BURST = 0.02, 0.5, (0.005, 0.03)
+
+
+def truth_of(model: jaxos4.FlightModel, rng: np.random.Generator) -> np.ndarray:
+    """What a flight's vehicle is: the secondary parameters as the airframe says, the others somewhere around it."""
+    center, half_width = np.asarray(model.alpha), np.asarray(model.half_width)
+    values = center + half_width * rng.uniform(-0.4, 0.4, center.size)
+    for i, name in enumerate(model.parameter_names):
+        if name in SECONDARY:
+            values[i] = center[i]
+        elif name.endswith("damping"):
+            values[i] = rng.uniform(0.5, 3.0)
+        elif name in ("rotor_lag", "rotor_delay"):
+            values[i] = LAG if name == "rotor_lag" else DELAY
+    return values
+
+
+def commands(model: jaxos4.FlightModel, truth: np.ndarray, duration: float, rng: np.random.Generator) -> np.ndarray:
+    """Rotor speeds [rad/s] every millisecond: all axes at once, three tones each, thrust besides, offsets trimmed."""
+    airframe, values = model.airframe, dict(zip(model.parameter_names, truth, strict=True))
+    tones = [np.sort(rng.uniform(*span, 3)) for span in TONES]
+    omega = np.array(jaxos4.multisine(airframe, duration=duration, dt=FINE, amplitude=AMPLITUDE, tones=tones))
+    t, phase = FINE * np.arange(omega.shape[0]), rng.uniform(0, 2 * np.pi)
+    squares = omega**2 * (1 + HEAVE * np.sin(2 * np.pi * rng.uniform(0.4, 1.5) * t + phase))[:, None]
+    axes = zip(("roll", "pitch", "yaw"), ("alpha3", "alpha6", "alpha8"), strict=True)
+    trim = np.array([-values[f"{axis}_offset"] / values[alpha] for axis, alpha in axes] + [0.0])
+    omega = np.sqrt(np.maximum(squares + np.linalg.solve(np.asarray(airframe.mixer), trim), 0.0))
+    held = np.arange(omega.shape[0]) // COMMANDED * COMMANDED
+    return omega[held]
+
+
+@eqx.filter_jit
+def fly(model: jaxos4.FlightModel, parameters: jax.Array, omega: jax.Array) -> jax.Array:
+    """The rates and the vertical specific force [m/s^2], every millisecond, from rest."""
+    empty = jaxos4.Flight(FINE * jnp.arange(omega.shape[0]), omega, jnp.full((omega.shape[0], 12), jnp.nan))
+    sigma = jnp.ones(12)
+    problem = jaxos4.ShootingProblem(
+        model, empty, sigma=sigma, initial_state=jnp.zeros(12), channels="rates", method="rk4"
+    )
+    return problem.predict(parameters, jnp.zeros(3))
+
+
+def dirty(exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What sensors show of it."""
+    samples, channels = exact.shape
+    t, seen = FINE * np.arange(samples), np.array(exact)
+    scale = np.array([0, 0, 0, 1])
+    colour, vibration, step = (np.array(pair)[scale] for pair in (COLOUR, VIBRATION, STEP))
+    decay = np.exp(-FINE / rng.uniform(*MEMORY, channels))
+    error = rng.standard_normal(channels)
+    for k in range(samples):
+        seen[k] += colour * error
+        error = decay * error + np.sqrt(1 - decay**2) * rng.standard_normal(channels)
+    # Rotors do not turn evenly: the phase of what they shake wanders.
+    wander = np.cumsum(np.sqrt(WANDER * FINE) * rng.standard_normal(samples))
+    phase = 2 * np.pi * rng.uniform(*VIBRATING) * t + wander
+    seen += vibration * np.sin(phase[:, None] + rng.uniform(0, 2 * np.pi, channels))
+    seen = step * np.round(seen / step)
+    seen[rng.uniform(size=samples) < LOST] = np.nan
+    for start in rng.uniform(0, t[-1], rng.poisson(BURSTS * t[-1])):
+        seen[(t >= start) & (t < start + rng.uniform(*BURST))] = np.nan
+    return seen
+
+
+def recorded(omega: np.ndarray, seen: np.ndarray) -> jaxos4.Flight:
+    """The flight as it is fitted."""
+    t = FINE * np.arange(omega.shape[0])
+    grid, speeds, channels = average(t, omega, seen, COARSE)
+    states, force = np.full((grid.size, 12), np.nan), np.full((grid.size, 3), np.nan)
+    states[:, [7, 9, 11]], force[:, 2] = channels[:, :3], channels[:, 3]
+    return jaxos4.join([jaxos4.Flight(grid, speeds, states, force)], length=int(WINDOW / COARSE))
+
+
+def problem_of(model: jaxos4.FlightModel, flight: jaxos4.Flight) -> jaxos4.ShootingProblem:
+    """The flight in windows."""
+    windows = flight.time.shape[0] // int(WINDOW / COARSE)
+    sigma = np.append(3 * jaxos4.SENSOR_SIGMA, np.full(3, 0.3))
+    return jaxos4.ShootingProblem(model, flight, sigma=sigma, channels="rates", method="rk4", windows=windows)
+
+
+def identify(airframe: jaxos4.Airframe, duration: float, seed: int, i: int, *, clean: bool = False) -> dict:
+    """One flight: the truth, what was found of it, and why not where not. `clean`: without noise."""
+    rng = np.random.default_rng([seed, i])
+    model = jaxos4.FlightModel(airframe, terms=TERMS)
+    truth = truth_of(model, rng)
+    omega = commands(model, truth, duration, rng)
+    exact = np.asarray(fly(model, jnp.asarray(truth), jnp.asarray(omega)))
+    flight = recorded(omega, exact if clean else dirty(exact, rng))
+    begin = time.perf_counter()
+    fit = jaxos4.fit_vehicle(problem_of(model, flight), jaxos4.Bracket.default(model))
+    names = fit.problem.model.parameter_names
+    half_width = np.asarray(fit.estimate.half_width(0.95))
+    return {
+        "flight": i,
+        "fastest": float(np.abs(exact[:, :3]).max()),
+        "result": str(jaxos4.result_names(fit.estimate.result)),
+        "truth": dict(zip(model.parameter_names, truth.tolist(), strict=True)),
+        "estimate": dict(zip(names, np.asarray(fit.estimate.parameters).tolist(), strict=True)),
+        "half_width": dict(zip(names, half_width.tolist(), strict=True)),
+        "bound": dict(zip(names, np.asarray(fit.bound).tolist(), strict=True)),
+        "held": {name: why for name, (_, why) in fit.held.items()},
+        "cut": fit.cut,
+        "seconds": time.perf_counter() - begin,
+    }
+
+
+def summary(flights: list[dict]) -> dict[str, dict]:
+    """For each parameter: how many flights told it, in which share of them the interval holds it, and by how far off.
+
+    - `bias`, `spread`: mean and standard deviation of the errors in standard deviations that the fits claim.
+    """
+    rows = {}
+    for name in flights[0]["truth"]:
+        told = [f for f in flights if name in f["estimate"] and np.isfinite(f["half_width"][name])]
+        errors = np.array([f["estimate"][name] - f["truth"][name] for f in told])
+        half_width = np.array([f["half_width"][name] for f in told])
+        if told:
+            scaled = 1.96 * errors / half_width
+            rows[name] = {
+                "told": len(told),
+                "covered": float((np.abs(errors) <= half_width).mean()),
+                "monte_carlo_error": float(np.sqrt(0.95 * 0.05 / len(told))),
+                "bias": float(scaled.mean()),
+                "spread": float(scaled.std(ddof=1)) if len(told) > 1 else None,
+                "mean_error": float(errors.mean()),
+                "claimed_over_bound": float(np.median([f["half_width"][name] / 1.96 / f["bound"][name] for f in told])),
+            }
+    return rows
+
+
+def main(
+    flights: Annotated[int, typer.Option(help="Of each airframe.")] = 120,
+    duration: Annotated[float, typer.Option(help="Of each flight [s].")] = 15.0,
+    seed: Annotated[int, typer.Option(help="Of truths, commands and noise.")] = 17,
+    airframes: Annotated[list[str], typer.Option(help="Of which.")] = tuple(AIRFRAMES),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+) -> None:
+    """Coverage of 95 % intervals on dirty flights."""
+    rows = {}
+    for name in airframes:
+        found = []
+        for i in range(flights):
+            found.append(identify(AIRFRAMES[name], duration, seed, i))
+            rows[name] = {"summary": summary(found), "flights": found}
+            if out is not None:
+                report = {
+                    "version": jaxos4.__version__,
+                    "precision": "float64",
+                    "seed": seed,
+                    "duration": duration,
+                    "airframes": rows,
+                }
+                out.write_text(json.dumps(report, indent=2) + "\n")
+        seconds = float(np.median([flight["seconds"] for flight in found]))
+        table = Table(title=f"95 % intervals of {flights} flights of {duration:g} s, {name}, {seconds:.1f} s a fit")
+        for heading in (
+            "parameter",
+            "told by",
+            "covered [%]",
+            "+-",
+            "bias [std]",
+            "spread [std]",
+            "mean error",
+            "/ CRB",
+        ):
+            table.add_column(heading)
+        for parameter, row in rows[name]["summary"].items():
+            table.add_row(
+                parameter,
+                str(row["told"]),
+                f"{100 * row['covered']:.1f}",
+                f"{100 * row['monte_carlo_error']:.1f}",
+                f"{row['bias']:.2f}",
+                "-" if row["spread"] is None else f"{row['spread']:.2f}",
+                f"{row['mean_error']:.2g}",
+                f"{row['claimed_over_bound']:.2f}",
+            )
+        Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,127 @@
+"""`jaxos4 estimate --model flight`: two logs of a simulated vehicle to its parameters, and every way to ask wrongly."""
+
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxos4
+from jaxos4.cli._choices import VehicleModel
+from jaxos4.cli._vehicle import Part, load_logs
+
+AIRFRAME = """
+mass = 0.65
+arm = 0.23
+inertia = [7.5e-3, 7.5e-3, 1.3e-2]
+thrust_coefficient = 3.13e-5
+drag_coefficient = 7.5e-7
+rotor_inertia = 6e-5
+max_rotor_speed = 500.0
+"""
+TERMS = ("offset", "lag")
+TRUTH = {"roll_offset_1": 0.8, "pitch_offset_1": -0.5, "roll_offset_2": -0.6, "rotor_lag": 0.06, "alpha3": 120.0}
+
+
+@pytest.fixture(scope="module")
+def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an airframe, and two logs of commands whose rotors lag."""
+    folder = tmp_path_factory.mktemp("vehicle")
+    (folder / "airframe.toml").write_text(AIRFRAME, encoding="utf-8")
+    airframe = jaxos4.load_airframe(str(folder / "airframe.toml"))
+    for number in (1, 2):
+        model = jaxos4.FlightModel(airframe, terms=TERMS)
+        named = {**TRUTH, **{k.removesuffix(f"_{number}"): v for k, v in TRUTH.items() if k.endswith(f"_{number}")}}
+        parameters = jnp.array(
+            [named.get(n, float(a)) for n, a in zip(model.parameter_names, model.alpha, strict=True)]
+        )
+        omega = jaxos4.multisine(airframe, duration=8.0, dt=0.01)
+        flight = jaxos4.simulate(model, parameters, omega, dt=0.01, method="rk4")
+        noisy = jaxos4.WhiteNoise(0.01)(flight, key=jax.random.key(number))
+        rates = np.full((omega.shape[0], 12), np.nan)
+        rates[:, [7, 9, 11]] = np.asarray(noisy.states)[:, [7, 9, 11]]
+        path = folder / f"flight{number}.csv"
+        jaxos4.write_flight(eqx.tree_at(lambda f: f.states, flight, jnp.asarray(rates)), path)
+        # What was recorded are commands.
+        text = path.read_text(encoding="utf-8").splitlines()
+        rows = [line.split(",") for line in text[1:]]
+        header = text[0].replace("omega", "command").split(",")
+        for row in rows:
+            row[1:5] = [repr(float(cell) / 500.0) for cell in row[1:5]]
+        path.write_text("\n".join(",".join(row) for row in (header, *rows)) + "\n", encoding="utf-8")
+    return folder
+
+
+def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
+    out = tmp_path / "found.json"
+    code, told, err = run(
+        *("estimate", str(vehicle / "flight1.csv"), str(vehicle / "flight2.csv"), "--model", "flight"),
+        *("--airframe", str(vehicle / "airframe.toml"), "--terms", ",".join(TERMS), "--out", str(out)),
+        *("--report", str(tmp_path / "found.html")),
+    )
+    assert code == 0, err
+    report = json.loads(out.read_text(encoding="utf-8"))
+    assert report["result"] == "successful"
+    for name, truth in TRUTH.items():
+        row = report["parameters"][name]
+        assert abs(row["estimate"] - truth) < 4 * row["std"], (name, row)
+    assert abs(report["parameters"]["rotor_lag"]["estimate"] - 0.06) < 0.005
+    # The equations are the truth's: what was held out is predicted to the noise.
+    assert min(report["skill"][rate]["skill"][1] for rate in "pq") > 0.9
+    assert "inertias" in told
+    page = (tmp_path / "found.html").read_text(encoding="utf-8")
+    assert all(name in page for name in TRUTH)
+    assert report["provenance"]["terms"] == list(TERMS)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--model", "flight", "--terms", "wings"), "--terms: knows no `wings`"),
+        (("--model", "flight", "--terms", "velocity"), "did not measure"),
+        (("--model", "flight", "--holdout", "0.9"), "--holdout"),
+        (("--model", "flight", "--window", "-1"), "--window"),
+        (("--model", "flight", "--window", "0.01"), "--window"),
+        (("--model", "flight", "--window", "100"), "--window"),
+        (("--model", "flight", "--sample-time", "nan"), "--sample-time"),
+        (("--model", "flight", "--sample-time", "0.001"), "--sample-time"),
+        (("--model", "flight", "--from", "5", "--to", "4"), "--from"),
+        (("--model", "flight", "--from", "50"), "fewer than two samples"),
+        (("--model", "flight", "--estimator", "kalman"), "--estimator"),
+        (("--model", "flight", "--channels", "rates"), "--channels"),
+        (("--model", "flight", "--initial-state", "known"), "--initial-state"),
+        (("--terms", "offset"), "--terms"),
+        (("--from", "1"), "--from"),
+    ],
+)
+def test_wrong_requests_are_one_line(run, vehicle, options, told):
+    code, _, err = run("estimate", str(vehicle / "flight1.csv"), "--airframe", str(vehicle / "airframe.toml"), *options)
+    assert code == 2
+    assert told in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_only_the_flight_model_takes_several_flights(run, vehicle):
+    flights = (str(vehicle / f"flight{number}.csv") for number in (1, 2))
+    code, _, err = run("estimate", *flights, "--airframe", str(vehicle / "airframe.toml"))
+    assert code == 2
+    assert "--model flight for several" in err
+
+
+def test_what_is_held_out_is_not_fitted_and_all_else_is(vehicle):
+    airframe = jaxos4.load_airframe(str(vehicle / "airframe.toml"))
+    paths = [vehicle / "flight1.csv", vehicle / "flight2.csv"]
+    recorded = load_logs(paths, airframe, Part(None, None, 0.25, None, 0.25))
+    assert recorded.tested is not None
+    there, aside = (~np.isnan(np.asarray(f.states)[:, 7]) for f in (recorded.fitted, recorded.tested))
+    assert (there ^ aside).all()
+    assert 0.15 < aside.mean() < 0.35
+    assert recorded.recordings == (0, 1)
+    assert recorded.fitted.commanded
+
+
+def test_the_models_of_the_command_line():
+    assert [model.value for model in VehicleModel] == ["published", "corrected", "flight"]

@@ -1,0 +1,444 @@
+"""`FlightModel`: each term against its equation written a second time, filter and delay, derivatives, estimates.
+
+The reference is plain NumPy in continuous time: commands held, rotors and body integrated together in small steps.
+"""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxos4
+from jaxos4.dynamics import CASCADE_ORDER, Inputs
+from jaxos4.flight_model import DEFAULT_TERMS
+
+ALL = tuple(jaxos4.TERMS)
+RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "flapping", "drag"))
+FULL = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, np.asarray(500.0))
+NAMES = {
+    "offset": ["roll_offset", "pitch_offset", "yaw_offset"],
+    "damping": ["roll_damping", "pitch_damping", "yaw_damping"],
+    "velocity": ["roll_velocity", "pitch_velocity"],
+    "flapping": ["roll_flapping", "pitch_flapping"],
+    "lag": ["rotor_lag"],
+    "delay": ["rotor_delay"],
+    "reaction": ["rotor_reaction"],
+    "curve": ["thrust_curve"],
+    "accelerometer": ["thrust_gain", "az_bias"],
+    "drag": ["x_drag", "y_drag"],
+    "gyro_bias": ["p_bias", "q_bias", "r_bias"],
+}
+# A vehicle with all of it; its delay is a whole number of samples of the steps below.
+VALUES = {
+    **dict(roll_offset=0.3, pitch_offset=-0.2, yaw_offset=0.1, roll_damping=1.5, pitch_damping=0.8, yaw_damping=0.4),
+    **dict(roll_velocity=0.3, pitch_velocity=-0.4, roll_flapping=0.2, pitch_flapping=-0.1, rotor_lag=0.06),
+    **dict(rotor_delay=0.02, rotor_reaction=0.02, thrust_curve=0.6, thrust_gain=1.2, x_drag=0.4, y_drag=0.3),
+    **dict(ax_bias=0.5, ay_bias=-0.4, az_bias=0.2, p_bias=0.03, q_bias=-0.02, r_bias=0.01),
+}
+
+
+def truth(model):
+    """A value for each parameter of a model, whatever recording it belongs to."""
+    alpha = dict(zip(jaxos4.CorrectedOS4().parameter_names, jaxos4.CorrectedOS4(FULL).alpha, strict=True))
+    values = {**alpha, **VALUES}
+    return jnp.array(
+        [values[n] if n in values else values[n[:-2]] * (1.0 - 2.0 * (n[-1] == "2")) for n in model.parameter_names]
+    )
+
+
+def commands(seconds, dt, *, hold=0.02):
+    """Rotor speeds that are held for 20 ms, the same on every time grid."""
+    rows = np.arange(round(seconds / dt) + 1) * dt
+    t = hold * np.floor(rows / hold + 1e-9)
+    hover = float(jaxos4.OS4.hover_speed)
+    phases, tones = np.array([0.0, 1.1, 2.0, 3.3]), np.array([0.9, 1.3, 1.1, 1.7])
+    return hover * (1 + 0.05 * np.sin(2 * np.pi * tones * t[:, None] + phases))
+
+
+def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
+    """The states in cascade order and the specific force, on the samples: the class's equations, with Runge-Kutta."""
+    v = {name: values[name] if name in sum((NAMES[t] for t in terms), []) else 0.0 for name in VALUES}
+    v["thrust_gain"] = values["thrust_gain"] if "accelerometer" in terms else 1.0
+    v["ax_bias"], v["ay_bias"] = ((values[n] if {"accelerometer", "drag"} <= set(terms) else 0.0) for n in NAMES_XY)
+    a1, a2, a3, a4, a5, a6, a7, a8 = np.asarray(jaxos4.CorrectedOS4(airframe).alpha)
+    b, d, m, g = (float(getattr(airframe, n)) for n in ("thrust_coefficient", "drag_coefficient", "mass", "gravity"))
+    (x, y), spin = np.asarray(airframe.rotor_positions).T, np.asarray(airframe.rotor_spins)
+    curve = values["thrust_curve"] if "curve" in terms else 1.0
+    full = float(airframe.max_rotor_speed)
+
+    def body(state, w, w_dot):
+        p, q, r, phi, theta, psi = state[:6]
+        force = b * (curve * w**2 + (1 - curve) * (full * w if curve != 1 else 0.0))
+        cx, sx, cy, sy, cz, sz = (f(angle) for angle in (phi, theta, psi) for f in (np.cos, np.sin))
+        turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]
+        turn = turn @ [[1, 0, 0], [0, cx, -sx], [0, sx, cx]]
+        vx, vy, _ = turn.T @ state[[7, 9, 11]]
+        specific = np.array([-v["x_drag"] * vx, -v["y_drag"] * vy, v["thrust_gain"] * force.sum() / m])
+        rates_dot = [
+            a1 * q * r - a2 * (spin @ w) * q + a3 * (y @ force) + v["roll_offset"] - v["roll_damping"] * p
+            + v["roll_velocity"] * vy,
+            a4 * p * r + a5 * (spin @ w) * p - a6 * (x @ force) + v["pitch_offset"] - v["pitch_damping"] * q
+            + v["pitch_velocity"] * vx,
+            a7 * p * q - a8 * d / b * (spin @ force) + v["yaw_offset"] - v["yaw_damping"] * r
+            - v["rotor_reaction"] * (spin @ w_dot),
+        ]  # fmt: skip
+        turning = [p + np.tan(theta) * (q * sx + r * cx), q * cx - r * sx, (q * sx + r * cx) / cy]
+        ax, ay, az = turn @ specific - [0, 0, g]
+        biased = specific + [v["ax_bias"], v["ay_bias"], v["az_bias"]]
+        return np.array([*rates_dot, *turning, state[7], ax, state[9], ay, state[11], az]), biased
+
+    def whole(z, u):
+        w = z[12:] if "lag" in terms else u
+        w_dot = (u - w) / v["rotor_lag"] if "lag" in terms else np.zeros(4)
+        dz, force = body(z[:12], w, w_dot)
+        return np.concatenate([dz, w_dot]), force
+
+    late = round(v["rotor_delay"] / dt)
+    z = np.concatenate([np.zeros(12), omega[0]])
+    states, forces, h = [], [], dt / fine
+    for k in range(omega.shape[0]):
+        u = omega[max(k - late, 0)]
+        states.append(z[:12])
+        forces.append(whole(z, u)[1])
+        for _ in range(fine):
+            k1 = whole(z, u)[0]
+            k2 = whole(z + h / 2 * k1, u)[0]
+            k3 = whole(z + h / 2 * k2, u)[0]
+            k4 = whole(z + h * k3, u)[0]
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    states = np.array(states)
+    for i, name in enumerate(NAMES["gyro_bias"]):
+        states[:, i] += v[name]
+    return states, np.array(forces)
+
+
+NAMES_XY = ("ax_bias", "ay_bias")
+
+
+def seen(model, omega, dt, *, method="rk4"):
+    """What the model's sensors show, from rest, beside the flight."""
+    blank = jaxos4.Flight(dt * np.arange(omega.shape[0]), omega, np.full((omega.shape[0], 12), np.nan))
+    problem = jaxos4.ShootingProblem(model, blank, sigma=np.ones(12), initial_state=np.zeros(12), method=method)
+    return np.asarray(problem.predict(truth(model), jnp.zeros(12)))
+
+
+def test_without_terms_it_is_the_corrected_model():
+    model, plain = jaxos4.FlightModel(terms=()), jaxos4.CorrectedOS4()
+    omega = jaxos4.multisine(jaxos4.OS4, duration=2.0)
+    driven, forced = model.drive(Inputs(omega, jnp.asarray(0.01)), model.alpha), plain.forcing(omega)
+    for name in forced._fields:
+        atol = 1e-13 * np.abs(getattr(forced, name)).max()
+        np.testing.assert_allclose(getattr(driven, name), getattr(forced, name), rtol=1e-13, atol=atol)
+    np.testing.assert_array_equal(model.alpha, plain.alpha)
+    np.testing.assert_array_equal(model.half_width, plain.half_width)
+    assert model.parameter_names == plain.parameter_names
+    assert model.parameter_units == plain.parameter_units
+    assert (model.is_linear, model.driving, model.force_axes, model.observes_states) == (True, (), (), True)
+    for method in ("euler", "rk4"):
+        flights = [jaxos4.simulate(m, plain.alpha, omega, dt=0.01, method=method).states for m in (model, plain)]
+        np.testing.assert_allclose(*flights, rtol=1e-11, atol=1e-12)
+    state = jnp.linspace(-0.4, 0.7, 12)
+    derivatives = [m.derivative(state, omega[3], plain.alpha) for m in (plain,)]
+    np.testing.assert_allclose(jnp.isfinite(derivatives[0]), True)
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        *((term,) for term in ALL if term not in ("flapping", "reaction", "drag", "delay")),
+        ("lag", "reaction"),
+        ("lag", "delay"),
+        ("accelerometer", "drag", "velocity"),
+        ("drag",),
+        tuple(term for term in ALL if term != "flapping"),
+    ],
+    ids="+".join,
+)
+def test_a_term_is_its_equation(terms):
+    """To second order in the sample time, and where rotors do not lag to fourth: inputs are held."""
+    errors = []
+    for dt in (0.01, 0.005):
+        omega = commands(1.0, dt)
+        model = jaxos4.FlightModel(FULL, terms=terms)
+        found = seen(model, omega, dt)
+        states, force = reference(terms, omega, dt, fine=4)
+        expected = np.concatenate([states, force[:, list(model.force_axes)]], axis=1)
+        assert found.shape == expected.shape
+        # Where no rotor lags the last row's force is as exact as the others; the specific force is at the sample.
+        errors.append(np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0).clip(1e-3))
+    assert errors[1].max() < (5e-4 if "lag" in terms else 1e-6), errors
+    assert np.all(errors[1] < 0.3 * errors[0] + 1e-9)
+
+
+def test_flapping_is_the_measured_force_as_an_input():
+    model = jaxos4.FlightModel(terms=("flapping",))
+    omega, rng = commands(1.0, 0.01), np.random.default_rng(0)
+    force = rng.normal(size=(omega.shape[0], 3))
+    force[10:14, 0] = np.nan  # is what it was before
+    force[:3, 1] = np.nan  # and at the beginning what it will be
+    blank = jaxos4.Flight(0.01 * np.arange(101), omega, np.full((101, 12), np.nan), force)
+    problem = jaxos4.ShootingProblem(model, blank, sigma=np.ones(12), channels="rates", initial_state=np.zeros(12))
+    found = np.asarray(problem.predict(truth(model), jnp.zeros(3)))
+    filled = force.copy()
+    filled[10:14, 0], filled[:3, 1] = force[9, 0], force[3, 1]
+    plain = jaxos4.CorrectedOS4()
+    rates, forcing = np.zeros((101, 3)), plain.forcing(jnp.asarray(omega))
+    for k in range(100):
+        at = jax.tree.map(lambda leaf, k=k: leaf[k], forcing)
+        slope = np.array(plain.angular_acceleration(jaxos4.dynamics.Rates(*rates[k]), at, plain.alpha))
+        slope[:2] += VALUES["roll_flapping"] * filled[k, 1], VALUES["pitch_flapping"] * filled[k, 0]
+        rates[k + 1] = rates[k] + 0.01 * slope
+    np.testing.assert_allclose(found, rates, rtol=1e-10, atol=1e-12)
+
+
+def test_a_measured_velocity_takes_the_place_of_the_simulated_one():
+    model = jaxos4.FlightModel(terms=("velocity",))
+    omega = commands(0.5, 0.01)
+    velocity = np.random.default_rng(0).normal(size=(omega.shape[0], 3))
+    rows = (0.01 * np.arange(51), omega, np.full((51, 12), np.nan))
+    for channels, size in (("rates", 3), ("all", 12)):
+        blank = jaxos4.Flight(*rows, body_velocity=velocity)
+        problem = jaxos4.ShootingProblem(model, blank, sigma=np.ones(12), channels=channels, initial_state=np.zeros(12))
+        rates = np.asarray(problem.predict(truth(model), jnp.zeros(size)))[:, :3]
+        still = eqx.tree_at(lambda p: p.flight.body_velocity, problem, jnp.zeros_like(jnp.asarray(velocity)))
+        without = np.asarray(still.predict(truth(model), jnp.zeros(size)))[:, :3]
+        # Yaw moves no velocity term; the first step is dt times the term.
+        np.testing.assert_allclose(
+            (rates - without)[1],
+            0.01 * np.array([VALUES["roll_velocity"] * velocity[0, 1], VALUES["pitch_velocity"] * velocity[0, 0], 0.0]),
+            rtol=1e-9,
+            atol=1e-15,
+        )
+    with pytest.raises(ValueError, match=r"velocity and drag need `Flight.body_velocity`"):
+        jaxos4.ShootingProblem(model, jaxos4.Flight(*rows), sigma=np.ones(12), channels="rates").cost(truth(model))
+    flapping = jaxos4.FlightModel(terms=("flapping",))
+    with pytest.raises(ValueError, match=r"flapping needs `Flight.specific_force`"):
+        jaxos4.ShootingProblem(flapping, jaxos4.Flight(*rows), sigma=np.ones(12), channels="rates").cost(
+            truth(flapping)
+        )
+
+
+@pytest.mark.parametrize("counts", [(1,), (2,), (37,), (5, 1, 20, 11), (1, 1, 1), (64, 64)])
+def test_the_filter_is_the_recursion(counts):
+    samples, dt, lag = sum(counts), 0.004, 0.05
+    omega = np.random.default_rng(0).uniform(100, 400, (samples, 4))
+    stretch = np.repeat(np.arange(len(counts)), counts)
+    model = jaxos4.FlightModel(FULL, terms=("lag", "reaction", "accelerometer"))
+    values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True)) | {"rotor_lag": lag}
+    given = None if len(counts) == 1 else jnp.asarray(stretch)
+    inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretch=given)
+    found = model.drive(inputs, jnp.array(list(values.values())))
+    decay, here = np.exp(-dt / lag), np.empty_like(omega)
+    for k in range(samples):
+        restart = k == 0 or stretch[k] != stretch[k - 1]
+        here[k] = omega[k] if restart else decay * here[k - 1] + (1 - decay) * omega[k - 1]
+    following = decay * here + (1 - decay) * omega
+    squares = (here**2 + here * following + following**2) / 3
+    b, m, spins = float(FULL.thrust_coefficient), float(FULL.mass), np.asarray(FULL.rotor_spins)
+    torques = squares @ np.asarray(FULL.mixer).T
+    for value, expected in (
+        (found.specific_thrust, b / m * (here**2).sum(axis=1)),
+        (found.thrust, b / m * squares.sum(axis=1)),
+        (found.spin_up, (following - here) @ spins / dt),
+        (found.residual_speed, (here + following) @ spins / 2),
+        *zip((found.roll, found.pitch, found.yaw), torques.T[:3], strict=True),
+    ):
+        np.testing.assert_allclose(value, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max() + 1e-15)
+
+
+def test_a_lag_too_short_to_show_is_as_short_as_can_be_told():
+    model = jaxos4.FlightModel(terms=("lag",))
+    omega = jnp.asarray(commands(0.5, 0.01))
+    for lag in (-1.0, 0.0, 1e-6):
+        found = model.drive(Inputs(omega, jnp.asarray(0.01)), model.alpha.at[8].set(lag))
+        plain = jaxos4.CorrectedOS4().forcing(omega)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found) if leaf is not None)
+        # What is left is the straight line over the sample in which the command changes.
+        assert np.abs(found.thrust - plain.thrust)[5:].max() < 0.1 * np.ptp(np.asarray(plain.thrust))
+
+
+def delayed(omega, delay, dt=0.01, stretch=None):
+    model = jaxos4.FlightModel(terms=("delay",))
+    inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretch=stretch)
+    return model.drive(inputs, model.alpha.at[8].set(delay)).residual_speed
+
+
+@pytest.mark.parametrize("samples", [-3, -1, 0, 1, 2, 7])
+def test_whole_delays_are_exact(samples):
+    counts = (30, 12, 1, 4)
+    omega = np.random.default_rng(0).uniform(100, 400, (sum(counts), 4))
+    stretch = np.repeat(np.arange(4), counts)
+    begin = np.repeat(np.cumsum((0, *counts[:-1])), counts)
+    end = np.repeat(np.cumsum(counts), counts) - 1
+    row = np.clip(np.arange(sum(counts)) - samples, begin, end)
+    expected = omega[row] @ np.asarray(jaxos4.OS4.rotor_spins)
+    found = delayed(omega, 0.01 * samples, stretch=jnp.asarray(stretch))
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-9)
+
+
+def test_parabolas_are_delayed_exactly():
+    t = 0.01 * np.arange(60)
+    omega = np.stack([200 + 30 * t, 210 - 500 * t**2, 190 + 100 * t**2, 200 + 0 * t], axis=1)
+    for delay in (0.0031, 0.0149, 0.0377, -0.0121):
+        late = t - delay
+        exact = np.stack([200 + 30 * late, 210 - 500 * late**2, 190 + 100 * late**2, 200 + 0 * late], axis=1)
+        expected = exact @ np.asarray(jaxos4.OS4.rotor_spins)
+        np.testing.assert_allclose(delayed(omega, delay)[8:-8], expected[8:-8], rtol=1e-10, atol=1e-9)
+
+
+def test_the_delay_has_a_continuous_derivative():
+    omega = np.random.default_rng(0).uniform(100, 400, (40, 4))
+    slope = jax.jacfwd(lambda delay: delayed(omega, delay))
+    size = np.abs(slope(0.0123)).max()
+    for whole in (0.0, 0.01, 0.02, -0.01):
+        below, above = slope(whole - 1e-9), slope(whole + 1e-9)
+        np.testing.assert_allclose(below, above, atol=1e-5 * size)
+        np.testing.assert_allclose(delayed(omega, whole - 1e-9), delayed(omega, whole + 1e-9), atol=1e-3)
+    middle = 0.0137
+    difference = (delayed(omega, middle + 1e-7) - delayed(omega, middle - 1e-7)) / 2e-7
+    np.testing.assert_allclose(slope(middle), difference, rtol=1e-5, atol=1e-5 * size)
+
+
+SUBSETS = [
+    (),
+    *((term,) for term in ALL),
+    *itertools.combinations(("offset", "lag", "gyro_bias", "accelerometer", "drag"), 3),
+    DEFAULT_TERMS,
+    RATE_TERMS,
+    ALL,
+]
+
+
+@pytest.mark.parametrize("recordings", [(0,), (0, 0), (0, 1), (1, 0, 2)])
+def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
+    count = max(recordings) + 1
+    for terms in SUBSETS:
+        model = jaxos4.FlightModel(terms=terms, recordings=recordings)
+        names = model.parameter_names
+        size = 8 + sum(
+            len(NAMES[term]) * (count if term in ("offset", "gyro_bias") else 1) for term in terms
+        ) + 2 * ({"accelerometer", "drag"} <= set(terms))  # fmt: skip
+        assert len(names) == len(set(names)) == size
+        assert len(model.parameter_units) == size
+        assert model.alpha.shape == model.half_width.shape == (size,)
+        assert np.isfinite(model.alpha).all()
+        assert np.all(np.isfinite(model.half_width) & (model.half_width > 0))
+        assert model.alpha.dtype == model.half_width.dtype == jnp.float64
+        driving = {"rotor_lag", "rotor_delay", "thrust_curve"} & set(names)
+        assert {names[i] for i in model.driving} == driving
+        assert model.is_linear == (not driving)
+        each = [name for name in names if name.startswith("roll_offset")]
+        assert each == ([] if "offset" not in terms else ["roll_offset"] if count == 1 else [f"roll_offset_{i + 1}" for i in range(count)])  # fmt: skip  # noqa: E501
+    # The order is that of TERMS, however they were given.
+    assert jaxos4.FlightModel(terms=("lag", "offset")).parameter_names == (
+        *jaxos4.CorrectedOS4().parameter_names,
+        *NAMES["offset"],
+        *NAMES["lag"],
+    )
+
+
+@pytest.mark.parametrize("terms", [("wind",), ("lag", "lag"), ("lag", "Lag")])
+def test_terms_that_do_not_exist_are_named(terms):
+    with pytest.raises(ValueError, match="`terms` must be some of offset, damping"):
+        jaxos4.FlightModel(terms=terms)
+
+
+@pytest.mark.parametrize("recordings", [(), (1,), (0, 2), (-1, 0)])
+def test_recordings_count_from_zero(recordings):
+    with pytest.raises(ValueError, match="`recordings` must count from 0"):
+        jaxos4.FlightModel(recordings=recordings)
+
+
+def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="rates"):
+    """Two stretches, flown by the model itself and seen by its sensors."""
+    parts, rng = [], np.random.default_rng(0)
+    recordings = model.recordings if len(model.recordings) == 2 else (0, 0)
+    for i, recording in enumerate(recordings):
+        omega = commands(seconds, dt, hold=dt)[:: 1 - 2 * i][:-1]
+        alone = jaxos4.FlightModel(model.airframe, terms=model.terms)
+        values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True))
+        own = jnp.array([values.get(n, values.get(f"{n}_{recording + 1}")) for n in alone.parameter_names])
+        blank = jaxos4.Flight(dt * np.arange(omega.shape[0]), omega, np.full((omega.shape[0], 12), np.nan))
+        problem = jaxos4.ShootingProblem(alone, blank, sigma=np.ones(12), channels=channels)
+        found = np.asarray(problem.predict(own, jnp.zeros(problem.size)))
+        states, force = np.full((omega.shape[0], 12), np.nan), np.full((omega.shape[0], 3), np.nan)
+        states[:, CASCADE_ORDER[: problem.size]] = found[:, : problem.size]
+        force[:, list(alone.force_axes)] = found[:, problem.size :]
+        states, force = states + rng.normal(0, noise, states.shape), force + rng.normal(0, 10 * noise, force.shape)
+        parts.append(jaxos4.Flight(blank.time, omega, states, force))
+    flight = jaxos4.join(parts, length=round(2 * seconds / dt / windows))
+    return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels=channels, windows=windows)
+
+
+def with_gyro(terms, recordings):
+    return jaxos4.FlightModel(FULL, terms=terms, recordings=recordings)
+
+
+@pytest.mark.parametrize("recordings", [(0, 0), (0, 1)])
+def test_gradient_and_information_are_the_residuals_derivatives(recordings):
+    terms = ("offset", "lag", "delay", "curve", "accelerometer", "gyro_bias")
+    problem = two_flights(jaxos4.FlightModel(FULL, terms=terms, recordings=recordings), windows=4, noise=0.01)
+    count = len(problem.model.parameter_names)
+    parameters = truth(problem.model) * 1.03
+    unknowns = jnp.concatenate([parameters, problem.first_state()[0]])
+
+    def residuals(u):
+        return problem.residuals(u[:count], u[count:])
+
+    jacobian, errors = np.asarray(jax.jacfwd(residuals)(unknowns)), np.asarray(residuals(unknowns))
+    scale = np.linalg.norm(jacobian, axis=0)
+    found = problem.curvatures(parameters, unknowns[count:])
+    own = problem.size
+    for w in range(4):
+        columns = np.r_[:count, count + w * own : count + (w + 1) * own]
+        rows = np.repeat(problem.window_of_samples() == w, problem.columns.size)
+        expected = jacobian[rows][:, columns]
+        size = np.outer(scale[columns], scale[columns])
+        np.testing.assert_allclose(found.information[w] / size, expected.T @ expected / size, atol=1e-10)
+        gradient = expected.T @ errors[rows] / scale[columns] / np.linalg.norm(errors)
+        np.testing.assert_allclose(found.gradient[w] / scale[columns] / np.linalg.norm(errors), gradient, atol=1e-10)
+        assert float(found.shot.cost[w]) == pytest.approx(0.5 * float(errors[rows] @ errors[rows]), rel=1e-10)
+
+
+@pytest.mark.parametrize("estimator", [jaxos4.IBSS(), jaxos4.OutputError()], ids=["ibss", "output error"])
+def test_the_truth_is_found_without_noise(estimator):
+    terms = ("offset", "damping", "lag", "delay", "reaction", "accelerometer")
+    problem = two_flights(jaxos4.FlightModel(FULL, terms=terms, recordings=(0, 1)), seconds=4.0)
+    model, values = problem.model, truth(problem.model)
+    # The bracket reaches from the truth to 60 % of its half-width.
+    bracket = jaxos4.Bracket.around(
+        values + 0.4 * jnp.cos(jnp.arange(values.size)) * model.half_width, model.half_width
+    )
+    found = estimator(problem, bracket)
+    assert np.all(np.abs(found.parameters - values) < 1e-5 * model.half_width)
+    # Which holds the offsets of two recordings that differ.
+    names = list(model.parameter_names)
+    first, second = (float(found.parameters[names.index(f"roll_offset_{i}")]) for i in (1, 2))
+    assert (first, second) == (pytest.approx(0.3, abs=1e-4), pytest.approx(-0.3, abs=1e-4))
+
+
+def test_a_gyros_bias_is_told_from_an_offset_by_the_attitude():
+    model = jaxos4.FlightModel(FULL, terms=("offset", "gyro_bias"))
+    problem = two_flights(model, seconds=3.0, channels="attitude", windows=2)
+    values = truth(model)
+    bracket = jaxos4.Bracket.around(values + 0.3 * model.half_width, model.half_width)
+    found = jaxos4.IBSS()(problem, bracket)
+    assert np.all(np.abs(found.parameters - values)[8:] < 1e-5 * model.half_width[8:])
+
+
+def test_batches_are_loops_and_trace_once():
+    model = jaxos4.FlightModel(FULL, terms=DEFAULT_TERMS)
+    omega = jnp.asarray(commands(0.5, 0.01))
+    batch = truth(model) * jnp.linspace(0.9, 1.1, 5)[:, None]
+
+    @jax.jit
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def fly(parameters):
+        return jaxos4.simulate(model, parameters, omega, dt=0.01).states
+
+    each = jnp.stack([fly(parameters) for parameters in batch])
+    together = jax.vmap(lambda parameters: jaxos4.simulate(model, parameters, omega, dt=0.01).states)(batch)
+    np.testing.assert_allclose(together, each, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,183 @@
+"""Stretches joined into one flight of windows, and rows averaged onto a coarser grid."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import jaxos4
+from jaxos4.logs.resample import average
+
+
+def stretch(samples, seed, *, force=False, velocity=False, dt=0.01, start=0.0):
+    rng = np.random.default_rng(seed)
+    states = rng.normal(size=(samples, 12))
+    states[rng.uniform(size=states.shape) < 0.1] = np.nan
+    return jaxos4.Flight(
+        time=start + dt * np.arange(samples),
+        omega=rng.uniform(100, 300, (samples, 4)),
+        states=states,
+        specific_force=rng.normal(size=(samples, 3)) if force else None,
+        body_velocity=rng.normal(size=(samples, 3)) if velocity else None,
+    )
+
+
+@given(
+    lengths=st.lists(st.integers(2, 60), min_size=1, max_size=5),
+    length=st.integers(2, 20),
+    forces=st.lists(st.booleans(), min_size=5, max_size=5),
+)
+@settings(max_examples=60)
+def test_no_window_reaches_from_one_stretch_into_the_next(lengths, length, forces):
+    flights = [stretch(n, i, force=forces[i], start=7.0 * i) for i, n in enumerate(lengths)]
+    kept = [n // length for n in lengths]
+    if not any(kept):
+        with pytest.raises(ValueError, match=f"`flights` must hold at least `length` = {length} samples"):
+            jaxos4.join(flights, length=length)
+        return
+    joined = jaxos4.join(flights, length=length)
+    windows = sum(kept)
+    assert joined.time.shape == (windows * length,)
+    np.testing.assert_allclose(joined.time, 0.01 * np.arange(windows * length), rtol=1e-12, atol=1e-12)
+    assert float(joined.dt) == pytest.approx(0.01, rel=1e-9)
+    whole = [(flight, n) for flight, n in zip(flights, kept, strict=True) if n]
+    rows = [(flight, slice(length * i, length * (i + 1))) for flight, n in whole for i in range(n)]
+    problem = jaxos4.ShootingProblem(
+        jaxos4.CorrectedOS4(), joined, sigma=jaxos4.SENSOR_SIGMA, channels="rates", windows=windows
+    )
+    np.testing.assert_array_equal(problem.window_of_samples(), np.repeat(np.arange(windows), length))
+    for w, (flight, part) in enumerate(rows):
+        at = slice(length * w, length * (w + 1))
+        np.testing.assert_array_equal(joined.omega[at], flight.omega[part])
+        np.testing.assert_array_equal(joined.states[at], flight.states[part])
+        np.testing.assert_array_equal(joined.channels[at], flight.channels[part])
+    assert joined.stretch is not None
+    np.testing.assert_array_equal(joined.stretch, np.repeat(np.arange(len(whole)), [n * length for _, n in whole]))
+    assert (joined.specific_force is None) == (not any(flight.specific_force is not None for flight, _ in whole))
+
+
+@pytest.mark.parametrize("velocities", [(True, True), (True, False), (False, False)])
+def test_a_velocity_is_kept_where_every_stretch_has_one(velocities):
+    flights = [stretch(30, i, velocity=v) for i, v in enumerate(velocities)]
+    joined = jaxos4.join(flights, length=10)
+    if all(velocities):
+        expected = np.concatenate([np.asarray(flight.body_velocity) for flight in flights])
+        np.testing.assert_array_equal(joined.body_velocity, expected)
+    else:
+        assert joined.body_velocity is None
+
+
+def test_the_cost_of_joined_flights_is_the_sum_of_theirs():
+    model = jaxos4.FlightModel(terms=("lag", "delay", "offset"))
+    omega = np.asarray(jaxos4.multisine(jaxos4.OS4, duration=0.6))
+    parts = []
+    for i in range(2):
+        flown = jaxos4.simulate(model, model.alpha, omega[:: 1 - 2 * i], dt=0.01)
+        flight = jaxos4.WhiteNoise(0.01)(flown, key=jax.random.key(i))
+        parts.append(flight)
+    arguments = dict(sigma=jaxos4.SENSOR_SIGMA, channels="rates")
+    together = jaxos4.ShootingProblem(model, jaxos4.join(parts, length=20), windows=6, **arguments)
+    each = [
+        jaxos4.ShootingProblem(
+            model,
+            eqx.tree_at(
+                lambda f: (f.time, f.omega, f.states), part, (part.time[:60], part.omega[:60], part.states[:60])
+            ),
+            windows=3,
+            **arguments,
+        )
+        for part in parts
+    ]
+    parameters = model.alpha.at[8:].add(jnp.array([0.1, 0.0, -0.1, 0.01, 0.013]))
+    assert float(together.cost(parameters)) == pytest.approx(sum(float(p.cost(parameters)) for p in each), rel=1e-12)
+
+
+def test_flights_of_other_sample_times_are_refused():
+    with pytest.raises(ValueError, match=r"`flights` must have one sample time, got 0.01, 0.02 s"):
+        jaxos4.join([stretch(30, 0), stretch(30, 1, dt=0.02)], length=10)
+    with pytest.raises(ValueError, match="`flights` must hold at least `length` = 40 samples"):
+        jaxos4.join([stretch(30, 0), stretch(39, 1)], length=40)
+    with pytest.raises(ValueError, match="`flights` must hold at least `length` = 40 samples"):
+        jaxos4.join([], length=40)
+
+
+def rows(samples, ratio, seed, *, lost=0.0):
+    rng = np.random.default_rng(seed)
+    t = 3.0 + 0.001 * np.arange(samples)
+    channels = np.cumsum(rng.normal(size=(samples, 3)), axis=0)
+    channels[rng.uniform(size=channels.shape) < lost] = np.nan
+    return t, rng.uniform(100, 300, (samples, 4)), channels, 0.001 * ratio
+
+
+def averaged_slowly(t, y, grid, dt):
+    """Each row's interval cut with each sample's, one by one."""
+    own, out = t[1] - t[0], np.full((grid.size, y.shape[1]), np.nan)
+    for k, center in enumerate(grid):
+        for column in range(y.shape[1]):
+            total = share = 0.0
+            for at, value in zip(t, y[:, column], strict=True):
+                overlap = min(at + own / 2, center + dt / 2) - max(at - own / 2, center - dt / 2)
+                if overlap > 0 and np.isfinite(value):
+                    total, share = total + overlap * value, share + overlap
+            if share > 0.45 * dt:
+                out[k, column] = total / share
+    return out
+
+
+@pytest.mark.parametrize("ratio", [2, 3, 4, 2.5, 5.7])
+@pytest.mark.parametrize("lost", [0.0, 0.3, 0.6])
+def test_averages_are_means_over_the_sample(ratio, lost):
+    t, omega, channels, dt = rows(83, ratio, 0, lost=lost)
+    grid, _, found = average(t, omega, channels, dt)
+    np.testing.assert_allclose(grid, t[0] + dt * np.arange(grid.size), rtol=1e-12)
+    assert grid[-1] <= t[-1] + 1e-6 < grid[-1] + dt + 1e-6
+    expected = averaged_slowly(t, channels, grid, dt)
+    np.testing.assert_array_equal(np.isfinite(found), np.isfinite(expected))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [2, 3, 4, 2.5])
+def test_a_straight_line_is_averaged_without_a_delay(ratio):
+    t, omega, _, dt = rows(100, ratio, 0)
+    lines = np.column_stack([2.0 * (t - 3), 1 - (t - 3), np.ones_like(t)])
+    grid, _, found = average(t, omega, lines, dt)
+    expected = np.column_stack([2.0 * (grid - 3), 1 - (grid - 3), np.ones_like(grid)])
+    # Half-covered ends see one side only.
+    inside = slice(1, -1)
+    within = 1e-9 if float(ratio).is_integer() else 0.25 * 0.001 * 2
+    np.testing.assert_allclose(found[inside], expected[inside], atol=within)
+
+
+@pytest.mark.parametrize("ratio", [2, 4, 2.5, 5.7])
+def test_no_impulse_is_lost(ratio):
+    t, omega, channels, dt = rows(83, ratio, 1)
+    grid, speeds, _ = average(t, omega, channels, dt)
+    for k in range(grid.size - 1):
+        begin, end = grid[k], grid[k + 1]
+        impulse = np.zeros(4)
+        for at, row in zip(t[:-1], omega[:-1], strict=True):
+            impulse += max(min(at + 0.001, end) - max(at, begin), 0.0) * row**2
+        np.testing.assert_allclose(speeds[k] ** 2 * dt, impulse, rtol=1e-9)
+    constant = np.full_like(omega, 250.0)
+    np.testing.assert_allclose(average(t, constant, channels, dt)[1], 250.0, rtol=1e-12)
+
+
+def test_nothing_is_measured_where_less_than_half_was():
+    t, omega, _, dt = rows(81, 4, 0)
+    y = np.ones((81, 1))
+    y[39:42] = np.nan  # a sample is the rows 38 (half), 39, 40, 41, 42 (half): one of four is left
+    y[59:61] = np.nan  # two of four
+    found = average(t, omega, y, dt)[2][:, 0]
+    assert np.flatnonzero(np.isnan(found)).tolist() == [10]
+    np.testing.assert_allclose(found[np.isfinite(found)], 1.0, rtol=1e-12)
+
+
+def test_vibration_above_the_new_rate_does_not_fold_down():
+    t = 0.001 * np.arange(4001)
+    y = np.sin(2 * np.pi * 250.0 * t + 0.3)[:, None]
+    found = average(t, np.full((t.size, 4), 200.0), y, 0.004)[2]
+    assert np.abs(found[1:-1]).max() < 1e-9
+    taken = y[::4]
+    assert np.abs(taken).max() > 0.25

@@ -1,0 +1,188 @@
+"""Predictions tenths of a second ahead: exact where the model is, worth nothing where it says that nothing moves."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxos4
+from jaxos4.validation import Predictions
+
+DT = 0.01
+HORIZONS = (0.1, 0.25, 0.5)
+RATES = (7, 9, 11)
+
+
+def flown(model, *, seconds=6.0, dt=DT, method="rk4"):
+    omega = jaxos4.multisine(model.airframe, duration=seconds, dt=dt)
+    return jaxos4.simulate(model, model.alpha, omega, dt=dt, method=method)
+
+
+def problem_of(model, flight, **arguments):
+    return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", method="rk4", **arguments)
+
+
+def spread(model, flight):
+    return jaxos4.predictions(problem_of(model, flight), model.alpha, horizons=HORIZONS)
+
+
+def made(errors, changes):
+    """Predictions with these errors of rates that changed by so much."""
+    errors, changes = np.broadcast_arrays(np.asarray(errors, float), np.asarray(changes, float))
+    starts = errors.shape[0]
+    measured = np.zeros((starts, 1, 3)) + changes
+    return Predictions(np.arange(starts), np.array([0.1]), np.zeros((starts, 3)), measured + errors, measured)
+
+
+@pytest.mark.parametrize("model", [jaxos4.CorrectedOS4(), jaxos4.FlightModel()], ids=["corrected", "flight"])
+def test_a_flight_without_noise_is_predicted(model):
+    flight = flown(model)
+    found = spread(model, flight)
+    skill = jaxos4.skill(found)
+    np.testing.assert_allclose(found.horizons, HORIZONS)
+    # The start is a mean over 0.02 s: what it is off by is the curvature of the rates, and nothing else.
+    off = np.abs(found.initial - np.asarray(flight.states)[found.start][:, RATES]).max()
+    assert off < 0.01
+    assert np.abs(found.predicted - found.measured).max() < 3 * off
+    assert np.all(skill.skill > 1 - 1e-3)
+    assert skill.starts == found.start.size == len(found.initial)
+
+
+def test_at_a_step_so_long_that_the_start_is_one_sample_predictions_are_exact():
+    model = jaxos4.CorrectedOS4()
+    flight = flown(model, dt=0.025)
+    found = spread(model, flight)
+    np.testing.assert_array_equal(found.initial, np.asarray(flight.states)[found.start][:, RATES])
+    np.testing.assert_allclose(found.predicted, found.measured, atol=1e-12)
+    skill = jaxos4.skill(found)
+    np.testing.assert_allclose(skill.skill, 1.0, atol=1e-12)
+    np.testing.assert_allclose(skill.std, 0.0, atol=1e-12)
+    # Horizons are whole samples.
+    np.testing.assert_allclose(found.horizons, np.rint(np.array(HORIZONS) / 0.025) * 0.025)
+
+
+def test_rates_that_stay_as_they_are_are_worth_nothing():
+    model = jaxos4.CorrectedOS4()
+    still = jnp.zeros(8)
+    found = jaxos4.predictions(problem_of(model, flown(model)), still, horizons=HORIZONS)
+    np.testing.assert_array_equal(found.predicted, np.repeat(found.initial[:, None], 3, axis=1))
+    skill = jaxos4.skill(found)
+    np.testing.assert_array_equal(skill.skill, 0.0)
+    np.testing.assert_array_equal(skill.rmse, skill.persistence)
+
+
+def test_a_gyros_bias_is_not_taken_for_motion():
+    model = jaxos4.FlightModel(terms=("gyro_bias",))
+    plain = jaxos4.CorrectedOS4()
+    flight = flown(plain, dt=0.025)
+    bias = jnp.array([0.05, -0.03, 0.02])
+    biased = jaxos4.Flight(flight.time, flight.omega, flight.states.at[:, jnp.array(RATES)].add(bias))
+    found = jaxos4.predictions(problem_of(model, biased), jnp.concatenate([plain.alpha, bias]))
+    np.testing.assert_allclose(found.predicted, found.measured, atol=1e-12)
+
+
+def test_windows_and_channels_do_not_matter():
+    model = jaxos4.CorrectedOS4()
+    flight = flown(model)
+    one = spread(model, flight)
+    for arguments in ({"windows": 5}, {"windows": 1}):
+        other = jaxos4.predictions(
+            jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="all", method="rk4", **arguments),
+            model.alpha,
+        )
+        np.testing.assert_allclose(other.predicted, one.predicted, rtol=1e-12, atol=1e-13)
+
+
+def test_no_prediction_crosses_into_another_stretch():
+    model = jaxos4.FlightModel()
+    rest = flown(model, seconds=4.0)
+    # The second stretch is flown from elsewhere: whatever crosses is far off.
+    away = jaxos4.Flight(rest.time, rest.omega, rest.states + 5.0)
+    flight = jaxos4.join([rest, away, rest], length=90)
+    stretch = np.asarray(flight.stretch)
+    found = spread(model, flight)
+    ahead = int(round(max(HORIZONS) / DT))
+    assert np.all(stretch[found.start - 1] == stretch[found.start + ahead])
+    # And all that could be are there, 0.05 s apart.
+    grid = np.arange(1, stretch.size - ahead - 1, 5)
+    np.testing.assert_array_equal(found.start, grid[stretch[grid - 1] == stretch[grid + ahead]])
+    for i in range(3):
+        assert np.count_nonzero(stretch[found.start] == i) > 50
+
+
+def test_what_was_not_measured_is_not_counted():
+    model = jaxos4.CorrectedOS4()
+    flight = flown(model)
+    states = np.array(flight.states)
+    states[200:220, 7] = np.nan
+    states[400, 9] = np.nan
+    found = spread(model, jaxos4.Flight(flight.time, flight.omega, states))
+    near = found.start[:, None] + np.arange(-1, 2)
+    assert np.isfinite(states[near][:, :, RATES]).all()
+    assert np.isfinite(found.initial).all()
+    assert np.isfinite(found.predicted).all()
+    at = found.start[:, None] + np.rint(found.horizons / DT).astype(int)
+    np.testing.assert_array_equal(found.measured, states[at][:, :, RATES])
+    skill = jaxos4.skill(found)
+    told = np.isfinite(found.measured)
+    assert told.sum() < told.size
+    errors = np.where(told, found.predicted - found.measured, np.nan)
+    np.testing.assert_allclose(skill.rmse, np.sqrt(np.nanmean(errors**2, axis=0)), rtol=1e-12)
+    assert np.all(skill.skill > 1 - 1e-3)
+
+
+def test_a_prediction_that_diverges_is_worth_less_than_any():
+    skill = jaxos4.skill(made(np.where(np.arange(40) == 7, np.nan, 0.1)[:, None, None], 1.0))
+    assert np.all(np.isneginf(skill.skill))
+    assert np.all(np.isinf(skill.rmse))
+
+
+def test_where_nothing_moves_or_nothing_was_measured_there_is_no_division_by_it():
+    skill = jaxos4.skill(made(np.full((30, 1, 3), 0.1), 0.0))
+    assert np.isfinite(skill.skill).all()
+    assert np.all(skill.skill < 0)
+    nothing = made(np.zeros((30, 1, 3)), 1.0)
+    skill = jaxos4.skill(nothing._replace(measured=np.full((30, 1, 3), np.nan)))
+    np.testing.assert_array_equal(skill.rmse, 0.0)
+
+
+def test_the_jackknife_is_the_spread_of_the_skill():
+    """Of independent errors, over many flights; and by its formula on one."""
+    rng = np.random.default_rng(0)
+    skills = [jaxos4.skill(made(0.5 * rng.normal(size=(200, 1, 3)), rng.normal(size=(200, 1, 3)))) for _ in range(300)]
+    actual = np.std([s.skill for s in skills], axis=0)
+    claimed = np.sqrt(np.mean([np.square(s.std) for s in skills], axis=0))
+    # Of 300 flights the spread itself is told to 4 %; the jackknife is a little wide.
+    np.testing.assert_allclose(claimed, actual, rtol=0.2)
+    one = made(rng.normal(size=(20, 1, 3)), rng.normal(size=(20, 1, 3)))
+    errors, changes = one.predicted - one.measured, one.initial[:, None] - one.measured
+    without = []
+    for part in range(10):
+        kept = np.delete(np.arange(20), [2 * part, 2 * part + 1])
+        without.append(1 - (errors[kept] ** 2).sum(axis=0) / (changes[kept] ** 2).sum(axis=0))
+    expected = np.sqrt(0.9 * np.square(without - np.mean(without, axis=0)).sum(axis=0))
+    np.testing.assert_allclose(jaxos4.skill(one).std, expected, rtol=1e-10)
+
+
+def test_a_single_start_has_a_skill_without_a_spread():
+    skill = jaxos4.skill(made(np.full((1, 1, 3), 0.1), 1.0))
+    np.testing.assert_allclose(skill.skill, 0.99)
+    np.testing.assert_array_equal(skill.std, 0.0)
+    assert skill.starts == 1
+
+
+def test_flights_that_are_too_short_or_without_rates_are_refused():
+    model = jaxos4.CorrectedOS4()
+    flight = flown(model, seconds=0.4)
+    with pytest.raises(ValueError, match=r"`problem.flight` holds no stretch .* longer than 0.5 s"):
+        spread(model, flight)
+    long = flown(model, seconds=3.0)
+    with pytest.raises(ValueError, match="no stretch with measured rates"):
+        spread(model, jaxos4.Flight(long.time, long.omega, jnp.full_like(long.states, jnp.nan)))
+    with pytest.raises(ValueError, match="longer than 0.5 s"):
+        spread(model, short_stretches(long))
+
+
+def short_stretches(flight):
+    """0.45 s each, none of which is long enough."""
+    samples = flight.time.shape[0]
+    return jaxos4.Flight(flight.time, flight.omega, flight.states, stretch=jnp.arange(samples) // 45)
