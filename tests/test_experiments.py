@@ -279,7 +279,7 @@ def test_real_flight(shared_flights, tmp_path):
         flights=shared_flights,
         out=tmp_path / "out",
         seconds=11.0,
-        names=[],
+        names=["ibss without flapping"],
         lags=[0.03, 0.06],
         sections=["lag"],
     )

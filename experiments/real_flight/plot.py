@@ -53,13 +53,14 @@ def draw_skill(column: SubFigure, report: dict[str, Any]) -> None:
     """Bars by horizon, with 95 % error bars; below -1 they are cut, and say what they are."""
     panels = list(column.subplots(3, 1))
     bars = {name: (name, report["estimators"][name]) for name in SHOOTING if name in report["estimators"]}
-    bars["ibss without flapping"] = ("ibss, no flapping term", report["estimators"]["ibss without flapping"])
+    if "ibss without flapping" in report["estimators"]:
+        bars["ibss without flapping"] = ("ibss, no flapping term", report["estimators"]["ibss without flapping"])
     for (name, label), key in zip(LABELS.items(), REGRESSION, strict=True):
         row = report.get("regression", {}).get("rows", {}).get(key)
         if row is not None:
             bars[name] = (label, row)
     looks = styles([*(name for name in bars if name != "ibss without flapping"), "svsf"])
-    looks["ibss without flapping"] = looks.pop("svsf")
+    looks["ibss without flapping"] = looks["svsf"]
     width = 0.84 / len(bars)
     for rate, panel in zip(RATES, panels, strict=True):
         for place, (name, (label, row)) in enumerate(bars.items()):
@@ -112,7 +113,7 @@ def draw_inertias(column: SubFigure, report: dict[str, Any]) -> None:
 
 def _scaled(rows: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
     """Estimates and their intervals' arms [1e-5 kg m^2]."""
-    y, ends = np.array([row["estimate"] for row in rows]), np.array([row["ci95"] for row in rows]).T
+    y, ends = np.array([row["estimate"] for row in rows]), np.array([row["ci95"] for row in rows], dtype=float).T
     return 1e5 * y, 1e5 * np.abs(ends - y)
 
 

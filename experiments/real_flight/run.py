@@ -3,6 +3,7 @@
 Blocks of 5 s of the roll and pitch flight, from 1 s on: the 1st, 3rd, ... are fitted, the 2nd, 4th, ... tested, the
 same for all estimators. Predictions use the recorded commands, and with `flapping` the recorded specific force along x
 and y as well, as inputs: they say what the vehicle does next, given these, not what a simulator would do without them.
+Torques, and so inertias, are in proportion to the documented thrust, which the accelerometer checks: `thrust_gain`.
 """
 
 import json
@@ -37,6 +38,7 @@ DELAYS = (0.0, 0.004, 0.008, 0.012, 0.016, 0.02)
 DT, WINDOW, BEGIN, BLOCK = 0.004, 0.25, 1.0, 5.0
 # Of the flight, one of which at a time is left out for errors of differences and of regressions: as in `jaxos4.skill`.
 PARTS = 10
+NAMES = ("output-error", "hybrid", "ibss, nothing held", "ibss without flapping")
 SECTIONS = ("regression", "lag", "joint")
 NINETY_FIVE = 1.96
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6"}
@@ -113,8 +115,9 @@ def inertias(values: Values, std: Values) -> dict[str, Any]:
     """Ix and Iy [kg m^2] with 95 % intervals, from alpha3 and alpha6."""
     table = {}
     for name, alpha in INERTIAS.items():
-        off = NINETY_FIVE * std[alpha]
-        table[name] = {"estimate": 1 / values[alpha], "ci95": [1 / (values[alpha] + off), 1 / (values[alpha] - off)]}
+        low, high = (values[alpha] + sign * NINETY_FIVE * std[alpha] for sign in (-1, 1))
+        # Where the interval of alpha reaches 0, that of the inertia has no upper end.
+        table[name] = {"estimate": 1 / values[alpha], "ci95": [1 / high, 1 / low if low > 0 else None]}
     return table
 
 
@@ -135,7 +138,26 @@ def described(fit: jaxos4.VehicleFit, seconds: float) -> tuple[Values, dict[str,
     }
     if all(alpha in values for alpha in INERTIAS.values()):
         report["inertias"] = inertias(values, std)
+        report["cross_checks"] = cross_checks(values, std)
     return values | {name: value for name, (value, _) in fit.held.items()}, report
+
+
+def cross_checks(values: Values, std: Values) -> dict[str, Any]:
+    """Parameters that hardly show, beside what those that are told imply of them: far apart, neither is to be believed.
+
+    J_R should be alpha2 Ix and alpha5 Iy alike; alpha7 should be (Ix - Iy) / Iz.
+    """
+    checks: dict[str, Any] = {}
+    for gyroscopic, alpha in (("alpha2", "alpha3"), ("alpha5", "alpha6")):
+        if gyroscopic in std:
+            checks[f"J_R from {gyroscopic}"] = {
+                "estimate": values[gyroscopic] / values[alpha],
+                "std": std[gyroscopic] / values[alpha],
+            }
+    if "alpha7" in std and "alpha8" in values:
+        implied = values["alpha8"] * (1 / values["alpha3"] - 1 / values["alpha6"])
+        checks["alpha7"] = {"estimate": values["alpha7"], "std": std["alpha7"], "of the inertias": implied}
+    return checks
 
 
 def fitted(problem: jaxos4.ShootingProblem) -> tuple[jaxos4.VehicleFit, float]:
@@ -165,7 +187,7 @@ def hybrid_for(fit: jaxos4.VehicleFit, steps: int) -> jaxos4.Hybrid:
 def estimators(parts: tuple[list, list], steps: int, names: list[str]) -> Iterator[tuple[str, dict, tuple]]:
     """IBSS in stages; the others, and IBSS with nothing held, on its last problem; IBSS without `flapping`."""
     fit, seconds = fitted(problem_of(parts[0], TERMS))
-    for name in ("ibss", *names, "ibss, nothing held", "ibss without flapping"):
+    for name in ("ibss", *names):
         terms, extra, used = TERMS, {}, fit
         if name == "output-error":
             used, seconds = again(fit, jaxos4.OutputError())
@@ -204,11 +226,12 @@ def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
     return float(jnp.sqrt(jnp.nanmean(off**2)))
 
 
-def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predictions, parts: tuple[list, list]) -> dict:
+def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
     """Equation error with the same terms: alone, and with what shooting found out about lag, delay and what to hold.
 
     Alone it takes the lag and the delay that leave least of each sample's change of the rates, and holds nothing.
     """
+    fit, shot, _ = found["ibss"]
     whole = problem_of(parts[0], without(TERMS, "accelerometer"))
     bare = eqx.tree_at(lambda p: p.sigma, whole, fit.problem.sigma[:12])
     of_shooting = {name: value for name, (value, _) in fit.held.items() if name in whole.model.parameter_names}
@@ -216,8 +239,8 @@ def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predicti
     def regress(memory: float, held: Values, *, bare: jaxos4.ShootingProblem = bare):
         model = jaxos4.hold(whole.model, held)
         problem = eqx.tree_at(lambda p: p.model, bare, model)
-        found = jaxos4.EquationError(memory=memory)(problem, jaxos4.Bracket.default(model))
-        return problem, found, dict(zip(model.parameter_names, found.parameters.tolist(), strict=True)) | held
+        estimate = jaxos4.EquationError(memory=memory)(problem, jaxos4.Bracket.default(model))
+        return problem, estimate, dict(zip(model.parameter_names, estimate.parameters.tolist(), strict=True)) | held
 
     def left_out(memory: float, held: Values) -> Values:
         """Standard deviations by leaving out a tenth of the flight at a time: what the model lacks is in them."""
@@ -230,8 +253,8 @@ def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predicti
     grid = []
     for lag in (0.01, *LAGS):
         for delay in DELAYS:
-            problem, found, values = regress(0.0, {"rotor_lag": lag, "rotor_delay": delay})
-            row = {"lag": lag, "delay": delay, "one_step": one_step(problem, found.parameters)}
+            problem, best_fit, values = regress(0.0, {"rotor_lag": lag, "rotor_delay": delay})
+            row = {"lag": lag, "delay": delay, "one_step": one_step(problem, best_fit.parameters)}
             grid.append(row | {name: 1 / values[alpha] for name, alpha in INERTIAS.items()})
     best = min(grid, key=lambda row: row["one_step"])
     own = {"rotor_lag": best["lag"], "rotor_delay": best["delay"]}
@@ -252,7 +275,11 @@ def regressions(fit: jaxos4.VehicleFit, shot: Values, reference: jaxos4.Predicti
                 "held": sorted(held),
                 "inertias": inertias(values, left_out(memory, held)),
                 "skill": worth(predicted),
-                "ibss_minus_this": difference(reference, predicted),
+                "minus_this": {
+                    name: difference(found[name][2], predicted)
+                    for name in ("ibss", "ibss, nothing held")
+                    if name in found
+                },
             }
     return {"grid": grid, "chosen": best, "rows": rows}
 
@@ -307,7 +334,7 @@ def main(
     flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
     seconds: Annotated[float, typer.Option(help="How much of each flight.")] = np.inf,
     steps: Annotated[int, typer.Option(help="Training of the hybrid's network.")] = 500,
-    names: Annotated[list[str], typer.Option(help="Beside IBSS.")] = ("output-error", "hybrid"),
+    names: Annotated[list[str], typer.Option(help="Beside IBSS.")] = NAMES,
     lags: Annotated[list[float], typer.Option(help="At which the lag is held [s].")] = LAGS,
     sections: Annotated[list[str], typer.Option(help="Of regression, lag, joint.")] = SECTIONS,
 ) -> None:
@@ -337,10 +364,10 @@ def main(
     for name, table, found[name] in estimators(parts, steps, list(names)):
         report["estimators"][name] = table
         save()
-    fit, values, predicted = found["ibss"]
+    fit, _, predicted = found["ibss"]
     np.savez(out / "predictions.npz", block=_block_of(predicted), **predicted._asdict())
     if "regression" in sections:
-        report["regression"] = regressions(fit, values, predicted, parts)
+        report["regression"] = regressions(found, parts)
         save()
     if "lag" in sections:
         report["lag"] = lag_sensitivity(fit, parts, list(lags))
