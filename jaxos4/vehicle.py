@@ -186,7 +186,7 @@ def _untold(
         if not std[i] <= half_width[i]:
             held[name] = (float(center[i]), "not told by these flights")
         elif name in _DAMPING and values[i] < -_NEGATIVE * std[i]:
-            held[name] = (0.0, "came out negative, which no air does: held at 0")
+            held[name] = (0.0, "came out negative, which no air does")
     # Something is left to estimate, whatever the flights tell.
     return held if len(held) < len(names) else {name: held[name] for name in SECONDARY if name in held}
 

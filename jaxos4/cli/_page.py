@@ -121,6 +121,11 @@ def print_vehicle(console: Console, report: dict[str, Any]) -> None:
         low, high = row["ci95"]
         table.add_row(name, row["unit"], f"{row['estimate']:.4g}", f"[{low:.4g}, {high:.4g}]", row["note"])
     console.print(table, markup=False)
+    reasons: dict[str, list[str]] = {}
+    for name, row in report["held"].items():
+        reasons.setdefault(row["note"], []).append(f"{name} {row['value']:.4g}")
+    for why, held in reasons.items():
+        console.print(f"held, {why}: {', '.join(held)}.", highlight=False, markup=False)
     inertias = [
         f"{name} {row['estimate']:.4g} +- {NINETY_FIVE * row['std']:.2g}"
         for name, row in report["constants"].items()

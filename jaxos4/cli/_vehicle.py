@@ -117,7 +117,11 @@ def identify_vehicle(
         "cost": finite(fit.estimate.cost),
         "seconds": time.perf_counter() - begin,
         "parameters": _parameters(fit, where, model) if fit.answered else {},
-        "held": {name: {"value": value, "note": why} for name, (value, why) in fit.held.items() if why},
+        "held": {
+            name: {"value": fit.held[name][0], "unit": unit, "note": fit.held[name][1] or "not asked"}
+            for name, unit in zip(model.parameter_names, model.parameter_units, strict=True)
+            if name in fit.held
+        },
         "constants": _constants(fit, where, model) if fit.answered else {},
         "cut": fit.cut,
         "noise": {
@@ -326,9 +330,6 @@ def _parameters(fit: VehicleFit, bracket: Bracket, model: FlightModel) -> dict[s
     table = {}
     for number, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True)):
         if name not in places:
-            value, why = fit.held[name]
-            row = {"estimate": None, "std": None, "bound": None, "ci95": None, "note": f"{why} (held at {value:.4g})"}
-            table[name] = {**row, "unit": unit}
             continue
         i = places[name]
         value, std = float(found.parameters[i]), float(found.std[i])
