@@ -82,8 +82,9 @@ class _Work:
         return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
 
     def _untried(self) -> _Program | None:
-        """What waits for its network, and can be compiled meanwhile."""
-        return next((p for p in self.programs if p.waiting and not p.devices), None)
+        """What waits for its network, and can be compiled meanwhile: a hybrid first, which takes longer."""
+        untried = [p for p in self.programs if p.waiting and not p.devices]
+        return min(untried, key=lambda p: (p.network, p.waiting[0].scenario.estimator != "hybrid"), default=None)
 
     def _training(self, number: int) -> _Task:
         job = self.needed[number]
