@@ -69,7 +69,7 @@ def truth_of(model: jaxos4.FlightModel, rng: np.random.Generator) -> np.ndarray:
 def commands(model: jaxos4.FlightModel, truth: np.ndarray, duration: float, rng: np.random.Generator) -> np.ndarray:
     """Rotor speeds [rad/s] every millisecond: all axes at once, three tones each, thrust besides, offsets trimmed."""
     airframe, values = model.airframe, dict(zip(model.parameter_names, truth, strict=True))
-    tones = [np.sort(rng.uniform(*span, 3)) for span in TONES]
+    tones = [np.sort(rng.uniform(*span, 3)).tolist() for span in TONES]
     omega = np.array(jaxos4.multisine(airframe, duration=duration, dt=FINE, amplitude=AMPLITUDE, tones=tones))
     t, phase = FINE * np.arange(omega.shape[0]), rng.uniform(0, 2 * np.pi)
     squares = omega**2 * (1 + HEAVE * np.sin(2 * np.pi * rng.uniform(0.4, 1.5) * t + phase))[:, None]
