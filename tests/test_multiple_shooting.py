@@ -167,9 +167,16 @@ def test_windows_and_estimators_that_have_none_are_refused():
             jaxos4.PublishedOS4(), flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0], windows=2
         )
     problem = windowed(2, "rates")
-    for estimator in (jaxos4.EquationError(), jaxos4.RecursiveLeastSquares(), jaxos4.SVSF(), jaxos4.JointEKF()):
+    for estimator in (jaxos4.RecursiveLeastSquares(), jaxos4.SVSF(), jaxos4.JointEKF()):
         with pytest.raises(ValueError, match="`problem.windows` must be 1"):
             estimator(problem, jaxos4.Bracket.default(problem.model))
+
+
+def test_equation_error_is_the_same_whatever_the_windows():
+    one, several = windowed(1, "rates"), windowed(4, "rates")
+    bracket = jaxos4.Bracket.default(one.model)
+    found, same = (jaxos4.EquationError()(problem, bracket) for problem in (one, several))
+    np.testing.assert_allclose(found.parameters, same.parameters, rtol=1e-9)
 
 
 def test_the_cost_of_each_estimator_is_that_of_its_answer():

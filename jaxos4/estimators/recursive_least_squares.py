@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from .._custom_types import Scalar, as_float
 from ..bracket import Bracket
 from ..shooting import ShootingProblem
-from ._estimate import AbstractEstimator, Estimate, check_bracket
+from ._estimate import AbstractEstimator, Estimate, check_bracket, check_one_window
 from ._regression import (
     answer,
     check_bridge,
@@ -65,6 +65,7 @@ class RecursiveLeastSquares(AbstractEstimator):
         in them, or a flight that is cut into windows.
         """
         check_bracket(problem, bracket)
+        check_one_window(problem)
         usable = bracket.usable
         data = regression(problem, usable, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
         rows = data.rows(data.rates)
