@@ -23,6 +23,7 @@ from ..logs import read_flight_and_notes
 from ..noise import SENSOR_SIGMA
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem
+from ..vehicle import NO_ANSWER
 from ._bracket_file import load_bracket
 from ._choices import Channels, InitialState, Model
 
@@ -30,7 +31,6 @@ from ._choices import Channels, InitialState, Model
 # this share, the fit is repeated with them. Weights within it cost less than one percent of the efficiency.
 OFF = 0.2
 PASSES = 4
-NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
 
 
 class Job(NamedTuple):

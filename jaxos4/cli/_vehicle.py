@@ -157,9 +157,8 @@ def load_logs(paths: list[Path], airframe: Airframe, part: Part) -> Recorded:
             raise InputError(f"{path}: a flight model needs p, q and r; log the gyro.")
         pieces, note = _pieces(path, flight, airframe, part)
         notes += [] if note is None else [f"{path}: {note}"]
-        parts += [(number, with_body_velocity(piece)) for piece in pieces]
-    step = max(float(flight.dt) for _, flight in parts) if part.sample is None else part.sample
-    step = max(step, SAMPLE) if part.sample is None else step
+        parts += [(number, piece) for piece in pieces]
+    step = max(SAMPLE, *(float(flight.dt) for _, flight in parts)) if part.sample is None else part.sample
     length = round(part.window / step)
     if length < 4:
         raise InputError(f"--window {part.window:g}: less than four samples of {step:g} s; give at least {4 * step:g}.")

@@ -38,6 +38,7 @@ from ..logs import read_flight_and_notes
 from ..report.flight_page import write_flight_page
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem
+from ..vehicle import NO_ANSWER
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,
@@ -53,7 +54,7 @@ from ._choices import (
     VehicleModel,
     WindowOption,
 )
-from ._fitting import NO_ANSWER, fit, fit_network, load_job, problem_of, seen_channels
+from ._fitting import fit, fit_network, load_job, problem_of, seen_channels
 from ._json import finite, write_json
 from ._page import COLOURED, print_page, print_vehicle
 from ._vehicle import HOLDOUT, WINDOW, Part, identify_vehicle

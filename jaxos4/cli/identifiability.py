@@ -11,6 +11,7 @@ from ..estimators import IBSS
 from ..flight import STATE_NAMES
 from ..identifiability import Identifiability, identifiability as information_of
 from ..results import result_names
+from ..vehicle import NO_ANSWER
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,
@@ -24,7 +25,7 @@ from ._choices import (
     OutOption,
     WindowOption,
 )
-from ._fitting import NO_ANSWER, fit, load_job
+from ._fitting import fit, load_job
 from ._json import finite, write_json
 
 # Of a direction, what is not shown: shares of a half-width below this one of the largest.
