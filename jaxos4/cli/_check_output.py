@@ -11,4 +11,4 @@ def check_output(out: Path, *inputs: Path | None) -> None:
     target = check_writable(out)
     for source in inputs:
         if source is not None and source.exists() and target.exists() and source.samefile(target):
-            raise InputError(f"{out}: --out would overwrite an input; give it another name.")
+            raise InputError(f"{out}: would overwrite an input; give the output another name.")

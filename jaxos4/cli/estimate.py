@@ -1,49 +1,21 @@
 """`jaxos4 estimate`: the parameters that a flight tells, with their intervals."""
 
-import dataclasses
 import shlex
 import sys
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
-import equinox as eqx
 import jax
-import numpy as np
 import typer
-from jaxtyping import Array, Float
 from rich.console import Console
 
-from ..bracket import Bracket
-from ..diagnostics import Diagnostics, residual_diagnostics
-from ..dynamics import CASCADE_ORDER, PARAMETER_NAMES, AbstractModel
 from ..errors import InputError
-from ..estimators import (
-    BASELINES,
-    IBSS,
-    WITH_PRIOR,
-    AbstractEstimator,
-    Estimate,
-    Hybrid,
-    NetworkEstimator,
-    TrainedNetwork,
-    fit_start,
-    load_network,
-)
-from ..flight import STATE_NAMES, STATE_UNITS
-from ..identifiability import Identifiability, identifiability
-from ..inertia import fit_inertia
-from ..information import robust_covariance
-from ..logs import read_flight_and_notes
 from ..report.flight_page import write_flight_page
-from ..results import RESULTS, result_names
-from ..shooting import ShootingProblem
-from ..vehicle import NO_ANSWER
+from ..results import RESULTS
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,
     BracketOption,
-    Channels,
     ChannelsOption,
     Estimator,
     InitialState,
@@ -54,21 +26,11 @@ from ._choices import (
     VehicleModel,
     WindowOption,
 )
-from ._fitting import fit, fit_network, load_job, problem_of, seen_channels
-from ._json import finite, write_json
-from ._page import COLOURED, print_page, print_vehicle
-from ._vehicle import HOLDOUT, WINDOW, Part, identify_vehicle
-
-# How long a network is trained that only has to say where to look.
-SEED_STEPS = 2000
-# Baselines that look at the body rates, whatever else was measured.
-RATES_ONLY = ("equation-error", "rls", "svsf")
-# Those that begin with the bracket as what is known, and mix it with what the flight tells.
-FILTERS = ("svsf", "kalman")
-# Estimators that fit by shooting, and reach the bound: theirs is the covariance that the noise found implies.
-SHOOTING = ("ibss", "hybrid", "output-error")
-# How far apart correlations of residuals are looked at, in samples.
-LAGS = 25
+from ._flight import identify_flight
+from ._json import write_json
+from ._page import print_flight, print_vehicle
+from ._recordings import HOLDOUT, WINDOW, Part
+from ._vehicle import identify_vehicle
 
 
 def estimate(
@@ -115,14 +77,37 @@ def estimate(
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
     console = Console()
-    if model != "flight":
-        only = {"--terms": terms, "--from": begin, "--to": end, "--sample-time": sample_time}
-        _refuse(
-            only | {"--holdout": holdout, "--loss": loss, "--report": report}, f"is for --model flight, not {model}"
+    for target in (out, report):
+        if target is not None:
+            check_output(target, *flights, Path(airframe), bracket, network, validate)
+    if out is not None and report is not None and out.absolute() == report.absolute():
+        raise InputError(f"{out}: --out and --report name one file; give them two.")
+    if model == "flight":
+        refused = {"--channels": channels, "--network": network}
+        _refuse(refused, "a flight model compares the rates and the specific force, and trains its own network")
+        if initial_state == "known":
+            raise InputError("--initial-state known: each window begins in a state of its own; leave it out.")
+        kept_back = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
+        print_page = print_vehicle
+        found, predicted = identify_vehicle(
+            console,
+            flights,
+            estimator=estimator.value,
+            airframe=airframe,
+            bracket=bracket,
+            terms=terms,
+            part=Part(begin, end, WINDOW if window is None else window, sample_time, kept_back),
+            validate=validate,
+            huber=loss != "squares",
         )
+    else:
+        only = {"--terms": terms, "--from": begin, "--to": end, "--sample-time": sample_time}
+        only |= {"--holdout": holdout, "--loss": loss, "--report": report}
+        _refuse(only, f"is for --model flight, not {model}")
         if len(flights) > 1:
             raise InputError(f"{flights[1]}: --model {model} explains one flight; use --model flight for several.")
-        _estimate_flight(
+        print_page, predicted = print_flight, None
+        found = identify_flight(
             console,
             flights[0],
             estimator,
@@ -134,41 +119,16 @@ def estimate(
             window=window,
             network=network,
             validate=validate,
-            out=out,
         )
-        return
-    refused = {"--channels": channels, "--network": network}
-    _refuse(refused, "a flight model compares the rates and the specific force, and trains its own network")
-    if initial_state == "known":
-        raise InputError("--initial-state known: each window begins in a state of its own; leave it out.")
-    kept_back = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
-    part = Part(begin, end, WINDOW if window is None else window, sample_time, kept_back)
-    for target in (out, report):
-        if target is not None:
-            check_output(target, *flights, Path(airframe), bracket, validate)
-    if out is not None and report is not None and out.absolute() == report.absolute():
-        raise InputError(f"{out}: --out and --report name one file; give them two.")
-    found, fit, predicted = identify_vehicle(
-        console,
-        flights,
-        estimator=estimator.value,
-        airframe=airframe,
-        bracket=bracket,
-        terms=terms,
-        part=part,
-        validate=validate,
-        huber=loss != "squares",
-    )
-    found["provenance"] |= _provenance() | {"command": shlex.join(["jaxos4", *sys.argv[1:]])}
+    found["provenance"] |= _provenance()
     if out is not None:
         write_json(found, out)
-    if fit.answered:
-        print_vehicle(console, found)
+    print_page(console, found)
     if report is not None:
         write_flight_page(report, report=found, predicted=predicted, title=", ".join(path.name for path in flights))
         console.print(f"report: {report}", markup=False, highlight=False)
     if found["result"] != "successful":
-        typer.echo(f"jaxos4: {found['result']}: {RESULTS[fit.estimate.result]}", err=True)
+        typer.echo(f"jaxos4: {found['result']}: {RESULTS[getattr(RESULTS, found['result'])]}", err=True)
         raise typer.Exit(1)
 
 
@@ -176,228 +136,6 @@ def _refuse(options: dict[str, Any], why: str) -> None:
     for name, value in options.items():
         if value is not None:
             raise InputError(f"{name}: {why}; leave it out.")
-
-
-def _estimate_flight(
-    console: Console,
-    flight: Path,
-    estimator: Estimator,
-    model: Model,
-    airframe: str,
-    *,
-    bracket: Path | None,
-    channels: Channels | None,
-    initial_state: InitialState,
-    window: float | None,
-    network: Path | None,
-    validate: Path | None,
-    out: Path | None,
-) -> None:
-    learned = estimator in ("network", "hybrid")
-    if network is not None and not learned:
-        raise InputError(f"--network: {estimator.value} uses none; say --estimator network or hybrid, or leave it out.")
-    if network is not None and estimator == "network" and bracket is not None:
-        raise InputError("--bracket: the network looks in the bracket that it was trained in; leave one of them out.")
-    if estimator in RATES_ONLY and channels not in (None, "rates"):
-        raise InputError(f"--channels {channels}: {estimator} looks at the rates; use --estimator output-error.")
-    if window is not None and estimator in (*RATES_ONLY, "kalman"):
-        raise InputError(f"--window: {estimator} does not shoot; use --estimator ibss, hybrid or output-error.")
-    if window is not None and network is not None:
-        raise InputError("--window: a network of windows serves one flight alone; leave --network out.")
-    if out is not None:
-        check_output(out, flight, Path(airframe), bracket, network, validate)
-    trained = None if network is None else load_network(network)
-    problem, where, notes = load_job(flight, model, airframe, bracket, channels, initial_state, window)
-    other = None
-    if validate is not None:
-        known = problem.initial_state is not None
-        recorded, said = read_flight_and_notes(validate, problem.model.airframe)
-        other = problem_of(validate, problem.model, recorded, None, known=known, window=window)
-        notes += tuple(f"{validate}: {note}" for note in said)
-    for note in notes:
-        console.print(f"note: {note}", markup=False, highlight=False)
-
-    begin = time.perf_counter()
-    method: AbstractEstimator = BASELINES[estimator]() if estimator in BASELINES else IBSS()
-    if estimator in RATES_ONLY:
-        if np.isnan(np.asarray(problem.restrict("rates").flight.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
-            raise InputError(f"{flight}: {estimator} needs p, q and r; use --estimator output-error.")
-        problem = problem.restrict("rates")
-    if learned:
-        if trained is None:
-            steps = SEED_STEPS if estimator == "hybrid" else NetworkEstimator.steps
-            training = NetworkEstimator(channels=seen_channels(problem), steps=steps)
-            console.print(f"note: training a network for this flight, {training.steps} steps", highlight=False)
-            trained = fit_network(training, flight, problem, where, seed=0)
-        different = trained.mismatch(problem)
-        if different is not None:
-            raise InputError(
-                f"{network or 'the network'}: cannot be used on {flight}: {different}; train one with `jaxos4 train`."
-            )
-        if estimator == "hybrid":
-            method = Hybrid(trained)
-        else:
-            method, problem, where = trained, problem.restrict(trained.channels), trained.bracket
-    if other is not None:
-        other = other.restrict(problem.channels) if other.size > problem.size else other
-        if np.isnan(np.asarray(other.measured())).all():
-            raise InputError(f"{validate}: nothing to compare was measured among the {problem.channels} channels.")
-    problem, found, bound, rollouts = fit(method, problem, where, shoots=estimator in SHOOTING)
-    name = str(result_names(found.result))
-    answered = name not in NO_ANSWER
-    left = None
-    if answered:
-        left = _diagnostics(problem, found.parameters, found.initial_state, fitted=True)
-        if estimator in SHOOTING and (left.colour > COLOURED).any():
-            robust = robust_covariance(problem, found.parameters, found.initial_state)
-            found = eqx.tree_at(lambda e: e.covariance, found, robust)
-    seconds = time.perf_counter() - begin
-
-    report = {
-        "estimator": estimator.value,
-        "model": model.value,
-        "result": name,
-        "rollouts": rollouts,
-        "cost": finite(found.cost),
-        "seconds": seconds,
-        "parameters": _parameters(problem, where, found, bound, with_prior=estimator in FILTERS),
-        "constants": _constants(problem.model, found) if answered else {},
-        "fit": {} if left is None else _quality(problem, left),
-        "validation": None if other is None or not answered else _validation(problem, found, other, validate),
-        "provenance": {
-            "flight": str(flight),
-            "airframe": airframe,
-            "channels": problem.channels,
-            "initial_state": initial_state.value,
-            "windows": problem.windows,
-            "samples": int(problem.flight.time.shape[0]),
-            "sample_time": float(problem.flight.dt),
-            "notes": list(notes),
-            **({} if trained is None else {"network": _network_provenance(network, trained)}),
-            **_provenance(),
-        },
-    }
-    if out is not None:
-        write_json(report, out)
-    if name == "nonfinite_trajectory":
-        remedy = " (try a --window, or a shorter one)" if estimator in (*SHOOTING, "network") else ""
-        console.print(
-            "No estimate: wherever the search went, the model's trajectory left this flight before its end. The "
-            f"vehicle may do what the model lacks{remedy}, or the airframe's constants or the units are far off.",
-            highlight=False,
-        )
-    elif answered:
-        print_page(console, report)
-    if name != "successful":
-        typer.echo(f"jaxos4: {name}: {RESULTS[found.result]}", err=True)
-        raise typer.Exit(1)
-
-
-def _parameters(
-    problem: ShootingProblem,
-    bracket: Bracket,
-    found: Estimate,
-    bound: Float[Array, " parameters"],
-    *,
-    with_prior: bool,
-) -> dict[str, dict[str, Any]]:
-    table, half_width, model = {}, np.asarray(found.half_width(0.95)), problem.model
-    known = None
-    if str(result_names(found.result)) not in NO_ANSWER:
-        known = identifiability(problem, bracket, found.parameters, found.initial_state)
-    for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True)):
-        value, std = float(found.parameters[i]), float(found.std[i])
-        lower, upper = float(bracket.lower[i]), float(bracket.upper[i])
-        # A network's errors are those of the flight and the bracket together.
-        most = (upper - lower) / 2 * (0.5 if found.calibration is not None else WITH_PRIOR if with_prior else 1.0)
-        told = np.isfinite(std) and std <= most
-        table[name] = {
-            "estimate": value if told else None,
-            "std": finite(std),
-            "bound": finite(bound[i]),
-            "ci95": [value - half_width[i], value + half_width[i]] if told else None,
-            "unit": unit,
-            "noise_limit": None if known is None else finite(known.noise_limit[i]),
-            "note": _note(found, i, half_width[i], lower, upper) if told else _why_untold(known, name, model),
-        }
-    return table
-
-
-def _why_untold(known: Identifiability | None, name: str, model: AbstractModel) -> str:
-    reasons = {} if known is None else known.notes(model.parameter_names)
-    reason = reasons.get(name, "")
-    return reason if reason.startswith("not told") else "not told by this flight"
-
-
-def _note(found: Estimate, i: int, half_width: float, lower: float, upper: float) -> str:
-    notes, value = [], float(found.parameters[i])
-    if abs(value) < half_width:
-        notes.append("below noise")
-    if not lower <= value <= upper:
-        notes.append("outside its bracket")
-    if found.seed is not None and not found.seed.lower[i] <= value <= found.seed.upper[i]:
-        notes.append("missed by the network, found beyond")
-    return "; ".join(notes)
-
-
-def _constants(model: AbstractModel, found: Estimate) -> dict[str, Any]:
-    """Ix, Iy, Iz, J_R of the rigid body that explains the alphas best; empty where they are not told."""
-    if model.parameter_names != PARAMETER_NAMES:
-        return {}
-    rigid = fit_inertia(model, found.parameters, found.covariance)
-    inertias = np.asarray(rigid.constants), np.asarray(rigid.std)
-    if not np.isfinite(inertias[1]).all() or (inertias[1] > np.abs(inertias[0]))[:3].any():
-        return {}
-    return {
-        **{
-            name: {"estimate": float(value), "std": float(std), "unit": "kg m^2"}
-            for name, value, std in zip(("Ix", "Iy", "Iz", "J_R"), *inertias, strict=True)
-        },
-        "consistency_p": float(rigid.p_value),
-        "rigid_body": bool(rigid.is_rigid_body),
-    }
-
-
-def _diagnostics(problem: ShootingProblem, parameters: Array, initial_state: Array, *, fitted: bool) -> Diagnostics:
-    lags = min(LAGS, problem.flight.states.shape[0] // 2)
-    return residual_diagnostics(problem, parameters, initial_state, fitted=fitted, lags=lags)
-
-
-def _quality(problem: ShootingProblem, left: Diagnostics) -> dict[str, dict[str, Any]]:
-    return {
-        STATE_NAMES[column]: {
-            "rms": float(left.rms[i]),
-            "unit": STATE_UNITS[column],
-            "percent": finite(left.percent[i]),
-            "level": float(left.level[i]),
-            "level_p": float(left.level_p[i]),
-            "correlation": float(left.colour[i]),
-            "white_p": float(left.white_p[i]),
-            "input_correlation": dict(zip(("roll", "pitch", "yaw"), left.input_correlation[i].tolist(), strict=True)),
-            "input_p": float(left.input_p[i]),
-        }
-        for i, column in enumerate(CASCADE_ORDER[: problem.size])
-        if left.count[i] > 2
-    }
-
-
-def _validation(problem: ShootingProblem, found: Estimate, other: ShootingProblem, path: Path | None) -> dict[str, Any]:
-    """How the parameters predict another flight, of which only the initial state is fitted."""
-    other = eqx.tree_at(lambda p: p.sigma, other, problem.sigma)
-    start, cost, sound, _ = eqx.filter_jit(fit_start)(other, found.parameters)
-    told = bool(sound)
-    left = _diagnostics(other, found.parameters, start, fitted=False) if told else None
-    return {
-        "flight": str(path),
-        "cost": finite(cost) if told else None,
-        "fit": None if left is None else _quality(other, left),
-    }
-
-
-def _network_provenance(path: Path | None, network: TrainedNetwork) -> dict[str, Any]:
-    settings = {field.name: getattr(network.settings, field.name) for field in dataclasses.fields(network.settings)}
-    bracket = {"lower": network.bracket.lower.tolist(), "upper": network.bracket.upper.tolist()}
-    return {"file": None if path is None else str(path), "settings": settings, "bracket": bracket}
 
 
 def _provenance() -> dict[str, str]:
@@ -408,4 +146,5 @@ def _provenance() -> dict[str, str]:
         "jax": jax.__version__,
         "device": jax.devices()[0].device_kind,
         "precision": "float64",
+        "command": shlex.join(["jaxos4", *sys.argv[1:]]),
     }
