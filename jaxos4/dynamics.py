@@ -78,6 +78,22 @@ class Forcing(NamedTuple):
     lateral: tuple[Float[Array, "*samples"], ...] | None = None
 
 
+class Stretches(NamedTuple):
+    """For each sample of joined flights: the `number` of its uninterrupted stretch, and that one's ends.
+
+    Numbers count from 0, in order. `first`, `last`: samples.
+    """
+
+    number: Int[Array, " samples"]
+    first: Int[Array, " samples"]
+    last: Int[Array, " samples"]
+
+    @classmethod
+    def of(cls, number: Int[Array, " samples"]) -> "Stretches":
+        """With the ends found."""
+        return cls(number, jnp.searchsorted(number, number), jnp.searchsorted(number, number, side="right") - 1)
+
+
 class Inputs(NamedTuple):
     """What drives a vehicle, on the time grid of its flight.
 
@@ -85,14 +101,14 @@ class Inputs(NamedTuple):
     - `dt`: the sample time [s].
     - `velocity`: along the body's axes [m/s], where that is known.
     - `force`: the measured specific force along the body's axes [m/s^2], where a model takes it as an input.
-    - `stretch`: which uninterrupted stretch each sample belongs to, counted from 0; `None`: all to one.
+    - `stretches`: which uninterrupted stretch each sample belongs to; `None`: all to one.
     """
 
     omega: RotorSpeeds
     dt: Scalar
     velocity: Float[Array, "samples 3"] | None = None
     force: Float[Array, "samples 3"] | None = None
-    stretch: Int[Array, " samples"] | None = None
+    stretches: Stretches | None = None
 
 
 # Where the leaves of a `State` stand in the paper's order, Eq. (14).

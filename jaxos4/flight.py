@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._custom_types import RotorSpeeds, Scalar, States, as_float
-from .dynamics import Inputs
+from .dynamics import Inputs, Stretches
 from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
@@ -83,7 +83,8 @@ class Flight(eqx.Module):
     def inputs(self) -> Inputs:
         """What drives the vehicle."""
         force = None if self.specific_force is None else held_values(self.specific_force)
-        return Inputs(self.omega, self.dt, self.body_velocity, force, self.stretch)
+        stretches = None if self.stretch is None else Stretches.of(self.stretch)
+        return Inputs(self.omega, self.dt, self.body_velocity, force, stretches)
 
     @property
     def channels(self) -> Float[Array, "samples 15"]:

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jax.core import Tracer
+from jaxtyping import Array, Int, Num
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, as_float
 from .airframe import OS4, Airframe
@@ -32,6 +33,8 @@ _AUTHORITY = 0.2
 _FAST = 5.0
 # Where rotors' lag and delay are looked for [s]: small vehicles have 0.02 to 0.1 s.
 _LAG, _LAG_WIDTH, _DELAY_WIDTH = 0.05, 0.03, 0.02
+# What an accelerometer that was levelled before take-off may be off [m/s^2].
+_BIAS = 0.3
 # A rotor's lag below this share of a sample is none: the filter stays stable wherever a search looks.
 _SHORTEST = 0.05
 # Of the torque that pairs of rotors make in roll and pitch, the share that they make in yaw.
@@ -92,7 +95,8 @@ class FlightModel(AbstractModel):
     `gyro_bias` can be told from offsets only where the attitude is compared too. Lag and delay do not apply to rotor
     speeds that were measured.
 
-    **Raises:** `ValueError` for a term that does not exist or stands twice, recordings that are not counted from 0.
+    **Raises:** `ValueError` for a term that does not exist or stands twice, recordings that are not counted from 0, or
+    a thrust curve without `airframe.max_rotor_speed`.
     """
 
     airframe: Airframe
@@ -111,6 +115,8 @@ class FlightModel(AbstractModel):
             raise ValueError(f"`terms` must be some of {', '.join(TERMS)}, each once, got {', '.join(terms)}.")
         if not recordings or sorted(set(recordings)) != list(range(max(recordings) + 1)):
             raise ValueError(f"`recordings` must count from 0 and leave none out, got {recordings}.")
+        if "curve" in terms and not has_full_scale(airframe):
+            raise ValueError("`airframe.max_rotor_speed` must be known for a thrust curve: set it or leave it out.")
         self.airframe, self.terms, self.recordings = airframe, tuple(terms), tuple(recordings)
 
     @property
@@ -159,9 +165,10 @@ class FlightModel(AbstractModel):
             "rotor_lag": _LAG_WIDTH,
             "rotor_delay": _DELAY_WIDTH,
             "rotor_reaction": 0.01 + airframe.rotor_inertia / jnp.asarray(airframe.inertia)[2],
-            "thrust_curve": 0.5,
+            "thrust_curve": 1.0,
             "thrust_gain": 0.5,
-            **dict.fromkeys(("ax_bias", "ay_bias", "az_bias", "x_drag", "y_drag"), 1.0),
+            **dict.fromkeys(("ax_bias", "ay_bias", "az_bias"), _BIAS),
+            **dict.fromkeys(("x_drag", "y_drag"), 1.0),
             **dict.fromkeys(("p_bias", "q_bias", "r_bias"), 0.1),
         }
         others = [as_float(widths[parameter.kind]) for parameter in self._table]
@@ -215,8 +222,9 @@ class FlightModel(AbstractModel):
 
         Over a sample the filter's speed is taken as a straight line, whose mean square makes the mean torque.
         """
-        omega, dt, stretch = inputs.omega, inputs.dt, inputs.stretch
-        first, last = _ends(stretch, omega.shape[0])
+        omega, dt, stretches = inputs.omega, inputs.dt, inputs.stretches
+        none = jnp.zeros(omega.shape[0], dtype=int)
+        number, first, last = (none, none, none + omega.shape[0] - 1) if stretches is None else stretches
         if "delay" in self.terms:
             omega = _delayed(omega, self._value(parameters, "rotor_delay") / dt, first, last)
         here = following = omega
@@ -237,7 +245,7 @@ class FlightModel(AbstractModel):
             at_sample = curve * at_sample + (1 - curve) * full * here
         roll, pitch, yaw, thrust = (squares @ self.airframe.mixer.T).T
         spins, mass = jnp.asarray(self.airframe.rotor_spins), self.airframe.mass
-        recording = jnp.asarray(self.recordings)[jnp.zeros(omega.shape[0], dtype=int) if stretch is None else stretch]
+        recording = jnp.asarray(self.recordings)[number]
         return Forcing(
             roll=roll,
             pitch=pitch,
@@ -328,6 +336,11 @@ class FlightModel(AbstractModel):
         return (*seen, *(force[i] + self._value(parameters, f"a{'xyz'[i]}_bias") for i in self.force_axes))
 
 
+def has_full_scale(airframe: Airframe) -> bool:
+    """Whether `max_rotor_speed` is known; a traced one is taken to be."""
+    return isinstance(airframe.max_rotor_speed, Tracer) or bool(np.isfinite(airframe.max_rotor_speed))
+
+
 def with_body_velocity(flight: Flight) -> Flight:
     """The flight with `body_velocity`, where velocity and attitude were measured; untouched where they were not.
 
@@ -365,16 +378,6 @@ def _parameters(terms: tuple[str, ...], recordings: int) -> tuple[Parameter, ...
     return tuple(parameter for term in TERMS if term in terms for parameter in of_term[term])
 
 
-def _ends(stretch: Int[Array, " samples"] | None, samples: int) -> tuple[Int[Array, "..."], Int[Array, "..."]]:
-    """The first and the last sample of the stretch that each sample belongs to."""
-    if stretch is None:
-        return jnp.asarray(0), jnp.asarray(samples - 1)
-    index, changes = jnp.arange(samples), jnp.diff(stretch) != 0
-    begins, ends = jnp.append(True, changes), jnp.append(changes, True)
-    first = jax.lax.cummax(jnp.where(begins, index, 0))
-    return first, jax.lax.cummin(jnp.where(ends, index, samples - 1), reverse=True)
-
-
 def _known(values: tuple[Scalar, ...] | None, what: str) -> tuple[Scalar, ...]:
     if values is None:
         raise ValueError(f"`terms`: {what}, which this flight lacks: leave the term out.")
@@ -387,54 +390,67 @@ def _own(value: Scalar | None) -> Scalar:
     return value
 
 
-def _delayed(omega: RotorSpeeds, samples: Scalar, first: Int[Array, "..."], last: Int[Array, "..."]) -> RotorSpeeds:
+def _delayed(omega: RotorSpeeds, samples: Scalar, first: Int[Array, " samples"], last: Int[Array, " samples"]):
     """Commands `samples` later, between samples by cubics that join smoothly (Catmull and Rom 1974).
 
     A delay of whole samples is exact, and the derivative in the delay has no jumps that a search could end at. What a
     stretch does not hold is its first command, or its last.
     """
+    count = omega.shape[0]
     whole = jnp.floor(jax.lax.stop_gradient(samples))
     f = samples - whole
-    index = jnp.arange(omega.shape[0]) - whole.astype(int)
     weights = (
         f * (-0.5 + f - f * f / 2),
         1 + f * f * (1.5 * f - 2.5),
         f * (0.5 + 2 * f - 1.5 * f * f),
         f * f * (f - 1) / 2,
     )
-    taps = [omega[jnp.clip(index + ahead, first, last)] for ahead in (1, 0, -1, -2)]
-    return sum((weight * tap for weight, tap in zip(weights, taps, strict=True)), jnp.zeros_like(omega))
+    # One slice holds all four taps; what it takes from beyond a stretch is replaced.
+    whole = jnp.clip(whole, -count, count).astype(int)
+    around = jnp.pad(omega, ((count + 2, count + 2), (0, 0)))
+    near = jax.lax.dynamic_slice_in_dim(around, count - whole, count + 3)
+    begin, end = omega[first], omega[last]
+    row = jnp.arange(count) - whole
+    total = jnp.zeros_like(omega)
+    for weight, ahead in zip(weights, (1, 0, -1, -2), strict=True):
+        tap = near[2 + ahead : 2 + ahead + count]
+        tap = jnp.where((row + ahead < first)[:, None], begin, tap)
+        total += weight * jnp.where((row + ahead > last)[:, None], end, tap)
+    return total
 
 
-def _filtered(omega: RotorSpeeds, decay: Scalar, first: Int[Array, "..."]) -> tuple[RotorSpeeds, RotorSpeeds]:
+def _filtered(omega: RotorSpeeds, decay: Scalar, first: Int[Array, " samples"]) -> tuple[RotorSpeeds, RotorSpeeds]:
     """Speeds at each sample and at the next, of rotors that begin each stretch at their command.
 
-    w_{k+1} = a w_k + (1 - a) u_k in blocks: what each block makes from rest for all of them at once, then what the one
-    before leaves to it. Twice the square root of the samples are the steps, instead of as many as there are.
+    w_{k+1} = a w_k + (1 - a) u_k in blocks: what each makes from rest, all of them at once, then what those before
+    leave to it. The square root of the samples are the steps, instead of as many as there are.
     """
     samples = omega.shape[0]
     length = max(int(np.sqrt(samples)), 1)
     blocks = -(-samples // length)
+
+    def in_blocks(x: Num[Array, "samples columns"]) -> Num[Array, "length blocks columns"]:
+        padded = jnp.pad(x, ((0, blocks * length - samples), (0, 0)))
+        return jnp.swapaxes(padded.reshape(blocks, length, x.shape[1]), 0, 1)
+
     # The row that begins a stretch forgets, and takes its command: as if it were the step before it.
-    starts = first == jnp.arange(samples)
-    keep = jnp.where(starts, 0.0, decay)[:, None]
+    starts = (first == jnp.arange(samples))[:, None]
     before = jnp.concatenate([omega[:1], omega[:-1]])
-    drive = jnp.where(starts[:, None], omega, (1 - decay) * before)
-    padding = ((0, blocks * length - samples), (0, 0))
-    keep, drive = (jnp.swapaxes(jnp.pad(x, padding).reshape(blocks, length, x.shape[1]), 0, 1) for x in (keep, drive))
+    rows = in_blocks(jnp.where(starts, 0.0, decay)), in_blocks(jnp.where(starts, omega, (1 - decay) * before))
 
-    def within(carry, row):
-        kept, speed = row[0] * carry[0], row[0] * carry[1] + row[1]
-        return (kept, speed), (kept, speed)
+    def within(speed, row):
+        speed = row[0] * speed + row[1]
+        return speed, speed
 
-    rest = (jnp.ones_like(keep[0]), jnp.zeros_like(drive[0]))
-    (kept, speed), (all_kept, all_speed) = jax.lax.scan(within, rest, (keep, drive))
-
-    def across(left, block):
-        return block[0] * left + block[1], left
-
-    _, left = jax.lax.scan(across, jnp.zeros_like(drive[0, 0]), (kept, speed))
-    here = jnp.swapaxes(all_kept * left + all_speed, 0, 1).reshape(blocks * length, -1)[:samples]
+    made, all_made = jax.lax.scan(within, jnp.zeros((blocks, omega.shape[1]), omega.dtype), rows)
+    # Of what a block makes, later ones get what has not been forgotten on the way to their begin.
+    begins = length * np.arange(blocks)
+    stretch_begins = in_blocks(first[:, None])[:, :, 0]
+    apart = np.maximum(begins[:, None] - begins, 0) - length
+    reaches = (apart >= 0) & (stretch_begins[0][:, None] < begins + length)
+    left = jnp.where(reaches, decay ** np.maximum(apart, 0), 0.0) @ made
+    kept = jnp.where(stretch_begins < begins, decay ** np.arange(1, length + 1)[:, None], 0.0)
+    here = jnp.swapaxes(all_made + kept[:, :, None] * left, 0, 1).reshape(blocks * length, -1)[:samples]
     return here, decay * here + (1 - decay) * omega
 
 

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar, StateVector, as_float
-from .dynamics import CASCADE_ORDER, CHANNELS, AbstractModel, Forcing, State, unstack
+from .dynamics import CASCADE_ORDER, CHANNELS, AbstractModel, Forcing, Inputs, State, unstack
 from .flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from .noise import FORCE_SIGMA
 from .simulate import STEPPERS
@@ -163,26 +163,45 @@ class ShootingProblem(eqx.Module):
         `parameters`: of the forcing, where it depends on some; what the airframe implies by default.
         """
         index, within = self.cut()
-        forcing = self.forcing(self.model.alpha if parameters is None else parameters)
-        windows = jax.tree.map(lambda leaf: leaf[index], forcing)
-        return Rows(windows, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
+        forcing = self._windowed(self.forcing(self.model.alpha if parameters is None else parameters))
+        return Rows(forcing, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
 
     def forcing(self, parameters: Parameters) -> Forcing:
         """What the rotors do in the whole flight, sample by sample."""
         return self.model.drive(self.flight.inputs, parameters)
 
-    def driven(self, rows: Rows, parameters: Parameters, *, tangents: bool = False) -> Rows:
-        """`rows` with the forcing of these parameters, and its tangents if wanted; untouched where it has none."""
+    def driven(
+        self, rows: Rows, parameters: Parameters, *, inputs: Inputs | None = None, tangents: bool = False
+    ) -> Rows:
+        """`rows` with the forcing of these parameters, and its tangents if wanted; untouched where it has none.
+
+        `inputs`: `flight.inputs`, prepared once where this is called in a loop.
+        """
         driving = np.asarray(self.model.driving, dtype=int)
         if not driving.size:
             return rows
-        index, _ = self.cut()
+        inputs = self.flight.inputs if inputs is None else inputs
 
         def forcing(values: Float[Array, " driving"]) -> Forcing:
-            return jax.tree.map(lambda leaf: leaf[index], self.forcing(parameters.at[driving].set(values)))
+            # What parameters do not change is taken from `rows`.
+            made = self.model.drive(inputs, parameters.at[driving].set(values))
+            return self._windowed(made._replace(recording=(), velocity=None, lateral=None))
+
+        def whole(forcing: Forcing, of: Forcing) -> Forcing:
+            return forcing._replace(recording=of.recording, velocity=of.velocity, lateral=of.lateral)
 
         values = parameters[driving]
-        return rows._replace(forcing=forcing(values), push=jax.jacfwd(forcing)(values) if tangents else None)
+        if not tangents:
+            return rows._replace(forcing=whole(forcing(values), rows.forcing))
+        slopes, made = jax.jacfwd(lambda x: (forcing(x),) * 2, has_aux=True)(values)
+        still = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, driving.size), leaf.dtype), rows.forcing)
+        return rows._replace(forcing=whole(made, rows.forcing), push=whole(slopes, still))
+
+    def _windowed(self, forcing: Forcing) -> Forcing:
+        """Sample by sample into window by window: without a copy where all windows are of one length."""
+        index, _ = self.cut()
+        even = index.size == self.flight.time.shape[0]
+        return jax.tree.map(lambda leaf: leaf.reshape(index.shape) if even else leaf[index], forcing)
 
     def split(self, initial_state: Float[Array, " starts"]) -> Float[Array, "windows size"]:
         """The initial state of each window."""
@@ -305,6 +324,7 @@ class ShootingProblem(eqx.Module):
         tangents = jax.vmap(unstack)(start_tangents)
         return jax.lax.scan(step, (unstack(initial_state), tangents, zero), rows)[0][2]
 
+    @eqx.filter_jit
     def reweighted(self, residuals: Float[Array, " residuals"]) -> "ShootingProblem":
         """The problem with each channel's sigma set to what its weighted `residuals` at a fit say it is.
 

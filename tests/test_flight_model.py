@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxos4
-from jaxos4.dynamics import CASCADE_ORDER, Inputs
+from jaxos4.dynamics import CASCADE_ORDER, Inputs, Stretches
 from jaxos4.flight_model import DEFAULT_TERMS
 
 ALL = tuple(jaxos4.TERMS)
@@ -225,7 +225,7 @@ def test_the_filter_is_the_recursion(counts):
     model = jaxos4.FlightModel(FULL, terms=("lag", "reaction", "accelerometer"))
     values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True)) | {"rotor_lag": lag}
     given = None if len(counts) == 1 else jnp.asarray(stretch)
-    inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretch=given)
+    inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretches=None if given is None else Stretches.of(given))
     found = model.drive(inputs, jnp.array(list(values.values())))
     decay, here = np.exp(-dt / lag), np.empty_like(omega)
     for k in range(samples):
@@ -258,7 +258,7 @@ def test_a_lag_too_short_to_show_is_as_short_as_can_be_told():
 
 def delayed(omega, delay, dt=0.01, stretch=None):
     model = jaxos4.FlightModel(terms=("delay",))
-    inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretch=stretch)
+    inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretches=None if stretch is None else Stretches.of(stretch))
     return model.drive(inputs, model.alpha.at[8].set(delay)).residual_speed
 
 

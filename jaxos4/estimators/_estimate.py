@@ -128,7 +128,7 @@ def conclude(
     """
     valid, center = bracket.valid, jnp.where(bracket.valid, bracket.center, 0.0)
     std, half_width = jnp.sqrt(jnp.diagonal(covariance)), jnp.where(valid, bracket.half_width, 1.0)
-    limit = (reach - 1e-3) * half_width
+    limit = (reach - 1e-2) * half_width
     finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
     sound = sound & jnp.isfinite(cost) & finite
     result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)

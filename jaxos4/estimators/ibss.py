@@ -11,12 +11,14 @@ windows' slopes, those of the initial states in all windows at once, each on its
 window, a row each, the same parameters in all of them.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
@@ -49,25 +51,17 @@ _MISSED = 2.0
 _UNEXPLAINED = 5.0
 
 
-class _Quadratic(NamedTuple):
-    """The cost around the current unknowns, and what it predicts: `ahead` is the longest step in standard deviations.
-
-    `factor` A with A A^T the information, and A^-T: the columns of `basis` are the search directions.
-    """
-
-    curvature: Curvature
-    factor: Float[Array, "windows unknowns unknowns"]
-    basis: Float[Array, "windows unknowns unknowns"]
-    ahead: Scalar
-
-
 class _Search(NamedTuple):
+    """Where a search stands; `curvature` and `basis`, the directions, are those of the last look around."""
+
     unknowns: Float[Array, "windows unknowns"]
-    quadratic: _Quadratic
+    curvature: Curvature
+    basis: Float[Array, "windows unknowns unknowns"]
     off: Scalar
     growth: Float[Array, "windows unknowns"]
     sweeps: Int[Array, ""]
     done: Bool[Array, ""]
+    ended: Bool[Array, ""]
     brackets: Float[Array, "record 2 parameters"] | None
 
 
@@ -126,6 +120,7 @@ class IBSS(AbstractEstimator):
         bracket: Bracket,
         *,
         start: Parameters | None = None,
+        spread: Float[Array, "parameters parameters"] | None = None,
         seed: Estimate | None = None,
     ) -> Estimate:
         """Identifies one flight.
@@ -135,6 +130,7 @@ class IBSS(AbstractEstimator):
         - `problem`: what is to be explained.
         - `bracket`: where the parameters are looked for; it may turn out not to hold them.
         - `start`: where in the bracket the search begins; its center by default.
+        - `spread`: the covariance of `start`, which sizes the first brackets; by default they are as wide as `bracket`.
         - `seed`: an earlier estimate of the same flight. The search then begins against all of the problem's channels
           at once, in brackets around the seed that are sized by its covariance. Where that does not end well, or far
           from the seed, or leaves more unexplained than noise, the bracket is searched as if there were none, and the
@@ -149,7 +145,7 @@ class IBSS(AbstractEstimator):
         trusted = bracket.usable
         begin = trusted.center if start is None else as_float(start)
         if seed is None:
-            wide = self._descend(problem, trusted, begin, asleep=jnp.zeros((), dtype=bool))
+            wide = self._descend(problem, trusted, begin, spread=spread, asleep=jnp.zeros((), dtype=bool))
             return self._finish(problem, bracket, *wide)
 
         near = self._finish(problem, bracket, *self._from_seed(problem, trusted, seed))
@@ -187,18 +183,21 @@ class IBSS(AbstractEstimator):
 
     def _from_seed(self, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> tuple[_Progress, Curvature]:
         """Against all channels at once, from a seed; a lane whose seed says nothing is left where it is."""
-        progress = self._begin(problem, bracket, seed.parameters, asleep=~jnp.isfinite(seed.covariance).all())
-        count = seed.parameters.shape[0]
-        spread = progress.spread.at[:, :count, :count].set(
-            jnp.where(progress.done, progress.spread[:, :count, :count], seed.covariance)
-        )
-        return self._search(problem, problem.rows(), progress._replace(spread=spread), bracket, last=jnp.asarray(True))
+        told = jnp.isfinite(seed.covariance).all()
+        progress = self._begin(problem, bracket, seed.parameters, spread=seed.covariance, asleep=~told)
+        return self._search(problem, problem.rows(), progress, bracket, last=jnp.asarray(True))
 
     def _descend(
-        self, problem: ShootingProblem, bracket: Bracket, begin: Parameters, *, asleep: Bool[Array, ""]
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        begin: Parameters,
+        *,
+        spread: Float[Array, "parameters parameters"] | None = None,
+        asleep: Bool[Array, ""],
     ) -> tuple[_Progress, Curvature]:
         """Down the cascade, from anywhere in the bracket; a lane that is `asleep` is left where it is."""
-        progress = self._begin(problem, bracket, begin, asleep=asleep)
+        progress = self._begin(problem, bracket, begin, spread=spread, asleep=asleep)
 
         def fit(channels: str, progress: _Progress, share: Scalar) -> tuple[_Progress, Curvature]:
             stage = problem.restrict(channels)
@@ -220,14 +219,22 @@ class IBSS(AbstractEstimator):
         return progress, curvature
 
     def _begin(
-        self, problem: ShootingProblem, bracket: Bracket, parameters: Parameters, *, asleep: Bool[Array, ""]
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        parameters: Parameters,
+        *,
+        spread: Float[Array, "parameters parameters"] | None,
+        asleep: Bool[Array, ""],
     ) -> _Progress:
         lower, upper = self._limits(problem, bracket)
-        unknowns = _joined(problem, parameters, problem.first_state()[0])
-        spread = jax.vmap(jnp.diag)(jnp.square(_prior(problem, bracket)))
+        unknowns, count = _joined(problem, parameters, problem.first_state()[0]), parameters.shape[0]
+        prior = jax.vmap(jnp.diag)(jnp.square(_prior(problem, bracket)))
+        if spread is not None:
+            prior = prior.at[:, :count, :count].set(jnp.where(asleep, prior[:, :count, :count], spread))
         none = jnp.zeros((), dtype=int)
-        brackets = jnp.full((self.record, 2, parameters.shape[0]), jnp.nan) if self.record else None
-        return _Progress(jnp.clip(unknowns, lower, upper), spread, none, none, asleep, brackets)
+        brackets = jnp.full((self.record, 2, count), jnp.nan) if self.record else None
+        return _Progress(jnp.clip(unknowns, lower, upper), prior, none, none, asleep, brackets)
 
     def _limits(
         self, problem: ShootingProblem, bracket: Bracket
@@ -279,94 +286,130 @@ class IBSS(AbstractEstimator):
         - `last`: whether to stop at `tolerance`, or coarsely.
         """
         count = bracket.lower.shape[0]
-        size = count + problem.free_size
+        size, driving = count + problem.free_size, len(problem.model.driving)
         own = size - count
-        starts = problem.split(problem.first_state()[0])
+        starts, inputs = problem.split(problem.first_state()[0]), problem.flight.inputs
         limits, finest = self._limits(problem, bracket), _finest(problem, rows)
         prior = 1 / jnp.square(_prior(problem, bracket))
         # What is known of the parameters without the flight counts once, not once a window.
         regular = jax.vmap(jnp.diag)(prior.at[:, :count].divide(problem.windows))
         spread = progress.spread[:, :size, :size]
-        is_shared = jnp.arange(size) >= own
 
         def gathered(shared: Bool[Array, ""], slopes: Float[Array, " windows"]) -> Float[Array, " windows"]:
             """A slope along a direction that all windows share is the sum of theirs."""
             return jnp.where(shared, slopes.sum(), slopes)
 
-        def fly(function, u, *, tangents: bool = False):
-            driven = problem.driven(rows, u[0, :count], tangents=tangents)
-            return jax.vmap(function)(driven, u[:, :count], u[:, count:] if problem.free_size else starts)
+        def driven(u, *, tangents: bool = False) -> Rows:
+            return problem.driven(rows, u[0, :count], inputs=inputs, tangents=tangents)
 
-        def slope(u, direction, shared) -> Callable[[Float[Array, " windows"]], Float[Array, " windows"]]:
+        def fly(function, rows, u):
+            return jax.vmap(function)(rows, u[:, :count], u[:, count:] if problem.free_size else starts)
+
+        def slope(rows_at, u, direction, shared) -> Callable[[Float[Array, " windows"]], Float[Array, " windows"]]:
             def at(step: Float[Array, " windows"]) -> Float[Array, " windows"]:
                 def cost(s: Float[Array, " windows"]) -> Float[Array, " windows"]:
-                    return fly(problem.shot, u + s[:, None] * direction).cost
+                    moved = u + s[:, None] * direction
+                    return fly(problem.shot, rows_at(moved), moved).cost
 
                 value = gathered(shared, jax.jvp(cost, (step,), (jnp.ones_like(step),))[1])
                 return jnp.where(jnp.isfinite(value), value, step)  # a failing shot points back to where it came from
 
             return at
 
-        def look(u) -> _Quadratic:
-            curvature = fly(problem.curvature, u, tangents=True)
-            factor, basis = self._directions(curvature.information + regular, count)
-            slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
-            ahead = jnp.maximum(jnp.abs(slopes[:, own:].sum(axis=0)).max(), jnp.abs(slopes[:, :own]).max(initial=0.0))
-            return _Quadratic(curvature, factor, basis, ahead)
-
         def sweep(search: _Search) -> _Search:
-            here, at_first = search.quadratic, search.sweeps == 0
-            information = here.curvature.information + regular
-            opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", here.factor, spread, here.factor))
-            later = jnp.maximum(search.off * here.ahead, finest) * search.growth
+            """Looks around, and unless the search ends there goes along each direction."""
+            here = driven(search.unknowns, tangents=True)
+            curvature = fly(problem.curvature, here, search.unknowns)
+            information = curvature.information + regular
+            factor, basis = self._directions(information, count, problem.model.driving)
+            slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
+            slopes = slopes.at[:, own:].set(slopes[:, own:].sum(axis=0))
+            rooms = jax.vmap(lambda direction: _room(search.unknowns, direction, limits), -1, -1)(basis)
+            # What lies beyond the limits is not ahead.
+            ahead = jnp.abs(jnp.clip(-slopes, -rooms[0], rooms[1])).max()
+            misfit = _misfit(curvature.shot.cost.sum(), rows)
+            coarse = _COARSE * jnp.maximum(misfit, 1.0)
+            enough = jnp.where(last, jnp.maximum(self.tolerance * misfit, finest), coarse)
+            at_first = search.sweeps == 0
+            done = ~at_first & (ahead <= enough)
+            finite = jnp.isfinite(curvature.shot.cost).all()
+            stay = done | ~finite | (search.sweeps >= self.max_sweeps)
+
+            opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", factor, spread, factor))
+            later = jnp.maximum(search.off * ahead, finest) * search.growth
             half_width = jnp.where(at_first, _FIRST * opening, later)
             leash = jnp.where(at_first, opening, jnp.inf)
 
-            def along(u, column):
-                direction, half_width, leash, shared = column
-                below, above = (jnp.minimum(room, leash) for room in _room(u, direction, limits))
-                ahead = here.curvature.gradient + jnp.einsum("wuv,wv->wu", information, u - search.unknowns)
-                predicted = gathered(shared, -(direction * ahead).sum(axis=-1))
+            def along(rows_at, number, moves):
+                u, steps, errors, at_end = moves
+                direction, shared = basis[:, :, number], number >= own
+                below, above = (jnp.minimum(room, leash[:, number]) for room in _room(u, direction, limits))
+                moved = curvature.gradient + jnp.einsum("wuv,wv->wu", information, u - search.unknowns)
+                predicted = gathered(shared, -(direction * moved).sum(axis=-1))
                 predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
-                lower, upper = jnp.maximum(predicted - half_width, -below), jnp.minimum(predicted + half_width, above)
-                step, at_lower, at_upper = _bisect(slope(u, direction, shared), lower, upper, self.halvings)
-                at_end = (at_lower & (lower > -below)) | (at_upper & (upper < above))
-                return u + step[:, None] * direction, (step, step - predicted, at_end)
+                lower = jnp.maximum(predicted - half_width[:, number], -below)
+                upper = jnp.minimum(predicted + half_width[:, number], above)
+                step, at_lower, at_upper = _bisect(slope(rows_at, u, direction, shared), lower, upper, self.halvings)
+                ended = (at_lower & (lower > -below)) | (at_upper & (upper < above))
+                return (
+                    u + step[:, None] * direction,
+                    steps.at[:, number].set(step),
+                    errors.at[:, number].set(step - predicted),
+                    at_end.at[:, number].set(ended),
+                )
 
-            columns = (jnp.moveaxis(here.basis, -1, 0), half_width.T, leash.T, is_shared)
-            widest = jnp.abs(here.basis * half_width[:, None, :]).max(axis=(0, 2))[:count]
-            around = search.unknowns[0, :count] + jnp.stack([-widest, widest])
-            moved, (steps, errors, at_end) = jax.lax.scan(along, search.unknowns, columns)
+            nothing = jnp.zeros_like(search.unknowns)
+            moves = (search.unknowns, nothing, nothing, nothing.astype(bool))
+            # Of the directions, only the last change what the forcing depends on.
+            first = 0 if driving and self.directions == "coordinate" else size - driving
+            for begin, end, rows_at in ((0, first, lambda _: here._replace(push=None)), (first, size, driven)):
+                if begin < end:
+                    along_these = functools.partial(along, rows_at)
+                    moves = jax.lax.fori_loop(begin, jnp.where(stay, begin, end), along_these, moves)
+            moved, steps, errors, at_end = moves
             off = _SAFETY * jnp.abs(errors).max() / jnp.maximum(jnp.abs(steps).max(), finest)
-            sound = jnp.isfinite(here.curvature.shot.cost).all() & jnp.isfinite(moved).all()
-            moved = jnp.where(sound, moved, search.unknowns)
-            there = look(moved)
-            cost, trusted = there.curvature.shot
-            there = there._replace(curvature=there.curvature._replace(shot=Shot(cost, trusted & sound)))
-            misfit = _misfit(cost.sum(), rows)
-            coarse = _COARSE * jnp.maximum(misfit, 1.0)
-            enough = jnp.where(last, jnp.maximum(self.tolerance * misfit, finest), coarse)
+            sound = finite & jnp.isfinite(moved).all()
+            widest = jnp.abs(basis * half_width[:, None, :]).max(axis=(0, 2))[:count]
+            around = search.unknowns[0, :count] + jnp.stack([-widest, widest])
+            cost, trusted = curvature.shot
             return _Search(
-                unknowns=moved,
-                quadratic=there,
+                unknowns=jnp.where(sound, moved, search.unknowns),
+                curvature=curvature._replace(shot=Shot(cost, trusted & sound)),
+                basis=basis,
                 off=jnp.clip(off, _LEAST, 1.0),
-                growth=jnp.where(at_end.T, _GROWTH * search.growth, 1.0),
-                sweeps=search.sweeps + 1,
-                done=~sound | (there.ahead <= enough),
-                brackets=_kept(search.brackets, progress.sweeps + search.sweeps, around),
+                growth=jnp.where(at_end, _GROWTH * search.growth, 1.0),
+                sweeps=search.sweeps + jnp.where(stay, 0, 1),
+                done=done | ~sound,
+                ended=stay | ~sound,
+                brackets=_kept(search.brackets, progress.sweeps + search.sweeps, around, unless=stay),
             )
 
         begin = progress.unknowns[:, :size]
-        none, one = jnp.zeros((), dtype=int), jnp.ones((), dtype=float)
-        search = _Search(begin, look(begin), one, jnp.ones_like(begin), none, progress.done, progress.brackets)
-        search = jax.lax.while_loop(lambda s: ~s.done & (s.sweeps < self.max_sweeps), sweep, search)
-        curvature = search.quadratic.curvature
+        zero, one = jnp.zeros((begin.shape[0],), dtype=float), jnp.ones((), dtype=float)
+        square = jnp.zeros((*begin.shape, size), dtype=float)
+        nowhere = Curvature(Shot(zero, zero > 0), jnp.zeros_like(begin), square)
+        search = _Search(
+            unknowns=begin,
+            curvature=nowhere,
+            basis=square,
+            off=one,
+            growth=jnp.ones_like(begin),
+            sweeps=jnp.zeros((), dtype=int),
+            done=progress.done,
+            ended=progress.done,
+            brackets=progress.brackets,
+        )
+        search = jax.lax.while_loop(lambda s: ~s.ended, sweep, search)
+        curvature = search.curvature
         misfit = jnp.maximum(_misfit(curvature.shot.cost.sum(), rows), 1.0)
-        covariance = jnp.square(misfit) * covariances(curvature.information + regular, count)
+        if self.directions == "coordinate":
+            covariance = covariances(curvature.information + regular, count)
+        else:
+            covariance = (search.basis[:, :, None, :] * search.basis[:, None, :, :]).sum(axis=-1)
         rollouts = jnp.where(progress.done, 0, size * (1 + search.sweeps * (self.halvings + 1)))
         return _Progress(
             progress.unknowns.at[:, :size].set(search.unknowns),
-            progress.spread.at[:, :size, :size].set(covariance),
+            progress.spread.at[:, :size, :size].set(jnp.square(misfit) * covariance),
             progress.sweeps + search.sweeps,
             progress.rollouts + rollouts,
             search.done,
@@ -374,12 +417,13 @@ class IBSS(AbstractEstimator):
         ), curvature
 
     def _directions(
-        self, information: Float[Array, "windows n n"], count: int
+        self, information: Float[Array, "windows n n"], count: int, driving: tuple[int, ...]
     ) -> tuple[Float[Array, "windows n n"], Float[Array, "windows n n"]]:
         """A factor A of the information A A^T, and A^-T: the search directions, the initial state's first.
 
         The initial state comes first in the Cholesky factorisation, so that a step along a parameter takes the initial
-        states along to where they fit best.
+        states along to where they fit best. Parameters that the forcing depends on, `driving`, come last: directions
+        before theirs leave it as it is.
         """
         if self.directions == "coordinate":
             size = information.shape[-1]
@@ -387,15 +431,27 @@ class IBSS(AbstractEstimator):
             scale = jnp.sqrt(diagonal.at[:, :count].set(diagonal[:, :count].sum(axis=0)))
             columns = jnp.eye(size)[:, jnp.roll(jnp.arange(size), -count)]
             return scale[:, :, None] * columns, columns / scale[:, :, None]
-        factor = joint_factor(information, count)
-        return factor, inverse_transpose(factor, count)
+        if not driving:
+            factor = joint_factor(information, count)
+            return factor, inverse_transpose(factor, count)
+        others = np.delete(np.arange(information.shape[-1]), driving)
+        order = np.concatenate([others[: count - len(driving)], driving, others[count - len(driving) :]])
+        factor = joint_factor(information[:, order][:, :, order], count)
+        back = np.argsort(order)
+        return factor[:, back], inverse_transpose(factor, count)[:, back]
 
 
 def _kept(
-    brackets: Float[Array, "record 2 parameters"] | None, sweep: Int[Array, ""], around: Float[Array, "2 parameters"]
+    brackets: Float[Array, "record 2 parameters"] | None,
+    sweep: Int[Array, ""],
+    around: Float[Array, "2 parameters"],
+    *,
+    unless: Bool[Array, ""],
 ) -> Float[Array, "record 2 parameters"] | None:
     """The record with one more sweep; what is beyond its length is dropped."""
-    return None if brackets is None else brackets.at[sweep].set(around, mode="drop")
+    if brackets is None:
+        return None
+    return brackets.at[jnp.where(unless, brackets.shape[0], sweep)].set(around, mode="drop")
 
 
 def _joined(
