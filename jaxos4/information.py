@@ -64,23 +64,27 @@ def robust_covariance(
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     count, free = parameters.shape[0], problem.free_size
 
-    def together(steps: Float[Array, " unknowns"]) -> Float[Array, "samples columns"]:
+    index, within = problem.cut()
+
+    def together(steps: Float[Array, " unknowns"]) -> Float[Array, "windows length columns"]:
         """Residuals where all windows' initial states take the same step: no sample feels more than one of them."""
         moved = problem.split(start) + (steps[count:] if free else 0.0)
-        return problem.residuals(parameters + steps[:count], moved.ravel()).reshape(-1, problem.columns.size)
+        residuals = problem.residuals(parameters + steps[:count], moved.ravel()).reshape(-1, problem.columns.size)
+        return jnp.where(within[:, :, None], residuals[index], 0.0)
 
-    # How far each residual moves each parameter of the estimate.
     still = jnp.zeros(count + free)
-    inverse = covariances(problem.curvatures(parameters, start).information, count)[:, :, :count]
-    moves = jnp.einsum("tcu,tuv->tcv", jax.jacfwd(together)(still), inverse[problem.window_of_samples()])
     errors = together(still)
+    # One unknown after the other: all at once would hold as many copies of a flight's forcing.
+    slopes = jax.lax.map(lambda step: jax.jvp(together, (still,), (step,))[1], jnp.eye(count + free))
+    inverse = covariances(jnp.einsum("uwtc,vwtc->wuv", slopes, slopes), count)[:, :, :count]
+    # How far each residual moves each parameter of the estimate.
+    moves = jnp.einsum("uwtc,wuv->wtcv", slopes, inverse)
     measured = (~jnp.isnan(problem.measured())).astype(errors.dtype)
     sound = jnp.isfinite(problem.cost(parameters, start)) & (measured.sum() > 0)
-    index, within = problem.cut()
     if problem.windows >= _MANY_WINDOWS and index.shape[1] * problem.columns.size <= _LARGEST_WINDOW:
-        own = within[:, :, None].astype(errors.dtype)
-        spread = _by_window(errors[index] * own, measured[index] * own, moves[index] * own[..., None])
+        spread = _by_window(errors, jnp.where(within[:, :, None], measured[index], 0.0), moves)
         return jnp.where(sound, spread, jnp.inf)
+    errors, moves = errors[within], moves[within]
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
     def products(x: Float[Array, "samples columns"]) -> Float[Array, "lags columns columns"]:

@@ -21,10 +21,12 @@ class Winsorised(NamedTuple):
 
     - `problem`: to be fitted by least squares; the noise levels are those of the residuals' medians.
     - `share`: of the measurements that were left as they are.
+    - `residuals`: in the noise levels told, none beyond the cut; 0 where nothing was measured.
     """
 
     problem: ShootingProblem
     share: Scalar
+    residuals: Float[Array, "samples columns"]
 
 
 @eqx.filter_jit
@@ -53,4 +55,5 @@ def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: 
             (states, problem.sigma.at[problem.columns].set(scale)) + ((force,) if has_force else ()),
         ),
         share,
+        jnp.where(there, cut / scale, 0.0),
     )

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -25,14 +24,17 @@ from .results import result_names
 from .robust import winsorised
 from .shooting import ShootingProblem
 
-# What turns the flow of the air, the gyroscope and the rotors' spin into small torques: told by few flights.
-SECONDARY = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7", "rotor_reaction")
+# What turns the flow of the air, the gyroscope and the rotors' spin into small torques, and the accelerometer's zero,
+# which looks like a thrust curve: told by few flights.
+SECONDARY = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7", "rotor_reaction", "az_bias")
 _DAMPING = ("roll_damping", "pitch_damping", "yaw_damping")
-# Noise levels that change by less than this share from one fit to the next are found.
+# Noise levels that change by less than this share from one search to the next are found.
 _OFF = 0.2
-_PASSES = 4
-# Outliers are cut until no parameter moves by more than this many of its standard deviations.
-_STILL = 0.1
+# Outliers are cut until no parameter moves by more than this many of its standard deviations, those of coloured noise.
+_STILL = 0.2
+_PASSES = 12
+# While these are sought, a search ends within so many of them.
+_ROUGH = 0.1
 # A damping below zero by more than so many standard deviations is none.
 _NEGATIVE = 2.0
 # Correlation of neighbouring residuals, beyond which the count of independent ones means nothing.
@@ -43,12 +45,12 @@ NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
 class VehicleFit(NamedTuple):
     """What flights tell of a vehicle.
 
-    - `problem`: with the noise found; its model is the whole one, less what is held.
+    - `problem`: with the noise found, and outliers cut; its model is the whole one, less what is held.
     - `estimate`: of what is left, with a covariance that allows for coloured residuals and cut outliers.
     - `held`: each parameter that is held: its value, and why.
     - `bound`: standard deviations of the Cramer-Rao bound at the noise found, as if that were white.
     - `cut`: the share of the measurements that Huber's loss cut.
-    - `rollouts`: of all fits together.
+    - `rollouts`: of all searches together.
     """
 
     problem: ShootingProblem
@@ -61,7 +63,7 @@ class VehicleFit(NamedTuple):
     @property
     def answered(self) -> bool:
         """Whether there is an estimate at all."""
-        return str(result_names(self.estimate.result)) not in NO_ANSWER
+        return _answered(self.estimate)
 
 
 def fit_vehicle(
@@ -78,7 +80,8 @@ def fit_vehicle(
 
     - `problem`: its sigma is where the search for the noise levels begins.
     - `bracket`: of all parameters of the model; what is held, is held at its center.
-    - `estimator`: of the last stage, one that shoots; IBSS by default. What is told is found by IBSS.
+    - `estimator`: of the answer, one that shoots; IBSS by default. Noise levels, outliers, and what is told are found
+      by IBSS.
     - `huber`: whether outliers are cut.
     - `progress`: told of each stage.
 
@@ -87,74 +90,82 @@ def fit_vehicle(
     whole, names = problem.model, problem.model.parameter_names
     if bracket.lower.shape != (len(names),):
         raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
-    centers = dict(zip(names, np.asarray(bracket.center).tolist(), strict=True))
-    held = {name: (centers[name], "") for name in SECONDARY if name in names}
+    values = np.array(bracket.center)
+    held = {name: (float(values[i]), "") for i, name in enumerate(names) if name in SECONDARY}
     progress("fitting what every flight tells")
-    first = _fit_noise(IBSS(), _holding(problem, whole, held), _left(bracket, whole, held))
+    left = _left(bracket, whole, held)
+    first = _settle(_holding(problem, whole, held), left, left.center, huber=False)
     if not first.answered:
-        return _unanswered(first, held)
+        return _unanswered(first, held, first.rollouts)
 
     progress("asking what else can be told")
-    values = np.array([centers[name] for name in names])
-    free = np.array([i for i, name in enumerate(names) if name not in held])
-    values[free] = np.asarray(first.estimate.parameters)
+    values[_free(whole, held)] = np.asarray(first.estimate.parameters)
     held = _untold(eqx.tree_at(lambda p: p.model, first.problem, whole), values, first, bracket)
 
     progress("fitting all that can be told")
-    method = IBSS() if estimator is None else estimator
     start = eqx.tree_at(lambda p: p.sigma, problem, first.problem.sigma)
-    last = _fit_noise(method, _holding(start, whole, held), _left(bracket, whole, held))
-    rollouts = first.rollouts + last.rollouts
+    left = _left(bracket, whole, held)
+    last = _settle(_holding(start, whole, held), left, jnp.asarray(values[_free(whole, held)]), huber=huber)
     if not last.answered:
-        return _unanswered(last._replace(rollouts=rollouts), held)
-
-    share = 1.0
-    used, found = last.problem, last.estimate
-    if huber:
-        progress("cutting outliers")
-        for _ in range(_PASSES):
-            cut = winsorised(last.problem, found.parameters, found.initial_state)
-            again = method(cut.problem, _left(bracket, whole, held))
-            rollouts += int(again.rollouts)
-            if str(result_names(again.result)) in NO_ANSWER:
-                break
-            moved = float((jnp.abs(again.parameters - found.parameters) / again.std).max())
-            used, found, share = cut.problem, again, float(cut.share)
-            if moved < _STILL:
-                break
+        return _unanswered(last, held, first.rollouts + last.rollouts)
+    rough, used = last.estimate, last.problem
+    if estimator is None:
+        found = IBSS()(used, left, start=rough.parameters, spread=rough.covariance)
+    else:
+        found = estimator(used, left)
+    rollouts = first.rollouts + last.rollouts + int(found.rollouts)
+    if not _answered(found):
+        return _unanswered(last._replace(estimate=found), held, rollouts)
     progress("computing errors")
-    bound = jnp.sqrt(jnp.diagonal(cramer_rao_bound(used, found.parameters, found.initial_state)))
-    covariance = robust_covariance(used, found.parameters, found.initial_state) / share**2
+    covariance = robust_covariance(used, found.parameters, found.initial_state) / last.share**2
     # Colour that averages out does not make an error smaller than white noise would.
     covariance = jnp.where(jnp.isfinite(covariance).all(), covariance, found.covariance)
-    found = eqx.tree_at(lambda e: e.covariance, found, covariance)
-    return VehicleFit(used, found, held, bound, 1 - share, rollouts)
+    bound, found = found.std, eqx.tree_at(lambda e: e.covariance, found, covariance)
+    return VehicleFit(used, found, held, bound, 1 - last.share, rollouts)
 
 
 class _Fit(NamedTuple):
     problem: ShootingProblem
     estimate: Estimate
     rollouts: int
+    growth: float
+    share: float
 
     @property
     def answered(self) -> bool:
-        return str(result_names(self.estimate.result)) not in NO_ANSWER
+        return _answered(self.estimate)
 
 
-def _fit_noise(method, problem: ShootingProblem, bracket: Bracket) -> _Fit:
-    """A fit, repeated with the noise levels that its residuals tell until these stand."""
-    found = jax.block_until_ready(method(problem, bracket))
-    fit = _Fit(problem, found, int(found.rollouts))
+def _answered(estimate: Estimate) -> bool:
+    return str(result_names(estimate.result)) not in NO_ANSWER
+
+
+def _settle(problem: ShootingProblem, bracket: Bracket, start: Parameters, *, huber: bool) -> _Fit:
+    """A rough fit, repeated with the noise levels that its residuals tell, and outliers cut, until it stands still."""
+    found = IBSS(tolerance=_ROUGH)(problem, bracket, start=start, spread=jnp.diag(jnp.square(bracket.half_width / 2)))
+    used, rollouts, share, growth = problem, int(found.rollouts), 1.0, 1.0
     for _ in range(_PASSES):
-        if not fit.answered:
-            return fit
-        found, used = fit.estimate, fit.problem
-        problem = used.reweighted(used.residuals(found.parameters, found.initial_state))
-        if bool(jnp.all(jnp.abs(problem.sigma / used.sigma - 1) < _OFF)):
-            return fit._replace(problem=problem)
-        found = jax.block_until_ready(method(problem, bracket))
-        fit = _Fit(problem, found, fit.rollouts + int(found.rollouts))
-    return fit
+        if not _answered(found):
+            break
+        if huber:
+            told, left, residuals = winsorised(problem, found.parameters, found.initial_state)
+            share = float(left)
+        else:
+            residuals = used.residuals(found.parameters, found.initial_state).reshape(-1, problem.columns.size)
+            told = used.reweighted(residuals.ravel())
+        growth = _growth(np.asarray(residuals))
+        moved, changed = jnp.abs(found.parameters - start) / found.std, jnp.abs(told.sigma / used.sigma - 1)
+        start, used = found.parameters, told
+        if changed.max() < _OFF and (not huber or moved.max() < _STILL * growth):
+            break
+        search = IBSS(tolerance=_ROUGH * growth)
+        found = search(used, bracket, start=start, spread=growth**2 * found.covariance)
+        rollouts += int(found.rollouts)
+    return _Fit(used, found, rollouts, growth, share)
+
+
+def _free(whole: AbstractModel, held: dict[str, tuple[float, str]]) -> np.ndarray:
+    return np.array([i for i, name in enumerate(whole.parameter_names) if name not in held])
 
 
 def _holding(problem: ShootingProblem, whole: AbstractModel, held: dict[str, tuple[float, str]]) -> ShootingProblem:
@@ -163,7 +174,7 @@ def _holding(problem: ShootingProblem, whole: AbstractModel, held: dict[str, tup
 
 
 def _left(bracket: Bracket, whole: AbstractModel, held: dict[str, tuple[float, str]]) -> Bracket:
-    free = np.array([i for i, name in enumerate(whole.parameter_names) if name not in held])
+    free = _free(whole, held)
     return Bracket(bracket.lower[free], bracket.upper[free])
 
 
@@ -173,13 +184,10 @@ def _untold(
     """What these flights cannot tell at the noise found, and damping that came out negative.
 
     A parameter is told where its standard deviation is below half the width of its bracket. That of the Cramer-Rao
-    bound is for white noise: it grows by the root of (1 + rho) / (1 - rho), the worst channel's, where neighbouring
-    residuals correlate by rho.
+    bound is for white noise, and grows with the residuals' colour.
     """
     names, start = problem.model.parameter_names, first.estimate.initial_state
-    residuals = np.asarray(first.problem.residuals(first.estimate.parameters, start))
-    growth = _growth(residuals.reshape(-1, problem.columns.size))
-    std = growth * np.sqrt(np.diagonal(np.asarray(cramer_rao_bound(problem, jnp.asarray(values), start))))
+    std = first.growth * np.sqrt(np.diagonal(np.asarray(cramer_rao_bound(problem, jnp.asarray(values), start))))
     center, half_width = np.asarray(bracket.center), np.asarray(bracket.half_width)
     held = {}
     for i, name in enumerate(names):
@@ -192,18 +200,15 @@ def _untold(
 
 
 def _growth(residuals: np.ndarray) -> float:
-    """By how much errors exceed those of white noise, as if residuals were a first-order process."""
+    """By how much errors exceed those of white noise, as if residuals were a first-order process.
+
+    The root of (1 + rho) / (1 - rho), the worst channel's, where neighbouring residuals correlate by rho.
+    """
     power = np.square(residuals).sum(axis=0)
     neighbours = (residuals[1:] * residuals[:-1]).sum(axis=0)
     rho = np.clip(neighbours / np.where(power > 0, power, 1.0), 0.0, _MOST_COLOUR)
     return float(np.sqrt(((1 + rho) / (1 - rho)).max()))
 
 
-def _unanswered(fit: _Fit, held: dict[str, tuple[float, str]]) -> VehicleFit:
-    return VehicleFit(fit.problem, fit.estimate, held, fit.estimate.std, 0.0, fit.rollouts)
-
-
-def whole_parameters(fit: VehicleFit, model: AbstractModel) -> Parameters:
-    """A value for each parameter of the whole model: estimated, or held."""
-    found = dict(zip(fit.problem.model.parameter_names, np.asarray(fit.estimate.parameters).tolist(), strict=True))
-    return jnp.asarray([found[name] if name in found else fit.held[name][0] for name in model.parameter_names])
+def _unanswered(fit: _Fit, held: dict[str, tuple[float, str]], rollouts: int) -> VehicleFit:
+    return VehicleFit(fit.problem, fit.estimate, held, fit.estimate.std, 0.0, rollouts)
