@@ -11,7 +11,7 @@ import pytest
 
 import jaxos4
 from jaxos4.cli._choices import VehicleModel
-from jaxos4.cli._vehicle import Part, load_logs
+from jaxos4.cli._recordings import Part, load_logs
 
 AIRFRAME = """
 mass = 0.65

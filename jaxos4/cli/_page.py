@@ -6,6 +6,8 @@ import rich.box
 from rich.console import Console
 from rich.table import Table
 
+from ..vehicle import NO_ANSWER
+
 # Residuals whose neighbours correlate by more than this are not noise.
 COLOURED = 0.3
 # The share of fits of true models that a test of all channels' residuals may call wrong.
@@ -14,7 +16,18 @@ SIGNIFICANCE = 0.01
 NINETY_FIVE = 1.96
 
 
-def print_page(console: Console, report: dict[str, Any]) -> None:
+def print_flight(console: Console, report: dict[str, Any]) -> None:
+    """An OS4: parameters, constants, and whether the model explains the flight."""
+    if report["result"] == "nonfinite_trajectory":
+        shoots = report["estimator"] in ("ibss", "hybrid", "output-error", "network")
+        remedy = " (try a --window, or a shorter one)" if shoots else ""
+        console.print(
+            "No estimate: wherever the search went, the model's trajectory left this flight before its end. The "
+            f"vehicle may do what the model lacks{remedy}, or the airframe's constants or the units are far off.",
+            highlight=False,
+        )
+    if report["result"] in NO_ANSWER:
+        return
     table = _table(("parameter", "unit", "estimate", "95 % interval", "bound", "note"))
     for name, row in report["parameters"].items():
         if row["estimate"] is None:
@@ -113,6 +126,8 @@ def _print_validation(console: Console, validation: dict[str, Any] | None) -> No
 
 def print_vehicle(console: Console, report: dict[str, Any]) -> None:
     """A real vehicle: parameters, inertias, and what the fit is worth on what it did not see."""
+    if report["result"] in NO_ANSWER:
+        return
     table = _table(("parameter", "unit", "estimate", "95 % interval", "note"))
     for name, row in report["parameters"].items():
         if row["estimate"] is None:
@@ -126,17 +141,11 @@ def print_vehicle(console: Console, report: dict[str, Any]) -> None:
         reasons.setdefault(row["note"], []).append(f"{name} {row['value']:.4g}")
     for why, held in reasons.items():
         console.print(f"held, {why}: {', '.join(held)}.", highlight=False, markup=False)
-    inertias = [
-        f"{name} {row['estimate']:.4g} +- {NINETY_FIVE * row['std']:.2g}"
-        for name, row in report["constants"].items()
-        if isinstance(row, dict)
-    ]
+    inertias = {name: row for name, row in report["constants"].items() if isinstance(row, dict)}
     if inertias:
-        console.print(
-            f"inertias [kg m^2]: {', '.join(inertias)}, if the airframe's thrust coefficient and arms are right.",
-            highlight=False,
-            markup=False,
-        )
+        told = [f"{name} {row['estimate']:.4g} +- {NINETY_FIVE * row['std']:.2g}" for name, row in inertias.items()]
+        why = next(iter(inertias.values()))["note"]
+        console.print(f"inertias [kg m^2], {why}: {', '.join(told)}.", highlight=False, markup=False)
     noise = ", ".join(f"{name} {value:.2g}" for name, value in report["noise"].items())
     console.print(
         f"left unexplained in a window (rad/s, m/s^2): {noise}; the intervals allow for its colour. "

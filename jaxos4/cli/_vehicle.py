@@ -1,70 +1,41 @@
 """`jaxos4 estimate --model flight`: a real vehicle from one log or several, checked on what was not fitted."""
 
-import math
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from rich.console import Console
 
 from ..airframe import Airframe, load_airframe
 from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, PARAMETER_NAMES, CorrectedOS4
+from ..dynamics import PARAMETER_NAMES, CorrectedOS4
 from ..errors import InputError
 from ..estimators import EquationError, Estimate, Hybrid, NetworkEstimator, OutputError
-from ..flight import Flight, join
-from ..flight_model import TERMS, FlightModel, with_body_velocity
+from ..flight import Flight
+from ..flight_model import TERMS, FlightModel, has_full_scale
 from ..held import hold
 from ..inertia import fit_inertia
-from ..logs import averaged, cut, read_log, stretches
-from ..logs.stretches import Stretch
 from ..results import result_names
 from ..shooting import ShootingProblem
 from ..validation import Predictions, Skill, predictions, skill
 from ..vehicle import VehicleFit, fit_vehicle
 from ._bracket_file import load_bracket
 from ._json import finite
+from ._recordings import Part, load_logs
 
-# [s] of a window, and of a sample where a log has more: no quadrotor turns faster than these tell.
-WINDOW, SAMPLE = 0.25, 0.004
-# The share that is held out, where no other flight is there to be predicted.
-HOLDOUT = 0.25
-# What is held out comes in blocks of this length [s], so that every part of a flight is in both.
-BLOCK = 5.0
 # Where the search for the noise levels begins [rad/s]: more the model's errors than the sensor's.
 FIRST_SIGMA = 0.5
 # How a network is trained that only has to say where to look in flights cut into windows.
 _SEED_STEPS, _SEED_BATCH = 500, 64
-_MOST_PARTS = 3
-
-
-class Recorded(NamedTuple):
-    """Logs, ready to be fitted.
-
-    - `fitted`, `tested`: one flight each, of all stretches; NaN where the other has its part. `None`: nothing held out.
-    - `recordings`: the log that each stretch is from.
-    - `seconds`: fitted, and tested.
-    """
-
-    fitted: Flight
-    tested: Flight | None
-    recordings: tuple[int, ...]
-    seconds: tuple[float, float]
-    notes: tuple[str, ...]
-
-
-class Part(NamedTuple):
-    """What of the logs is used: from and to [s], window and sample [s], the share that is held out."""
-
-    begin: float | None
-    end: float | None
-    window: float
-    sample: float | None
-    holdout: float
+# [GiB] of output error's dense Jacobian; a few of its size are needed.
+_MOST_DENSE = 1.0
+# Which alpha is torque over which inertia.
+_TORQUES = {"Ix": 2, "Iy": 5, "Iz": 7}
 
 
 def identify_vehicle(
@@ -78,15 +49,14 @@ def identify_vehicle(
     part: Part,
     validate: Path | None,
     huber: bool,
-) -> tuple[dict[str, Any], VehicleFit, Predictions | None]:
-    """The report, the fit, and the predictions over what was held out. Raises `InputError` for what cannot be used."""
+) -> tuple[dict[str, Any], Predictions | None]:
+    """The report, and the predictions over what was held out. Raises `InputError` for what cannot be used."""
     if estimator not in ("ibss", "hybrid", "output-error"):
         raise InputError(f"--estimator {estimator}: a flight model is shot; use ibss, hybrid or output-error.")
-    _check(part)
     begin = time.perf_counter()
     vehicle = load_airframe(airframe)
     recorded = load_logs(logs, vehicle, part)
-    model = FlightModel(vehicle, terms=_terms(terms, recorded.fitted), recordings=recorded.recordings)
+    model = FlightModel(vehicle, terms=_terms(terms, recorded.fitted, vehicle), recordings=recorded.recordings)
     where = Bracket.default(model) if bracket is None else load_bracket(bracket, model)
     other = recorded.tested
     notes = recorded.notes
@@ -100,6 +70,12 @@ def identify_vehicle(
     if measured <= len(model.parameter_names) + problem.windows * problem.free_size:
         raise InputError(
             f"{logs[0]}: {measured} measurements are too few for windows of {part.window:g} s; use longer."
+        )
+    dense = problem.measured().size * (len(model.parameter_names) + problem.windows * problem.free_size) * 8 / 2**30
+    if estimator == "output-error" and dense > _MOST_DENSE:
+        raise InputError(
+            f"--estimator output-error: its Jacobian would take {dense:.0f} GiB in {problem.windows} windows; "
+            "use ibss, or less of the flight by --from and --to."
         )
     with console.status("fitting") as status:
         fit = fit_vehicle(
@@ -143,108 +119,10 @@ def identify_vehicle(
             "notes": list(notes),
         },
     }
-    return report, fit, predicted
+    return report, predicted
 
 
-def load_logs(paths: list[Path], airframe: Airframe, part: Part) -> Recorded:
-    """Several logs as one flight of stretches that can be used, cut into whole windows."""
-    notes: list[str] = []
-    parts: list[tuple[int, Flight]] = []
-    for number, path in enumerate(paths):
-        flight, said = read_log(path, airframe)
-        notes += [f"{path}: {note}" for note in said]
-        if np.isnan(np.asarray(flight.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
-            raise InputError(f"{path}: a flight model needs p, q and r; log the gyro.")
-        pieces, note = _pieces(path, flight, airframe, part)
-        notes += [] if note is None else [f"{path}: {note}"]
-        parts += [(number, piece) for piece in pieces]
-    step = max(SAMPLE, *(float(flight.dt) for _, flight in parts)) if part.sample is None else part.sample
-    length = round(part.window / step)
-    if length < 4:
-        raise InputError(f"--window {part.window:g}: less than four samples of {step:g} s; give at least {4 * step:g}.")
-    even = [(number, _evened(paths[number], flight, step)) for number, flight in parts]
-    kept = [(number, flight) for number, flight in even if flight.time.shape[0] >= length]
-    if not kept:
-        raise InputError(f"{paths[0]}: no part is as long as --window {part.window:g}; give a shorter one.")
-    numbers = sorted({number for number, _ in kept})
-    lost = [paths[number] for number in range(len(paths)) if number not in numbers]
-    if lost:
-        raise InputError(
-            f"{lost[0]}: no part is as long as --window {part.window:g}; leave it out or give a shorter one."
-        )
-    together = join([flight for _, flight in kept], length=length)
-    fitted, tested = _held_out(together, length, part.holdout)
-    seconds = tuple(0.0 if f is None else float((~jnp.isnan(f.states[:, 7])).sum() * f.dt) for f in (fitted, tested))
-    return Recorded(fitted, tested, tuple(number for number, _ in kept), (seconds[0], seconds[1]), tuple(notes))
-
-
-def _pieces(path: Path, flight: Flight, airframe: Airframe, part: Part) -> tuple[list[Flight], str | None]:
-    """The stretches that can be used, or what `--from` and `--to` say, and what is told of it."""
-    first, last = float(flight.time[0]), float(flight.time[-1])
-    if part.begin is not None or part.end is not None:
-        asked = Stretch(first if part.begin is None else part.begin, last if part.end is None else part.end)
-        try:
-            return [cut(flight, asked)], None
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
-    every = stretches(flight, airframe)
-    usable = [each for each in every if not each.reason]
-    refused = [each for each in every if each.reason]
-    if not usable:
-        why = max(refused, key=lambda each: each.length)
-        raise InputError(
-            f"{path}: no stretch of it can be used (from {why.begin:.1f} s to {why.end:.1f} s: {why.reason}); say "
-            "--from and --to to use one all the same."
-        )
-    if not refused:
-        return [flight], None
-    longest = sorted(refused, key=lambda each: -each.length)[:_MOST_PARTS]
-    told = "; ".join(f"{each.begin:.1f} to {each.end:.1f} s: {each.reason}" for each in longest)
-    seconds = sum(each.length for each in usable)
-    return [cut(flight, each) for each in usable], (
-        f"{seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {told}"
-        f"{'; ...' if len(refused) > _MOST_PARTS else ''} (--from and --to override)"
-    )
-
-
-def _evened(path: Path, flight: Flight, step: float) -> Flight:
-    if float(flight.dt) > step * 1.01:
-        raise InputError(f"{path}: --sample-time {step:g}: it has a sample every {float(flight.dt):.4g} s only.")
-    return with_body_velocity(averaged(flight, step))
-
-
-def _held_out(flight: Flight, length: int, share: float) -> tuple[Flight, Flight | None]:
-    """The flight without the measurements of every so many blocks of whole windows, and with those alone."""
-    if not share:
-        return flight, None
-    windows = flight.time.shape[0] // length
-    period = round(1 / share)
-    block = max(min(round(BLOCK / (length * float(flight.dt))), windows // (2 * period)), 1)
-    aside = np.repeat((np.arange(windows) // block) % period == period - 1, length)
-    if not aside.any() or aside.all():
-        return flight, None
-
-    def without(where: np.ndarray, flight: Flight, *, force: bool) -> Flight:
-        blank = eqx.tree_at(lambda f: f.states, flight, jnp.where(where[:, None], jnp.nan, flight.states))
-        if not force or flight.specific_force is None:
-            return blank
-        return eqx.tree_at(lambda f: f.specific_force, blank, jnp.where(where[:, None], jnp.nan, flight.specific_force))
-
-    return without(aside, flight, force=True), without(~aside, flight, force=False)
-
-
-def _check(part: Part) -> None:
-    if not (math.isfinite(part.window) and part.window > 0):
-        raise InputError(f"--window: must be a positive number of seconds, got {part.window:g}.")
-    if part.sample is not None and not (math.isfinite(part.sample) and part.sample > 0):
-        raise InputError(f"--sample-time: must be a positive number of seconds, got {part.sample:g}.")
-    if not 0 <= part.holdout <= 0.5:
-        raise InputError(f"--holdout: must be a share from 0 to 0.5, got {part.holdout:g}.")
-    if part.begin is not None and part.end is not None and not part.begin < part.end:
-        raise InputError(f"--from {part.begin:g} --to {part.end:g}: must be in this order.")
-
-
-def _terms(asked: str | None, flight: Flight) -> tuple[str, ...]:
+def _terms(asked: str | None, flight: Flight, airframe: Airframe) -> tuple[str, ...]:
     """The terms asked for, or those that what was measured allows."""
     force = np.asarray(flight.channels)[:, 12:]
     ax, ay, az = (not bool(np.isnan(force[:, i]).all()) for i in range(3))
@@ -260,7 +138,9 @@ def _terms(asked: str | None, flight: Flight) -> tuple[str, ...]:
             chosen.append("velocity")
         elif able["flapping"]:
             chosen.append("flapping")
-        chosen += ["accelerometer"] if able["accelerometer"] else []
+        if able["accelerometer"]:
+            # Commands are in no known proportion to thrust; what was accelerated says in which.
+            chosen += ["accelerometer", *(["curve"] if flight.commanded and has_full_scale(airframe) else [])]
         return tuple(term for term in TERMS if term in chosen)
     names = [name.strip() for name in asked.split(",") if name.strip()]
     for name in names:
@@ -268,6 +148,8 @@ def _terms(asked: str | None, flight: Flight) -> tuple[str, ...]:
             raise InputError(f"--terms: knows no `{name[:40]}`; the terms are {', '.join(TERMS)}.")
         if not able.get(name, True):
             raise InputError(f"--terms: {name} needs what these logs did not measure; leave it out.")
+        if name == "curve" and not has_full_scale(airframe):
+            raise InputError("--terms: curve needs max_rotor_speed in the airframe's file; set it or leave it out.")
     return tuple(term for term in TERMS if term in names)
 
 
@@ -291,21 +173,17 @@ def _hybrid(problem: ShootingProblem, bracket: Bracket) -> Estimate:
 
 def _validate(fit: VehicleFit, flight: Flight, path: Path) -> tuple[Predictions, dict[str, Any]]:
     """How far ahead the rates of a flight that was not fitted are predicted, and how regression does with the terms."""
+    problem, found = fit.problem, fit.estimate.parameters
 
-    def scored(problem: ShootingProblem, parameters) -> tuple[Predictions, Skill]:
+    def scored(parameters: Array) -> tuple[Predictions, Skill]:
         try:
             predicted = predictions(eqx.tree_at(lambda p: p.flight, problem, flight), parameters)
         except ValueError as error:
             raise InputError(f"{path}: {error}") from None
         return predicted, skill(predicted)
 
-    predicted, worth = scored(fit.problem, fit.estimate.parameters)
-    model, names = fit.problem.model, fit.problem.model.parameter_names
-    found = dict(zip(names, np.asarray(fit.estimate.parameters).tolist(), strict=True))
-    known = [name for name in ("rotor_lag", "rotor_delay", "thrust_curve") if name in names]
-    linear = eqx.tree_at(lambda p: p.model, fit.problem, hold(model, {n: found[n] for n in known}) if known else model)
-    regressed = EquationError(memory=0.0)(linear, Bracket.default(linear.model))
-    _, theirs = scored(linear, regressed.parameters)
+    predicted, worth = scored(found)
+    _, theirs = scored(_regressed(problem, found))
     return predicted, {
         "horizons": predicted.horizons.tolist(),
         "starts": worth.starts,
@@ -320,6 +198,18 @@ def _validate(fit: VehicleFit, flight: Flight, path: Path) -> tuple[Predictions,
             for i, name in enumerate("pqr")
         },
     }
+
+
+@eqx.filter_jit
+def _regressed(problem: ShootingProblem, found: Array) -> Array:
+    """What regression with the terms finds, told what it cannot find: lag, delay and thrust curve."""
+    names = problem.model.parameter_names
+    known = {names[i]: found[i] for i in problem.model.driving}
+    if not known:
+        return EquationError(memory=0.0).solution(problem, Bracket.default(problem.model))
+    linear = hold(problem.model, known)
+    problem = eqx.tree_at(lambda p: p.model, problem, linear)
+    return linear.complete(EquationError(memory=0.0).solution(problem, Bracket.default(linear)))
 
 
 def _parameters(fit: VehicleFit, bracket: Bracket, model: FlightModel) -> dict[str, dict[str, Any]]:
@@ -347,19 +237,28 @@ def _parameters(fit: VehicleFit, bracket: Bracket, model: FlightModel) -> dict[s
 
 
 def _constants(fit: VehicleFit, bracket: Bracket, model: FlightModel) -> dict[str, Any]:
-    """Ix, Iy, Iz of the rigid body that explains the alphas that are told."""
-    names = fit.problem.model.parameter_names
-    whole = np.asarray(bracket.center)[:8].copy()
-    covariance = np.diag((1e3 * np.asarray(bracket.half_width)[:8]) ** 2)
-    alphas = [name for name in PARAMETER_NAMES if name in names]
-    to = [PARAMETER_NAMES.index(name) for name in alphas]
-    of = [names.index(name) for name in alphas]
-    whole[to] = np.asarray(fit.estimate.parameters)[of]
-    covariance[np.ix_(to, to)] = np.asarray(fit.estimate.covariance)[np.ix_(of, of)]
-    told = {}
-    for name, axis in (("Ix", 2), ("Iy", 5), ("Iz", 7)):
+    """Ix, Iy, Iz of the rigid body that explains the alphas that are told.
+
+    Torques are as much larger than the airframe says as thrust is, where an accelerometer tells that: alpha3, alpha6
+    and alpha8 are divided by `thrust_gain`.
+    """
+    names, values = fit.problem.model.parameter_names, np.asarray(fit.estimate.parameters)
+    gain = names.index("thrust_gain") if "thrust_gain" in names else None
+    whole, slopes = np.asarray(bracket.center)[:8].copy(), np.zeros((8, len(names)))
+    spread = (1e3 * np.asarray(bracket.half_width)[:8]) ** 2
+    for to, name in enumerate(PARAMETER_NAMES):
+        if name not in names:
+            continue
+        of = names.index(name)
+        whole[to], slopes[to, of], spread[to] = values[of], 1.0, 0.0
+        if gain is not None and to in _TORQUES.values():
+            whole[to] /= values[gain]
+            slopes[to, of], slopes[to, gain] = 1 / values[gain], -whole[to] / values[gain]
+    covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(spread)
+    told, note = {}, f"if arms and {'thrust_coefficient' if gain is None else 'mass'} are right"
+    for name, axis in _TORQUES.items():
         if PARAMETER_NAMES[axis] in names and whole[axis] > 0:
             std = float(np.sqrt(covariance[axis, axis])) / whole[axis] ** 2
-            told[name] = {"estimate": 1 / float(whole[axis]), "std": std, "unit": "kg m^2"}
+            told[name] = {"estimate": 1 / float(whole[axis]), "std": std, "unit": "kg m^2", "note": note}
     rigid = fit_inertia(CorrectedOS4(model.airframe), jnp.asarray(whole), jnp.asarray(covariance))
     return {**told, "consistency_p": float(rigid.p_value), "rigid_body": bool(rigid.is_rigid_body)}

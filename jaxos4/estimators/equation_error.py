@@ -1,12 +1,14 @@
 """Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares."""
 
 import equinox as eqx
+from jaxtyping import Array, Float
 
-from .._custom_types import Scalar, as_float
+from .._custom_types import Parameters, Scalar, as_float
 from ..bracket import Bracket
 from ..shooting import ShootingProblem
 from ._estimate import AbstractEstimator, Estimate, check_bracket
 from ._regression import (
+    Regression,
     answer,
     check_bridge,
     check_share,
@@ -77,10 +79,23 @@ class EquationError(AbstractEstimator):
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
         linear in them.
         """
-        check_bracket(problem, bracket)
+        data, steps, inverse = self._solved(problem, bracket)
         usable = bracket.usable
-        data = regression(problem, usable, memory=self.memory, forgetting=1.0, bridge=self.bridge)
-        steps, inverse = solve(*normal_equations(data.rows(data.rates)))
         parameters = parameters_of(usable, steps)
         covariance = covariance_of(usable, propagated_covariance(data, steps, inverse))
         return answer(problem, bracket, parameters, covariance)
+
+    @eqx.filter_jit
+    def solution(self, problem: ShootingProblem, bracket: Bracket) -> Parameters:
+        """The least-squares solution alone: no errors, and no look at how the flight goes with it.
+
+        **Raises:** as a call does.
+        """
+        return parameters_of(bracket.usable, self._solved(problem, bracket)[1])
+
+    def _solved(
+        self, problem: ShootingProblem, bracket: Bracket
+    ) -> tuple[Regression, Parameters, Float[Array, "parameters parameters"]]:
+        check_bracket(problem, bracket)
+        data = regression(problem, bracket.usable, memory=self.memory, forgetting=1.0, bridge=self.bridge)
+        return data, *solve(*normal_equations(data.rows(data.rates)))
