@@ -10,7 +10,6 @@ from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.logs import (
     Stretch,
-    chosen_part,
     cut,
     excitation,
     gyro_noise,
@@ -48,9 +47,6 @@ def reasons(flight, airframe=CRAZYFLIE):
 def test_a_flight_without_faults_is_one_stretch():
     flight = flight_of(hovering())
     assert usable_stretches(flight, CRAZYFLIE) == (Stretch(0.0, pytest.approx(20.0)),)
-    part, note = chosen_part(flight, CRAZYFLIE)
-    assert note is None
-    assert part is flight
 
 
 @pytest.mark.parametrize("airframe", [CRAZYFLIE, None])
@@ -162,7 +158,6 @@ def test_parts_are_the_flight(seed):
     assert sum(cut(flight, part).time.size for part in parts if part.length > 0) == n - sum(
         part.length == 0 for part in parts
     )
-    chosen_part(flight)
 
 
 # Cutting
@@ -179,29 +174,12 @@ def test_a_cut_keeps_time_and_rows():
     assert bare.time.size == flight.time.size
 
 
-def test_what_the_user_asks_for_is_used():
-    flight = flight_of(hovering(rest=((0, 3),)))
-    part, note = chosen_part(flight, CRAZYFLIE, begin=1.0)
-    assert note is None
-    assert (float(part.time[0]), float(part.time[-1])) == (1.0, 20.0)
-    assert float(chosen_part(flight, CRAZYFLIE, end=1.0)[0].time[-1]) == 1.0
+def test_a_part_beyond_the_flight_is_refused():
+    flight = flight_of(hovering())
     with pytest.raises(
-        InputError, match="from 30 s to 20 s: fewer than two samples; the flight lasts from 0 s to 20 s"
+        InputError, match="from 30 s to 40 s: fewer than two samples; the flight lasts from 0 s to 20 s"
     ):
-        chosen_part(flight, CRAZYFLIE, begin=30.0)
-
-
-def test_what_is_chosen_is_told():
-    flight = flight_of(hovering(rest=((0, 3), (12, 12.2))))
-    part, note = chosen_part(flight, CRAZYFLIE)
-    assert note is not None
-    assert "used is 3.30 to 12.00 s of 0.00 to 20.00 s" in note.replace("11.99", "12.00").replace("3.31", "3.30")
-    assert "1 other usable stretch is left out" in note
-    grounded = flight_of(hovering(rest=((0, 20),)))
-    part, note = chosen_part(grounded, CRAZYFLIE)
-    assert part is grounded
-    assert note is not None
-    assert "no stretch of the flight looks usable (mostly: on the ground)" in note
+        cut(flight, Stretch(30.0, 40.0))
 
 
 # Excitation

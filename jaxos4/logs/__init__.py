@@ -10,7 +10,6 @@ from .excited import Excitation as Excitation, excitation as excitation, gyro_no
 from .resample import averaged as averaged
 from .stretches import (
     Stretch as Stretch,
-    chosen_part as chosen_part,
     cut as cut,
     stretches as stretches,
     usable_stretches as usable_stretches,

@@ -107,36 +107,6 @@ def cut(flight: Flight, stretch: Stretch) -> Flight:
     return Flight(time[part], omega, states, force, flight.result, commanded=flight.commanded)
 
 
-def chosen_part(
-    flight: Flight, airframe: Airframe | None = None, *, begin: float | None = None, end: float | None = None
-) -> tuple[Flight, str | None]:
-    """What an identification should use of a flight, and a note for the user; `None` where that is all of it.
-
-    It is the part from `begin` to `end` [s], where either is given; otherwise the longest usable stretch, or all of
-    the flight where none is usable.
-
-    **Raises:** `InputError` where fewer than two samples lie between `begin` and `end`.
-    """
-    first, last = float(flight.time[0]), float(flight.time[-1])
-    if begin is not None or end is not None:
-        asked = Stretch(first if begin is None else begin, last if end is None else end)
-        return cut(flight, asked), None
-    parts = stretches(flight, airframe)
-    usable = [part for part in parts if not part.reason]
-    if not usable:
-        why = max(parts, key=lambda part: part.length)
-        return flight, f"no stretch of the flight looks usable (mostly: {why.reason}); all of it is used"
-    if len(parts) == 1:
-        return flight, None
-    longest = max(usable, key=lambda part: part.length)
-    others = len(usable) - 1
-    more = "" if others == 0 else f"; {others} other usable {'stretch is' if others == 1 else 'stretches are'} left out"
-    return cut(flight, longest), (
-        f"used is {longest.begin:.2f} to {longest.end:.2f} s of {first:.2f} to {last:.2f} s, the longest stretch in "
-        f"undisturbed flight{more}"
-    )
-
-
 def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
     squares = (omega**2).sum(axis=1)
     usual = squares[squares > 0.1 * squares.max(initial=0.0)]
