@@ -1,10 +1,10 @@
 """How often 95 % intervals hold the truth where flights are dirty: rotors that lag, commands late, vibration, colour.
 
 Each flight is flown at 1 kHz by Runge-Kutta with a truth of its own: rotors that follow their commands with a lag of
-60 ms, 8 ms late, offsets and damping. Its gyro and accelerometer show coloured noise, the rotors' vibration and
-rounding, and lose samples, alone and in bursts. What was recorded is averaged to 4 ms, cut into windows of a quarter of
-a second, and fitted by `fit_vehicle`, whose intervals are asked for the truth. Parameters that a fit holds are not
-counted.
+60 ms, 8 ms late, a thrust between linear and quadratic in them, offsets and damping. Its gyro and accelerometer show
+coloured noise, the rotors' vibration and rounding, and lose samples, alone and in bursts. What was recorded is averaged
+to 4 ms, cut into windows of a quarter of a second, and fitted by `fit_vehicle`, whose intervals are asked for the
+truth. Parameters that a fit holds are not counted.
 """
 
 import json
@@ -36,10 +36,13 @@ CRAZYFLIE = jaxos4.Airframe(
     thrust_coefficient=2.25e-8,
     drag_coefficient=1.34e-10,
     rotor_inertia=1.0e-8,
+    max_rotor_speed=2600.0,
 )
-AIRFRAMES = {"os4": jaxos4.OS4, "crazyflie": CRAZYFLIE}
-TERMS = (*DEFAULT_TERMS, "accelerometer")
-LAG, DELAY = 0.06, 0.008
+# The paper does not say how fast its rotors turn at most: twice as fast as in hover.
+FAST_OS4 = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, 450.0)
+AIRFRAMES = {"os4": FAST_OS4, "crazyflie": CRAZYFLIE}
+TERMS = (*DEFAULT_TERMS, "curve", "accelerometer")
+LAG, DELAY, CURVE = 0.06, 0.008, (0.4, 1.0)
 # Of the truth and of what is fitted [s]; commands come every other millisecond.
 FINE, COARSE, COMMANDED = 1e-3, 4e-3, 2
 WINDOW = 0.25
@@ -63,6 +66,8 @@ def truth_of(model: jaxos4.FlightModel, rng: np.random.Generator) -> np.ndarray:
             values[i] = rng.uniform(0.5, 3.0)
         elif name in ("rotor_lag", "rotor_delay"):
             values[i] = LAG if name == "rotor_lag" else DELAY
+        elif name == "thrust_curve":
+            values[i] = rng.uniform(*CURVE)
     return values
 
 
@@ -75,7 +80,11 @@ def commands(model: jaxos4.FlightModel, truth: np.ndarray, duration: float, rng:
     squares = omega**2 * (1 + HEAVE * np.sin(2 * np.pi * rng.uniform(0.4, 1.5) * t + phase))[:, None]
     axes = zip(("roll", "pitch", "yaw"), ("alpha3", "alpha6", "alpha8"), strict=True)
     trim = np.array([-values[f"{axis}_offset"] / values[alpha] for axis, alpha in axes] + [0.0])
-    omega = np.sqrt(np.maximum(squares + np.linalg.solve(np.asarray(airframe.mixer), trim), 0.0))
+    squares = np.maximum(squares + np.linalg.solve(np.asarray(airframe.mixer), trim), 0.0)
+    # Commands of which the thrust curve makes what these squares of speeds would.
+    curve = values["thrust_curve"]
+    linear = (1 - curve) * float(airframe.max_rotor_speed)
+    omega = (np.sqrt(linear**2 + 4 * curve * squares) - linear) / (2 * curve)
     held = np.arange(omega.shape[0]) // COMMANDED * COMMANDED
     return omega[held]
 

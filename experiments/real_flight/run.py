@@ -3,7 +3,8 @@
 Blocks of 5 s of the roll and pitch flight, from 1 s on: the 1st, 3rd, ... are fitted, the 2nd, 4th, ... tested, the
 same for all estimators. Predictions use the recorded commands, and with `flapping` the recorded specific force along x
 and y as well, as inputs: they say what the vehicle does next, given these, not what a simulator would do without them.
-Torques, and so inertias, are in proportion to the documented thrust, which the accelerometer checks: `thrust_gain`.
+Commands are not rotor speeds: how thrust grows with them is fitted to the accelerometer (`thrust_curve`,
+`thrust_gain`), and torques, so inertias, go with that thrust.
 """
 
 import json
@@ -28,7 +29,7 @@ jax.config.update("jax_enable_x64", True)
 
 AIRFRAME = jaxos4.load_airframe(Path(__file__).with_name("crazyflie.toml"))
 AUTHORS = {"Ix": 1.03e-5, "Iy": 1.11e-5}
-TERMS = ("offset", "damping", "flapping", "lag", "delay", "reaction", "accelerometer")
+TERMS = ("offset", "damping", "flapping", "lag", "delay", "reaction", "curve", "accelerometer")
 FLIGHTS = ("rollpitch", "yaw_a", "yaw_b", "hover")
 HORIZONS = (0.05, 0.1, 0.25, 0.5)
 MEMORIES = (0.0, 0.9, 1.0)
@@ -112,12 +113,12 @@ def worth(predicted: jaxos4.Predictions) -> dict[str, Any]:
 
 
 def inertias(values: Values, std: Values) -> dict[str, Any]:
-    """Ix and Iy [kg m^2] with 95 % intervals, from alpha3 and alpha6."""
-    table = {}
+    """Ix and Iy [kg m^2] with 95 % intervals: thrust_gain / alpha, as torques go with thrust."""
+    table, gain = {}, values["thrust_gain"]
     for name, alpha in INERTIAS.items():
-        low, high = (values[alpha] + sign * NINETY_FIVE * std[alpha] for sign in (-1, 1))
-        # Where the interval of alpha reaches 0, that of the inertia has no upper end.
-        table[name] = {"estimate": 1 / values[alpha], "ci95": [1 / high, 1 / low if low > 0 else None]}
+        estimate = gain / values[alpha]
+        relative = NINETY_FIVE * np.hypot(std[alpha] / values[alpha], std.get("thrust_gain", 0.0) / gain)
+        table[name] = {"estimate": estimate, "ci95": [estimate * (1 - relative), estimate * (1 + relative)]}
     return table
 
 
@@ -227,9 +228,10 @@ def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
 
 
 def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
-    """Equation error with the same terms: alone, and with what shooting found out about lag, delay and what to hold.
+    """Equation error with the same terms: alone, and with what shooting found out about the rotors and what to hold.
 
-    Alone it takes the lag and the delay that leave least of each sample's change of the rates, and holds nothing.
+    Alone it takes the lag and the delay that leave least of each sample's change of the rates, thrust and its curve as
+    documented, and holds nothing else.
     """
     fit, shot, _ = found["ibss"]
     whole = problem_of(parts[0], without(TERMS, "accelerometer"))
@@ -250,30 +252,30 @@ def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
             some.append(regress(memory, held, bare=eqx.tree_at(lambda p: p.flight.states, bare, states))[2])
         return {alpha: float(np.sqrt((PARTS - 1) * np.var([x[alpha] for x in some]))) for alpha in INERTIAS.values()}
 
-    grid = []
+    documented, grid = {"thrust_curve": 1.0}, []
     for lag in (0.01, *LAGS):
         for delay in DELAYS:
-            problem, best_fit, values = regress(0.0, {"rotor_lag": lag, "rotor_delay": delay})
+            problem, best_fit, values = regress(0.0, documented | {"rotor_lag": lag, "rotor_delay": delay})
             row = {"lag": lag, "delay": delay, "one_step": one_step(problem, best_fit.parameters)}
             grid.append(row | {name: 1 / values[alpha] for name, alpha in INERTIAS.items()})
     best = min(grid, key=lambda row: row["one_step"])
-    own = {"rotor_lag": best["lag"], "rotor_delay": best["delay"]}
+    own = documented | {"rotor_lag": best["lag"], "rotor_delay": best["delay"]}
     its = {name: shot[name] for name in own}
     choices = {
-        "alone": own,
-        "own lag, holds what shooting held": own | of_shooting,
-        "lag of shooting": its,
-        "lag of shooting, holds what shooting held": its | of_shooting,
+        "alone": (own, 1.0),
+        "own rotors, holds what shooting held": (own | of_shooting, 1.0),
+        "rotors of shooting": (its, shot["thrust_gain"]),
+        "rotors of shooting, holds what shooting held": (its | of_shooting, shot["thrust_gain"]),
     }
     rows = {}
-    for choice, held in choices.items():
+    for choice, (held, gain) in choices.items():
         for memory in MEMORIES:
             values = regress(memory, held)[2]
             predicted = predict(values, parts[1])
             rows[f"memory {memory:g}, {choice}"] = {
                 "values": values,
                 "held": sorted(held),
-                "inertias": inertias(values, left_out(memory, held)),
+                "inertias": inertias(values | {"thrust_gain": gain}, left_out(memory, held)),
                 "skill": worth(predicted),
                 "minus_this": {
                     name: difference(found[name][2], predicted)
