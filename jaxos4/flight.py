@@ -82,8 +82,8 @@ class Flight(eqx.Module):
     @property
     def inputs(self) -> Inputs:
         """What drives the vehicle."""
-        force = None if self.specific_force is None else held_values(self.specific_force)
         stretches = None if self.stretch is None else Stretches.of(self.stretch)
+        force = None if self.specific_force is None else held_values(self.specific_force, stretches)
         return Inputs(self.omega, self.dt, self.body_velocity, force, stretches)
 
     @property
@@ -99,12 +99,18 @@ def channel_indices(*names: str) -> Array:
     return jnp.array([STATE_NAMES.index(name) for name in names])
 
 
-def held_values(values: Float[Array, "samples columns"]) -> Float[Array, "samples columns"]:
-    """Each column with what was not measured at the value before it, or at its first; 0 where there is none."""
-    index, measured = jnp.arange(values.shape[0])[:, None], ~jnp.isnan(values)
-    last = jax.lax.cummax(jnp.where(measured, index, -1))
-    first = jnp.argmax(measured, axis=0)
-    return jnp.nan_to_num(jnp.take_along_axis(values, jnp.where(last < 0, first, last), axis=0))
+def held_values(
+    values: Float[Array, "samples columns"], stretches: Stretches | None = None
+) -> Float[Array, "samples columns"]:
+    """Each column with what was not measured at the value before it, or after it, in its stretch; 0 where none is."""
+    count = values.shape[0]
+    index, measured = jnp.arange(count)[:, None], ~jnp.isnan(values)
+    first, last = (0, count - 1) if stretches is None else (stretches.first[:, None], stretches.last[:, None])
+    before = jax.lax.cummax(jnp.where(measured, index, -1))
+    after = jax.lax.cummin(jnp.where(measured, index, count), reverse=True)
+    known = (before >= first) | (after <= last)
+    taken = jnp.where(before >= first, before, jnp.minimum(after, count - 1))
+    return jnp.where(known, jnp.nan_to_num(jnp.take_along_axis(values, taken, axis=0)), 0.0)
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:

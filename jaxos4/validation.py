@@ -10,7 +10,8 @@ from jaxtyping import Array, Float, Int
 
 from ._custom_types import Parameters
 from .dynamics import CASCADE_ORDER, State, unstack
-from .shooting import ShootingProblem
+from .flight import Flight
+from .shooting import FASTEST, ShootingProblem
 
 HORIZONS = (0.1, 0.25, 0.5)
 RATES = CASCADE_ORDER[:3]
@@ -70,8 +71,23 @@ def predictions(
     **Raises:** `ValueError` for a flight that is shorter than the longest horizon, or measured no rates.
     """
     flight = problem.flight
-    dt, samples = float(flight.dt), flight.time.shape[0]
-    ahead = np.maximum(np.rint(np.asarray(horizons) / dt).astype(int), 1)
+    dt, ahead = float(flight.dt), _ahead(flight, horizons)
+    start, initial = starts(flight, horizons)
+    rates = np.asarray(flight.states)[:, RATES]
+    rate_problem = ShootingProblem(problem.model, flight, sigma=problem.sigma, channels="rates", method=problem.method)
+    predicted = _predict(rate_problem, parameters, jnp.asarray(start), jnp.asarray(initial), int(ahead.max()))
+    at = start[:, None] + ahead
+    return Predictions(start, ahead * dt, initial, np.asarray(predicted)[:, ahead], rates[at])
+
+
+def starts(
+    flight: Flight, horizons: tuple[float, ...] = HORIZONS
+) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 3"]]:
+    """The samples from which `predictions` predicts a flight, and the rates there.
+
+    **Raises:** as `predictions` does.
+    """
+    dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
     around = int(_AROUND / 2 / dt)
     stretch = np.zeros(samples, dtype=int) if flight.stretch is None else np.asarray(flight.stretch)
     rates = np.asarray(flight.states)[:, RATES]
@@ -81,13 +97,12 @@ def predictions(
     initial = rates[near].mean(axis=1)
     start, initial = start[np.isfinite(initial).all(axis=1)], initial[np.isfinite(initial).all(axis=1)]
     if not start.size:
-        raise ValueError(
-            f"`problem.flight` holds no stretch with measured rates that is longer than {max(horizons)} s."
-        )
-    rate_problem = problem.restrict("rates")
-    predicted = _predict(rate_problem, parameters, jnp.asarray(start), jnp.asarray(initial), int(ahead.max()))
-    at = start[:, None] + ahead
-    return Predictions(start, ahead * dt, initial, np.asarray(predicted)[:, ahead], rates[at])
+        raise ValueError(f"`flight` holds no stretch with measured rates that is longer than {max(horizons)} s.")
+    return start, initial
+
+
+def _ahead(flight: Flight, horizons: tuple[float, ...]) -> Int[np.ndarray, " horizons"]:
+    return np.maximum(np.rint(np.asarray(horizons) / float(flight.dt)).astype(int), 1)
 
 
 @eqx.filter_jit
@@ -119,8 +134,8 @@ def skill(predicted: Predictions) -> Skill:
     told = np.isfinite(predicted.measured)
     errors = np.where(told, predicted.predicted - predicted.measured, 0.0)
     changes = np.where(told, predicted.initial[:, None] - predicted.measured, 0.0)
-    finite = np.isfinite(errors)
-    squares = np.where(finite, np.square(np.where(finite, errors, 0.0)), np.inf)
+    # A prediction that diverged errs by as much as no gyro measures, so that one of many shows, and stays a number.
+    squares = np.square(np.clip(np.nan_to_num(errors, nan=FASTEST), -FASTEST, FASTEST))
     parts = np.array_split(np.arange(errors.shape[0]), min(_PARTS, errors.shape[0]))
 
     def worth(kept: np.ndarray) -> np.ndarray:
@@ -129,14 +144,12 @@ def skill(predicted: Predictions) -> Skill:
             return 1 - squares[kept].sum(axis=0) / reference
 
     everything = np.arange(errors.shape[0])
-    without = (
-        np.stack([worth(np.setdiff1d(everything, part)) for part in parts])
-        if len(parts) > 1
-        else worth(everything)[None]
-    )
+    without = np.stack([worth(np.setdiff1d(everything, part)) for part in parts])
     count = np.maximum(told.sum(axis=0), 1)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt((len(parts) - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
+    if len(parts) == 1:
+        spread = np.full_like(spread, np.nan)
     return Skill(
         rmse=np.sqrt(squares.sum(axis=0) / count),
         persistence=np.sqrt(np.square(changes).sum(axis=0) / count),

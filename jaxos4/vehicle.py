@@ -117,9 +117,10 @@ def fit_vehicle(
     if not _answered(found):
         return _unanswered(last._replace(estimate=found), held, rollouts)
     progress("computing errors")
-    covariance = robust_covariance(used, found.parameters, found.initial_state) / last.share**2
-    # Colour that averages out does not make an error smaller than white noise would.
-    covariance = jnp.where(jnp.isfinite(covariance).all(), covariance, found.covariance)
+    covariance = robust_covariance(used, found.parameters, found.initial_state)
+    # Where flights are too short to tell their noise's colour it is taken as white.
+    told = jnp.isfinite(covariance).all() & (jnp.diagonal(covariance) > 0).all()
+    covariance = jnp.where(told, covariance, found.covariance) / last.share**2
     bound, found = found.std, eqx.tree_at(lambda e: e.covariance, found, covariance)
     return VehicleFit(used, found, held, bound, 1 - last.share, rollouts)
 
@@ -204,8 +205,11 @@ def _growth(residuals: np.ndarray) -> float:
 
     The root of (1 + rho) / (1 - rho), the worst channel's, where neighbouring residuals correlate by rho.
     """
-    power = np.square(residuals).sum(axis=0)
-    neighbours = (residuals[1:] * residuals[:-1]).sum(axis=0)
+    products = residuals[1:] * residuals[:-1]
+    # What was not measured is 0, and no neighbour.
+    pairs = products != 0
+    power = np.where(pairs, (np.square(residuals[1:]) + np.square(residuals[:-1])) / 2, 0.0).sum(axis=0)
+    neighbours = products.sum(axis=0)
     rho = np.clip(neighbours / np.where(power > 0, power, 1.0), 0.0, _MOST_COLOUR)
     return float(np.sqrt(((1 + rho) / (1 - rho)).max()))
 

@@ -125,3 +125,76 @@ def test_what_is_held_out_is_not_fitted_and_all_else_is(vehicle):
 
 def test_the_models_of_the_command_line():
     assert [model.value for model in VehicleModel] == ["published", "corrected", "flight"]
+
+
+def rewritten(path: Path, to: Path, change) -> Path:
+    """A log with its header and its rows changed."""
+    header, *rows = (line.split(",") for line in path.read_text(encoding="utf-8").splitlines())
+    header, rows = change(header, rows)
+    to.write_text("\n".join(",".join(row) for row in (header, *rows)) + "\n", encoding="utf-8")
+    return to
+
+
+def sampled(path: Path, to: Path, dt: float) -> Path:
+    """A log whose samples are `dt` apart."""
+    return rewritten(path, to, lambda h, rows: (h, [[repr(k * dt), *row[1:]] for k, row in enumerate(rows)]))
+
+
+@pytest.mark.parametrize("steps", [(1 / 252,), (1 / 249, 1 / 251), (0.01, 0.00998), (0.004,), (0.0040001, 0.003)])
+def test_no_window_reaches_from_one_stretch_into_the_next(vehicle, tmp_path, steps):
+    airframe = jaxos4.load_airframe(str(vehicle / "airframe.toml"))
+    paths = [sampled(vehicle / "flight1.csv", tmp_path / f"{i}.csv", dt) for i, dt in enumerate(steps)]
+    recorded = load_logs(paths, airframe, Part(None, None, 0.25, None, 0.0))
+    flight = recorded.fitted
+    assert flight.time.shape[0] == recorded.windows * recorded.length
+    assert flight.stretch is not None
+    for stretch in np.asarray(flight.stretch).reshape(recorded.windows, recorded.length):
+        assert np.ptp(stretch) == 0
+    problem = jaxos4.ShootingProblem(
+        jaxos4.FlightModel(airframe, recordings=recorded.recordings),
+        flight,
+        sigma=np.ones(12),
+        channels="rates",
+        windows=recorded.windows,
+    )
+    assert (np.diff(problem.window_of_samples().reshape(recorded.windows, -1)) == 0).all()
+
+
+def test_a_log_counts_once(run, vehicle):
+    flight, airframe = str(vehicle / "flight1.csv"), ("--airframe", str(vehicle / "airframe.toml"))
+    code, _, err = run("estimate", flight, flight, "--model", "flight", *airframe)
+    assert code == 2
+    assert "given twice" in err
+    code, _, err = run("estimate", flight, "--model", "flight", *airframe, "--validate", flight)
+    assert code == 2
+    assert "--validate" in err
+    assert "is fitted" in err
+
+
+def test_commands_and_speeds_do_not_mix(run, vehicle, tmp_path):
+    def as_speeds(header, rows):
+        return [name.replace("command", "omega") for name in header], [
+            [row[0], *(repr(500 * float(x)) for x in row[1:5]), *row[5:]] for row in rows
+        ]
+
+    speeds = rewritten(vehicle / "flight2.csv", tmp_path / "speeds.csv", as_speeds)
+    files = str(vehicle / "flight1.csv"), str(speeds)
+    code, _, err = run("estimate", *files, "--model", "flight", "--airframe", str(vehicle / "airframe.toml"))
+    assert code == 2
+    assert "some of these logs hold commands" in err
+
+
+def test_what_cannot_be_predicted_is_told_before_the_fit(run, vehicle, tmp_path):
+    def rarely(header, rows):
+        at = header.index("q")
+        return header, [row if k % 10 == 0 else [*row[:at], "", *row[at + 1 :]] for k, row in enumerate(rows)]
+
+    rare = rewritten(vehicle / "flight2.csv", tmp_path / "rare.csv", rarely)
+    out = tmp_path / "out.json"
+    code, _, err = run(
+        *("estimate", str(vehicle / "flight1.csv"), "--model", "flight", "--validate", str(rare)),
+        *("--airframe", str(vehicle / "airframe.toml"), "--out", str(out)),
+    )
+    assert code == 2
+    assert "nothing is long enough to be predicted 0.5 s ahead" in err
+    assert not out.exists()

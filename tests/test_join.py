@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
+from jaxos4.dynamics import Stretches
+from jaxos4.flight import held_values
 from jaxos4.logs.resample import average
 
 
@@ -181,3 +183,12 @@ def test_vibration_above_the_new_rate_does_not_fold_down():
     assert np.abs(found[1:-1]).max() < 1e-9
     taken = y[::4]
     assert np.abs(taken).max() > 0.25
+
+
+def test_what_is_held_stays_in_its_stretch():
+    nan = np.nan
+    values = jnp.array([[nan, 1.0, nan, 2.0, nan, nan, nan, nan, 5.0, nan]]).T
+    number = jnp.array([0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
+    found = held_values(values, Stretches.of(number))[:, 0]
+    np.testing.assert_array_equal(found, [1, 1, 1, 2, 0, 0, 5, 5, 5, 5])
+    np.testing.assert_array_equal(held_values(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])

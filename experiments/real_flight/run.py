@@ -294,7 +294,7 @@ def lag_sensitivity(fit: jaxos4.VehicleFit, parts: tuple[list, list], lags: list
         model = jaxos4.hold(whole, held | {"rotor_lag": lag})
         problem = eqx.tree_at(lambda p: p.model, fit.problem, model)
         found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(model))
-        covariance = jaxos4.robust_covariance(problem, found.parameters, found.initial_state)
+        covariance = jaxos4.robust_covariance(problem, found.parameters, found.initial_state) / (1 - fit.cut) ** 2
         values = dict(zip(model.parameter_names, found.parameters.tolist(), strict=True))
         std = dict(zip(model.parameter_names, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
         at_quarter = worth(predict(values | held | {"rotor_lag": lag}, parts[1]))

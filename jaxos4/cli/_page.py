@@ -143,13 +143,15 @@ def print_vehicle(console: Console, report: dict[str, Any]) -> None:
         console.print(f"held, {why}: {', '.join(held)}.", highlight=False, markup=False)
     inertias = {name: row for name, row in report["constants"].items() if isinstance(row, dict)}
     if inertias:
-        told = [f"{name} {row['estimate']:.4g} +- {NINETY_FIVE * row['std']:.2g}" for name, row in inertias.items()]
-        why = next(iter(inertias.values()))["note"]
-        console.print(f"inertias [kg m^2], {why}: {', '.join(told)}.", highlight=False, markup=False)
+        told = [
+            f"{name} {row['estimate']:.4g} +- {NINETY_FIVE * row['std']:.2g} ({row['note']})"
+            for name, row in inertias.items()
+        ]
+        console.print(f"inertias [kg m^2], 95 %: {', '.join(told)}.", highlight=False, markup=False)
     noise = ", ".join(f"{name} {value:.2g}" for name, value in report["noise"].items())
     console.print(
         f"left unexplained in a window (rad/s, m/s^2): {noise}; the intervals allow for its colour. "
-        f"Outliers cut: {100 * report['cut']:.0f} %.",
+        f"Outliers cut: {100 * report['cut']:.0f} % (of Gaussian noise it would be 18 %).",
         highlight=False,
     )
     _print_skill(console, report["skill"])
@@ -166,8 +168,8 @@ def _print_skill(console: Console, skill: dict[str, Any] | None) -> None:
     if skill is None:
         return
     console.print(
-        "Predictions of what was not fitted: 1 is perfect, 0 as good as rates that stay as they are "
-        f"({skill['starts']} starts).",
+        "Predictions of what was not fitted: 1 is perfect, 0 as good as rates that stay as they are; +- one standard "
+        f"error ({skill['starts']} starts).",
         highlight=False,
     )
     table = _table(("ahead", "p", "q", "r", "equation error: p, q, r"))

@@ -23,6 +23,8 @@ HOLDOUT = 0.25
 # What is held out comes in blocks of this length [s], so that every part of a flight is in both.
 BLOCK = 5.0
 _MOST_PARTS = 3
+# Sample times that differ by less may be taken as one.
+_NEARLY = 1.01
 
 
 class Recorded(NamedTuple):
@@ -30,14 +32,23 @@ class Recorded(NamedTuple):
 
     - `fitted`, `tested`: one flight each, of all stretches; NaN where the other has its part. `None`: nothing held out.
     - `recordings`: the log that each stretch is from.
+    - `length`: of a window, in samples.
+    - `force_axes`: along which of x, y, z every log measured the specific force.
     - `seconds`: fitted, and tested.
     """
 
     fitted: Flight
     tested: Flight | None
     recordings: tuple[int, ...]
+    length: int
+    force_axes: tuple[bool, bool, bool]
     seconds: tuple[float, float]
     notes: tuple[str, ...]
+
+    @property
+    def windows(self) -> int:
+        """How many windows there are: none reaches from one stretch into the next."""
+        return self.fitted.time.shape[0] // self.length
 
 
 class Part(NamedTuple):
@@ -53,6 +64,9 @@ class Part(NamedTuple):
 def load_logs(paths: list[Path], airframe: Airframe, part: Part) -> Recorded:
     """Several logs as one flight of stretches that can be used, cut into whole windows."""
     _check(part)
+    for number, path in enumerate(paths):
+        if any(path.exists() and other.exists() and path.samefile(other) for other in paths[:number]):
+            raise InputError(f"{path}: given twice; a log counts once.")
     notes: list[str] = []
     parts: list[tuple[int, Flight]] = []
     for number, path in enumerate(paths):
@@ -63,11 +77,18 @@ def load_logs(paths: list[Path], airframe: Airframe, part: Part) -> Recorded:
         pieces, note = _pieces(path, flight, airframe, part)
         notes += [] if note is None else [f"{path}: {note}"]
         parts += [(number, piece) for piece in pieces]
-    step = max(SAMPLE, *(float(flight.dt) for _, flight in parts)) if part.sample is None else part.sample
+    if len({piece.commanded for _, piece in parts}) > 1:
+        raise InputError(f"{paths[0]}: some of these logs hold commands, others rotor speeds; fit them by themselves.")
+    slowest = max(float(flight.dt) for _, flight in parts)
+    step = max(SAMPLE if part.sample is None else part.sample, slowest)
+    if part.sample is not None and step > part.sample * _NEARLY:
+        raise InputError(f"--sample-time {part.sample:g}: there is a sample every {slowest:.4g} s only.")
     length = round(part.window / step)
     if length < 4:
         raise InputError(f"--window {part.window:g}: less than four samples of {step:g} s; give at least {4 * step:g}.")
-    even = [(number, _evened(paths[number], flight, step)) for number, flight in parts]
+    least = (length - 1) * step
+    long = [(number, flight) for number, flight in parts if float(flight.time[-1] - flight.time[0]) >= least / _NEARLY]
+    even = [(number, with_body_velocity(averaged(flight, step))) for number, flight in long]
     kept = [(number, flight) for number, flight in even if flight.time.shape[0] >= length]
     if not kept:
         raise InputError(f"{paths[0]}: no part is as long as --window {part.window:g}; give a shorter one.")
@@ -80,7 +101,18 @@ def load_logs(paths: list[Path], airframe: Airframe, part: Part) -> Recorded:
     together = join([flight for _, flight in kept], length=length)
     fitted, tested = _held_out(together, length, part.holdout)
     seconds = tuple(0.0 if f is None else float((~jnp.isnan(f.states[:, 7])).sum() * f.dt) for f in (fitted, tested))
-    return Recorded(fitted, tested, tuple(number for number, _ in kept), (seconds[0], seconds[1]), tuple(notes))
+    axes = [
+        all(not np.isnan(np.asarray(flight.channels)[:, 12 + axis]).all() for _, flight in kept) for axis in range(3)
+    ]
+    return Recorded(
+        fitted,
+        tested,
+        tuple(number for number, _ in kept),
+        length,
+        (axes[0], axes[1], axes[2]),
+        (seconds[0], seconds[1]),
+        tuple(notes),
+    )
 
 
 def _pieces(path: Path, flight: Flight, airframe: Airframe, part: Part) -> tuple[list[Flight], str | None]:
@@ -110,12 +142,6 @@ def _pieces(path: Path, flight: Flight, airframe: Airframe, part: Part) -> tuple
         f"{seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {told}"
         f"{'; ...' if len(refused) > _MOST_PARTS else ''} (--from and --to override)"
     )
-
-
-def _evened(path: Path, flight: Flight, step: float) -> Flight:
-    if float(flight.dt) > step * 1.01:
-        raise InputError(f"{path}: --sample-time {step:g}: it has a sample every {float(flight.dt):.4g} s only.")
-    return with_body_velocity(averaged(flight, step))
 
 
 def _held_out(flight: Flight, length: int, share: float) -> tuple[Flight, Flight | None]:

@@ -22,16 +22,18 @@ from ..held import hold
 from ..inertia import fit_inertia
 from ..results import result_names
 from ..shooting import ShootingProblem
-from ..validation import Predictions, Skill, predictions, skill
+from ..validation import HORIZONS, Predictions, Skill, predictions, skill, starts
 from ..vehicle import VehicleFit, fit_vehicle
 from ._bracket_file import load_bracket
 from ._json import finite
-from ._recordings import Part, load_logs
+from ._recordings import Part, Recorded, load_logs
 
 # Where the search for the noise levels begins [rad/s]: more the model's errors than the sensor's.
 FIRST_SIGMA = 0.5
 # How a network is trained that only has to say where to look in flights cut into windows.
 _SEED_STEPS, _SEED_BATCH = 500, 64
+# Of the regression that predictions are compared with: the best of those tried on real flights.
+_MEMORY = 0.9
 # [GiB] of output error's dense Jacobian; a few of its size are needed.
 _MOST_DENSE = 1.0
 # Which alpha is torque over which inertia.
@@ -56,16 +58,26 @@ def identify_vehicle(
     begin = time.perf_counter()
     vehicle = load_airframe(airframe)
     recorded = load_logs(logs, vehicle, part)
-    model = FlightModel(vehicle, terms=_terms(terms, recorded.fitted, vehicle), recordings=recorded.recordings)
+    model = FlightModel(vehicle, terms=_terms(terms, recorded, vehicle), recordings=recorded.recordings)
     where = Bracket.default(model) if bracket is None else load_bracket(bracket, model)
-    other = recorded.tested
-    notes = recorded.notes
+    other, seconds, notes = recorded.tested, recorded.seconds[1], recorded.notes
     if validate is not None:
-        elsewhere = load_logs([validate], vehicle, part._replace(begin=None, end=None, holdout=0.0))
-        other, notes = elsewhere.fitted, notes + elsewhere.notes
+        elsewhere = _other_log(logs, validate, recorded, model, part)
+        other, seconds, notes = elsewhere.fitted, elsewhere.seconds[0], notes + elsewhere.notes
+    if other is not None:
+        try:
+            starts(other)
+        except ValueError:
+            remedy = "give another one" if validate is not None else "give --holdout 0 or --validate"
+            raise InputError(
+                f"{validate or logs[0]}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
+            ) from None
     for note in notes:
         console.print(f"note: {note}", markup=False, highlight=False)
-    problem = _problem(model, recorded.fitted, part)
+    sigma = np.full(12, FIRST_SIGMA)
+    problem = ShootingProblem(
+        model, recorded.fitted, sigma=sigma, channels="rates", method="rk4", windows=recorded.windows
+    )
     measured = (~np.isnan(np.asarray(problem.measured()))).sum()
     if measured <= len(model.parameter_names) + problem.windows * problem.free_size:
         raise InputError(
@@ -84,7 +96,7 @@ def identify_vehicle(
         predicted = compared = None
         if fit.answered and other is not None:
             status.update("predicting what was not fitted")
-            predicted, compared = _validate(fit, other, logs[0] if validate is None else validate)
+            predicted, compared = _validate(fit, model, other, same=validate is None)
     report = {
         "estimator": estimator,
         "model": "flight",
@@ -114,7 +126,7 @@ def identify_vehicle(
             "window": part.window,
             "sample_time": float(recorded.fitted.dt),
             "fitted_seconds": recorded.seconds[0],
-            "tested_seconds": recorded.seconds[1],
+            "tested_seconds": seconds,
             "loss": "huber" if huber else "squares",
             "notes": list(notes),
         },
@@ -122,16 +134,28 @@ def identify_vehicle(
     return report, predicted
 
 
-def _terms(asked: str | None, flight: Flight, airframe: Airframe) -> tuple[str, ...]:
+def _other_log(logs: list[Path], validate: Path, recorded: Recorded, model: FlightModel, part: Part) -> Recorded:
+    """The log that is predicted, sampled like those that are fitted, once it is known to serve."""
+    if any(validate.exists() and log.samefile(validate) for log in logs):
+        raise InputError(f"--validate {validate}: is fitted; leave it out: a part of the flight is held out by itself.")
+    alike = part._replace(begin=None, end=None, holdout=0.0, sample=float(recorded.fitted.dt))
+    found = load_logs([validate], model.airframe, alike)
+    lacks = [term for term in model.terms if term != "accelerometer" and not _able(found).get(term, True)]
+    if lacks:
+        raise InputError(f"--validate {validate}: {lacks[0]} needs what it did not measure; give --terms without it.")
+    return found
+
+
+def _able(recorded: Recorded) -> dict[str, bool]:
+    """Of the terms that need more than rates, which have it in every log."""
+    ax, ay, az = recorded.force_axes
+    velocity = recorded.fitted.body_velocity is not None
+    return {"flapping": ax and ay, "velocity": velocity, "drag": velocity and ax and ay, "accelerometer": az}
+
+
+def _terms(asked: str | None, recorded: Recorded, airframe: Airframe) -> tuple[str, ...]:
     """The terms asked for, or those that what was measured allows."""
-    force = np.asarray(flight.channels)[:, 12:]
-    ax, ay, az = (not bool(np.isnan(force[:, i]).all()) for i in range(3))
-    able = {
-        "flapping": ax and ay,
-        "velocity": flight.body_velocity is not None,
-        "drag": flight.body_velocity is not None and ax and ay,
-        "accelerometer": az,
-    }
+    able, flight = _able(recorded), recorded.fitted
     if asked is None:
         chosen = ["offset", "damping", "reaction", *(["lag", "delay"] if flight.commanded else [])]
         if able["velocity"]:
@@ -153,12 +177,6 @@ def _terms(asked: str | None, flight: Flight, airframe: Airframe) -> tuple[str, 
     return tuple(term for term in TERMS if term in names)
 
 
-def _problem(model: FlightModel, flight: Flight, part: Part) -> ShootingProblem:
-    windows = flight.time.shape[0] // round(part.window / float(flight.dt))
-    sigma = np.full(12, FIRST_SIGMA)
-    return ShootingProblem(model, flight, sigma=sigma, channels="rates", method="rk4", windows=windows)
-
-
 def _method(estimator: str):
     if estimator == "ibss":
         return None
@@ -171,19 +189,21 @@ def _hybrid(problem: ShootingProblem, bracket: Bracket) -> Estimate:
     return Hybrid(training.fit(problem, bracket, key=jax.random.key(0)))(problem, bracket)
 
 
-def _validate(fit: VehicleFit, flight: Flight, path: Path) -> tuple[Predictions, dict[str, Any]]:
-    """How far ahead the rates of a flight that was not fitted are predicted, and how regression does with the terms."""
-    problem, found = fit.problem, fit.estimate.parameters
+def _validate(fit: VehicleFit, model: FlightModel, flight: Flight, *, same: bool) -> tuple[Predictions, dict[str, Any]]:
+    """How far ahead the rates of a flight that was not fitted are predicted, and how regression does with the terms.
+
+    `same`: whether it is part of the logs that were fitted, with their offsets.
+    """
 
     def scored(parameters: Array) -> tuple[Predictions, Skill]:
-        try:
-            predicted = predictions(eqx.tree_at(lambda p: p.flight, problem, flight), parameters)
-        except ValueError as error:
-            raise InputError(f"{path}: {error}") from None
+        problem = eqx.tree_at(lambda p: p.flight, fit.problem, flight)
+        if not same:
+            problem, parameters = _another(fit, model, parameters, flight)
+        predicted = predictions(problem, parameters)
         return predicted, skill(predicted)
 
-    predicted, worth = scored(found)
-    _, theirs = scored(_regressed(problem, found))
+    predicted, worth = scored(fit.estimate.parameters)
+    _, theirs = scored(_regressed(fit.problem, fit.estimate.parameters))
     return predicted, {
         "horizons": predicted.horizons.tolist(),
         "starts": worth.starts,
@@ -200,16 +220,31 @@ def _validate(fit: VehicleFit, flight: Flight, path: Path) -> tuple[Predictions,
     }
 
 
+def _another(fit: VehicleFit, model: FlightModel, parameters: Array, flight: Flight) -> tuple[ShootingProblem, Array]:
+    """The vehicle on another flight: of what each recording has its own, the mean."""
+    names, found = fit.problem.model.parameter_names, np.asarray(parameters).tolist()
+    values = dict(zip(names, found, strict=True)) | {name: value for name, (value, _) in fit.held.items()}
+    stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
+    other = FlightModel(model.airframe, terms=model.terms, recordings=(0,) * stretches)
+    recordings = range(1, max(model.recordings) + 2)
+    means = [
+        values[name] if name in values else float(np.mean([values[f"{name}_{i}"] for i in recordings]))
+        for name in other.parameter_names
+    ]
+    problem = ShootingProblem(other, flight, sigma=fit.problem.sigma, channels="rates", method="rk4")
+    return problem, jnp.asarray(means)
+
+
 @eqx.filter_jit
 def _regressed(problem: ShootingProblem, found: Array) -> Array:
     """What regression with the terms finds, told what it cannot find: lag, delay and thrust curve."""
     names = problem.model.parameter_names
     known = {names[i]: found[i] for i in problem.model.driving}
     if not known:
-        return EquationError(memory=0.0).solution(problem, Bracket.default(problem.model))
+        return EquationError(memory=_MEMORY).solution(problem, Bracket.default(problem.model))
     linear = hold(problem.model, known)
     problem = eqx.tree_at(lambda p: p.model, problem, linear)
-    return linear.complete(EquationError(memory=0.0).solution(problem, Bracket.default(linear)))
+    return linear.complete(EquationError(memory=_MEMORY).solution(problem, Bracket.default(linear)))
 
 
 def _parameters(fit: VehicleFit, bracket: Bracket, model: FlightModel) -> dict[str, dict[str, Any]]:
@@ -255,10 +290,14 @@ def _constants(fit: VehicleFit, bracket: Bracket, model: FlightModel) -> dict[st
             whole[to] /= values[gain]
             slopes[to, of], slopes[to, gain] = 1 / values[gain], -whole[to] / values[gain]
     covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(spread)
-    told, note = {}, f"if arms and {'thrust_coefficient' if gain is None else 'mass'} are right"
+    told, thrust = {}, "thrust_coefficient" if gain is None else "mass"
+    notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and drag are right"}
     for name, axis in _TORQUES.items():
         if PARAMETER_NAMES[axis] in names and whole[axis] > 0:
             std = float(np.sqrt(covariance[axis, axis])) / whole[axis] ** 2
-            told[name] = {"estimate": 1 / float(whole[axis]), "std": std, "unit": "kg m^2", "note": note}
+            told[name] = {"estimate": 1 / float(whole[axis]), "std": std, "unit": "kg m^2", "note": notes[name]}
+    # What is held is no evidence for or against a rigid body.
+    if not set(PARAMETER_NAMES) <= set(names):
+        return told
     rigid = fit_inertia(CorrectedOS4(model.airframe), jnp.asarray(whole), jnp.asarray(covariance))
     return {**told, "consistency_p": float(rigid.p_value), "rigid_body": bool(rigid.is_rigid_body)}

@@ -80,7 +80,7 @@ def estimate(
     for target in (out, report):
         if target is not None:
             check_output(target, *flights, Path(airframe), bracket, network, validate)
-    if out is not None and report is not None and out.absolute() == report.absolute():
+    if out is not None and report is not None and out.resolve() == report.resolve():
         raise InputError(f"{out}: --out and --report name one file; give them two.")
     if model == "flight":
         refused = {"--channels": channels, "--network": network}

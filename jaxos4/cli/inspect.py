@@ -179,7 +179,7 @@ def _identifiable(console: Console, flight: Flight, stretch: Stretch, airframe: 
     for each, name in zip(excitation(part), RATES, strict=True):
         column = STATE_NAMES.index(name)
         sigma[column] = max(float(np.nan_to_num(each.noise)), sigma[column])
-    windows = max(round(stretch.length / WINDOW), 1)
+    windows = min(max(round(stretch.length / WINDOW), 1), part.time.shape[0] // 2)
     problem = ShootingProblem(model, part, sigma=sigma, channels="rates", windows=windows)
     known = identifiability(problem, Bracket.default(model), model.alpha)
     names, notes = model.parameter_names, known.notes(model.parameter_names)

@@ -9,6 +9,8 @@ from jaxtyping import Float
 from ..flight import Flight
 
 UNIFORM = 0.01  # of dt: rows no further from a grid stand as they were recorded
+# Sample times that differ by less than this share are one: as in `join`.
+_SAME_STEP = 1e-6
 REACH = 1.5  # times dt: measured samples further apart have a gap between them
 _HALF = 0.45  # of a coarser sample: less of it measured is not measured; the first and the last have half of theirs
 ROUNDING = 1e-6  # of dt: times no further from a grid are the grid, rounded
@@ -75,7 +77,7 @@ def resample(
 
 def averaged(flight: Flight, dt: float) -> Flight:
     """A flight on a coarser grid of step `dt` [s]: see `average`. Itself where its own step is no finer."""
-    if dt <= float(flight.dt) * (1 + UNIFORM):
+    if dt <= float(flight.dt) * (1 + _SAME_STEP):
         return flight
     t, omega, channels = (np.asarray(x) for x in (flight.time, flight.omega, flight.channels))
     time, omega, channels = average(t, omega, channels, dt)
