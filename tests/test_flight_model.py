@@ -312,7 +312,7 @@ SUBSETS = [
 def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     count = max(recordings) + 1
     for terms in SUBSETS:
-        model = jaxos4.FlightModel(terms=terms, recordings=recordings)
+        model = jaxos4.FlightModel(FULL, terms=terms, recordings=recordings)
         names = model.parameter_names
         size = 8 + sum(
             len(NAMES[term]) * (count if term in ("offset", "gyro_bias") else 1) for term in terms
@@ -334,6 +334,11 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
         *NAMES["offset"],
         *NAMES["lag"],
     )
+
+
+def test_a_thrust_curve_needs_a_full_scale():
+    with pytest.raises(ValueError, match="max_rotor_speed"):
+        jaxos4.FlightModel(terms=("curve",))
 
 
 @pytest.mark.parametrize("terms", [("wind",), ("lag", "lag"), ("lag", "Lag")])
