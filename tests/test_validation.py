@@ -178,7 +178,7 @@ def test_a_single_start_has_a_skill_without_a_spread():
 def test_flights_that_are_too_short_or_without_rates_are_refused():
     model = jaxos4.CorrectedOS4()
     flight = flown(model, seconds=0.4)
-    with pytest.raises(ValueError, match=r"`problem.flight` holds no stretch .* longer than 0.5 s"):
+    with pytest.raises(ValueError, match=r"`flight` holds no stretch .* longer than 0.5 s"):
         spread(model, flight)
     long = flown(model, seconds=3.0)
     with pytest.raises(ValueError, match="no stretch with measured rates"):
