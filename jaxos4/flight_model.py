@@ -390,7 +390,9 @@ def _own(value: Scalar | None) -> Scalar:
     return value
 
 
-def _delayed(omega: RotorSpeeds, samples: Scalar, first: Int[Array, " samples"], last: Int[Array, " samples"]):
+def _delayed(
+    omega: RotorSpeeds, samples: Scalar, first: Int[Array, " samples"], last: Int[Array, " samples"]
+) -> RotorSpeeds:
     """Commands `samples` later, between samples by cubics that join smoothly (Catmull and Rom 1974).
 
     A delay of whole samples is exact, and the derivative in the delay has no jumps that a search could end at. What a

@@ -78,12 +78,13 @@ def identify_vehicle(
     problem = ShootingProblem(
         model, recorded.fitted, sigma=sigma, channels="rates", method="rk4", windows=recorded.windows
     )
-    measured = (~np.isnan(np.asarray(problem.measured()))).sum()
-    if measured <= len(model.parameter_names) + problem.windows * problem.free_size:
+    there = ~np.isnan(np.asarray(problem.measured()))
+    measured, unknowns = there.sum(), len(model.parameter_names) + problem.windows * problem.free_size
+    if measured <= unknowns:
         raise InputError(
             f"{logs[0]}: {measured} measurements are too few for windows of {part.window:g} s; use longer."
         )
-    dense = problem.measured().size * (len(model.parameter_names) + problem.windows * problem.free_size) * 8 / 2**30
+    dense = there.size * unknowns * 8 / 2**30
     if estimator == "output-error" and dense > _MOST_DENSE:
         raise InputError(
             f"--estimator output-error: its Jacobian would take {dense:.0f} GiB in {problem.windows} windows; "
