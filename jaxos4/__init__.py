@@ -15,50 +15,39 @@ from .airframe import (
     load_airframe as load_airframe,
     plus_layout as plus_layout,
 )
+from .analysis.diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
+from .analysis.fisher import cramer_rao_bound as cramer_rao_bound, fisher_information as fisher_information
+from .analysis.huber import winsorised as winsorised
+from .analysis.identifiability import Identifiability as Identifiability, identifiability as identifiability
+from .analysis.inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia
+from .analysis.prediction import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
+from .analysis.sandwich import robust_covariance as robust_covariance
 from .bracket import Bracket as Bracket
-from .diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
-from .dynamics import (
-    DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH,
-    AbstractModel as AbstractModel,
-    CorrectedOS4 as CorrectedOS4,
-    InertialOS4 as InertialOS4,
-    PublishedOS4 as PublishedOS4,
-)
 from .errors import InputError as InputError, TrainingError as TrainingError
+from .estimate import AbstractEstimator as AbstractEstimator, Estimate as Estimate
 from .estimators import (
     IBSS as IBSS,
     SVSF as SVSF,
-    AbstractEstimator as AbstractEstimator,
     EquationError as EquationError,
-    Estimate as Estimate,
     Hybrid as Hybrid,
     JointEKF as JointEKF,
-    NetworkEstimator as NetworkEstimator,
     OutputError as OutputError,
     Profile as Profile,
     RecursiveLeastSquares as RecursiveLeastSquares,
-    TrainedNetwork as TrainedNetwork,
-    load_network as load_network,
     profile_likelihood as profile_likelihood,
-    save_network as save_network,
 )
-from .excitation import (
-    chirp as chirp,
-    doublet as doublet,
-    multisine as multisine,
-    step3211 as step3211,
-)
+from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
 from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight, join as join
-from .flight_model import TERMS as TERMS, FlightModel as FlightModel
-from .held import HeldParameters as HeldParameters, hold as hold
-from .identifiability import Identifiability as Identifiability, identifiability as identifiability
-from .inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia
-from .information import (
-    cramer_rao_bound as cramer_rao_bound,
-    fisher_information as fisher_information,
-    robust_covariance as robust_covariance,
-)
+from .identification.vehicle import VehicleFit as VehicleFit, fit_vehicle as fit_vehicle
 from .logs import read_flight as read_flight, write_flight as write_flight
+from .models.abstract import DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH, AbstractModel as AbstractModel
+from .models.corrected import CorrectedOS4 as CorrectedOS4
+from .models.held import HeldParameters as HeldParameters, hold as hold
+from .models.inertial import InertialOS4 as InertialOS4
+from .models.published import PublishedOS4 as PublishedOS4
+from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
+from .networks.file import load_network as load_network, save_network as save_network
+from .networks.network import NetworkEstimator as NetworkEstimator, TrainedNetwork as TrainedNetwork
 from .noise import (
     SENSOR_SIGMA as SENSOR_SIGMA,
     AbstractNoise as AbstractNoise,
@@ -70,10 +59,7 @@ from .noise import (
     WhiteNoise as WhiteNoise,
 )
 from .results import RESULTS as RESULTS, result_names as result_names
-from .robust import winsorised as winsorised
 from .shooting import ShootingProblem as ShootingProblem
-from .simulate import simulate as simulate
-from .validation import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
-from .vehicle import VehicleFit as VehicleFit, fit_vehicle as fit_vehicle
+from .simulation import simulate as simulate
 
 __version__ = _version("jaxos4")

@@ -5,7 +5,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Parameters, as_float
-from .dynamics import AbstractModel
+from .models.abstract import AbstractModel
+
+# How an estimator uses a bracket: the largest standard deviation of an identifiable parameter, in half-widths.
+# Only where to search: the flight must tell more than the bracket did.
+NO_PRIOR = 1.0
+# As a Gaussian prior of one half-width: the flight must tell at least as much as the prior.
+GAUSSIAN_PRIOR = 0.5**0.5
+# As a uniform prior, whose standard deviation is 0.577 half-widths.
+UNIFORM_PRIOR = 0.5
 
 
 class Bracket(eqx.Module):
@@ -47,6 +55,16 @@ class Bracket(eqx.Module):
         """Whether every interval is finite and has its lower end below its upper one."""
         width = self.upper - self.lower
         return ((width > 0) & (width < float("inf"))).all()
+
+    def identifies(self, std: Float[ArrayLike, " parameters"], prior: float = NO_PRIOR) -> Bool[Array, " parameters"]:
+        """Whether each parameter is identifiable: its standard deviation is finite and small against the bracket.
+
+        **Arguments:**
+
+        - `std`: of each parameter, in its unit.
+        - `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
+        """
+        return as_float(std) <= prior * self.half_width
 
     @property
     def usable(self) -> "Bracket":

@@ -1,6 +1,7 @@
 """What a flight recorded: rotor speeds in, rates, attitude, velocity and position out."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._custom_types import RotorSpeeds, Scalar, States, as_float
-from .dynamics import Inputs, Stretches
 from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
@@ -29,6 +29,39 @@ def _optional_float(x: ArrayLike | None) -> Array | None:
 
 def _success() -> RESULTS:
     return RESULTS.successful
+
+
+class Stretches(NamedTuple):
+    """For each sample of joined flights: the `number` of its uninterrupted stretch, and that one's ends.
+
+    Numbers count from 0, in order. `first`, `last`: samples.
+    """
+
+    number: Int[Array, " samples"]
+    first: Int[Array, " samples"]
+    last: Int[Array, " samples"]
+
+    @classmethod
+    def of(cls, number: Int[Array, " samples"]) -> "Stretches":
+        """With the ends found."""
+        return cls(number, jnp.searchsorted(number, number), jnp.searchsorted(number, number, side="right") - 1)
+
+
+class Inputs(NamedTuple):
+    """What drives a vehicle, on the time grid of its flight.
+
+    - `omega`: rotor speeds, measured or commanded [rad/s].
+    - `dt`: the sample time [s].
+    - `velocity`: along the body's axes [m/s], where that is known.
+    - `force`: the measured specific force along the body's axes [m/s^2], where a model takes it as an input.
+    - `stretches`: which uninterrupted stretch each sample belongs to; `None`: all to one.
+    """
+
+    omega: RotorSpeeds
+    dt: Scalar
+    velocity: Float[Array, "samples 3"] | None = None
+    force: Float[Array, "samples 3"] | None = None
+    stretches: Stretches | None = None
 
 
 class Flight(eqx.Module):

@@ -3,6 +3,9 @@
 import equinox as eqx
 import numpy as np
 
+NINETY_FIVE = 1.959963984540054
+"""So many standard deviations to either side hold 95 % of a Gaussian."""
+
 
 class RESULTS(eqx.Enumeration):
     """How a simulation or an estimate ended. Codes are for this process only: store names (`result_names`)."""

@@ -15,10 +15,11 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar, StateVector, as_float
-from .dynamics import CASCADE_ORDER, CHANNELS, AbstractModel, Forcing, Inputs, State, unstack
-from .flight import CHANNEL_NAMES, STATE_NAMES, Flight
+from .flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
+from .models.abstract import AbstractModel
+from .models.state import CASCADE_ORDER, CHANNELS, Forcing, State, unstack
 from .noise import FORCE_SIGMA
-from .simulate import STEPPERS
+from .simulation import STEPPERS
 
 # A body rate [rad/s] that no quadrotor reaches, and no gyro measures: beyond it a trial trajectory has diverged.
 FASTEST = 1e3
@@ -33,12 +34,12 @@ _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2
 class Rows(NamedTuple):
     """A window as the scan reads it, or a batch of them: a leaf a channel. `measured` is NaN where it says nothing.
 
-    `push` is the forcing's derivative in the parameters that it depends on, of a model in which it does.
+    `forcing_tangents` is the forcing's derivative in the parameters that it depends on, of a model in which it does.
     """
 
     forcing: Forcing
     measured: tuple[Float[Array, "*windows rows"], ...]
-    push: Forcing | None = None
+    forcing_tangents: Forcing | None = None
 
 
 class Shot(NamedTuple):
@@ -168,23 +169,23 @@ class ShootingProblem(eqx.Module):
 
     def forcing(self, parameters: Parameters) -> Forcing:
         """What the rotors do in the whole flight, sample by sample."""
-        return self.model.drive(self.flight.inputs, parameters)
+        return self.model.forcing(self.flight.inputs, parameters)
 
-    def driven(
+    def with_forcing(
         self, rows: Rows, parameters: Parameters, *, inputs: Inputs | None = None, tangents: bool = False
     ) -> Rows:
         """`rows` with the forcing of these parameters, and its tangents if wanted; untouched where it has none.
 
         `inputs`: `flight.inputs`, prepared once where this is called in a loop.
         """
-        driving = np.asarray(self.model.driving, dtype=int)
+        driving = np.asarray(self.model.forcing_parameters, dtype=int)
         if not driving.size:
             return rows
         inputs = self.flight.inputs if inputs is None else inputs
 
         def forcing(values: Float[Array, " driving"]) -> Forcing:
             # What parameters do not change is taken from `rows`.
-            made = self.model.drive(inputs, parameters.at[driving].set(values))
+            made = self.model.forcing(inputs, parameters.at[driving].set(values))
             return self._windowed(made._replace(recording=(), velocity=None, lateral=None))
 
         def whole(forcing: Forcing, of: Forcing) -> Forcing:
@@ -195,7 +196,7 @@ class ShootingProblem(eqx.Module):
             return rows._replace(forcing=whole(forcing(values), rows.forcing))
         slopes, made = jax.jacfwd(lambda x: (forcing(x),) * 2, has_aux=True)(values)
         still = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, driving.size), leaf.dtype), rows.forcing)
-        return rows._replace(forcing=whole(made, rows.forcing), push=whole(slopes, still))
+        return rows._replace(forcing=whole(made, rows.forcing), forcing_tangents=whole(slopes, still))
 
     def _windowed(self, forcing: Forcing) -> Forcing:
         """Sample by sample into window by window: without a copy where all windows are of one length."""
@@ -264,7 +265,7 @@ class ShootingProblem(eqx.Module):
 
     def curvatures(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Curvature:
         """Of each window, in the parameters and its own initial state."""
-        rows = self.driven(self.rows(), parameters, tangents=True)
+        rows = self.with_forcing(self.rows(), parameters, tangents=True)
         return jax.vmap(self.curvature, in_axes=(0, None, 0))(rows, parameters, self.split(initial_state))
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
@@ -296,12 +297,14 @@ class ShootingProblem(eqx.Module):
             return self.step(state, forcing, scalars), self.model.observe(state, forcing, scalars)
 
         def linearised(state: State, tangent: State, row: Rows):
-            if row.push is None:
+            if row.forcing_tangents is None:
                 at, push = jax.linearize(lambda x, a: advance(x, row.forcing, a), state, scalars)
                 return at, jax.vmap(push)(tangent, parameter_tangents)
             at, push = jax.linearize(advance, state, row.forcing, scalars)
-            driving = np.asarray(self.model.driving)
-            forcing = jax.tree.map(lambda slope: jnp.zeros(unknowns, dtype=float).at[driving].set(slope), row.push)
+            driving = np.asarray(self.model.forcing_parameters)
+            forcing = jax.tree.map(
+                lambda slope: jnp.zeros(unknowns, dtype=float).at[driving].set(slope), row.forcing_tangents
+            )
             return at, jax.vmap(push)(tangent, forcing, parameter_tangents)
 
         def step(carry: tuple[State, State, Curvature], row: Rows):

@@ -17,7 +17,7 @@ from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 import jaxos4
-from jaxos4.dynamics import CASCADE_ORDER, CHANNELS, stack, unstack
+from jaxos4.models.state import CASCADE_ORDER, CHANNELS, stack, unstack
 
 MODELS = [jaxos4.PublishedOS4, jaxos4.CorrectedOS4]
 every_model = pytest.mark.parametrize("model_class", MODELS)
@@ -216,7 +216,7 @@ def test_the_published_model_is_no_rigid_body():
 def test_a_shallower_state_gives_the_same_derivative(model_class):
     model = model_class()
     state, omega, alpha = (jnp.asarray(x[0]) for x in random_points(1))
-    forcing = jax.tree.map(lambda leaf: leaf[0], model.forcing(omega[None]))
+    forcing = jax.tree.map(lambda leaf: leaf[0], model.rotor_forcing(omega[None]))
     full = stack(model.cascade(unstack(state[CASCADE_ORDER]), forcing, alpha))
     for size in CHANNELS.values():
         part = stack(model.cascade(unstack(state[CASCADE_ORDER[:size]]), forcing, alpha))

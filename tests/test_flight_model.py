@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import jaxos4
-from jaxos4.dynamics import CASCADE_ORDER, Inputs, Stretches
-from jaxos4.flight_model import DEFAULT_TERMS
+from jaxos4.flight import Inputs, Stretches
+from jaxos4.models.state import CASCADE_ORDER
+from jaxos4.models.vehicle import DEFAULT_TERMS
 
 ALL = tuple(jaxos4.TERMS)
 RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "flapping", "drag"))
@@ -128,7 +129,7 @@ def seen(model, omega, dt, *, method="rk4"):
 def test_without_terms_it_is_the_corrected_model():
     model, plain = jaxos4.FlightModel(terms=()), jaxos4.CorrectedOS4()
     omega = jaxos4.multisine(jaxos4.OS4, duration=2.0)
-    driven, forced = model.drive(Inputs(omega, jnp.asarray(0.01)), model.alpha), plain.forcing(omega)
+    driven, forced = model.forcing(Inputs(omega, jnp.asarray(0.01)), model.alpha), plain.rotor_forcing(omega)
     for name in forced._fields[:5]:
         atol = 1e-13 * np.abs(getattr(forced, name)).max()
         np.testing.assert_allclose(getattr(driven, name), getattr(forced, name), rtol=1e-13, atol=atol)
@@ -136,7 +137,7 @@ def test_without_terms_it_is_the_corrected_model():
     np.testing.assert_array_equal(model.half_width, plain.half_width)
     assert model.parameter_names == plain.parameter_names
     assert model.parameter_units == plain.parameter_units
-    assert (model.is_linear, model.driving, model.force_axes, model.observes_states) == (True, (), (), True)
+    assert (model.is_linear, model.forcing_parameters, model.force_axes, model.observes_states) == (True, (), (), True)
     for method in ("euler", "rk4"):
         flights = [jaxos4.simulate(m, plain.alpha, omega, dt=0.01, method=method).states for m in (model, plain)]
         np.testing.assert_allclose(*flights, rtol=1e-11, atol=1e-12)
@@ -181,10 +182,10 @@ def test_flapping_is_the_measured_force_as_an_input():
     filled = force.copy()
     filled[10:14, 0], filled[:3, 1] = force[9, 0], force[3, 1]
     plain = jaxos4.CorrectedOS4()
-    rates, forcing = np.zeros((101, 3)), plain.forcing(jnp.asarray(omega))
+    rates, forcing = np.zeros((101, 3)), plain.rotor_forcing(jnp.asarray(omega))
     for k in range(100):
         at = jax.tree.map(lambda leaf, k=k: leaf[k], forcing)
-        slope = np.array(plain.angular_acceleration(jaxos4.dynamics.Rates(*rates[k]), at, plain.alpha))
+        slope = np.array(plain.angular_acceleration(jaxos4.models.state.Rates(*rates[k]), at, plain.alpha))
         slope[:2] += VALUES["roll_flapping"] * filled[k, 1], VALUES["pitch_flapping"] * filled[k, 0]
         rates[k + 1] = rates[k] + 0.01 * slope
     np.testing.assert_allclose(found, rates, rtol=1e-10, atol=1e-12)
@@ -226,7 +227,7 @@ def test_the_filter_is_the_recursion(counts):
     values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True)) | {"rotor_lag": lag}
     given = None if len(counts) == 1 else jnp.asarray(stretch)
     inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretches=None if given is None else Stretches.of(given))
-    found = model.drive(inputs, jnp.array(list(values.values())))
+    found = model.forcing(inputs, jnp.array(list(values.values())))
     decay, here = np.exp(-dt / lag), np.empty_like(omega)
     for k in range(samples):
         restart = k == 0 or stretch[k] != stretch[k - 1]
@@ -249,8 +250,8 @@ def test_a_lag_too_short_to_show_is_as_short_as_can_be_told():
     model = jaxos4.FlightModel(terms=("lag",))
     omega = jnp.asarray(commands(0.5, 0.01))
     for lag in (-1.0, 0.0, 1e-6):
-        found = model.drive(Inputs(omega, jnp.asarray(0.01)), model.alpha.at[8].set(lag))
-        plain = jaxos4.CorrectedOS4().forcing(omega)
+        found = model.forcing(Inputs(omega, jnp.asarray(0.01)), model.alpha.at[8].set(lag))
+        plain = jaxos4.CorrectedOS4().rotor_forcing(omega)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found) if leaf is not None)
         # What is left is the straight line over the sample in which the command changes.
         assert np.abs(found.thrust - plain.thrust)[5:].max() < 0.1 * np.ptp(np.asarray(plain.thrust))
@@ -259,7 +260,7 @@ def test_a_lag_too_short_to_show_is_as_short_as_can_be_told():
 def delayed(omega, delay, dt=0.01, stretch=None):
     model = jaxos4.FlightModel(terms=("delay",))
     inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretches=None if stretch is None else Stretches.of(stretch))
-    return model.drive(inputs, model.alpha.at[8].set(delay)).residual_speed
+    return model.forcing(inputs, model.alpha.at[8].set(delay)).residual_speed
 
 
 @pytest.mark.parametrize("samples", [-3, -1, 0, 1, 2, 7])
@@ -324,7 +325,7 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
         assert np.all(np.isfinite(model.half_width) & (model.half_width > 0))
         assert model.alpha.dtype == model.half_width.dtype == jnp.float64
         driving = {"rotor_lag", "rotor_delay", "thrust_curve"} & set(names)
-        assert {names[i] for i in model.driving} == driving
+        assert {names[i] for i in model.forcing_parameters} == driving
         assert model.is_linear == (not driving)
         each = [name for name in names if name.startswith("roll_offset")]
         assert each == ([] if "offset" not in terms else ["roll_offset"] if count == 1 else [f"roll_offset_{i + 1}" for i in range(count)])  # fmt: skip  # noqa: E501

@@ -8,7 +8,8 @@ import pytest
 from helpers import standard_flight
 
 import jaxos4
-from jaxos4.dynamics import Inputs, Rates
+from jaxos4.flight import Inputs
+from jaxos4.models.state import Rates
 
 FLIGHT_MODEL = jaxos4.FlightModel(terms=("offset", "damping", "lag", "delay", "accelerometer", "gyro_bias"))
 # The whole model, and what of it is known.
@@ -53,18 +54,18 @@ def test_a_held_model_is_the_whole_one_with_its_values(model, values):
     np.testing.assert_array_equal(held.without(held.complete(free)), free)
     np.testing.assert_array_equal(held.alpha, held.without(model.alpha))
     np.testing.assert_array_equal(held.half_width, held.without(model.half_width))
-    assert {held.parameter_names[i] for i in held.driving} == {model.parameter_names[i] for i in model.driving} - set(
-        values
-    )
+    assert {held.parameter_names[i] for i in held.forcing_parameters} == {
+        model.parameter_names[i] for i in model.forcing_parameters
+    } - set(values)
     assert held.airframe is model.airframe
     assert (held.force_axes, held.observes_states) == (model.force_axes, model.observes_states)
     omega = jnp.asarray(standard_flight().omega[:20])
     inputs = Inputs(omega, jnp.asarray(0.01))
     for one, other in zip(
-        jax.tree.leaves(held.drive(inputs, tuple(free))), jax.tree.leaves(model.drive(inputs, whole)), strict=True
+        jax.tree.leaves(held.forcing(inputs, tuple(free))), jax.tree.leaves(model.forcing(inputs, whole)), strict=True
     ):
         np.testing.assert_array_equal(one, other)
-    row = jax.tree.map(lambda leaf: leaf[3], model.drive(inputs, whole))
+    row = jax.tree.map(lambda leaf: leaf[3], model.forcing(inputs, whole))
     rates = Rates(*jnp.array([0.3, -0.2, 0.1]))
     np.testing.assert_array_equal(
         jnp.stack(held.angular_acceleration(rates, row, tuple(free))),
@@ -97,7 +98,7 @@ def test_a_model_is_linear_once_what_drives_it_is_known():
     assert not FLIGHT_MODEL.is_linear
     assert not jaxos4.hold(FLIGHT_MODEL, {"rotor_lag": 0.05}).is_linear
     assert jaxos4.hold(FLIGHT_MODEL, driving).is_linear
-    assert jaxos4.hold(FLIGHT_MODEL, driving).driving == ()
+    assert jaxos4.hold(FLIGHT_MODEL, driving).forcing_parameters == ()
     inertial = jaxos4.InertialOS4(jaxos4.CorrectedOS4())
     assert not jaxos4.hold(inertial, {"J_R": 6e-5}).is_linear
     assert jaxos4.hold(jaxos4.CorrectedOS4(), {"alpha7": 0.0}).is_linear

@@ -8,7 +8,7 @@ import pytest
 from helpers import DT, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.estimators import BASELINES
+from jaxos4.estimators import ESTIMATORS
 
 MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
 
@@ -199,9 +199,9 @@ def test_where_the_model_cannot_fly_nothing_is_told():
         jaxos4.identifiability(problem, jaxos4.Bracket(bracket.lower[:4], bracket.upper[:4]), problem.model.alpha)
 
 
-@pytest.mark.parametrize("name", ["ibss", *BASELINES])
+@pytest.mark.parametrize("name", [name for name, kind in ESTIMATORS.items() if not kind.needs_network])
 def test_no_estimator_invents_numbers_for_a_hover_or_a_single_axis(name):
-    estimator = jaxos4.IBSS() if name == "ibss" else BASELINES[name]()
+    estimator = ESTIMATORS[name]()
     identify = eqx.filter_jit(lambda problem: estimator(problem, jaxos4.Bracket.default(problem.model)))
     for omega in (
         jnp.full((501, 4), jaxos4.OS4.hover_speed),

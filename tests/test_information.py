@@ -5,8 +5,8 @@ import pytest
 from helpers import noisy_states, standard_problem
 
 import jaxos4
-from jaxos4.dynamics import CHANNELS
-from jaxos4.information import covariance_of_shared, covariances, inverse_transpose, invert, joint_factor
+from jaxos4.linalg import covariance_of_shared, covariances, inverse_transpose, invert, joint_factor
+from jaxos4.models.state import CHANNELS
 
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
 known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
-from jaxos4.dynamics import Stretches
-from jaxos4.flight import held_values
-from jaxos4.logs.resample import average
+from jaxos4.flight import Stretches, held_values
+from jaxos4.recording.averaging import average
 
 
 def stretch(samples, seed, *, force=False, velocity=False, dt=0.01, start=0.0):

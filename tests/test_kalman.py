@@ -217,7 +217,7 @@ class Slopes(jaxos4.PublishedOS4):
         t = (forcing.roll, forcing.pitch, forcing.yaw)
         p = a3 * t[0] + a1 * t[1] / 100 + a2 * t[2] / 10
         q = a6 * t[1] + a4 * t[2] / 100 + a5 * t[0] / 10
-        return jaxos4.dynamics.Rates(p, q, a8 * t[2] + a7 * t[0] / 100)
+        return jaxos4.models.state.Rates(p, q, a8 * t[2] + a7 * t[0] / 100)
 
 
 def test_a_linear_model_with_a_wide_prior_is_least_squares():

@@ -8,7 +8,7 @@ import scipy.stats
 import xarray as xr
 from synthetic_study import BOUND, LEVELS, RESULTS, SCENARIO, synthetic_study
 
-from jaxos4 import metrics
+from jaxos4.study import metrics
 
 TOLD = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
 

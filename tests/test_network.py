@@ -13,10 +13,10 @@ from helpers import DT, standard_flight
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
-from jaxos4.estimators._regressor import Regressor
-from jaxos4.estimators.network import _regressor
-from jaxos4.features import FEATURES, Coordinates
-from jaxos4.training import draw_many
+from jaxos4.networks.architecture import Regressor
+from jaxos4.networks.features import FEATURES, Coordinates
+from jaxos4.networks.network import _regressor
+from jaxos4.networks.training import draw_many
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 DURATION = 3.0

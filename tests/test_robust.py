@@ -8,8 +8,8 @@ import pytest
 from helpers import DT, noisy_states, standard_flight
 
 import jaxos4
-from jaxos4.dynamics import CASCADE_ORDER
-from jaxos4.robust import CUT
+from jaxos4.analysis.huber import CUT
+from jaxos4.models.state import CASCADE_ORDER
 
 RATE_COLUMNS = CASCADE_ORDER[:3]
 

@@ -6,7 +6,7 @@ import pytest
 from helpers import REFERENCES, euler_trajectory, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.dynamics import CASCADE_ORDER, CHANNELS
+from jaxos4.models.state import CASCADE_ORDER, CHANNELS
 
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
 known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])

@@ -7,7 +7,7 @@ from helpers import DT, REFERENCES, standard_flight
 from scipy.integrate import solve_ivp
 
 import jaxos4
-from jaxos4.simulate import METHODS
+from jaxos4.simulation import METHODS
 
 every_model = pytest.mark.parametrize("model_class", REFERENCES)
 every_method = pytest.mark.parametrize("method", METHODS)

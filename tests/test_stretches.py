@@ -8,15 +8,10 @@ from test_flight_csv import CRAZYFLIE, identical
 
 from jaxos4.errors import InputError
 from jaxos4.flight import Flight
-from jaxos4.logs import (
-    Stretch,
-    cut,
-    excitation,
-    gyro_noise,
-    read_log,
-    stretches,
-    usable_stretches,
-)
+from jaxos4.logs import read_log
+from jaxos4.recording import stretches
+from jaxos4.recording.excited import excitation, gyro_noise
+from jaxos4.recording.stretches import Stretch, cut, usable_stretches
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)

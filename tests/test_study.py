@@ -18,7 +18,6 @@ from hypothesis import given, settings, strategies as st
 from small_study import COMMAND, environment, run_study, specification
 
 import jaxos4
-from jaxos4.estimators import BASELINES
 from jaxos4.flight import STATE_NAMES
 from jaxos4.study import OUTCOMES, Study, cell as cells_module, load_study, open_store, run as run_module
 from jaxos4.study.cell import run_cell
@@ -306,7 +305,7 @@ def test_the_dataset_is_what_the_library_computes(dataset, number, scale):
     )
     bound = jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(problem, truth)))
     where = {"flight": number, "scale": scale}
-    for estimator in (jaxos4.IBSS(), BASELINES["equation-error"]()):
+    for estimator in (jaxos4.IBSS(), jaxos4.EquationError()):
         name = "ibss" if isinstance(estimator, jaxos4.IBSS) else "equation-error"
         found = estimator(problem, bracket)
         of = dataset.sel(where | {"estimator": name}).squeeze()

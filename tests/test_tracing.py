@@ -8,7 +8,7 @@ import pytest
 from helpers import standard_flight
 
 import jaxos4
-from jaxos4.simulate import METHODS
+from jaxos4.simulation import METHODS
 
 DURATION = 0.1
 once = eqx.debug.assert_max_traces(max_traces=1)
@@ -20,9 +20,9 @@ def counted():
     count = [0]
 
     class Counted(jaxos4.PublishedOS4):
-        def forcing(self, omega):
+        def rotor_forcing(self, omega):
             count[0] += 1
-            return super().forcing(omega)
+            return super().rotor_forcing(omega)
 
     return Counted, count
 

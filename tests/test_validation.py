@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxos4
-from jaxos4.validation import Predictions
+from jaxos4.analysis.prediction import Predictions
 
 DT = 0.01
 HORIZONS = (0.1, 0.25, 0.5)

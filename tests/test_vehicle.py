@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxos4
-from jaxos4.vehicle import SECONDARY
+from jaxos4.identification.vehicle import SECONDARY
 
 DT, SECONDS, WINDOWS = 0.01, 4.8, 8
 MODEL = jaxos4.FlightModel(terms=("offset", "damping"))

@@ -17,21 +17,15 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.cli.experiment import (
-    PARAMETERS,
-    brackets_around,
-    count_results,
-    identify,
-    in_words,
-    measure,
-    table_of,
-)
-from jaxos4.estimators import BASELINES
+from jaxos4.cli.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
+from jaxos4.estimators import ESTIMATORS as ALL
 from jaxos4.noise import NOISES
 
 jax.config.update("jax_enable_x64", True)
 
-ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {"ibss": jaxos4.IBSS, **BASELINES}
+ESTIMATORS: dict[str, Callable[[], jaxos4.AbstractEstimator]] = {
+    name: kind for name, kind in ALL.items() if not kind.needs_network
+}
 
 
 def row_of(

@@ -21,9 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxos4
-from jaxos4.flight_model import DEFAULT_TERMS
-from jaxos4.logs.resample import average
-from jaxos4.vehicle import SECONDARY
+from jaxos4.identification.vehicle import SECONDARY
+from jaxos4.models.vehicle import DEFAULT_TERMS
+from jaxos4.recording.averaging import average
 
 jax.config.update("jax_enable_x64", True)
 

@@ -8,8 +8,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxos4.cli.experiment import load_results, write_figure
-from jaxos4.metrics import NOISE_FLOOR
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
+from jaxos4.study.metrics import NOISE_FLOOR
 
 LEVEL = 0.01
 TESTS = {"white_p": "white", "input_p": "free of\ninputs", "level_p": "of the\nnoise's size"}

@@ -22,8 +22,9 @@ import typer
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs import Stretch, cut, read_log, usable_stretches
-from jaxos4.logs.resample import average
+from jaxos4.logs import read_log
+from jaxos4.recording.averaging import average
+from jaxos4.recording.stretches import Stretch, cut, usable_stretches
 
 jax.config.update("jax_enable_x64", True)
 
@@ -218,7 +219,7 @@ def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
     rates, forcing, scalars = flight.states[:, columns], problem.forcing(parameters), tuple(parameters)
 
     def change(rates: jax.Array, forcing) -> jax.Array:
-        return flight.dt * jnp.stack(model.angular_acceleration(jaxos4.dynamics.Rates(*rates), forcing, scalars))
+        return flight.dt * jnp.stack(model.angular_acceleration(jaxos4.models.state.Rates(*rates), forcing, scalars))
 
     rows = jax.tree.map(lambda leaf: leaf[:-1], forcing)
     predicted = (jax.vmap(change)(rates[:-1], rows) + jax.vmap(change)(rates[1:], rows)) / 2

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxos4
-from jaxos4.simulate import METHODS
+from jaxos4.simulation import METHODS
 
 jax.config.update("jax_enable_x64", True)
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from .._files import read_toml
 from ..bracket import Bracket
-from ..dynamics import AbstractModel
 from ..errors import InputError
+from ..models.abstract import AbstractModel
 
 
 def load_bracket(path: Path, model: AbstractModel) -> Bracket:

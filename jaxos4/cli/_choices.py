@@ -6,18 +6,20 @@ from typing import Annotated
 
 import typer
 
-from ..dynamics import CHANNELS, MODELS
-from ..estimators import APPROXIMATORS, BASELINES
+from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
-from ..features import FEATURES
-from ..simulate import METHODS
+from ..models import MODELS
+from ..models.state import CHANNELS
+from ..networks.features import FEATURES
+from ..networks.network import APPROXIMATORS
+from ..simulation import METHODS
 
 Model = StrEnum("Model", list(MODELS))
 Excitation = StrEnum("Excitation", list(EXCITATIONS))
 Method = StrEnum("Method", list(METHODS))
 Channels = StrEnum("Channels", list(CHANNELS))
 InitialState = StrEnum("InitialState", ["free", "known"])
-Estimator = StrEnum("Estimator", list(("ibss", "network", "hybrid", *BASELINES)))
+Estimator = StrEnum("Estimator", list(ESTIMATORS))
 Features = StrEnum("Features", list(FEATURES))
 Approximator = StrEnum("Approximator", list(APPROXIMATORS))
 

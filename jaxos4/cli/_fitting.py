@@ -13,17 +13,20 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from ..airframe import load_airframe
+from ..analysis.fisher import cramer_rao_bound
 from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
 from ..errors import InputError
-from ..estimators import AbstractEstimator, Estimate, NetworkEstimator, TrainedNetwork
+from ..estimate import AbstractEstimator, Estimate
 from ..flight import STATE_NAMES, Flight
-from ..information import cramer_rao_bound
+from ..identification.vehicle import NO_ANSWER
 from ..logs import read_flight_and_notes
+from ..models import MODELS
+from ..models.abstract import AbstractModel
+from ..models.state import CASCADE_ORDER, CHANNELS
+from ..networks.network import NetworkEstimator, TrainedNetwork
 from ..noise import SENSOR_SIGMA
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem
-from ..vehicle import NO_ANSWER
 from ._bracket_file import load_bracket
 from ._choices import Channels, InitialState, Model
 

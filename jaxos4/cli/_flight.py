@@ -10,30 +10,23 @@ import numpy as np
 from jaxtyping import Array, Float
 from rich.console import Console
 
+from ..analysis.diagnostics import Diagnostics, residual_diagnostics
+from ..analysis.identifiability import Identifiability, identifiability
+from ..analysis.inertia import fit_inertia
+from ..analysis.sandwich import robust_covariance
 from ..bracket import Bracket
-from ..diagnostics import Diagnostics, residual_diagnostics
-from ..dynamics import CASCADE_ORDER, PARAMETER_NAMES, AbstractModel
 from ..errors import InputError
-from ..estimators import (
-    BASELINES,
-    IBSS,
-    WITH_PRIOR,
-    AbstractEstimator,
-    Estimate,
-    Hybrid,
-    NetworkEstimator,
-    TrainedNetwork,
-    fit_start,
-    load_network,
-)
+from ..estimate import AbstractEstimator, Estimate, fit_start
+from ..estimators import ESTIMATORS, IBSS, Hybrid
 from ..flight import STATE_NAMES, STATE_UNITS
-from ..identifiability import Identifiability, identifiability
-from ..inertia import fit_inertia
-from ..information import robust_covariance
+from ..identification.vehicle import NO_ANSWER
 from ..logs import read_flight_and_notes
+from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from ..models.state import CASCADE_ORDER
+from ..networks.file import load_network
+from ..networks.network import NetworkEstimator, TrainedNetwork
 from ..results import result_names
 from ..shooting import ShootingProblem
-from ..vehicle import NO_ANSWER
 from ._choices import Channels, Estimator, InitialState, Model
 from ._fitting import fit, fit_network, load_job, problem_of, seen_channels
 from ._json import finite
@@ -41,12 +34,6 @@ from ._page import COLOURED
 
 # How long a network is trained that only has to say where to look.
 SEED_STEPS = 2000
-# Baselines that look at the body rates, whatever else was measured.
-RATES_ONLY = ("equation-error", "rls", "svsf")
-# Those that begin with the bracket as what is known, and mix it with what the flight tells.
-FILTERS = ("svsf", "kalman")
-# Estimators that fit by shooting, and reach the bound: theirs is the covariance that the noise found implies.
-SHOOTING = ("ibss", "hybrid", "output-error")
 # How far apart correlations of residuals are looked at, in samples.
 LAGS = 25
 
@@ -66,14 +53,15 @@ def identify_flight(
     validate: Path | None,
 ) -> dict[str, Any]:
     """The report. Raises `InputError` for what cannot be used."""
-    learned = estimator in ("network", "hybrid")
+    kind = ESTIMATORS[estimator]
+    learned, rates_only = kind.needs_network, kind.looks_at == "rates" and not kind.needs_network
     if network is not None and not learned:
         raise InputError(f"--network: {estimator.value} uses none; say --estimator network or hybrid, or leave it out.")
     if network is not None and estimator == "network" and bracket is not None:
         raise InputError("--bracket: the network looks in the bracket that it was trained in; leave one of them out.")
-    if estimator in RATES_ONLY and channels not in (None, "rates"):
+    if rates_only and channels not in (None, "rates"):
         raise InputError(f"--channels {channels}: {estimator} looks at the rates; use --estimator output-error.")
-    if window is not None and estimator in (*RATES_ONLY, "kalman"):
+    if window is not None and not (kind.shoots or learned):
         raise InputError(f"--window: {estimator} does not shoot; use --estimator ibss, hybrid or output-error.")
     if window is not None and network is not None:
         raise InputError("--window: a network of windows serves one flight alone; leave --network out.")
@@ -89,8 +77,8 @@ def identify_flight(
         console.print(f"note: {note}", markup=False, highlight=False)
 
     begin = time.perf_counter()
-    method: AbstractEstimator = BASELINES[estimator]() if estimator in BASELINES else IBSS()
-    if estimator in RATES_ONLY:
+    method: AbstractEstimator = IBSS() if learned else kind()
+    if rates_only:
         if np.isnan(np.asarray(problem.restrict("rates").flight.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
             raise InputError(f"{flight}: {estimator} needs p, q and r; use --estimator output-error.")
         problem = problem.restrict("rates")
@@ -113,13 +101,13 @@ def identify_flight(
         other = other.restrict(problem.channels) if other.size > problem.size else other
         if np.isnan(np.asarray(other.measured())).all():
             raise InputError(f"{validate}: nothing to compare was measured among the {problem.channels} channels.")
-    problem, found, bound, rollouts = fit(method, problem, where, shoots=estimator in SHOOTING)
+    problem, found, bound, rollouts = fit(method, problem, where, shoots=kind.shoots)
     name = str(result_names(found.result))
     answered = name not in NO_ANSWER
     left = None
     if answered:
         left = _diagnostics(problem, found.parameters, found.initial_state, fitted=True)
-        if estimator in SHOOTING and (left.colour > COLOURED).any():
+        if kind.shoots and (left.colour > COLOURED).any():
             robust = robust_covariance(problem, found.parameters, found.initial_state)
             found = eqx.tree_at(lambda e: e.covariance, found, robust)
     seconds = time.perf_counter() - begin
@@ -131,7 +119,7 @@ def identify_flight(
         "rollouts": rollouts,
         "cost": finite(found.cost),
         "seconds": seconds,
-        "parameters": _parameters(problem, where, found, bound, with_prior=estimator in FILTERS),
+        "parameters": _parameters(problem, where, found, bound, prior=kind.prior),
         "constants": _constants(problem.model, found) if answered else {},
         "fit": {} if left is None else _quality(problem, left),
         "validation": None if other is None or not answered else _validation(problem, found, other, validate),
@@ -155,8 +143,9 @@ def _parameters(
     found: Estimate,
     bound: Float[Array, " parameters"],
     *,
-    with_prior: bool,
+    prior: float,
 ) -> dict[str, dict[str, Any]]:
+    identified = np.asarray(bracket.identifies(found.std, prior))
     table, half_width, model = {}, np.asarray(found.half_width(0.95)), problem.model
     known = None
     if str(result_names(found.result)) not in NO_ANSWER:
@@ -164,9 +153,7 @@ def _parameters(
     for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True)):
         value, std = float(found.parameters[i]), float(found.std[i])
         lower, upper = float(bracket.lower[i]), float(bracket.upper[i])
-        # A network's errors are those of the flight and the bracket together.
-        most = (upper - lower) / 2 * (0.5 if found.calibration is not None else WITH_PRIOR if with_prior else 1.0)
-        told = np.isfinite(std) and std <= most
+        told = bool(identified[i])
         table[name] = {
             "estimate": value if told else None,
             "std": finite(std),

@@ -6,14 +6,13 @@ import rich.box
 from rich.console import Console
 from rich.table import Table
 
-from ..vehicle import NO_ANSWER
+from ..identification.vehicle import NO_ANSWER
+from ..results import NINETY_FIVE
 
 # Residuals whose neighbours correlate by more than this are not noise.
 COLOURED = 0.3
 # The share of fits of true models that a test of all channels' residuals may call wrong.
 SIGNIFICANCE = 0.01
-# Standard deviations to either side that hold 95 % of a Gaussian.
-NINETY_FIVE = 1.96
 
 
 def print_flight(console: Console, report: dict[str, Any]) -> None:

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..airframe import Airframe
-from ..dynamics import CASCADE_ORDER
 from ..errors import InputError
 from ..flight import Flight, join
-from ..flight_model import with_body_velocity
-from ..logs import averaged, cut, read_log, stretches
-from ..logs.stretches import Stretch
+from ..logs import read_log
+from ..models.state import CASCADE_ORDER
+from ..models.vehicle import with_body_velocity
+from ..recording import stretches
+from ..recording.averaging import averaged
+from ..recording.stretches import Stretch, cut
 
 # [s] of a window, and of a sample where a log has more: no quadrotor turns faster than these tell.
 WINDOW, SAMPLE = 0.25, 0.004

@@ -12,18 +12,21 @@ from jaxtyping import Array
 from rich.console import Console
 
 from ..airframe import Airframe, load_airframe
+from ..analysis.inertia import fit_inertia
+from ..analysis.prediction import HORIZONS, Predictions, Skill, predictions, skill, starts
 from ..bracket import Bracket
-from ..dynamics import PARAMETER_NAMES, CorrectedOS4
 from ..errors import InputError
-from ..estimators import EquationError, Estimate, Hybrid, NetworkEstimator, OutputError
+from ..estimate import Estimate
+from ..estimators import EquationError, Hybrid, OutputError
 from ..flight import Flight
-from ..flight_model import TERMS, FlightModel, has_full_scale
-from ..held import hold
-from ..inertia import fit_inertia
+from ..identification.vehicle import VehicleFit, fit_vehicle
+from ..models.abstract import PARAMETER_NAMES
+from ..models.corrected import CorrectedOS4
+from ..models.held import hold
+from ..models.vehicle import TERMS, FlightModel, has_full_scale
+from ..networks.network import NetworkEstimator
 from ..results import result_names
 from ..shooting import ShootingProblem
-from ..validation import HORIZONS, Predictions, Skill, predictions, skill, starts
-from ..vehicle import VehicleFit, fit_vehicle
 from ._bracket_file import load_bracket
 from ._json import finite
 from ._recordings import Part, Recorded, load_logs
@@ -240,7 +243,7 @@ def _another(fit: VehicleFit, model: FlightModel, parameters: Array, flight: Fli
 def _regressed(problem: ShootingProblem, found: Array) -> Array:
     """What regression with the terms finds, told what it cannot find: lag, delay and thrust curve."""
     names = problem.model.parameter_names
-    known = {names[i]: found[i] for i in problem.model.driving}
+    known = {names[i]: found[i] for i in problem.model.forcing_parameters}
     if not known:
         return EquationError(memory=_MEMORY).solution(problem, Bracket.default(problem.model))
     linear = hold(problem.model, known)

@@ -7,14 +7,15 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from ..study import ESTIMATORS, Study, Training, run_here
+from ..estimators import ESTIMATORS
+from ..study import Study, Training, run_here
 from ._studies import carry_out, device_name, summary, use_all_cores
 
 # Shorter training than a network takes at its best: it costs the network, and not the hybrid, which needs no more than
 # the rates' network to know where to look.
 STANDARD = Study(
     title="IBSS, network, hybrid and baselines under sensor noise",
-    estimators=ESTIMATORS,
+    estimators=tuple(ESTIMATORS),
     flights=256,
     network=Training(steps=2000, held_out=5000, hybrid_channels="rates"),
 )

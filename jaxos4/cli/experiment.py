@@ -15,9 +15,9 @@ from rich.table import Table
 from .._custom_types import Key, States
 from .._files import write_atomically
 from ..bracket import Bracket
-from ..dynamics import AbstractModel
-from ..estimators import AbstractEstimator, Estimate
+from ..estimate import AbstractEstimator, Estimate
 from ..flight import Flight
+from ..models.abstract import AbstractModel
 from ..noise import AbstractNoise
 from ..report.style import Style, drawing, pdf, svg
 from ..shooting import ShootingProblem

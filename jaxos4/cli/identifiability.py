@@ -7,11 +7,11 @@ import rich.box
 from rich.console import Console
 from rich.table import Table
 
+from ..analysis.identifiability import Identifiability, identifiability as information_of
 from ..estimators import IBSS
 from ..flight import STATE_NAMES
-from ..identifiability import Identifiability, identifiability as information_of
+from ..identification.vehicle import NO_ANSWER
 from ..results import result_names
-from ..vehicle import NO_ANSWER
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,
@@ -64,7 +64,7 @@ def identifiability(
     names, units = problem.model.parameter_names, problem.model.parameter_units
     notes = known.notes(names)
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
-        shows = f"{limit[i]:.2g} x" if known.told[i] and limit[i] > 0 else "-"
+        shows = f"{limit[i]:.2g} x" if known.identifiable[i] and limit[i] > 0 else "-"
         table.add_row(name, unit, f"{std[i]:.2g}", f"{alone[i]:.2g}", f"{share[i]:.2g}", shows)
     console.print(table, markup=False)
     console.print(

@@ -11,12 +11,15 @@ from rich.console import Console
 from rich.table import Table
 
 from ..airframe import Airframe, load_airframe
+from ..analysis.identifiability import Identifiability, identifiability
 from ..bracket import Bracket
-from ..dynamics import CorrectedOS4
 from ..flight import STATE_NAMES, Flight
-from ..identifiability import Identifiability, identifiability
-from ..logs import Excitation, Stretch, cut, excitation, log_format, read_log, stretches
+from ..logs import log_format, read_log
+from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
+from ..recording import stretches
+from ..recording.excited import Excitation, excitation
+from ..recording.stretches import Stretch, cut
 from ..shooting import ShootingProblem
 from ._check_output import check_output
 from ._choices import OutOption

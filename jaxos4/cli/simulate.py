@@ -7,13 +7,13 @@ import jax
 import typer
 
 from ..airframe import load_airframe
-from ..dynamics import MODELS
 from ..errors import InputError
 from ..excitation import EXCITATIONS
 from ..logs import write_flight
+from ..models import MODELS
 from ..noise import SENSOR_SIGMA, WhiteNoise
 from ..results import RESULTS, result_names
-from ..simulate import simulate as fly
+from ..simulation import simulate as fly
 from ._check_output import check_output
 from ._choices import AirframeOption, Excitation, Method, Model, ModelOption
 

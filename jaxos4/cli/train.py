@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
-from ..estimators import NetworkEstimator, save_network
+from ..networks.file import save_network
+from ..networks.network import NetworkEstimator
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,

@@ -1,31 +1,43 @@
 """Estimators: a `ShootingProblem` and a `Bracket` in, an `Estimate` out; one algorithm a file."""
 
-from ._estimate import (
-    WITH_PRIOR as WITH_PRIOR,
-    AbstractEstimator as AbstractEstimator,
-    Calibration as Calibration,
-    Estimate as Estimate,
-    fit_start as fit_start,
-)
+from ..estimate import AbstractEstimator
+from ..networks.network import TrainedNetwork
 from .equation_error import EquationError as EquationError
 from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS
 from .kalman import JointEKF as JointEKF
-from .network import (
-    APPROXIMATORS as APPROXIMATORS,
-    NetworkEstimator as NetworkEstimator,
-    TrainedNetwork as TrainedNetwork,
-)
-from .network_file import load_network as load_network, save_network as save_network
 from .output_error import OutputError as OutputError
 from .profile import Profile as Profile, profile_likelihood as profile_likelihood
 from .recursive_least_squares import RecursiveLeastSquares as RecursiveLeastSquares
 from .svsf import SVSF as SVSF
 
-BASELINES: dict[str, type[AbstractEstimator]] = {
+ESTIMATORS: dict[str, type[AbstractEstimator]] = {
+    "ibss": IBSS,
+    "network": TrainedNetwork,
+    "hybrid": Hybrid,
     "output-error": OutputError,
     "equation-error": EquationError,
     "rls": RecursiveLeastSquares,
     "svsf": SVSF,
     "kalman": JointEKF,
 }
+"""The estimators by the names that the command line, studies and figures use. A new estimator is one line here."""
+
+
+def make_estimator(name: str, network: TrainedNetwork | None = None) -> AbstractEstimator:
+    """The estimator of that name, with its default settings.
+
+    **Arguments:**
+
+    - `network`: a trained network, for an estimator that needs one.
+
+    **Raises:** `ValueError` for an unknown name, or if the estimator needs a network and there is none.
+    """
+    if name not in ESTIMATORS:
+        raise ValueError(f"`name` must be one of {', '.join(ESTIMATORS)}, got {name!r}.")
+    kind = ESTIMATORS[name]
+    if not kind.needs_network:
+        return kind()
+    if network is None:
+        raise ValueError(f"`network` must be given for {name!r}.")
+    return network if kind is TrainedNetwork else kind(network)  # pyright: ignore[reportCallIssue]

@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Parameters, Scalar
 from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, Rates
-from ..information import invert
+from ..estimate import Estimate, conclude, fit_start
+from ..linalg import invert
+from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
-from ._estimate import Estimate, conclude, fit_start
 
 # The standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It decides
 # what a flight says nothing about, and nothing else.

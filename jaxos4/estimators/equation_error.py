@@ -1,12 +1,14 @@
 """Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares."""
 
+from typing import ClassVar
+
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, Scalar, as_float
-from ..bracket import Bracket
+from ..bracket import NO_PRIOR, Bracket
+from ..estimate import AbstractEstimator, Estimate, check_bracket
 from ..shooting import ShootingProblem
-from ._estimate import AbstractEstimator, Estimate, check_bracket
 from ._regression import (
     Regression,
     answer,
@@ -64,6 +66,11 @@ class EquationError(AbstractEstimator):
     References: Klein and Morelli, Aircraft System Identification, ch. 5; Jategaonkar, Flight Vehicle System
     Identification, ch. 6; Ljung, System Identification, section 7.3.
     """
+
+    looks_at: ClassVar[str] = "rates"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = NO_PRIOR
+    needs_network: ClassVar[bool] = False
 
     memory: Scalar = eqx.field(converter=as_float, default=1.0)
     bridge: int = eqx.field(static=True, default=4)

@@ -1,12 +1,14 @@
 """The hybrid: a network says where to look, and shooting finds the answer there."""
 
+from typing import ClassVar
+
 import equinox as eqx
 
-from ..bracket import Bracket
+from ..bracket import NO_PRIOR, Bracket
+from ..estimate import AbstractEstimator, Estimate
+from ..networks.network import TrainedNetwork
 from ..shooting import ShootingProblem
-from ._estimate import AbstractEstimator, Estimate
 from .ibss import IBSS
-from .network import TrainedNetwork
 
 
 class Hybrid(AbstractEstimator):
@@ -23,6 +25,11 @@ class Hybrid(AbstractEstimator):
     - `network`: a trained network. One that looks at all the channels of the problem makes the shortest search.
     - `ibss`: how to shoot. A seed is close enough for one halving less than a wide bracket takes.
     """
+
+    looks_at: ClassVar[str] = "all"
+    shoots: ClassVar[bool] = True
+    prior: ClassVar[float] = NO_PRIOR
+    needs_network: ClassVar[bool] = True
 
     network: TrainedNetwork
     ibss: IBSS = eqx.field(default_factory=lambda: IBSS(halvings=3))

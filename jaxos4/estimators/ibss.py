@@ -13,7 +13,7 @@ window, a row each, the same parameters in all of them.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,12 +23,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar, as_float
-from ..bracket import Bracket
-from ..dynamics import CHANNELS
-from ..information import covariance_of_shared, covariances, inverse_transpose, joint_factor
+from ..bracket import NO_PRIOR, Bracket
+from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
+from ..linalg import covariance_of_shared, covariances, inverse_transpose, joint_factor
+from ..models.state import CHANNELS
 from ..results import RESULTS
 from ..shooting import ROUNDING, Curvature, Rows, ShootingProblem, Shot
-from ._estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
 
 DIRECTIONS = ("whitened", "coordinate")
 
@@ -93,6 +93,11 @@ class IBSS(AbstractEstimator):
 
     An initial state that is free is searched like the parameters, from the first measurement of each channel.
     """
+
+    looks_at: ClassVar[str] = "all"
+    shoots: ClassVar[bool] = True
+    prior: ClassVar[float] = NO_PRIOR
+    needs_network: ClassVar[bool] = False
 
     directions: str = eqx.field(static=True, default="whitened")
     halvings: int = eqx.field(static=True, default=4)
@@ -286,7 +291,7 @@ class IBSS(AbstractEstimator):
         - `last`: whether to stop at `tolerance`, or coarsely.
         """
         count = bracket.lower.shape[0]
-        size, driving = count + problem.free_size, len(problem.model.driving)
+        size, driving = count + problem.free_size, len(problem.model.forcing_parameters)
         own = size - count
         starts, inputs = problem.split(problem.first_state()[0]), problem.flight.inputs
         limits, finest = self._limits(problem, bracket), _finest(problem, rows)
@@ -300,7 +305,7 @@ class IBSS(AbstractEstimator):
             return jnp.where(shared, slopes.sum(), slopes)
 
         def driven(u, *, tangents: bool = False) -> Rows:
-            return problem.driven(rows, u[0, :count], inputs=inputs, tangents=tangents)
+            return problem.with_forcing(rows, u[0, :count], inputs=inputs, tangents=tangents)
 
         def fly(function, rows, u):
             return jax.vmap(function)(rows, u[:, :count], u[:, count:] if problem.free_size else starts)
@@ -321,7 +326,7 @@ class IBSS(AbstractEstimator):
             here = driven(search.unknowns, tangents=True)
             curvature = fly(problem.curvature, here, search.unknowns)
             information = curvature.information + regular
-            factor, basis = self._directions(information, count, problem.model.driving)
+            factor, basis = self._directions(information, count, problem.model.forcing_parameters)
             slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
             slopes = slopes.at[:, own:].set(slopes[:, own:].sum(axis=0))
             rooms = jax.vmap(lambda direction: _room(search.unknowns, direction, limits), -1, -1)(basis)
@@ -362,7 +367,10 @@ class IBSS(AbstractEstimator):
             moves = (search.unknowns, nothing, nothing, nothing.astype(bool))
             # Of the directions, only the last change what the forcing depends on.
             first = 0 if driving and self.directions == "coordinate" else size - driving
-            for begin, end, rows_at in ((0, first, lambda _: here._replace(push=None)), (first, size, driven)):
+            for begin, end, rows_at in (
+                (0, first, lambda _: here._replace(forcing_tangents=None)),
+                (first, size, driven),
+            ):
                 if begin < end:
                     along_these = functools.partial(along, rows_at)
                     moves = jax.lax.fori_loop(begin, jnp.where(stay, begin, end), along_these, moves)

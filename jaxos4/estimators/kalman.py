@@ -5,7 +5,7 @@ the way: each column of S is a tangent that travels with the state, and a measur
 (Potter's update, one scalar at a time). No matrix is inverted, and P cannot lose its sign in single precision.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar
-from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, stack, unstack
+from ..bracket import GAUSSIAN_PRIOR, Bracket
+from ..estimate import AbstractEstimator, Estimate, check_bracket, check_one_window, conclude
+from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
-from ._estimate import WITH_PRIOR, AbstractEstimator, Estimate, check_bracket, check_one_window, conclude
 
 # The passes end once none moves a parameter by more than this many standard deviations.
 _SETTLED = 0.1
@@ -65,6 +65,11 @@ class JointEKF(AbstractEstimator):
     Discrete Sequential Estimation, on Potter's update; Bell and Cathey 1993, IEEE Trans. Autom. Control 38(2), on
     iterated updates as Gauss-Newton steps.
     """
+
+    looks_at: ClassVar[str] = "all"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = GAUSSIAN_PRIOR
+    needs_network: ClassVar[bool] = False
 
     passes: int = eqx.field(static=True, default=10)
 
@@ -116,7 +121,7 @@ class JointEKF(AbstractEstimator):
             rollouts=last.passes * (count + problem.free_size + 1) + 1,
             sweeps=last.passes,
             sound=sound,
-            most=WITH_PRIOR,
+            prior=self.prior,
             done=last.done,
             history=last.history,
         )

@@ -5,6 +5,8 @@ noise maximum likelihood (Ljung, System Identification, chapter 7; Jategaonkar, 
 chapter 4). The minimiser is optimistix's.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,11 +14,11 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..bracket import Bracket
-from ..dynamics import CHANNELS
-from ..information import cholesky, covariance_of_shared, invert_factor
+from ..bracket import NO_PRIOR, Bracket
+from ..estimate import AbstractEstimator, Estimate, check_bracket, conclude
+from ..linalg import cholesky, covariance_of_shared, invert_factor
+from ..models.state import CHANNELS
 from ..shooting import ShootingProblem
-from ._estimate import AbstractEstimator, Estimate, check_bracket, conclude
 
 Unknowns = Float[Array, " unknowns"]
 
@@ -36,6 +38,11 @@ class OutputError(AbstractEstimator):
     - `tolerance`: of the step, relative and absolute in scaled unknowns, and of the cost.
     - `max_steps`: for each stage.
     """
+
+    looks_at: ClassVar[str] = "all"
+    shoots: ClassVar[bool] = True
+    prior: ClassVar[float] = NO_PRIOR
+    needs_network: ClassVar[bool] = False
 
     tolerance: float = eqx.field(static=True, default=1e-8)
     max_steps: int = eqx.field(static=True, default=100)

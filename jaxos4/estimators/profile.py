@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Scalar, as_float
 from ..bracket import Bracket
-from ..held import HeldParameters
+from ..estimate import AbstractEstimator, Estimate
+from ..models.held import HeldParameters
 from ..shooting import ShootingProblem
-from ._estimate import AbstractEstimator, Estimate
 
 
 class Profile(NamedTuple):

@@ -1,13 +1,15 @@
 """Recursive least squares: equation error sample by sample, with the past forgotten at a chosen pace."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from .._custom_types import Scalar, as_float
-from ..bracket import Bracket
+from ..bracket import NO_PRIOR, Bracket
+from ..estimate import AbstractEstimator, Estimate, check_bracket, check_one_window
 from ..shooting import ShootingProblem
-from ._estimate import AbstractEstimator, Estimate, check_bracket, check_one_window
 from ._regression import (
     answer,
     check_bridge,
@@ -47,6 +49,11 @@ class RecursiveLeastSquares(AbstractEstimator):
 
     Reference: Ljung, System Identification, section 11.2, with exponential forgetting.
     """
+
+    looks_at: ClassVar[str] = "rates"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = NO_PRIOR
+    needs_network: ClassVar[bool] = False
 
     forgetting: Scalar = eqx.field(converter=as_float, default=1.0)
     memory: Scalar = eqx.field(converter=as_float, default=1.0)

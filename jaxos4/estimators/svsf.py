@@ -11,7 +11,7 @@ Phi12 is the derivative of the rates in the parameters, and Phi22 = 1, because p
 and multiplies by it again; here neither is done, so that e = 0 is no case of its own.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,13 +20,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, as_float
-from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, stack, unstack
-from ..information import invert
-from ..shooting import Rows, ShootingProblem
-from ._estimate import (
+from ..bracket import GAUSSIAN_PRIOR, Bracket
+from ..estimate import (
     REACH,
-    WITH_PRIOR,
     AbstractEstimator,
     Estimate,
     check_bracket,
@@ -34,6 +30,9 @@ from ._estimate import (
     conclude,
     fit_start,
 )
+from ..linalg import invert
+from ..models.state import CASCADE_ORDER, stack, unstack
+from ..shooting import Rows, ShootingProblem
 
 # The share of the last pass over which the parameters are averaged.
 _AVERAGED = 0.5
@@ -96,6 +95,11 @@ class SVSF(AbstractEstimator):
     Reference: Habibi 2007, Proc. IEEE 95(5), 1026-1059; Al-Shabi and Habibi 2011, ISRN Signal Processing 725108, for
     the idea of iterating it.
     """
+
+    looks_at: ClassVar[str] = "rates"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = GAUSSIAN_PRIOR
+    needs_network: ClassVar[bool] = False
 
     gamma: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
     rates_layer: Float[Array, ""] = eqx.field(converter=as_float, default=110.0)
@@ -174,7 +178,7 @@ class SVSF(AbstractEstimator):
             rollouts=self.passes * (1 + 3 + count) + rollouts,
             sweeps=self.passes,
             sound=sound,
-            most=WITH_PRIOR,
+            prior=self.prior,
             done=jnp.ones((), dtype=bool),
             history=box.center + box.half_width * history,
         )

@@ -6,11 +6,3 @@ from .csv import (
     read_flight_and_notes as read_flight_and_notes,
     write_flight as write_flight,
 )
-from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
-from .resample import averaged as averaged
-from .stretches import (
-    Stretch as Stretch,
-    cut as cut,
-    stretches as stretches,
-    usable_stretches as usable_stretches,
-)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from .. import metrics
+from ..study import metrics
 from .figures_noise import dodged, error_unit, positive_scales
 from .figures_spread import error_quantiles, nearest_scale, price, rollout_ticks
 from .scenario import bounds, names

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from .. import metrics
+from ..study import metrics
 from .legend import legend
 from .numbers import plain
 from .scenario import bounds, names

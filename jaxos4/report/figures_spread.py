@@ -7,7 +7,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from .. import metrics
+from ..study import metrics
 from .figures_noise import positive_scales
 from .legend import legend
 from .scenario import names

@@ -10,7 +10,8 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from .._files import check_writable, write_atomically
-from ..validation import Predictions
+from ..analysis.prediction import Predictions
+from ..results import NINETY_FIVE
 from .charts import without_nan
 from .numbers import MISSING, plain
 from .page import environment, script_json
@@ -20,7 +21,6 @@ RATE_NAMES = ("p", "q", "r")
 # The horizon that the chart shows first [s], the share of the errors that its bands hold, and of a panel [pixels].
 _SHOWN, _BAND, _HEIGHT = 0.25, 0.95, 190
 # Standard deviations to either side that hold 95 % of a Gaussian.
-_NINETY_FIVE = 1.96
 _DIGITS = 4
 # What the page says elsewhere than in the list of provenance.
 _APART = ("command", "notes")
@@ -199,7 +199,7 @@ def _constants(constants: dict[str, Any]) -> list[ParameterRow]:
             continue
         value, std, interval = row.get("estimate"), row.get("std"), row.get("ci95")
         if interval is None and value is not None and std is not None:
-            interval = [value - _NINETY_FIVE * std, value + _NINETY_FIVE * std]
+            interval = [value - NINETY_FIVE * std, value + NINETY_FIVE * std]
         rows.append(
             ParameterRow(
                 name, row.get("unit") or "", _number(value), _interval(interval), "", row.get("note") or "", False

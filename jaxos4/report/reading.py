@@ -4,9 +4,8 @@ from pathlib import Path
 
 import xarray as xr
 
-from .. import metrics
 from ..errors import InputError
-from ..study import RESULTS_FILE
+from ..study import RESULTS_FILE, metrics
 
 _DIMENSIONS = (*metrics.SCENARIO, "flight", "parameter")
 _VARIABLES = {

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import xarray as xr
 
-from ..metrics import SCENARIO
+from ..study.metrics import SCENARIO
 
 # What one table or figure shows side by side.
 _SHOWN = ("scale", "estimator")

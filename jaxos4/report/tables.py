@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from .. import metrics
+from ..study import metrics
 from .numbers import MISSING, percent, plain
 from .scenario import bounds, names
 

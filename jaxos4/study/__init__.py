@@ -5,7 +5,7 @@ from .cluster import run_on_cluster as run_on_cluster
 from .dataset import assemble as assemble, provenance as provenance, save_dataset as save_dataset
 from .plan import Plan as Plan, plan as plan
 from .run import Step as Step, run_here as run_here
-from .specification import ESTIMATORS as ESTIMATORS, Study as Study, Training as Training, load_study as load_study
+from .specification import Study as Study, Training as Training, load_study as load_study
 from .store import (
     RESULTS_FILE as RESULTS_FILE,
     Store as Store,

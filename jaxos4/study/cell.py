@@ -6,6 +6,7 @@ same bit for bit however many cells are run side by side, in whichever process.
 """
 
 import contextlib
+import dataclasses
 import functools
 import io
 from collections.abc import Iterator
@@ -18,18 +19,21 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
+from ..analysis.fisher import cramer_rao_bound
 from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, CHANNELS, MODELS, AbstractModel
-from ..estimators import BASELINES, IBSS, AbstractEstimator, Estimate, Hybrid, NetworkEstimator, TrainedNetwork
-from ..estimators.network import untrained
+from ..estimate import AbstractEstimator, Estimate
+from ..estimators import IBSS, make_estimator
 from ..excitation import EXCITATIONS
 from ..flight import Flight
-from ..information import cramer_rao_bound
+from ..models import MODELS
+from ..models.abstract import AbstractModel
+from ..models.state import CASCADE_ORDER, CHANNELS
+from ..networks.network import NetworkEstimator, TrainedNetwork, untrained
 from ..noise import NOISES, SENSOR_SIGMA
 from ..results import NAMES, RESULTS, result_names
 from ..shooting import ShootingProblem
-from ..simulate import simulate
-from .specification import NETWORKED, Cell, Scenario, Study
+from ..simulation import simulate
+from .specification import Cell, Scenario, Study
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 # How an estimate ended, as a study counts it: `failed` where the cell could not be computed, `not_run` where it has
@@ -63,7 +67,7 @@ class _Fleet(NamedTuple):
 
 def jobs(study: Study) -> list[Job]:
     """The networks of a study."""
-    networked = (cell.scenario for cell in _scenarios(study) if cell.scenario.estimator in NETWORKED)
+    networked = (cell.scenario for cell in _scenarios(study) if cell.scenario.needs_network)
     return list(dict.fromkeys(job_of(study, scenario) for scenario in networked))
 
 
@@ -134,7 +138,7 @@ def bracket_of(study: Study, model: str, airframe: str, width: float) -> Bracket
 def program_of(study: Study, cell: Cell) -> tuple:
     """Cells of which this is the same are run by the same compiled program."""
     scenario = cell.scenario._replace(noise="", scale=0.0, method="")
-    return scenario, job_of(study, scenario) if scenario.estimator in NETWORKED else None
+    return scenario, job_of(study, scenario) if scenario.needs_network else None
 
 
 def truth_of(study: Study, cell: Cell) -> np.ndarray:
@@ -316,15 +320,10 @@ def _identify(
 
 
 def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:
-    if name in BASELINES:
-        return BASELINES[name]()
-    if name == "ibss":
-        return IBSS(record=_RECORD)
-    if network is None:
-        raise ValueError(f"`network` must be given for {name!r}.")
-    # How long it was trained is no part of the program.
-    timeless: TrainedNetwork = eqx.tree_at(lambda n: n.history, network, jnp.zeros((0, 2)))
-    return timeless if name == "network" else Hybrid(timeless)
+    # The length of the training is no part of the program.
+    timeless = None if network is None else eqx.tree_at(lambda n: n.history, network, jnp.zeros((0, 2)))
+    estimator = make_estimator(name, timeless)
+    return dataclasses.replace(estimator, record=_RECORD) if isinstance(estimator, IBSS) else estimator
 
 
 def _results(study: Study, cell: Cell, flown: _Flown, found: _Found) -> dict[str, np.ndarray]:

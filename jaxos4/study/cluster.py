@@ -15,7 +15,8 @@ import jax
 import msgspec
 
 from ..errors import InputError
-from ..estimators import TrainedNetwork, load_network, save_network
+from ..networks.file import load_network, save_network
+from ..networks.network import TrainedNetwork
 from .cell import jobs, train
 from .run import FAILURES, Step, compute, label_of, network_number
 from .specification import Study

@@ -13,13 +13,13 @@ import tomlkit
 import xarray as xr
 
 from .._files import write_atomically
-from ..dynamics import MODELS
 from ..errors import InputError
-from ..estimators import TrainedNetwork
 from ..flight import STATE_NAMES, STATE_UNITS
-from ..metrics import SCENARIO
-from ..training import CHECK
+from ..models import MODELS
+from ..networks.network import TrainedNetwork
+from ..networks.training import CHECK
 from .cell import LEVELS, OUTCOMES, bracket_of, fly_again, jobs, truth_of
+from .metrics import SCENARIO
 from .specification import AXES, Cell, Study
 from .store import RESULTS_FILE, Store
 

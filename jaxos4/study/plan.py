@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
-from ..estimators import NetworkEstimator
+from ..estimators import ESTIMATORS
+from ..networks.network import NetworkEstimator
 from .cell import job_of
-from .specification import NETWORKED, Scenario, Study
+from .specification import Scenario, Study
 
 # Measured on one core in double precision, at the standard noise: microseconds, and bytes, for a sample of a flight,
 # of the rates and of all channels.
@@ -47,7 +48,7 @@ def plan(study: Study, missing: list[int], devices: int) -> list[Plan]:
         memory = max((_cost(s, 1) * study.batch * _samples(study, s) * devices / 2**20 for s in programs), default=0.0)
         seconds = sum(1e-6 * _cost(cell.scenario, 0) * study.batch * _samples(study, cell.scenario) for cell in own)
         seconds = seconds / devices + _COMPILING * len(programs)
-        wanted = {job_of(study, s) for s in programs} - trained if estimator in NETWORKED else set()
+        wanted = {job_of(study, s) for s in programs} - trained if ESTIMATORS[estimator].needs_network else set()
         trained |= wanted
         step = _TRAINING * NetworkEstimator.batch * study.network.steps
         seconds += sum(_COMPILING + step * job.duration / study.dt for job in wanted)

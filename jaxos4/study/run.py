@@ -13,9 +13,10 @@ import jax
 import numpy as np
 
 from ..errors import InputError, TrainingError
-from ..estimators import TrainedNetwork, save_network
+from ..networks.file import save_network
+from ..networks.network import TrainedNetwork
 from .cell import Job, blank_network, encode, job_of, jobs, program_of, run_cell, train
-from .specification import NETWORKED, Cell, Study
+from .specification import Cell, Study
 from .store import Store
 
 # What a cell that cannot be computed raises: it is kept as failed, with the message, and the study goes on.
@@ -196,7 +197,7 @@ def failed(message: str) -> dict[str, np.ndarray]:
 
 def network_number(study: Study, cell: Cell, needed: list[Job]) -> int | None:
     """The place among the study's networks of the one that a cell needs."""
-    return needed.index(job_of(study, cell.scenario)) if cell.scenario.estimator in NETWORKED else None
+    return needed.index(job_of(study, cell.scenario)) if cell.scenario.needs_network else None
 
 
 def label_of(study: Study, cell: Cell) -> str:

@@ -16,22 +16,20 @@ import numpy as np
 
 from .._files import read_toml
 from ..airframe import PRESETS, Airframe, airframe_from_table
-from ..dynamics import CHANNELS, MODELS
 from ..errors import InputError
-from ..estimators import BASELINES, NetworkEstimator
+from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
+from ..models import MODELS
+from ..models.state import CHANNELS
+from ..networks.network import NetworkEstimator
 from ..noise import NOISES
-from ..simulate import METHODS
+from ..simulation import METHODS
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
-ESTIMATORS = ("ibss", "network", "hybrid", *BASELINES)
-NETWORKED = ("network", "hybrid")
-# What these look at of a flight whose attitude or position was measured too.
-RATES_ONLY = ("network", "equation-error", "rls", "svsf")
 AXES = (
     "models",
     "airframes",
@@ -50,7 +48,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "methods": tuple(METHODS),
     "noises": tuple(NOISES),
     "channels": tuple(CHANNELS),
-    "estimators": ESTIMATORS,
+    "estimators": tuple(ESTIMATORS),
 }
 # A study of more is a mistake in its specification: each cell is a file, and all estimates together must fit in memory.
 _MOST_CELLS = 1_000_000
@@ -88,9 +86,14 @@ class Scenario(NamedTuple):
     estimator: str
 
     @property
+    def needs_network(self) -> bool:
+        """Whether its estimator is made from a trained network."""
+        return ESTIMATORS[self.estimator].needs_network
+
+    @property
     def seen(self) -> str:
         """The channels that the estimator looks at."""
-        return "rates" if self.estimator in RATES_ONLY else self.channels
+        return min(self.channels, ESTIMATORS[self.estimator].looks_at, key=CHANNELS.__getitem__)
 
 
 class Cell(NamedTuple):

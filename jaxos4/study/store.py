@@ -19,7 +19,8 @@ import numpy as np
 
 from .._files import BROKEN, write_atomically
 from ..errors import InputError
-from ..estimators import TrainedNetwork, load_network
+from ..networks.file import load_network
+from ..networks.network import TrainedNetwork
 from .cell import decode
 from .specification import Study, differences
 

@@ -14,15 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._custom_types import Parameters
-from .bracket import Bracket
-from .dynamics import AbstractModel
-from .estimators import IBSS, AbstractEstimator, Estimate
-from .held import hold
-from .information import cramer_rao_bound, robust_covariance
-from .results import result_names
-from .robust import winsorised
-from .shooting import ShootingProblem
+from .._custom_types import Parameters
+from ..analysis.fisher import cramer_rao_bound
+from ..analysis.huber import winsorised
+from ..analysis.sandwich import robust_covariance
+from ..bracket import Bracket
+from ..estimate import AbstractEstimator, Estimate
+from ..estimators import IBSS
+from ..models.abstract import AbstractModel
+from ..models.held import hold
+from ..results import result_names
+from ..shooting import ShootingProblem
 
 # What turns the flow of the air, the gyroscope and the rotors' spin into small torques, and the accelerometer's zero,
 # which looks like a thrust curve: told by few flights.

@@ -5,13 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._custom_types import Parameters, as_float
-from .bracket import Bracket
-from .information import cramer_rao_bound, fisher_information
-from .shooting import ShootingProblem
+from .._custom_types import Parameters, as_float
+from ..bracket import Bracket
+from ..results import NINETY_FIVE
+from ..shooting import ShootingProblem
+from .fisher import cramer_rao_bound, fisher_information
 
-# A parameter is told apart from 0 where it is this many standard deviations away: 95 %.
-_NOISE_FLOOR = 1.959964
 # Parameters that share more than this of a direction that the flight does not tell are named as partners.
 _PARTNER = 0.2
 
@@ -36,7 +35,7 @@ class Identifiability(eqx.Module):
     directions: Float[Array, "parameters parameters"]
 
     @property
-    def told(self) -> Bool[Array, " parameters"]:
+    def identifiable(self) -> Bool[Array, " parameters"]:
         """Whether the flight tells more about each parameter than its bracket did."""
         return self.std <= self.half_width
 
@@ -48,12 +47,12 @@ class Identifiability(eqx.Module):
     @property
     def noise_limit(self) -> Parameters:
         """Multiples of the problem's sigma below which a parameter of nominal size is told apart from 0, with 95 %."""
-        return jnp.abs(self.nominal) / (_NOISE_FLOOR * self.std)
+        return jnp.abs(self.nominal) / (NINETY_FIVE * self.std)
 
     def notes(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of which something must be said, what it is. Of one flight, not of a batch."""
         notes = {}
-        told, excited, limit = (np.asarray(x) for x in (self.told, self.excited, self.noise_limit))
+        told, excited, limit = (np.asarray(x) for x in (self.identifiable, self.excited, self.noise_limit))
         nominal = np.asarray(self.nominal)
         for i, name in enumerate(names):
             if not np.isfinite(self.std[i]):

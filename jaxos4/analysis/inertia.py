@@ -5,10 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._custom_types import Parameters, Scalar, as_float
-from .airframe import inertia_from_alpha
-from .dynamics import AbstractModel, InertialOS4
-from .information import cholesky, invert, invert_factor
+from .._custom_types import Parameters, Scalar, as_float
+from ..airframe import inertia_from_alpha
+from ..linalg import cholesky, invert, invert_factor
+from ..models.abstract import AbstractModel
+from ..models.inertial import InertialOS4
 
 # Gauss-Newton converges quadratically here: the alphas are nearly linear in the constants over their errors.
 _STEPS = 20

@@ -5,7 +5,7 @@ The paper does not state its network; what follows is our choice.
 
 import math
 import statistics
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,17 +16,17 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Scalar, as_float
-from ..bracket import Bracket
-from ..dynamics import CASCADE_ORDER, CHANNELS
+from ..bracket import UNIFORM_PRIOR, Bracket
 from ..errors import TrainingError
-from ..features import FEATURES, AbstractFeatures, Coordinates
+from ..estimate import AbstractEstimator, Calibration, Estimate
 from ..flight import STATE_NAMES
-from ..information import covariances
+from ..linalg import covariances
+from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem
-from ..training import Pair, draw_many, split_key, train
-from ._estimate import AbstractEstimator, Calibration, Estimate
-from ._regressor import Regressor, Scaling, compress, squared_error
+from .architecture import Regressor, Scaling, compress, squared_error
+from .features import FEATURES, AbstractFeatures, Coordinates
+from .training import Pair, draw_many, split_key, train
 
 APPROXIMATORS = ("mlp", "cmac")
 
@@ -44,9 +44,6 @@ _PER_FEATURE = 4
 _RIDGE = 1e-6
 # Flights whose missing samples cost more than this factor in any parameter's precision are another problem.
 _INFLATION = 2.0
-# A bracket alone leaves a standard deviation of 0.577 half-widths. Half a half-width is left where the flight tells no
-# more than a bound of one half-width.
-_VAGUE = 0.5
 # The largest number of features from which a network starts at the best linear answer, and what training may take.
 _MOST_FEATURES = 6000
 _MOST_STEPS = 1_000_000
@@ -187,6 +184,11 @@ class TrainedNetwork(AbstractEstimator):
     interpolated between them.
     """
 
+    looks_at: ClassVar[str] = "rates"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = UNIFORM_PRIOR
+    needs_network: ClassVar[bool] = True
+
     settings: NetworkEstimator
     features: AbstractFeatures
     scaling: Scaling
@@ -271,7 +273,7 @@ class TrainedNetwork(AbstractEstimator):
         deviations = std * coordinates.width[:count]
         shot = problem.shots(parameters, initial_state)
         outside = jnp.abs(answer.u[:count]) > 1 + factors[-1] * std
-        vague = std > _VAGUE
+        vague = std > self.prior
 
         other = jnp.stack(list(self._differences(problem).values())).any()
         other |= (seen.inflation > _INFLATION).any() | (scale > self.settings.noise[1] * (1 + _SAME))

@@ -16,9 +16,9 @@ from .._custom_types import as_float
 from .._files import BROKEN, write_atomically
 from ..airframe import Airframe
 from ..bracket import Bracket
-from ..dynamics import MODELS
 from ..errors import InputError
 from ..flight import Flight
+from ..models import MODELS
 from ..shooting import ShootingProblem
 from .network import NetworkEstimator, TrainedNetwork, untrained
 

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._custom_types import Parameters, Scalar
-from .flight import STATE_NAMES
-from .shooting import ShootingProblem
+from .._custom_types import Parameters, Scalar
+from ..flight import STATE_NAMES
+from ..shooting import ShootingProblem
 
 # Where residuals are cut, in standard deviations: of Gaussian noise the estimate keeps 95 % of its efficiency.
 CUT = 1.345

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._custom_types import Parameters, RotorSpeeds, Scalar, as_float
-from .airframe import Airframe
-from .dynamics import AbstractModel, Attitude, Forcing, Inputs, Rates, State
+from .._custom_types import Parameters, RotorSpeeds, Scalar, as_float
+from ..airframe import Airframe
+from ..flight import Inputs
+from .abstract import AbstractModel
+from .state import Attitude, Forcing, Rates, State
 
 
 class HeldParameters(AbstractModel):
@@ -61,12 +63,12 @@ class HeldParameters(AbstractModel):
     @property
     def is_linear(self) -> bool:
         """As the whole model, or where all that its forcing depends on is held."""
-        return self.model.is_linear or (bool(self.model.driving) and not self.driving)
+        return self.model.is_linear or (bool(self.model.forcing_parameters) and not self.forcing_parameters)
 
     @property
-    def driving(self) -> tuple[int, ...]:
+    def forcing_parameters(self) -> tuple[int, ...]:
         """The whole model's, of those that are left."""
-        return tuple(np.flatnonzero(np.isin(self.free, self.model.driving)).tolist())
+        return tuple(np.flatnonzero(np.isin(self.free, self.model.forcing_parameters)).tolist())
 
     @property
     def force_axes(self) -> tuple[int, ...]:
@@ -98,13 +100,13 @@ class HeldParameters(AbstractModel):
         """The whole model's, of those that are left."""
         return tuple(self.model.parameter_units[i] for i in self.free)
 
-    def forcing(self, omega: RotorSpeeds) -> Forcing:
+    def rotor_forcing(self, omega: RotorSpeeds) -> Forcing:
         """The whole model's."""
-        return self.model.forcing(omega)
+        return self.model.rotor_forcing(omega)
 
-    def drive(self, inputs: Inputs, parameters) -> Forcing:
+    def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The whole model's, with the values in their places."""
-        return self.model.drive(inputs, self.complete(jnp.stack(list(parameters))))
+        return self.model.forcing(inputs, self.complete(jnp.stack(list(parameters))))
 
     def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
         """The whole model's, with the values in their places."""

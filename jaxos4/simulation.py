@@ -11,8 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float
-from .dynamics import CASCADE_ORDER, AbstractModel, Forcing, Inputs, State, stack, unstack
-from .flight import STATE_NAMES, Flight
+from .flight import STATE_NAMES, Flight, Inputs
+from .models.abstract import AbstractModel
+from .models.state import CASCADE_ORDER, Forcing, State, stack, unstack
 from .results import RESULTS
 
 Stepper = Callable[[AbstractModel, State, Forcing, Parameters | tuple[Scalar, ...], Scalar], State]
@@ -110,7 +111,7 @@ def _fly(
         return following, following
 
     first = unstack(start[CASCADE_ORDER])
-    forcing = jax.tree.map(lambda leaf: leaf[:-1], model.drive(Inputs(omega, dt), parameters))
+    forcing = jax.tree.map(lambda leaf: leaf[:-1], model.forcing(Inputs(omega, dt), parameters))
     _, rest = jax.lax.scan(step, first, forcing)
     trajectory = jnp.concatenate([stack(first)[None], stack(rest)])
     states, result = _until_failure(trajectory[:, CASCADE_ORDER.argsort()])

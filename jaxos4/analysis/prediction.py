@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._custom_types import Parameters
-from .dynamics import CASCADE_ORDER, State, unstack
-from .flight import Flight
-from .shooting import FASTEST, ShootingProblem
+from .._custom_types import Parameters
+from ..flight import Flight
+from ..models.state import CASCADE_ORDER, State, unstack
+from ..shooting import FASTEST, ShootingProblem
 
 HORIZONS = (0.1, 0.25, 0.5)
 RATES = CASCADE_ORDER[:3]

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._custom_types import Parameters, Scalar, as_float
-from .shooting import ROUNDING, ShootingProblem
+from .._custom_types import Parameters, Scalar, as_float
+from ..shooting import ROUNDING, ShootingProblem
 
 # Residuals below this share of a channel's largest value are rounding, whatever their correlation; in single precision
 # below as many rounding errors as add up over a flight.

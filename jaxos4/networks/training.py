@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, PyTree
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ._custom_types import Key, Scalar
-from .errors import TrainingError
+from .._custom_types import Key, Scalar
+from ..errors import TrainingError
 from .features import AbstractFeatures
 
 # Steps between two looks at the validation flights.

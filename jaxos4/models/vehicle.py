@@ -10,23 +10,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Int, Num
 
-from ._custom_types import Parameters, RotorSpeeds, Scalar, as_float
-from .airframe import OS4, Airframe
-from .dynamics import (
-    PARAMETER_NAMES,
-    AbstractModel,
-    Attitude,
-    CorrectedOS4,
-    Forcing,
-    Inputs,
-    PublishedOS4,
-    Rates,
-    State,
-    Translation,
-    attitude_rates,
-)
-from .flight import STATE_NAMES, Flight, held_values
-from .trigonometry import sincos
+from .._custom_types import Parameters, RotorSpeeds, Scalar, as_float
+from ..airframe import OS4, Airframe
+from ..flight import STATE_NAMES, Flight, Inputs, held_values
+from ..trigonometry import sincos
+from .abstract import PARAMETER_NAMES, AbstractModel, attitude_rates
+from .corrected import CorrectedOS4
+from .published import PublishedOS4
+from .state import Attitude, Forcing, Rates, State, Translation
 
 # The share of the torque that one pair of rotors makes in hover that an offset may be, and that 5 m/s may make.
 _AUTHORITY = 0.2
@@ -182,10 +173,10 @@ class FlightModel(AbstractModel):
     @property
     def is_linear(self) -> bool:
         """Where lag, delay and thrust curve are no terms."""
-        return not self.driving
+        return not self.forcing_parameters
 
     @property
-    def driving(self) -> tuple[int, ...]:
+    def forcing_parameters(self) -> tuple[int, ...]:
         """Lag, delay and thrust curve."""
         names = ("rotor_lag", "rotor_delay", "thrust_curve")
         return tuple(self._positions[name] for name in names if name in self._positions)
@@ -217,7 +208,7 @@ class FlightModel(AbstractModel):
         values = [self._value(parameters, f"{name}_{i + 1}") for i in range(len(forcing.recording))]
         return sum((share * value for share, value in zip(forcing.recording, values, strict=True)), as_float(0.0))
 
-    def drive(self, inputs: Inputs, parameters) -> Forcing:
+    def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """What rotors make of their commands: delayed, filtered, and turned into torque and thrust.
 
         Over a sample the filter's speed is taken as a straight line, whose mean square makes the mean torque.
@@ -259,9 +250,9 @@ class FlightModel(AbstractModel):
             lateral=None if inputs.force is None or "flapping" not in self.terms else tuple(inputs.force.T[:2]),
         )
 
-    def forcing(self, omega: RotorSpeeds) -> Forcing:
+    def rotor_forcing(self, omega: RotorSpeeds) -> Forcing:
         """Of speeds that the rotors have: see `drive`, which is what commands need."""
-        return CorrectedOS4(self.airframe).forcing(omega)
+        return CorrectedOS4(self.airframe).rotor_forcing(omega)
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """The first three equations of the class."""

@@ -2,22 +2,26 @@
 
 import abc
 import functools
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, Scalar
-from ..bracket import Bracket
-from ..information import invert
-from ..results import RESULTS
-from ..shooting import ShootingProblem
+from ._custom_types import Parameters, Scalar
+from .bracket import NO_PRIOR, Bracket
+from .linalg import invert
+from .results import RESULTS
+from .shooting import ShootingProblem
+
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractClassVar  # what type checkers understand
+else:
+    from equinox import AbstractClassVar
 
 # How many half-widths around its bracket's center an answer may lie.
 REACH = 4.0
-# The standard deviation, in half-widths, where a filter that begins with one half-width owes as much to the flight.
-WITH_PRIOR = 0.5**0.5
 # Towards an initial state with the parameters known: the trajectory is nearly linear in it.
 _START_STEPS = 4
 
@@ -114,7 +118,7 @@ def conclude(
     sound: Bool[Array, ""],
     done: Bool[Array, ""],
     reach: Scalar | float = REACH,
-    most: float = 1.0,
+    prior: float = NO_PRIOR,
     history: Float[Array, "samples parameters"] | None = None,
 ) -> Estimate:
     """What an algorithm found, as an estimate: its result told, and nothing that is not a number passed on.
@@ -124,7 +128,7 @@ def conclude(
     - `sound`: whether the trajectory stayed sound to its end.
     - `done`: whether the search ended by itself.
     - `reach`: how many half-widths around the bracket's center an answer may lie.
-    - `most`: the share of a half-width that the standard deviation of a parameter that is told may be.
+    - `prior`: how the estimator uses the bracket, see `Bracket.identifies`.
     """
     valid, center = bracket.valid, jnp.where(bracket.valid, bracket.center, 0.0)
     std, half_width = jnp.sqrt(jnp.diagonal(covariance)), jnp.where(valid, bracket.half_width, 1.0)
@@ -133,7 +137,7 @@ def conclude(
     sound = sound & jnp.isfinite(cost) & finite
     result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
     result = RESULTS.where((jnp.abs(parameters - center) > limit).any(), RESULTS.at_bound, result)
-    result = RESULTS.where((std > most * half_width).any(), RESULTS.unidentifiable, result)
+    result = RESULTS.where((std > prior * half_width).any(), RESULTS.unidentifiable, result)
     result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
     result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
     told = sound & valid
@@ -176,7 +180,7 @@ def check_one_window(problem: ShootingProblem) -> None:
     """Raises `ValueError` for a problem that a filter cannot walk through: windows, or sensors with their own terms."""
     if problem.windows > 1:
         raise ValueError(f"`problem.windows` must be 1 for this estimator, got {problem.windows}: it shoots none.")
-    if problem.model.driving or not problem.model.observes_states:
+    if problem.model.forcing_parameters or not problem.model.observes_states:
         raise ValueError("`problem.model` must be one without rotor lag, delay, thrust curve or sensor terms: shoot.")
 
 
@@ -188,7 +192,20 @@ def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
 
 
 class AbstractEstimator(eqx.Module):
-    """An algorithm that identifies parameters; its fields are its settings."""
+    """An algorithm that identifies parameters; its fields are its settings.
+
+    What an estimator can do is written on its class:
+
+    - `looks_at`: the most channels that it compares: `"rates"`, `"attitude"` or `"all"`.
+    - `shoots`: whether it minimises the problem's cost. If so, it takes windows, and its errors follow from the noise.
+    - `prior`: how it uses the bracket, one of the constants in `jaxos4.bracket`.
+    - `needs_network`: whether it is made from a trained network.
+    """
+
+    looks_at: AbstractClassVar[str]
+    shoots: AbstractClassVar[bool]
+    prior: AbstractClassVar[float]
+    needs_network: AbstractClassVar[bool]
 
     @abc.abstractmethod
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._custom_types import Key, Parameters, Scalar
-from .bracket import Bracket
-from .dynamics import CASCADE_ORDER
-from .information import cholesky, invert_factor
-from .shooting import FASTEST, ShootingProblem
+from .._custom_types import Key, Parameters, Scalar
+from ..bracket import Bracket
+from ..linalg import cholesky, invert_factor
+from ..models.state import CASCADE_ORDER
+from ..shooting import FASTEST, ShootingProblem
 
 
 class Seen(NamedTuple):

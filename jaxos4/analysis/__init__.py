@@ -1,0 +1,1 @@
+"""What a fit is worth: information, bounds, covariances, residuals, predictions."""

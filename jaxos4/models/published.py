@@ -1,0 +1,57 @@
+"""The model as the paper prints it."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._custom_types import Scalar
+from ..airframe import OS4, Airframe, alpha_from_inertia
+from ..trigonometry import sincos
+from .abstract import AbstractModel
+from .state import Attitude, Forcing, Rates
+
+
+class PublishedOS4(AbstractModel):
+    """The model as the paper prints it, Eqs. (1)-(13), to the letter.
+
+    It departs from rigid-body physics, and is kept as the benchmark it is: the gyroscopic terms lack the rotor speed
+    (alpha2 = J_R d / Ix multiplies q alone, in 1/s), Eq. (2) has alpha5 r where physics has alpha5 p, Eqs. (7)-(9)
+    mix two earth frames. See `CorrectedOS4`.
+    """
+
+    airframe: Airframe = OS4
+
+    @property
+    def alpha(self) -> Float[Array, "8"]:
+        """alpha_1..8 as defined below Eq. (13)."""
+        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
+
+    @property
+    def gyroscopic_factor(self) -> Scalar:
+        """The drag coefficient, as the paper prints alpha2 = J_R d / Ix."""
+        return jnp.asarray(self.airframe.drag_coefficient)
+
+    @property
+    def parameter_units(self) -> tuple[str, ...]:
+        """Units; alpha2 and alpha5 have the unit that Eqs. (1)-(2) need."""
+        return ("1", "1/s", "1/(kg m^2)", "1", "1/s", "1/(kg m^2)", "1", "1/(kg m^2)")
+
+    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
+        """Eqs. (1)-(3)."""
+        p, q, r = rates
+        a1, a2, a3, a4, a5, a6, a7, a8 = parameters
+        return Rates(
+            q * r * a1 - a2 * q + a3 * forcing.roll,
+            p * r * a4 + r * a5 + a6 * forcing.pitch,
+            p * q * a7 + a8 * forcing.yaw,
+        )
+
+    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+        """Eqs. (7)-(9)."""
+        sin_phi, cos_phi = sincos(attitude.phi)
+        sin_theta, cos_theta = sincos(attitude.theta)
+        sin_psi, cos_psi = sincos(attitude.psi)
+        return (
+            (sin_phi * cos_psi - sin_psi * sin_theta * cos_phi) * forcing.thrust,
+            (-sin_psi * sin_phi - sin_theta * cos_phi * cos_psi) * forcing.thrust,
+            cos_theta * cos_phi * forcing.thrust - self.airframe.gravity,
+        )

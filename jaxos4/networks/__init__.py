@@ -1,0 +1,1 @@
+"""Networks that identify a flight: features, training, architecture, file."""
