@@ -1,4 +1,4 @@
-"""Shapes that recur in public signatures, and the two conversions that fields use."""
+"""Shapes that public signatures share, and the two converters of fields."""
 
 from typing import Any
 
@@ -17,13 +17,13 @@ Numeric = Array | np.ndarray
 
 
 def as_float(x: ArrayLike) -> Array:
-    """A strongly typed array of the default floating type, so that equal shapes share one trace."""
+    """Convert to a strongly typed array of the default float type, so that equal shapes share one compiled program."""
     return jnp.asarray(x, dtype=float)
 
 
 def as_constant(x: Any) -> Array | np.ndarray:
-    """A physical constant: kept in double precision by NumPy until a computation rounds it to its own precision.
+    """Keep a physical constant as a NumPy array in double precision, until a computation uses it.
 
-    A module constant made at import would otherwise be rounded before the user had chosen a precision.
+    JAX would round a module's constants at import, before the user has chosen a precision.
     """
     return x if isinstance(x, jax.Array) else np.asarray(x, dtype=np.float64)

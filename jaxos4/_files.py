@@ -1,4 +1,4 @@
-"""Output files that are either whole or as they were before; TOML files that are tables or an error in one line."""
+"""Output files are written completely or not at all. TOML files are read, or refused in one line."""
 
 import contextlib
 import errno
@@ -15,7 +15,7 @@ from typing import Any
 
 from .errors import InputError
 
-# What a file of NumPy arrays that was cut, altered or never was one makes its readers raise.
+# Exceptions that NumPy and zip readers raise for a file that is truncated, altered or of another format.
 BROKEN = (
     ArithmeticError,
     AttributeError,
@@ -33,16 +33,16 @@ BROKEN = (
 
 @contextlib.contextmanager
 def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A path beside `path` to write to, renamed to `path` once the block is done.
+    """Yields a temporary path in the folder of `path`, and renames it to `path` when the block ends.
 
-    Where the block raises, the file beside is removed and an older `path` stays as it was. The name beside keeps the
-    suffix; a link is followed, an older file's mode is kept. A pipe or a device cannot be renamed onto: it is yielded
-    itself.
+    If the block raises, the temporary file is removed and an older `path` does not change. The temporary name keeps
+    the suffix. Links are followed, and the mode of an older file is kept. A pipe or a device cannot be replaced by a
+    rename, so `path` itself is yielded.
 
-        with write_atomically("flight.csv") as beside:
-            beside.write_text(text)
+        with write_atomically("flight.csv") as temporary:
+            temporary.write_text(text)
 
-    **Raises:** `OSError` that names `path` where its folder is missing or `path` is a folder.
+    **Raises:** `OSError` that names `path` if its folder does not exist or `path` is a folder.
     """
     target = check_writable(path)
     if target.exists() and not target.is_file():
@@ -51,24 +51,24 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         except OSError as error:
             raise OSError(error.errno, error.strerror, os.fspath(path)) from None
         return
-    beside = target.with_name(f".{target.stem[:40]}.{secrets.token_hex(4)}.part{target.suffix}")
+    temporary = target.with_name(f".{target.stem[:40]}.{secrets.token_hex(4)}.part{target.suffix}")
     try:
-        yield beside
-        with open(beside, "rb+") as file:
+        yield temporary
+        with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         if target.exists():
-            shutil.copymode(target, beside)
-        os.replace(beside, target)
+            shutil.copymode(target, temporary)
+        os.replace(temporary, target)
     except OSError as error:
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
-    """The file that `path` names, links followed: for asking before a long computation.
+    """Checks before a long computation that `path` can be written, and returns it with links resolved.
 
-    **Raises:** `OSError` that names `path` where its folder is missing or not writable, or `path` is a folder.
+    **Raises:** `OSError` that names `path` if its folder does not exist or is not writable, or if `path` is a folder.
     """
     target = Path(os.path.realpath(path))
     if target.is_dir():
@@ -81,15 +81,15 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The table of a TOML file.
+    """The table in a TOML file.
 
-    **Raises:** `InputError` for what is not TOML; `OSError` where it cannot be read.
+    **Raises:** `InputError` if the file is not TOML; `OSError` if it cannot be read.
     """
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)
     except RecursionError:
-        raise InputError(f"{path}: nested too deeply for a TOML file of this kind; flatten it.") from None
+        raise InputError(f"{path}: its tables are nested too deeply; use fewer levels.") from None
     except ValueError as error:
         what = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: not a TOML file ({what}); correct it there.") from None
+        raise InputError(f"{path}: not a TOML file ({what}); correct that place.") from None

@@ -1,4 +1,4 @@
-"""The physical constants of a quadrotor, published presets, TOML files, and inertia <-> alpha."""
+"""The physical constants of a quadrotor: presets, TOML files, and the conversion between inertia and alpha."""
 
 import math
 from os import PathLike
@@ -29,9 +29,9 @@ class Airframe(eqx.Module):
     - `drag_coefficient`: d, yaw torque = -spin d omega^2 [N m s^2/rad^2].
     - `rotor_inertia`: J_R [kg m^2].
     - `gravity`: g [m/s^2].
-    - `max_rotor_speed`: full-scale rotor speed [rad/s]; infinite where it is not known.
+    - `max_rotor_speed`: full-scale rotor speed [rad/s]; infinite if unknown.
 
-    Any layout of four rotors fits: plus, X, or asymmetric. `plus_layout` gives the paper's.
+    Any layout of four rotors is possible: plus, X, or asymmetric. `plus_layout` makes the layout of the paper.
     """
 
     mass: Float[Numeric, ""] = eqx.field(converter=as_constant)
@@ -46,9 +46,9 @@ class Airframe(eqx.Module):
 
     @property
     def mixer(self) -> Float[Array, "4 4"]:
-        """Rows that turn squared rotor speeds into roll, pitch and yaw torque [N m] and thrust [N].
+        """The matrix that maps squared rotor speeds to roll, pitch and yaw torque [N m] and thrust [N].
 
-        Reference: Eqs. (10)-(13), written for any layout:
+        Reference: Eqs. (10)-(13), generalised to any layout:
         d_roll = sum y_i b w_i^2, d_pitch = -sum x_i b w_i^2, d_yaw = -d sum s_i w_i^2, U_c = sum b w_i^2.
         """
         x, y = jnp.asarray(self.rotor_positions).T
@@ -66,7 +66,7 @@ def plus_layout(arm: float) -> list[tuple[float, float]]:
     return [(arm, 0.0), (0.0, -arm), (-arm, 0.0), (0.0, arm)]
 
 
-# The paper's own Table 1 is not available to us; these numbers are from public literature and code.
+# Table 1 of the paper is not available to us. These values are from public literature and code.
 OS4 = Airframe(  # the values of the OS4 thesis
     mass=0.650,
     inertia=(7.5e-3, 7.5e-3, 1.3e-2),
@@ -104,7 +104,7 @@ def alpha_from_inertia(inertia: Float[ArrayLike, "3"], gyroscopic: Float[ArrayLi
     **Arguments:**
 
     - `inertia`: Ix, Iy, Iz [kg m^2].
-    - `gyroscopic`: what stands over Ix and Iy in alpha2 and alpha5: J_R d as the paper prints it, J_R in physics.
+    - `gyroscopic`: the numerator of alpha2 and alpha5: J_R d in the published model, J_R in the corrected model.
 
     Reference: the definitions below Eq. (13).
     """
@@ -113,7 +113,7 @@ def alpha_from_inertia(inertia: Float[ArrayLike, "3"], gyroscopic: Float[ArrayLi
 
 
 def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tuple[Scalar, ...]:
-    """`alpha_from_inertia`, scalar by scalar: what a scan needs."""
+    """`alpha_from_inertia` with scalars in and out, for use inside a scan."""
     return (
         (iy - iz) / ix,
         gyroscopic / ix,
@@ -127,10 +127,11 @@ def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tup
 
 
 def inertia_from_alpha(alpha: Float[ArrayLike, "8"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Ix, Iy, Iz [kg m^2] and the gyroscopic constant that `alpha` implies: the inverse of `alpha_from_inertia`.
+    """Ix, Iy, Iz [kg m^2] and the gyroscopic constant: the inverse of `alpha_from_inertia`.
 
-    The inertias are the reciprocals of alpha3, 6, 8, which a flight tells best; the constant is the mean of the two
-    that alpha2 and alpha5 imply. alpha1, 4 and 7 are not used: where they disagree, the alphas are no rigid body's.
+    The inertias are the reciprocals of alpha3, alpha6 and alpha8, which a flight determines best. The constant is the
+    mean of the two that alpha2 and alpha5 imply. alpha1, alpha4 and alpha7 are not used: if they disagree with the
+    inertias, no rigid body has these alphas. `jaxos4.fit_inertia` uses all eight.
     """
     a = jnp.asarray(alpha)
     inertia = 1 / a[jnp.array([2, 5, 7])]
@@ -138,13 +139,13 @@ def inertia_from_alpha(alpha: Float[ArrayLike, "8"]) -> tuple[Float[Array, "3"],
 
 
 def load_airframe(source: str | PathLike[str]) -> Airframe:
-    """An airframe from a preset's name (`os4`, `os4-simulator`, `voos`) or from a TOML file.
+    """Load an airframe by the name of a preset (`os4`, `os4-simulator`, `voos`) or from a TOML file.
 
-    The file holds `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, `drag_coefficient`, `rotor_inertia`, either
-    `arm` (plus layout) or `rotor_positions = [[x1, y1], ...]`, and optionally `rotor_spins`, `gravity` and
-    `max_rotor_speed`, in SI units.
+    The keys of the file, in SI units: `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, `drag_coefficient`,
+    `rotor_inertia`; either `arm` (plus layout) or `rotor_positions = [[x1, y1], ...]`; optionally `rotor_spins`,
+    `gravity` and `max_rotor_speed`.
 
-    **Raises:** `InputError` with one line that says what is wrong in which key; `OSError` where it cannot be read.
+    **Raises:** `InputError` with one line that names the wrong key; `OSError` if the file cannot be read.
     """
     if source in PRESETS:
         return PRESETS[str(source)]
@@ -152,7 +153,7 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
         table = read_toml(source)
     except FileNotFoundError:
         raise InputError(
-            f"{source}: neither a file nor one of the presets {', '.join(PRESETS)}; give one of them."
+            f"{source}: neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}."
         ) from None
     try:
         return airframe_from_table(table)
@@ -161,7 +162,7 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
 
 def airframe_from_table(table: dict[str, Any]) -> Airframe:
-    """The airframe in a TOML table, keys as in `load_airframe`. Raises `InputError` that says what is wrong."""
+    """The airframe of a TOML table with the keys of `load_airframe`. Raises `InputError` that names the wrong key."""
     table = dict(table)
     if "arm" in table:
         if "rotor_positions" in table:
@@ -173,13 +174,24 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
     table.setdefault("rotor_spins", ALTERNATING_SPINS)
     missing = [name for name in _SHAPES if name not in table and name not in _OPTIONAL]
     if missing:
-        raise InputError(
-            f"lacks `{missing[0]}`; an airframe needs {', '.join(s for s in _SHAPES if s not in _OPTIONAL)}."
-        )
+        required = ", ".join(name for name in _SHAPES if name not in _OPTIONAL)
+        raise InputError(f"`{missing[0]}` is missing; an airframe needs {required}.")
     unknown = [name for name in table if name not in _SHAPES]
     if unknown:
-        raise InputError(f"knows no key `{unknown[0]}`; the keys are arm, {', '.join(_SHAPES)}.")
+        raise InputError(f"`{unknown[0]}` is not a known key; the keys are arm, {', '.join(_SHAPES)}.")
     constants = {name: _numbers(name, value, _SHAPES[name]) for name, value in table.items()}
+    _check_sizes(constants, table)
+    airframe = Airframe(**constants)
+    mixer = np.asarray(airframe.mixer)
+    scale = np.abs(mixer).max(axis=1, keepdims=True)
+    if np.linalg.matrix_rank(mixer / np.where(scale > 0, scale, 1)) < 4:
+        raise InputError(
+            "`rotor_positions` and `rotor_spins` cannot produce roll, pitch, yaw and thrust independently; correct one."
+        )
+    return airframe
+
+
+def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> None:
     for name in _POSITIVE & constants.keys():
         least, most = (0.0, np.inf) if name == "max_rotor_speed" else (1e-15, 1e6)
         if not np.all((constants[name] > least) & (constants[name] <= most)):
@@ -188,20 +200,16 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
             )
     if constants["rotor_inertia"] < 0:
         raise InputError(f"`rotor_inertia` must not be negative, got {table['rotor_inertia']}.")
-    for name, most in (("rotor_positions", 1e3), ("rotor_inertia", 1e3)):
-        if np.any(np.abs(constants[name]) > most):
+    for name in ("rotor_positions", "rotor_inertia"):
+        if np.any(np.abs(constants[name]) > 1e3):
             raise InputError(f"`{name}` must be of a quadrotor's size in SI units, got {_short(table[name])}.")
     if np.any(np.abs(constants["rotor_spins"]) != 1):
         raise InputError(f"`rotor_spins` must be 1 (counter-clockwise) or -1, got {_short(table['rotor_spins'])}.")
     inertia = constants["inertia"]
     if 2 * inertia.max() > inertia.sum():
-        raise InputError(f"`inertia` {inertia.tolist()} breaks the triangle inequality: no rigid body has it.")
-    airframe = Airframe(**constants)
-    mixer = np.asarray(airframe.mixer)
-    scale = np.abs(mixer).max(axis=1, keepdims=True)
-    if np.linalg.matrix_rank(mixer / np.where(scale > 0, scale, 1)) < 4:
-        raise InputError("`rotor_positions` and `rotor_spins` cannot make roll, pitch, yaw and thrust independently.")
-    return airframe
+        raise InputError(
+            f"`inertia` {inertia.tolist()} breaks the triangle inequality: no moment may exceed the sum of the others."
+        )
 
 
 _SHAPES: dict[str, tuple[int, ...]] = {

@@ -1,4 +1,4 @@
-"""Where the parameters are looked for: an interval for each."""
+"""A bracket: for each parameter the interval in which an estimator searches."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,17 +7,30 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ._custom_types import Parameters, as_float
 from .models.abstract import AbstractModel
 
-# How an estimator uses a bracket: the largest standard deviation of an identifiable parameter, in half-widths.
-# Only where to search: the flight must tell more than the bracket did.
+# The largest standard deviation of an identifiable parameter, in half-widths of its bracket. It depends on how the
+# estimator uses the bracket. As a region to search: the flight must contain more information than the bracket.
 NO_PRIOR = 1.0
-# As a Gaussian prior of one half-width: the flight must tell at least as much as the prior.
+# As a Gaussian prior with a standard deviation of one half-width: the flight must contain as much information as it.
 GAUSSIAN_PRIOR = 0.5**0.5
 # As a uniform prior, whose standard deviation is 0.577 half-widths.
 UNIFORM_PRIOR = 0.5
 
 
+def is_identifiable(
+    std: Float[ArrayLike, "*parameters"], half_width: Float[ArrayLike, "*parameters"], prior: float = NO_PRIOR
+) -> Bool[Array, "*parameters"]:
+    """The rule: a parameter is identifiable if its standard deviation is at most `prior` half-widths of its bracket.
+
+    **Arguments:**
+
+    - `std`, `half_width`: in the unit of each parameter. A standard deviation that is not finite is too large.
+    - `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
+    """
+    return as_float(std) <= prior * as_float(half_width)
+
+
 class Bracket(eqx.Module):
-    """An interval for each parameter, in the parameter's unit."""
+    """An interval from `lower` to `upper` for each parameter, in the parameter's unit."""
 
     lower: Parameters = eqx.field(converter=as_float)
     upper: Parameters = eqx.field(converter=as_float)
@@ -37,7 +50,7 @@ class Bracket(eqx.Module):
 
     @classmethod
     def default(cls, model: AbstractModel) -> "Bracket":
-        """The model's own half-widths around the parameters that its airframe implies."""
+        """The bracket around the parameters that the model's airframe implies, with the model's half-widths."""
         return _default(model)
 
     @property
@@ -52,26 +65,20 @@ class Bracket(eqx.Module):
 
     @property
     def valid(self) -> Bool[Array, ""]:
-        """Whether every interval is finite and has its lower end below its upper one."""
+        """Whether every interval is finite and its lower end is below its upper end."""
         width = self.upper - self.lower
         return ((width > 0) & (width < float("inf"))).all()
 
     def identifies(self, std: Float[ArrayLike, " parameters"], prior: float = NO_PRIOR) -> Bool[Array, " parameters"]:
-        """Whether each parameter is identifiable: its standard deviation is finite and small against the bracket.
-
-        **Arguments:**
-
-        - `std`: of each parameter, in its unit.
-        - `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
-        """
-        return as_float(std) <= prior * self.half_width
+        """Whether each parameter is identifiable. The rule and the arguments are those of `is_identifiable`."""
+        return is_identifiable(std, self.half_width, prior)
 
     @property
     def usable(self) -> "Bracket":
-        """Itself where it is valid, else 0 +- 1: what a computation that must stay finite goes on with."""
+        """The bracket itself if it is valid, else 0 +- 1, so that a computation in a batch stays finite."""
         return Bracket.around(jnp.where(self.valid, self.center, 0.0), jnp.where(self.valid, self.half_width, 1.0))
 
 
-@eqx.filter_jit  # one program, where its operations by themselves would each be one
+@eqx.filter_jit  # one compiled program instead of one for each operation
 def _default(model: AbstractModel) -> Bracket:
     return Bracket.around(model.alpha, model.half_width)

@@ -1,4 +1,4 @@
-"""Errors that are somebody's to mend, in one line: what, where, what to do."""
+"""Errors that the user can fix. The message says in one line what is wrong, where, and what to do."""
 
 
 class InputError(ValueError):

@@ -1,9 +1,9 @@
-"""Predefined inputs: rotor speeds that turn a hovering quadrotor about its axes, sized so that it can fly them.
+"""Inputs that excite the parameters: rotor speeds that turn a hovering quadrotor about its axes.
 
-Each function designs angular accelerations about roll, pitch and yaw, asks for torque = inertia x acceleration and
-thrust = weight, and solves Eqs. (10)-(13) for the rotor speeds. They set a flight up and are not for tracing: they
-compute in NumPy's double precision and refuse what the airframe cannot fly. They are open loop: the rates follow the
-design up to the gyroscopic coupling. The paper does not state its inputs; these are ours.
+Each function designs angular accelerations about roll, pitch and yaw. The torque is inertia x acceleration, the thrust
+is the weight, and Eqs. (10)-(13) are solved for the rotor speeds. An input that the airframe cannot fly is refused. The
+inputs are open loop: the rates follow the design except for the gyroscopic coupling. The functions compute in NumPy's
+double precision and cannot be traced by JAX. The paper does not state its inputs; these are our choice.
 """
 
 import math
@@ -33,21 +33,21 @@ def multisine(
     amplitude: Amplitude = 1.0,
     tones: Sequence[Sequence[float]] = STANDARD_TONES,
 ) -> RotorSpeeds:
-    """All axes at once, each with its own tones: the input that shows every parameter, and the default.
+    """A sum of sines about all axes at once. The default input, because it excites every parameter.
 
-    The rate of an axis with n tones is amplitude/n sum sin(2 pi f t), which starts at rest. Distinct tones make the
-    axes uncorrelated over a common period (10 s for the default tones).
+    The rate of an axis with n tones is amplitude/n sum sin(2 pi f t), which starts at rest. The axes are uncorrelated
+    over a common period (10 s for the default tones) if no two axes share a tone.
 
     **Arguments:**
 
-    - `airframe`: what flies.
-    - `duration`, `dt`: length and sample time [s]; there are round(duration / dt) + 1 rows.
-    - `amplitude`: the designed rates stay within it [rad/s]; one number, or one for roll, pitch and yaw each. 0: still.
-    - `tones`: frequencies [Hz] of roll, pitch and yaw, below half the sample rate; an empty list keeps an axis still.
+    - `airframe`: the vehicle.
+    - `duration`, `dt`: length and sample time [s]. The result has round(duration / dt) + 1 rows.
+    - `amplitude`: limit of the designed rates [rad/s]: one number, or three for roll, pitch and yaw. 0: no motion.
+    - `tones`: frequencies [Hz] of roll, pitch and yaw, below half the sample rate. An empty list: no motion.
 
     **Returns:** rotor speeds [rad/s].
 
-    **Raises:** `ValueError` for arguments out of range, or for what the airframe cannot fly.
+    **Raises:** `ValueError` for arguments out of range, or if the airframe cannot fly the input.
     """
     intervals, peak = _intervals(duration, dt), _peak_rates(amplitude)
     if len(tones) != 3:
@@ -71,23 +71,24 @@ def doublet(
     width: float = 0.3,
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
-    """A doublet of torque about one axis after the other.
+    """A doublet of torque about one axis after another.
 
-    Torque turns a quadrotor as a double integrator: the pulses + - stop the rate but leave an angle of amplitude x
-    width. So the mirror image - + follows, which brings the angle back, and a rest of one width. An axis takes five
-    widths; the sequence repeats as often as it fits, then the quadrotor hovers. With one axis at a time the products
-    of rates in Eqs. (1)-(3) are zero: such a flight does not show alpha1, alpha4 and alpha7.
+    From torque to angle a quadrotor is a double integrator. After the pulses + - the rate is zero, but the angle is
+    amplitude x width. The mirror image - + brings the angle back, and a rest of one width follows: five widths for an
+    axis. The sequence repeats as often as it fits, then the quadrotor hovers. Only one axis turns at a time, so the
+    products of rates in Eqs. (1)-(3) are zero, and alpha1, alpha4 and alpha7 are not excited.
 
     **Arguments:**
 
     - `airframe`, `duration`, `dt`: as in `multisine`.
-    - `amplitude`: the largest rate [rad/s]; one number, or one for roll, pitch and yaw each.
-    - `width`: of one pulse [s], rounded to samples.
-    - `axes`: which of `"roll"`, `"pitch"`, `"yaw"`, in this order.
+    - `amplitude`: the largest rate [rad/s]: one number, or three for roll, pitch and yaw.
+    - `width`: length of one pulse [s], rounded to samples.
+    - `axes`: some of `"roll"`, `"pitch"`, `"yaw"`, in the order in which they are excited.
 
     **Returns:** rotor speeds [rad/s].
 
-    **Raises:** `ValueError` for arguments out of range, a duration too short, or for what the airframe cannot fly.
+    **Raises:** `ValueError` for arguments out of range, if the duration is too short, or if the airframe cannot fly
+    the input.
     """
     return _pulses(airframe, DOUBLET, duration, dt, amplitude, width, axes)
 
@@ -101,11 +102,11 @@ def step3211(
     width: float = 0.1,
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
-    """Pulses of 3, 2, 1 and 1 widths and alternating sign about one axis after the other.
+    """Pulses of 3, 2, 1 and 1 widths and alternating sign about one axis after another.
 
-    Equal heights would leave a rate; 0.8, 1.2, 1.1 and 1.1 stop it (3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 = 0). They leave an
-    angle of 2.96 amplitude x width, which the mirror image that follows brings back. With its rest of one width an
-    axis takes fifteen. Arguments, repetition, what the flight does not show, and errors are those of `doublet`.
+    Pulses of equal height would not end at rest. Heights of 0.8, 1.2, 1.1 and 1.1 do: 3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 =
+    0. The angle is then 2.96 amplitude x width, and the mirror image brings it back. With a rest of one width an axis
+    takes 15 widths. Arguments, repetition, errors, and the parameters that are not excited are those of `doublet`.
     """
     return _pulses(airframe, STEP_3211, duration, dt, amplitude, width, axes)
 
@@ -119,24 +120,23 @@ def chirp(
     frequencies: tuple[float, float] = (0.6, 3.0),
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
-    """A linear frequency sweep about one axis after the other, which share the duration equally.
+    """A linear frequency sweep about one axis after another. The axes share the duration equally.
 
-    The angle swept is sin(phase) / (2 pi f), faded in and out over a fifth of the sweep each, so rate and angle return
-    to zero. The angle stays within about amplitude / (2 pi x the lowest frequency). As in `doublet`, alpha1, alpha4
-    and alpha7 are not shown.
+    The angle is sin(phase) / (2 pi f). It is faded in over the first fifth of the sweep and out over the last, so that
+    rate and angle return to zero. It stays within about amplitude / (2 pi x the lowest frequency). As with `doublet`,
+    alpha1, alpha4 and alpha7 are not excited.
 
     **Arguments:**
 
-    - `airframe`, `duration`, `dt`: as in `multisine`.
-    - `amplitude`: the largest rate [rad/s]; one number, or one for roll, pitch and yaw each. The yaw torque of rotors
-      is weak: the default asks for half the rate there.
+    - `airframe`, `duration`, `dt`, `axes`: as in `doublet`.
+    - `amplitude`: the largest rate [rad/s]: one number, or three for roll, pitch and yaw. The default yaw rate is half
+      the others, because the yaw torque of rotors is small.
     - `frequencies`: first and last [Hz], below half the sample rate.
-    - `axes`: which of `"roll"`, `"pitch"`, `"yaw"`, in this order.
 
     **Returns:** rotor speeds [rad/s].
 
-    **Raises:** `ValueError` for arguments out of range, a duration that leaves an axis less than one cycle, or for
-    what the airframe cannot fly.
+    **Raises:** `ValueError` for arguments out of range, if an axis gets less than one cycle, or if the airframe cannot
+    fly the input.
     """
     intervals, order = _intervals(duration, dt), _axis_indices(axes)
     for frequency in frequencies:
@@ -191,7 +191,7 @@ def _pulses(
 
 
 def _in_turn(shape: np.ndarray, intervals: int, order: list[int], peak: np.ndarray) -> np.ndarray:
-    """`shape` (unit peak rate) about each axis in turn, again and again as long as a whole sequence fits."""
+    """Accelerations with `shape` (unit peak rate) about each axis in turn, repeated while a complete sequence fits."""
     acceleration = np.zeros((intervals + 1, 3))
     slots = intervals // (len(order) * len(shape)) * order
     for slot, axis in enumerate(slots):
@@ -200,7 +200,7 @@ def _in_turn(shape: np.ndarray, intervals: int, order: list[int], peak: np.ndarr
 
 
 def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> RotorSpeeds:
-    """Rotor speeds [rad/s] for angular accelerations [rad/s^2] at a thrust that equals the weight."""
+    """Rotor speeds [rad/s] that produce these angular accelerations [rad/s^2] and carry the weight."""
     mixer = np.asarray(_mixer(airframe), dtype=np.float64)
     torque = np.asarray(airframe.inertia, dtype=np.float64) * acceleration
     weight = float(airframe.mass) * float(airframe.gravity)
@@ -210,17 +210,17 @@ def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> Ro
     return as_float(np.sqrt(hover + change))
 
 
-@eqx.filter_jit  # one program, where its operations by themselves would each be one
+@eqx.filter_jit  # one compiled program instead of one for each operation
 def _mixer(airframe: Airframe) -> Float[Array, "4 4"]:
     return airframe.mixer
 
 
 def _check_flyable(hover: np.ndarray, change: np.ndarray, fastest: float, dt: float) -> None:
-    """Refuse squared rotor speeds `hover + change` outside 0..fastest^2, and say how much of `change` would do."""
+    """Refuse squared rotor speeds `hover + change` outside 0..fastest^2, and say which share of `change` can fly."""
     if (hover < 0).any() or (hover > fastest**2).any():
         raise ValueError(
-            f"`airframe` cannot hover: that takes squared rotor speeds of {np.round(hover).tolist()} rad^2/s^2, and "
-            f"its `max_rotor_speed` is {fastest:g} rad/s."
+            f"`airframe` cannot hover: it needs squared rotor speeds of {np.round(hover).tolist()} rad^2/s^2, but its "
+            f"`max_rotor_speed` is {fastest:g} rad/s; correct its mass, thrust coefficient or largest speed."
         )
     room = np.where(change > 0, fastest**2 - hover, hover)
     share = np.divide(room, np.abs(change), out=np.full_like(change, np.inf), where=change != 0)

@@ -1,4 +1,4 @@
-"""What a flight recorded: rotor speeds in, rates, attitude, velocity and position out."""
+"""A flight: the recorded rotor speeds, and the measured rates, attitude, velocity and position."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,10 +16,9 @@ STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi",
 STATE_UNITS = ("m", "m/s", "m", "m/s", "m", "m/s", "rad", "rad/s", "rad", "rad/s", "rad", "rad/s")
 FORCE_NAMES = ("ax", "ay", "az")
 CHANNEL_NAMES = (*STATE_NAMES, *FORCE_NAMES)
-CHANNEL_UNITS = (*STATE_UNITS, *("m/s^2",) * 3)
-"""All that a flight can have measured: the states, then the specific force."""
+"""Every channel that a flight can measure: the states, then the specific force."""
 
-# Sample times that differ by less than this share are one.
+# Relative difference up to which two sample times count as equal.
 _SAME_STEP = 1e-6
 
 
@@ -32,9 +31,10 @@ def _success() -> RESULTS:
 
 
 class Stretches(NamedTuple):
-    """For each sample of joined flights: the `number` of its uninterrupted stretch, and that one's ends.
+    """The uninterrupted stretch to which each sample of joined flights belongs.
 
-    Numbers count from 0, in order. `first`, `last`: samples.
+    - `number`: of the stretch, counted from 0 in order.
+    - `first`, `last`: the first and the last sample of that stretch.
     """
 
     number: Int[Array, " samples"]
@@ -43,7 +43,7 @@ class Stretches(NamedTuple):
 
     @classmethod
     def of(cls, number: Int[Array, " samples"]) -> "Stretches":
-        """With the ends found."""
+        """The stretches with these numbers."""
         return cls(number, jnp.searchsorted(number, number), jnp.searchsorted(number, number, side="right") - 1)
 
 
@@ -52,9 +52,9 @@ class Inputs(NamedTuple):
 
     - `omega`: rotor speeds, measured or commanded [rad/s].
     - `dt`: the sample time [s].
-    - `velocity`: along the body's axes [m/s], where that is known.
-    - `force`: the measured specific force along the body's axes [m/s^2], where a model takes it as an input.
-    - `stretches`: which uninterrupted stretch each sample belongs to; `None`: all to one.
+    - `velocity`: along the body's axes [m/s]. `None`: unknown.
+    - `force`: the measured specific force along the body's axes [m/s^2], an input of some models. `None`: not measured.
+    - `stretches`: the uninterrupted stretch of each sample. `None`: the flight is one stretch.
     """
 
     omega: RotorSpeeds
@@ -72,12 +72,14 @@ class Flight(eqx.Module):
     - `time`: sample times [s], uniform.
     - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing.
     - `states`: in the order of `STATE_NAMES` (Eq. (14)) and the units of `STATE_UNITS`. NaN: not measured.
-    - `specific_force`: what an accelerometer measures along the body axes [m/s^2]. `None` or NaN: not measured.
-    - `result`: how a simulation ended; rows from a failure on are NaN.
-    - `body_velocity`: along the body's axes [m/s], where a model takes it as an input; no NaN. `None`: not known.
-    - `stretch`: which uninterrupted stretch each sample belongs to, counted from 0, where several are joined
-      (`jaxos4.join`): time then is a count of samples. `None`: all belong to one.
-    - `commanded`: whether the rotor speeds are commands, which rotors follow with a lag, and were not measured.
+    - `specific_force`: what an accelerometer measures along the body's axes [m/s^2]. `None` or NaN: not measured.
+    - `result`: how a simulation ended. Rows after a failure are NaN.
+    - `body_velocity`: along the body's axes [m/s], an input of some models; no NaN. `None`: unknown.
+    - `stretch`: the number of the uninterrupted stretch of each sample, counted from 0. Joined flights have several
+      (`jaxos4.join`), and their time counts samples. `None`: the flight is one stretch.
+    - `commanded`: whether `omega` holds commands, which the rotors follow with a lag, and not measured speeds.
+
+    **Raises:** `ValueError` for arrays whose shapes do not agree, or fewer than two samples.
     """
 
     time: Float[Array, " samples"] = eqx.field(converter=as_float)
@@ -114,36 +116,31 @@ class Flight(eqx.Module):
 
     @property
     def inputs(self) -> Inputs:
-        """What drives the vehicle."""
+        """What drives the vehicle, with gaps in the specific force filled."""
         stretches = None if self.stretch is None else Stretches.of(self.stretch)
-        force = None if self.specific_force is None else held_values(self.specific_force, stretches)
+        force = None if self.specific_force is None else fill_gaps(self.specific_force, stretches)
         return Inputs(self.omega, self.dt, self.body_velocity, force, stretches)
 
     @property
     def channels(self) -> Float[Array, "samples 15"]:
-        """All that was measured, in the order of `CHANNEL_NAMES`; NaN where not."""
+        """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
         force = self.specific_force
         nothing = jnp.full((*self.states.shape[:-1], len(FORCE_NAMES)), jnp.nan, self.states.dtype)
         return jnp.concatenate([self.states, nothing if force is None else force], axis=-1)
 
 
-def channel_indices(*names: str) -> Array:
-    """Columns of `Flight.states` of the states `names`."""
-    return jnp.array([STATE_NAMES.index(name) for name in names])
-
-
-def held_values(
+def fill_gaps(
     values: Float[Array, "samples columns"], stretches: Stretches | None = None
 ) -> Float[Array, "samples columns"]:
-    """Each column with what was not measured at the value before it, or after it, in its stretch; 0 where none is."""
+    """Fill each gap (NaN) with the previous value in the stretch, or the next if there is none, or 0 if all is NaN."""
     count = values.shape[0]
     index, measured = jnp.arange(count)[:, None], ~jnp.isnan(values)
     first, last = (0, count - 1) if stretches is None else (stretches.first[:, None], stretches.last[:, None])
-    before = jax.lax.cummax(jnp.where(measured, index, -1))
-    after = jax.lax.cummin(jnp.where(measured, index, count), reverse=True)
-    known = (before >= first) | (after <= last)
-    taken = jnp.where(before >= first, before, jnp.minimum(after, count - 1))
-    return jnp.where(known, jnp.nan_to_num(jnp.take_along_axis(values, taken, axis=0)), 0.0)
+    previous = jax.lax.cummax(jnp.where(measured, index, -1))
+    following = jax.lax.cummin(jnp.where(measured, index, count), reverse=True)
+    exists = (previous >= first) | (following <= last)
+    source = jnp.where(previous >= first, previous, jnp.minimum(following, count - 1))
+    return jnp.where(exists, jnp.nan_to_num(jnp.take_along_axis(values, source, axis=0)), 0.0)
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:

@@ -1,4 +1,14 @@
-"""Factors and inverses of small positive semidefinite matrices, in plain operations that vectorise over lanes."""
+"""Factors and inverses of small symmetric positive semidefinite matrices: information and covariance matrices.
+
+All functions use plain operations in loops, for two reasons. They vectorise over a batch of small matrices, and
+LAPACK's batched kernels inside a loop can deadlock on a CPU (seen with jaxlib 0.10 and 512 lanes).
+
+A direction without information gets a variance that is huge, but neither infinite nor negative.
+
+**Windows.** Each window of a flight has an information matrix (n, n). Its first `count` unknowns are the parameters,
+which all windows share. Its other unknowns are the initial state of that window. Elimination works on
+one window after another, so its time is linear in the number of windows.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -6,90 +16,55 @@ from jaxtyping import Array, Float
 
 
 def joint_factor(information: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
-    """For each window A, with A A^T the inverse of the covariance of its unknowns when those of all are unknown.
+    """A factor A of the joint information of each window: A A^T is the inverse of its covariance.
 
-    The first `count` unknowns are shared by all windows, the others are each window's own. A window's own come first in
-    a Cholesky factorisation, in which the Schur complements of all windows are summed: block elimination, in time
-    linear in the windows, and nothing is subtracted that single precision would lose. The last `count` columns of A
-    hold the factor of what is shared.
+    The covariance is that of the window's unknowns when the unknowns of all windows are estimated together. The last
+    `count` columns of A hold the factor for the shared unknowns.
+
+    Block elimination by Cholesky factors: each window's own unknowns are eliminated first, and the remaining
+    Schur complements are summed. No subtraction loses digits in single precision.
     """
     size = information.shape[-1]
     own = size - count
-    order, back = jnp.roll(jnp.arange(size), -count), jnp.roll(jnp.arange(size), count)
+    own_first, shared_first = _orders(size, count)
     shared = information[:, :count, :count].sum(axis=0)
     diagonal = jax.vmap(jnp.diagonal)(information).at[:, :count].set(jnp.diagonal(shared))
-    scale = _scale(diagonal)[:, order]
-    unit = information[:, order][:, :, order] / (scale[:, :, None] * scale[:, None, :])
-    rest, first = jax.vmap(lambda matrix: _eliminate(matrix, own))(unit)
-    _, last = _eliminate(rest[:, own:, own:].sum(axis=0), count, floor=size)
+    scale = _scale(diagonal)[:, own_first]
+    unit = information[:, own_first][:, :, own_first] / (scale[:, :, None] * scale[:, None, :])
+    remaining, first = jax.vmap(lambda matrix: _eliminate(matrix, own))(unit)
+    _, last = _eliminate(remaining[:, own:, own:].sum(axis=0), count, floor=size)
     last = jnp.broadcast_to(jnp.pad(last, ((own, 0), (0, 0))), (information.shape[0], size, count))
-    return (scale[:, :, None] * jnp.concatenate([first, last], axis=-1))[:, back]
+    return (scale[:, :, None] * jnp.concatenate([first, last], axis=-1))[:, shared_first]
+
+
+def inverse_transpose(factor: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
+    """A^-T of each factor A from `joint_factor`. Its columns are directions of unit information."""
+    own_first, shared_first = _orders(factor.shape[-1], count)
+    return jnp.swapaxes(jax.vmap(invert_factor)(factor[:, own_first]), 1, 2)[:, shared_first]
 
 
 def covariances(information: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
-    """For each window the covariance of its unknowns, of which the first `count` are shared by all windows.
-
-    A direction without information gets a variance that is huge, not negative or infinite.
-    """
+    """The covariance of each window's unknowns, when the unknowns of all windows are estimated together."""
     basis = inverse_transpose(joint_factor(information, count), count)
     return (basis[:, :, None, :] * basis[:, None, :, :]).sum(axis=-1)
 
 
 def covariance_of_shared(information: Float[Array, "windows n n"], count: int) -> Float[Array, "count count"]:
-    """The covariance of the first `count` unknowns, which all windows share, when the others are unknown too."""
+    """The covariance of the `count` shared unknowns, when the unknowns of all windows are estimated together."""
     inverse = invert_factor(joint_factor(information, count)[0, :count, -count:])
     return (inverse[:, :, None] * inverse[:, None, :]).sum(axis=0)
 
 
-def inverse_transpose(factor: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
-    """A^-T of each factor A that `joint_factor` made: its columns are directions of unit information."""
-    size = factor.shape[-1]
-    order, back = jnp.roll(jnp.arange(size), -count), jnp.roll(jnp.arange(size), count)
-    return jnp.swapaxes(jax.vmap(invert_factor)(factor[:, order]), 1, 2)[:, back]
-
-
 def invert(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse of a symmetric positive semidefinite matrix, whatever its units and with a floor on its pivots.
-
-    A direction without information gets a variance that is huge, not negative or infinite.
-    """
+    """The inverse of a symmetric positive semidefinite matrix, whatever the units of its rows."""
     return covariance_of_shared(information[None], information.shape[0])
 
 
 def cholesky(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The lower triangular L with L L^T = `information`, where a pivot that is lost in rounding is taken as rounding.
-
-    In plain operations, as `invert_factor` is: they vectorise over a batch of small matrices, while LAPACK's batched
-    kernels inside a loop can wait for one another for ever on a CPU (seen with jaxlib 0.10 and 512 lanes).
-    """
+    """The lower triangular L with L L^T = `information`. Pivots have a floor at the size of rounding errors."""
     scale = _scale(jnp.diagonal(information))
     _, factor = _eliminate(information / (scale[:, None] * scale[None, :]), information.shape[0])
     return scale[:, None] * factor
-
-
-def _scale(diagonal: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-    """What makes a diagonal one of ones, where it is not 0."""
-    return jnp.where(diagonal > 0, jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
-
-
-def _eliminate(
-    matrix: Float[Array, "n n"], columns: int, *, floor: int | None = None
-) -> tuple[Float[Array, "n n"], Float[Array, "n columns"]]:
-    """The first columns of the Cholesky factor of a matrix with a unit diagonal, and what they leave to the others.
-
-    `floor`: of the pivots, in rounding errors; the size of the matrix by default.
-    """
-    size = matrix.shape[0]
-    least = jnp.finfo(matrix.dtype).eps * (floor or size)
-
-    def eliminate_column(k, carry):
-        rest, factor = carry
-        pivot = jnp.sqrt(jnp.maximum(rest[k, k], least))
-        column = jnp.where(jnp.arange(size) > k, rest[:, k] / pivot, 0.0).at[k].set(pivot)
-        return rest - column[:, None] * column[None, :], factor.at[:, k].set(column)
-
-    nothing = jnp.zeros((size, columns), matrix.dtype)
-    return jax.lax.fori_loop(0, columns, eliminate_column, (matrix, nothing)) if columns else (matrix, nothing)
 
 
 def invert_factor(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -100,3 +75,34 @@ def invert_factor(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
         return inverse.at[i].set((identity[i] - (factor[i][:, None] * inverse).sum(axis=0)) / factor[i, i])
 
     return jax.lax.fori_loop(0, factor.shape[0], solve_row, jnp.zeros_like(factor))
+
+
+def _orders(size: int, count: int) -> tuple[Array, Array]:
+    """Indices that put each window's own unknowns first, and indices that put the shared ones first again."""
+    return jnp.roll(jnp.arange(size), -count), jnp.roll(jnp.arange(size), count)
+
+
+def _scale(diagonal: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """The roots of a diagonal, by which a matrix is scaled to a unit diagonal; 1 for an entry of 0."""
+    return jnp.where(diagonal > 0, jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
+
+
+def _eliminate(
+    matrix: Float[Array, "n n"], columns: int, *, floor: int | None = None
+) -> tuple[Float[Array, "n n"], Float[Array, "n columns"]]:
+    """Some steps of a Cholesky factorisation of a matrix with a unit diagonal.
+
+    Returns the Schur complement that remains, and the first `columns` columns of the factor. `floor`: the smallest
+    squared pivot, in rounding errors; the size of the matrix by default.
+    """
+    size = matrix.shape[0]
+    least = jnp.finfo(matrix.dtype).eps * (floor or size)
+
+    def eliminate_column(k, carry):
+        remaining, factor = carry
+        pivot = jnp.sqrt(jnp.maximum(remaining[k, k], least))
+        column = jnp.where(jnp.arange(size) > k, remaining[:, k] / pivot, 0.0).at[k].set(pivot)
+        return remaining - column[:, None] * column[None, :], factor.at[:, k].set(column)
+
+    start = jnp.zeros((size, columns), matrix.dtype)
+    return jax.lax.fori_loop(0, columns, eliminate_column, (matrix, start)) if columns else (matrix, start)

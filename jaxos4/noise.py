@@ -1,7 +1,7 @@
-"""Sensor noise: what turns a simulated flight into a measured one.
+"""Sensor noise: turns a simulated flight into a measured one.
 
-Every noise changes `Flight.states` and nothing else: time, rotor speeds and specific force are kept. States that were
-not measured (NaN) stay so. A noise is unbatched and `vmap`s over keys, over flights and over its own numbers.
+A noise changes `Flight.states` and nothing else. States that were not measured stay NaN. A noise acts on one flight;
+`vmap` it over keys, flights or its own numbers.
 """
 
 import abc
@@ -23,14 +23,14 @@ _SIGMA_OF_UNIT = {"m": 0.005, "m/s": 0.02, "rad": 0.005, "rad/s": 0.01}
 SENSOR_SIGMA = np.array([_SIGMA_OF_UNIT[unit] for unit in STATE_UNITS])
 """Standard deviations of the standard flight's sensors in the order and units of `STATE_NAMES`, `STATE_UNITS`."""
 SENSOR_SIGMA.flags.writeable = False
-# Of an accelerometer in flight [m/s^2]: vibration, more than the sensor.
+# Standard deviation of an accelerometer in flight [m/s^2]: mostly vibration.
 FORCE_SIGMA = 0.3
 
 
 def _per_channel(
     name: str, low: float, high: float = np.inf, *, open_below: bool = False
 ) -> Callable[[ArrayLike], Array]:
-    """A field's converter: one number or one for each of the 12 states, in range as far as its values are known."""
+    """A field's converter: accepts one number or 12, and checks the range unless the values are traced."""
 
     def convert(value: ArrayLike) -> Array:
         array = as_float(value)
@@ -51,16 +51,16 @@ def _with_states(flight: Flight, states: States) -> Flight:
 
 
 class AbstractNoise(eqx.Module):
-    """How measured states differ from true ones."""
+    """The difference between measured and true states. A number for "each state" is one number or an array of 12."""
 
     @abc.abstractmethod
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
-        """The flight as measured.
+        """Returns the flight with noisy states.
 
         **Arguments:**
 
-        - `flight`: the true states, or what an earlier noise made of them.
-        - `key`: of the random numbers; the same key gives the same flight.
+        - `flight`: the true flight, or the result of another noise.
+        - `key`: for the random numbers. The same key gives the same flight.
         """
 
 
@@ -69,7 +69,7 @@ class WhiteNoise(AbstractNoise):
 
     **Arguments:**
 
-    - `sigma`: standard deviation of each state, in the units of `STATE_UNITS`; one number or 12. 0: exact.
+    - `sigma`: standard deviation for each state, in the units of `STATE_UNITS`. 0: exact.
     """
 
     sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
@@ -80,12 +80,12 @@ class WhiteNoise(AbstractNoise):
 
 
 class ConstantBias(AbstractNoise):
-    """An offset of each state that lasts the whole flight, drawn anew for every key.
+    """A Gaussian offset of each state that is constant during the flight.
 
     **Arguments:**
 
-    - `sigma`: standard deviation of the offset from flight to flight, in the units of `STATE_UNITS`; one number or 12.
-    - `mean`: its mean. `ConstantBias(0, mean=offset)` is a known offset.
+    - `sigma`: standard deviation of the offset for each state, in the units of `STATE_UNITS`.
+    - `mean`: mean of the offset. `ConstantBias(0, mean=offset)` is a known offset.
     """
 
     sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
@@ -99,13 +99,13 @@ class ConstantBias(AbstractNoise):
 class GaussMarkov(AbstractNoise):
     """Coloured errors: a stationary first-order process with autocorrelation sigma^2 exp(-|tau| / T).
 
-    Sampled exactly: e_{k+1} = a e_k + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T), w_k standard normal and e_0 drawn
-    with variance sigma^2.
+    The samples are exact: e_{k+1} = a e_k + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T) and w_k standard normal. e_0
+    has the variance sigma^2.
 
     **Arguments:**
 
-    - `sigma`: standard deviation of each state, in the units of `STATE_UNITS`; one number or 12.
-    - `correlation_time`: T [s], positive; one number or 12. Infinite: a constant bias.
+    - `sigma`: standard deviation for each state, in the units of `STATE_UNITS`.
+    - `correlation_time`: T [s] for each state, positive. Infinite: a constant bias.
     """
 
     sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
@@ -126,11 +126,11 @@ class GaussMarkov(AbstractNoise):
 
 
 class Quantisation(AbstractNoise):
-    """Rounding to the nearest multiple of a step. Nothing in it is random: the key is not used.
+    """Rounding to the nearest multiple of a step. The result does not depend on the key.
 
     **Arguments:**
 
-    - `step`: of each state, in the units of `STATE_UNITS`; one number or 12. 0: not rounded.
+    - `step`: for each state, in the units of `STATE_UNITS`. 0: not rounded.
     """
 
     step: PerChannel = eqx.field(converter=_per_channel("step", 0.0))
@@ -142,11 +142,11 @@ class Quantisation(AbstractNoise):
 
 
 class Dropouts(AbstractNoise):
-    """Samples that are lost, each state's by itself: they become NaN, not measured.
+    """Lost samples: each sample of each state becomes NaN (not measured), independently of the others.
 
     **Arguments:**
 
-    - `probability`: that a sample is lost; one number or 12.
+    - `probability`: that a sample is lost, for each state.
     """
 
     probability: PerChannel = eqx.field(converter=_per_channel("probability", 0.0, 1.0))
@@ -158,11 +158,11 @@ class Dropouts(AbstractNoise):
 
 
 class Chain(AbstractNoise):
-    """Noises one after the other; noise i draws from `fold_in(key, i)`.
+    """Several noises, applied in order. Noise i draws from `fold_in(key, i)`.
 
     **Arguments:**
 
-    - `noises`: in the order in which they happen: `Chain((WhiteNoise(sigma), Quantisation(step), Dropouts(0.01)))`.
+    - `noises`: for example `(WhiteNoise(sigma), Quantisation(step), Dropouts(0.01))`.
     """
 
     noises: tuple[AbstractNoise, ...] = eqx.field(converter=tuple)
@@ -178,7 +178,7 @@ def _normal(key: Key, like: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     return jax.random.normal(key, like.shape, like.dtype)
 
 
-# Memory [s] of coloured noise; offsets and steps in multiples of the white noise beside them; share that is lost.
+# Correlation time [s] of coloured noise, offset and step in multiples of the white noise, share of lost samples.
 _MEMORY, _OFFSET, _STEP, _LOST = 0.05, 0.5, 2.0, 0.1
 
 NOISES: dict[str, Callable[[ArrayLike], AbstractNoise]] = {
@@ -188,5 +188,11 @@ NOISES: dict[str, Callable[[ArrayLike], AbstractNoise]] = {
     "quantised": lambda sigma: Chain((WhiteNoise(sigma), Quantisation(_STEP * as_float(sigma)))),
     "lossy": lambda sigma: Chain((WhiteNoise(sigma), Dropouts(_LOST))),
 }
-"""Kinds of noise of a standard deviation: white; with a memory of 0.05 s; white with an offset that lasts a flight, of
-half its size; white, rounded to twice its size; white, with a tenth of the samples lost."""
+"""The kinds of noise that studies name, each made from a standard deviation sigma.
+
+- `white`: white noise.
+- `coloured`: Gauss-Markov noise with a correlation time of 0.05 s.
+- `biased`: white noise and a constant offset with a standard deviation of sigma / 2.
+- `quantised`: white noise, then rounding to multiples of 2 sigma.
+- `lossy`: white noise, then 10 % of the samples are lost.
+"""

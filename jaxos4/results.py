@@ -1,23 +1,31 @@
-"""How a computation ended, as a value: one result for every lane of a batch, and no exception inside it."""
+"""How a computation ended, as a value: one result for each lane of a batch, and no exception inside the batch."""
 
 import equinox as eqx
 import numpy as np
 
 NINETY_FIVE = 1.959963984540054
-"""So many standard deviations to either side hold 95 % of a Gaussian."""
+"""Half the width of a 95 % interval of a Gaussian, in standard deviations."""
 
 
 class RESULTS(eqx.Enumeration):
-    """How a simulation or an estimate ended. Codes are for this process only: store names (`result_names`)."""
+    """How a simulation or an estimate ended.
+
+    The codes are valid in this process only. Files store the names, see `result_names`.
+    """
 
     successful = ""
-    at_bound = "a parameter lies at the limit around its bracket, or beyond: widen the bracket or fix the model"
-    unidentifiable = "the flight tells less about a parameter than its bracket already did"
-    nonfinite_trajectory = "the trajectory does not stay finite to its end, or the input is not finite"
-    attitude_singularity = "the pitch angle passed +-90 degrees, where Euler angles end"
-    bracket_invalid = "a bracket's lower end is not below its upper end, or its width is not finite"
-    network_mismatch = "the network was trained for other inputs, sampling or start, or for less noise and fewer gaps"
-    max_sweeps = "the brackets still moved after the largest number of sweeps"
+    at_bound = "a parameter reached the limit of the search around its bracket: widen the bracket or correct the model"
+    unidentifiable = (
+        "a parameter is no better known after the flight than from its bracket: fly with more excitation, or hold it"
+    )
+    nonfinite_trajectory = "the simulated trajectory or its input is not finite: check the input and the bracket"
+    attitude_singularity = "the pitch angle passed +-90 degrees, where Euler angles fail: use a flight without loops"
+    bracket_invalid = "a bracket is not finite, or its lower end is not below its upper end: correct the bracket"
+    network_mismatch = (
+        "the flight differs from the network's training in inputs, sampling or start, or has more noise or gaps: "
+        "train a network for this flight"
+    )
+    max_sweeps = "the search did not converge within the largest number of sweeps: allow more sweeps"
 
 
 NAMES = (
@@ -33,6 +41,6 @@ NAMES = (
 
 
 def result_names(result: RESULTS) -> np.ndarray:
-    """The names of a result or of a batch of them, as an array of strings of the batch's shape."""
+    """The name of each result in a batch, as an array of strings of the batch's shape."""
     conditions = [np.asarray(result == getattr(RESULTS, name)) for name in NAMES]
     return np.select(conditions, NAMES, default="")

@@ -1,7 +1,7 @@
-"""Sine and cosine together, in arithmetic that vectorises over a batch of lanes.
+"""Sine and cosine in one polynomial evaluation that vectorises over a batch of lanes.
 
-A library call per element is what a simulation step would otherwise spend its time on: with this the full-state Euler
-scan runs about six times faster on a CPU (`experiments/speed`).
+On a CPU, calls of the library's sine and cosine would take most of the time of a simulation step
+(see docs/measured.md).
 """
 
 import math
@@ -10,19 +10,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# pi/2 in parts short enough that k * part is exact for |k| < 2**20 (2**13 in single precision); Cody and Waite.
+# pi/2 in short parts: k * part is exact for |k| < 2**20 (2**13 in single precision). Reference: Cody and Waite.
 _HALF_PI_DOUBLE = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _HALF_PI_SINGLE = (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8)
-# Taylor coefficients in r^2: on |r| <= pi/4 their truncation is below half an ulp of double precision.
+# Taylor coefficients in r^2: for |r| <= pi/4 the truncation error is below half an ulp of double precision.
 _SIN = tuple((-1) ** i / math.factorial(2 * i + 1) for i in range(8))
 _COS = tuple((-1) ** i / math.factorial(2 * i) for i in range(9))
 
 
 @jax.custom_jvp
 def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """`(sin(x), cos(x))` to about one ulp, for an angle x [rad] of less than a million turns.
+    """`(sin(x), cos(x))` to about one ulp, for angles x [rad] of less than a million turns.
 
-    Not-a-number and infinity give not-a-number, as in the library's own functions.
+    NaN and infinity give NaN, as in the library's functions.
     """
     quarter = jnp.round(x * (2 / math.pi))
     r = x
@@ -45,6 +45,7 @@ def _sincos_jvp(primals, tangents):
 
 
 def _horner(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The polynomial with these coefficients, lowest power first."""
     total = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = total * x + coefficient

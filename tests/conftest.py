@@ -1,4 +1,7 @@
-"""What every test shares: precision, platform, runtime shape checks, property-test settings, real flights."""
+"""Settings and fixtures of all tests: precision, platform, runtime shape checks, property tests, real flights.
+
+The hooks below are few and simple, so that a report (for example of the number of compiled programs) can be added.
+"""
 
 import os
 import pathlib
@@ -12,30 +15,30 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS") or "cpu")
-# Compiled programs are shared by the workers and with later runs.
-jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).resolve().parents[1] / ".pytest_cache/jax"))
+# Workers and later runs share the compiled programs.
+CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or pathlib.Path(__file__).resolve().parents[1] / ".pytest_cache/jax"
+jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
 
-# Before the first import of jaxos4: every annotated function and module in it is checked from here on.
+# Before the first import of jaxos4: all its annotated functions and modules are checked.
 jaxtyping.install_import_hook("jaxos4", "typechecker.check")
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
 
-
-# The modules that take longest begin first, so that workers end together.
+# The slowest modules start first, so that the workers end together.
 LONGEST = ("network", "experiments", "equation_error", "ibss", "kalman", "study_resume", "cli", "svsf", "study_cluster")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sorts the modules; the tests of each stay as they are."""
+    """Sorts the modules. The order of the tests in a module does not change."""
     places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log):
-    """A module stays with one worker: its fixtures are made, and its programs traced and compiled, once."""
+    """One worker runs all tests of a module, so that its fixtures and compiled programs are made once."""
     if config.getvalue("dist") != "load":  # the default of `-n`
         return None
     from xdist.scheduler import LoadFileScheduling
@@ -46,7 +49,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_programs_end_with_their_module() -> Iterator[None]:
-    """Every compiled program holds memory maps, and a process that reaches the kernel's limit of them (65,530) dies."""
+    """Compiled programs hold memory maps. A process dies at the kernel's limit of 65,530 maps."""
     yield
     jax.clear_caches()
 
@@ -63,12 +66,12 @@ def shared_flights() -> pathlib.Path:
 
 @pytest.fixture
 def run(monkeypatch, capsys, tmp_path):
-    """Runs one command in an empty folder; gives its exit code, output and error output."""
+    """Runs one command in an empty folder. Returns its exit code, output and error output."""
     from jaxos4.cli import main  # after the hook
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")  # this process computes already, and has its devices
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "1")  # the devices of this process are fixed by now
 
     def call(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["jaxos4", *arguments])

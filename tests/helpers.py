@@ -1,4 +1,4 @@
-"""The standard flight, and the equations of motion a second time: plain NumPy, written from the printed equations."""
+"""The standard flight, and an independent copy of the equations of motion in NumPy, from the printed equations."""
 
 import functools
 
@@ -9,14 +9,14 @@ import numpy as np
 
 import jaxos4
 
-# Typed in again, not imported: the constants of the OS4 thesis.
+# The constants of the OS4 thesis, typed again instead of imported.
 OS4 = {"m": 0.650, "L": 0.23, "b": 3.13e-5, "d": 7.5e-7, "g": 9.81}
 DT = 0.01
 
 
 @functools.cache
 def standard_flight(model_class=jaxos4.PublishedOS4, duration=5.0):
-    """The exact flight that all figures are about."""
+    """The standard flight without noise."""
     model = model_class(jaxos4.OS4)
     omega = jaxos4.multisine(model.airframe, duration=duration, dt=DT)
     return jaxos4.simulate(model, model.alpha, omega, dt=DT)
@@ -31,7 +31,7 @@ def standard_problem(
     duration=5.0,
     method="euler",
 ):
-    """The standard job: the exact flight, or one of the same input with other `states`."""
+    """The problem of the standard flight without noise, or with other measured `states`."""
     flight = standard_flight(model_class, duration)
     start = None if free else flight.states[0]
     if states is not None:
@@ -47,7 +47,7 @@ def standard_problem(
 
 
 def noisy_states(count, model_class=jaxos4.PublishedOS4, *, seed=0, scale=1.0, duration=5.0):
-    """States of `count` standard flights as measured; flight i draws from `fold_in(key, i)`."""
+    """Noisy states of `count` standard flights. Flight i draws from `fold_in(key, i)`."""
     flight, noise = standard_flight(model_class, duration), jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
     return measured(noise, flight, folded(jax.random.key(seed), jnp.arange(count)))
 
@@ -60,12 +60,12 @@ def folded(key, numbers):
 
 @eqx.filter_jit
 def measured(noise, flight, keys):
-    """States of a flight as measured, for each key; one after the other, as XLA takes seconds to compile a batch."""
+    """Noisy states of a flight for each key. In a loop, because a batch takes XLA seconds to compile."""
     return jax.lax.map(lambda key: noise(flight, key=key).states, keys)
 
 
 def random_starts(model, count, *, seed=0, share=0.8):
-    """Where a search begins: uniform within `share` of the default bracket."""
+    """Starts of searches: uniform within `share` of the default bracket."""
     around = jaxos4.Bracket.default(model)
     draws = jax.random.uniform(jax.random.key(seed), (count, 8), minval=-share, maxval=share)
     return around.center + draws * around.half_width
@@ -101,7 +101,7 @@ def published_derivative(state, omega, alpha, constants=OS4):
 
 
 def corrected_derivative(state, omega, alpha, constants=OS4):
-    """dX/dt of the rigid body: what the printed equations share with it, and what they do not."""
+    """dX/dt of the corrected model: starts from the printed equations and replaces those that it corrects."""
     _, _, _, _, _, _, phi, p, theta, q, psi, r = np.moveaxis(np.asarray(state, dtype=float), -1, 0)
     w1, w2, w3, w4 = np.moveaxis(np.asarray(omega, dtype=float), -1, 0)
     a1, a2, a3, a4, a5, a6, a7, a8 = np.moveaxis(np.asarray(alpha, dtype=float), -1, 0)
@@ -122,7 +122,7 @@ REFERENCES = {jaxos4.PublishedOS4: published_derivative, jaxos4.CorrectedOS4: co
 
 
 def euler_trajectory(derivative, alpha, omega, *, dt=DT, start=None, constants=OS4):
-    """x_{k+1} = x_k + T f(x_k, u_k), one row a sample."""
+    """x_{k+1} = x_k + T f(x_k, u_k), one row for each sample."""
     states = [np.zeros(12) if start is None else np.asarray(start, dtype=float)]
     for row in np.asarray(omega)[:-1]:
         states.append(states[-1] + dt * derivative(states[-1], row, alpha, constants))
@@ -130,6 +130,7 @@ def euler_trajectory(derivative, alpha, omega, *, dt=DT, start=None, constants=O
 
 
 def refused(result: tuple[int, str, str], *fragments: str) -> None:
+    """A command ended with exit code 2 and one line on stderr that contains the fragments."""
     code, _, err = result
     assert code == 2, result
     assert err.count("\n") == 1, err

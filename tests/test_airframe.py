@@ -39,7 +39,7 @@ rotor_inertia = 6e-5
     ],
 )
 def test_published_alpha(airframe, expected):
-    """The figures for OS4 are the published ones; those of the others were worked out by hand from their constants."""
+    """The values for OS4 are published. Those for the others were computed by hand from their constants."""
     alpha = alpha_from_inertia(airframe.inertia, airframe.rotor_inertia * airframe.drag_coefficient)
     np.testing.assert_allclose(alpha, expected, rtol=2e-4)
 
@@ -78,15 +78,10 @@ def test_mixer_is_the_printed_one(name, arm):
     np.testing.assert_allclose(airframe.mixer @ (omega.T**2), printed, rtol=1e-12, atol=1e-15)
 
 
-def test_hover_speed_differentiates_by_mass():
-    def hover(mass):
-        return eqx.tree_at(lambda a: a.mass, OS4, mass).hover_speed
-
-    slope = jax.jit(jax.grad(hover))(jnp.asarray(0.65))
+def test_hover_speed_and_mixer_differentiate():
+    slope = jax.jit(jax.grad(lambda mass: eqx.tree_at(lambda a: a.mass, OS4, mass).hover_speed))(jnp.asarray(0.65))
     np.testing.assert_allclose(slope, OS4.hover_speed / (2 * 0.65), rtol=1e-12)
 
-
-def test_mixer_differentiates_by_arm():
     def roll_authority(positions):
         return eqx.tree_at(lambda a: a.rotor_positions, OS4, positions).mixer[0, 3]
 
@@ -95,7 +90,7 @@ def test_mixer_differentiates_by_arm():
 
 
 def test_presets_outlive_a_change_of_precision():
-    """A preset is made at import, when JAX still rounds to float32: the user's later choice must not come too late."""
+    """A preset is made at import, when JAX still rounds to float32. The user chooses double precision later."""
     script = (
         "import jax, numpy as np\n"
         "from jaxos4.airframe import OS4\n"
@@ -118,29 +113,22 @@ def test_equal_shapes_share_a_trace():
     assert hover(OS4) != hover(VOOS)
 
 
-def test_toml_with_an_arm(tmp_path):
+def test_toml_with_an_arm_and_with_positions(tmp_path):
     path = tmp_path / "quad.toml"
     path.write_text(GOOD)
-    airframe = load_airframe(path)
     plus = eqx.tree_at(lambda a: a.inertia, OS4, np.array([7.5e-3, 7.0e-3, 1.3e-2]))
-    assert eqx.tree_equal(airframe, plus, typematch=True)
-
-
-def test_toml_with_positions(tmp_path):
-    path = tmp_path / "quad.toml"
+    assert eqx.tree_equal(load_airframe(path), plus, typematch=True)
     positions = "[[0.1, -0.1], [-0.1, -0.1], [-0.1, 0.1], [0.1, 0.1]]"
     rest = "rotor_spins = [-1, 1, -1, 1]\ngravity = 9.8\nmax_rotor_speed = 900"
     path.write_text(GOOD.replace("arm = 0.23", f"rotor_positions = {positions}\n{rest}"))
     airframe = load_airframe(str(path))
     np.testing.assert_array_equal(airframe.rotor_positions, [[0.1, -0.1], [-0.1, -0.1], [-0.1, 0.1], [0.1, 0.1]])
     np.testing.assert_array_equal(airframe.rotor_spins, [-1, 1, -1, 1])
-    assert airframe.gravity == 9.8
-    assert airframe.max_rotor_speed == 900.0
+    assert (airframe.gravity, airframe.max_rotor_speed) == (9.8, 900.0)
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_by_name(name):
-    assert load_airframe(name) is PRESETS[name]
+def test_presets_by_name():
+    assert all(load_airframe(name) is preset for name, preset in PRESETS.items())
 
 
 def _replaced(key, line):
@@ -175,7 +163,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("key", "text"), BAD.values(), ids=BAD)
-def test_unusable_toml_is_told_in_one_line(tmp_path, key, text):
+def test_unusable_toml_is_refused_in_one_line(tmp_path, key, text):
     path = tmp_path / "quad.toml"
     path.write_text(text)
     with pytest.raises(InputError) as caught:

@@ -1,4 +1,4 @@
-"""Diagnostics of residuals: right about true models, and not blind to wrong ones."""
+"""Diagnostics of residuals accept true models and detect wrong ones."""
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ LAGS = 25
 @eqx.filter_jit
 @eqx.filter_vmap
 def judged(states):
-    """Of the best fit of a flight."""
+    """The diagnostics of a fit to each flight."""
     problem = standard_problem(states=states, channels="rates")
     found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
     return jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
@@ -59,7 +59,7 @@ def test_true_models_pass_as_often_as_the_level_says():
         assert abs(float((p < 0.05).mean()) - 0.05) < 4 * error
     assert scipy.stats.kstest(np.asarray(found.white_p[:, 0]), "uniform").pvalue > 1e-3
     assert abs(float(found.level.mean()) - 1) < 4 * np.sqrt(2 / (3 * 500 * flights))
-    # On the safe side: the best of many tests that agree with one another.
+    # Conservative, because the many tests are correlated.
     assert float((found.input_p < 0.05).mean()) < 0.05 + 4 * error
 
 
@@ -80,21 +80,21 @@ def test_coloured_noise_and_a_wrong_size_are_seen():
     np.testing.assert_allclose(louder.level.mean(), 1.69, rtol=0.03)
 
 
-def test_what_an_input_does_that_the_model_lacks_is_seen_in_its_channel():
-    """The roll torque acts three samples late, on the roll rate alone."""
+def test_an_effect_of_the_input_that_the_model_lacks_is_detected_in_its_channel():
+    """The roll torque acts three samples late, on the roll rate only."""
     flight, model = standard_flight(), jaxos4.PublishedOS4()
     late = jnp.asarray(np.roll(np.asarray(flight.states[:, 7]), 3)).at[:3].set(0.0)
     states = flight.states.at[:, 7].set(late)
     noise = jaxos4.SENSOR_SIGMA * jax.random.normal(jax.random.key(1), states.shape)
     problem = standard_problem(states=states + noise, channels="rates")
     found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(model))
-    left = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
-    assert left.input_p[0] < 1e-6
-    assert jnp.abs(left.input_correlation[0]).argmax() == 0
-    assert left.input_p[2] > 1e-3
+    judgement = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+    assert judgement.input_p[0] < 1e-6
+    assert jnp.abs(judgement.input_correlation[0]).argmax() == 0
+    assert judgement.input_p[2] > 1e-3
 
 
-def test_nothing_measured_rounding_alone_and_divergence_are_no_figures_to_worry_about():
+def test_no_alarm_without_measurements_or_with_rounding_errors_or_after_divergence():
     problem = standard_problem(channels="attitude")
     exact = jaxos4.residual_diagnostics(problem, problem.model.alpha)
     assert (exact.white_p == 1).all()
@@ -117,31 +117,27 @@ def test_lags_that_cannot_be_are_named(lags):
         jaxos4.residual_diagnostics(problem, problem.model.alpha, lags=lags)
 
 
-def test_what_was_measured_now_and_then_is_tested_at_the_lags_that_there_are():
-    """Every fifth sample: five of 25 lags have pairs at all."""
+def test_sparse_measurements_are_tested_at_the_lags_that_have_pairs():
+    """Every fifth sample was measured: five of 25 lags have pairs."""
     kept = (jnp.arange(501) % 5 == 0)[:, None]
     white = judged(jnp.where(kept, noisy_states(200, seed=23), jnp.nan))
     assert abs(float((white.white_p < 0.05).mean()) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 600)
     slow = jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.1)
     coloured = judged(jnp.where(kept, coloured_states(16, slow), jnp.nan))
     assert np.median(coloured.white_p) < 1e-3
-    # Five samples, half a correlation time, apart; some of it is taken for motion.
+    # Five samples are half a correlation time. The fit explains some of the noise as motion.
     assert 0.3 < float(coloured.colour.mean()) < np.exp(-0.5)
 
 
-def test_channels_and_inputs_that_stand_still_say_so():
+def test_channels_and_inputs_that_do_not_move_have_neutral_diagnostics():
     model = jaxos4.PublishedOS4()
     omega = jnp.broadcast_to(jnp.array([220.0, 226.0, 221.0, 227.0]), (501, 4))
     flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)
     noise = 0.2 * jaxos4.SENSOR_SIGMA * jax.random.normal(jax.random.key(2), flight.states.shape)
     still = (flight.states + noise).at[:, 11].set(0.1)
-    problem = jaxos4.ShootingProblem(
-        model,
-        eqx.tree_at(lambda f: f.states, flight, still),
-        sigma=jaxos4.SENSOR_SIGMA,
-        initial_state=flight.states[0],
-        channels="rates",
-    )
+    noisy = eqx.tree_at(lambda f: f.states, flight, still)
+    known = {"sigma": jaxos4.SENSOR_SIGMA, "initial_state": flight.states[0], "channels": "rates"}
+    problem = jaxos4.ShootingProblem(model, noisy, **known)
     found = jaxos4.residual_diagnostics(problem, model.alpha)
     assert (found.input_correlation == 0).all()
     assert (found.input_p == 1).all()
@@ -152,9 +148,9 @@ def test_windows_have_no_verdict_on_whiteness():
     problem = standard_problem(states=noisy_states(1)[0], channels="rates", free=True)
     problem = jaxos4.ShootingProblem(problem.model, problem.flight, sigma=problem.sigma, channels="rates", windows=20)
     found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
-    left = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
-    assert (left.white_p == 1).all()
-    np.testing.assert_allclose(left.level, 1, atol=5 * np.sqrt(2 / 430))
+    judgement = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+    assert (judgement.white_p == 1).all()
+    np.testing.assert_allclose(judgement.level, 1, atol=5 * np.sqrt(2 / 430))
     with pytest.raises(ValueError, match=r"`initial_state` must be of shape \(60,\)"):
         jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state[:30])
     with pytest.raises(ValueError, match=r"`parameters` must be of shape \(8,\)"):

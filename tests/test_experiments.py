@@ -1,4 +1,4 @@
-"""Each experiment runs in a small configuration, writes what it found, and draws it."""
+"""Each experiment runs in a small configuration, writes its results, and draws them."""
 
 import importlib.util
 import json
@@ -12,7 +12,7 @@ from jaxos4.report import read_results
 from jaxos4.study import load_study, metrics
 
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
-# Of which a study is all there is to run.
+# The experiments that are a study without a script of their own.
 STUDIES = ("comparison", "noise_study", "noise_kinds", "scale")
 WITH_FIGURES = (*STUDIES, "frontier", "rollout_budget", "published_corrected", "inverse_crime", "bracket_and_seeds")
 
@@ -22,6 +22,12 @@ def load(name: str, script: str = "run"):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def report_of(name: str, folder: pathlib.Path, **options) -> dict:
+    """Runs an experiment with these options, and returns the JSON that it writes."""
+    load(name).main(**options, out=folder / "out.json")
+    return json.loads((folder / "out.json").read_text())
 
 
 def small(name: str) -> pathlib.Path:
@@ -43,8 +49,8 @@ def plot(name: str, results: pathlib.Path, figures: pathlib.Path) -> None:
 
 
 def test_efficiency(tmp_path):
-    load("efficiency").main(flights=48, seed=0, scale=1.0, cases=["published, rates"], out=tmp_path / "out.json")
-    row = json.loads((tmp_path / "out.json").read_text())["cases"]["published, rates"]
+    case = "published, rates"
+    row = report_of("efficiency", tmp_path, flights=48, seed=0, scale=1.0, cases=[case])["cases"][case]
     assert row["results"] == {"successful": 48}
     # Within four Monte-Carlo standard errors of the bound, on each of the eight parameters.
     assert np.all(np.abs(np.array(row["efficiency"]) - 1) < 4 * row["monte_carlo_error"])
@@ -53,38 +59,19 @@ def test_efficiency(tmp_path):
 
 
 def test_speed(tmp_path):
-    load("speed").main(
-        batch=64,
-        steps=40,
-        flights=[2],
-        repeats=2,
-        channels=["rates"],
-        methods=["euler", "rk4"],
-        out=tmp_path / "out.json",
-    )
-    report = json.loads((tmp_path / "out.json").read_text())
+    sizes = {"batch": 64, "steps": 40, "flights": [2], "repeats": 2}
+    report = report_of("speed", tmp_path, **sizes, channels=["rates"], methods=["euler", "rk4"])
     assert report["provenance"]["precision"] == "float64"
     assert all(row["rate"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
 
 
 def test_networks(tmp_path):
-    load("networks").main(
-        flights=100,
-        seed=7,
-        cases=["standard"],
-        networks=["score, mlp"],
-        noises=[1.0],
-        channels="rates",
-        steps=250,
-        many=100,
-        separate=False,
-        out=tmp_path / "out.json",
-    )
-    report = json.loads((tmp_path / "out.json").read_text())
+    cases = {"cases": ["standard"], "networks": ["score, mlp"], "noises": [1.0], "channels": "rates", "separate": False}
+    report = report_of("networks", tmp_path, flights=100, seed=7, steps=250, many=100, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
     assert report["one_call"]["flights"] == 100
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
-    # Of 100 flights, each of eight parameters within five Monte-Carlo errors of the bound.
+    # Each of eight parameters within five Monte-Carlo errors of the bound.
     for name in ("hybrid", "ibss"):
         assert np.all(np.abs(np.array(rows[name]["efficiency"]) - 1) < 5 * rows[name]["monte_carlo_error"])
     assert rows["hybrid"]["rollouts"] < rows["ibss"]["rollouts"]
@@ -92,16 +79,8 @@ def test_networks(tmp_path):
 
 
 def test_baselines(tmp_path):
-    load("baselines").main(
-        flights=100,
-        seed=5,
-        channels="rates",
-        estimators=["equation-error", "output-error"],
-        noises=["white"],
-        scales=[0.0, 1.0],
-        out=tmp_path / "out.json",
-    )
-    rows = json.loads((tmp_path / "out.json").read_text())["rows"]
+    cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
+    rows = report_of("baselines", tmp_path, flights=100, seed=5, channels="rates", **cases)["rows"]
     exact, noisy = rows[:2], rows[2:]
     assert all(row["answers"] == 100 for row in rows)
     assert all(max(row["efficiency"]) < 1e-6 for row in exact)
@@ -111,33 +90,23 @@ def test_baselines(tmp_path):
 
 
 def test_coverage(tmp_path):
-    load("coverage").main(
-        flights=100,
-        seed=11,
-        model="published",
-        channels="rates",
-        estimators=["ibss", "hybrid", "output-error"],
-        scales=[1.0],
-        steps=250,
-        out=tmp_path / "out.json",
-    )
-    rows = json.loads((tmp_path / "out.json").read_text())["rows"]
-    assert [row["estimator"] for row in rows] == ["ibss", "hybrid", "output-error"]
+    cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
+    rows = report_of("coverage", tmp_path, flights=100, seed=11, scales=[1.0], steps=250, **cases)["rows"]
+    assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
         assert row["results"] == {"successful": 100}
-        np.testing.assert_allclose(row["std"], 1, atol=0.05)  # and not by being wide
+        np.testing.assert_allclose(row["std"], 1, atol=0.05)  # the intervals are not too wide
         covered = np.array(row["covered"] + row["constants_covered"])
         assert np.all(np.abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 100))
 
 
 def test_dirty_flights(tmp_path):
-    out = tmp_path / "out.json"
-    load("dirty_flights").main(flights=2, duration=6.0, seed=17, airframes=["os4"], out=out)
-    plot("dirty_flights", out, tmp_path / "figures")
-    found = json.loads(out.read_text())["airframes"]["os4"]
+    report = report_of("dirty_flights", tmp_path, flights=2, duration=6.0, seed=17, airframes=["os4"])
+    plot("dirty_flights", tmp_path / "out.json", tmp_path / "figures")
+    found = report["airframes"]["os4"]
     assert {flight["result"] for flight in found["flights"]} == {"successful"}
     assert max(flight["fastest"] for flight in found["flights"]) < 5
-    # The lag of 60 ms and the delay of 8 ms come back, to a few of the errors that are claimed.
+    # The lag of 60 ms and the delay of 8 ms are found within a few standard errors.
     for name in ("rotor_lag", "rotor_delay", "alpha3", "alpha6", "roll_damping", "thrust_gain"):
         assert found["summary"][name]["told"] == 2
         assert abs(found["summary"][name]["bias"]) < 4
@@ -146,17 +115,8 @@ def test_dirty_flights(tmp_path):
 
 
 def test_long_flight(tmp_path):
-    load("long_flight").main(
-        duration=10.0,
-        flights=2,
-        seed=3,
-        drifts=[1e-3],
-        windows=[1, 20],
-        estimators=["ibss"],
-        steps=200,
-        out=tmp_path / "out.json",
-    )
-    one, many = json.loads((tmp_path / "out.json").read_text())["rows"]
+    cases = {"duration": 10.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
+    one, many = report_of("long_flight", tmp_path, flights=2, seed=3, steps=200, **cases)["rows"]
     assert many["results"] == {"successful": 2}
     assert max(many["percent"]) < 5
     assert one["percent"] is None or max(one["percent"]) > 3 * max(many["percent"])
@@ -164,7 +124,7 @@ def test_long_flight(tmp_path):
 
 @pytest.mark.parametrize("name", WITH_FIGURES)
 def test_configurations(name):
-    """The real one, which is not run here, can be."""
+    """The full configuration is valid, and no smaller than the small one."""
     real, short = load_study(EXPERIMENTS / name / "study.toml"), load_study(small(name))
     assert real.count * real.batch >= short.count * short.batch
     assert (EXPERIMENTS / name / "run.py").exists() == (name not in STUDIES)
@@ -190,14 +150,14 @@ def test_noise_kinds(tmp_path):
     covered = metrics.mean_coverage(data).sel(level=0.95)
     assert float(covered["low"].sel(noise="white")) < 0.95 < float(covered["high"].sel(noise="white"))
     assert (covered["coverage"].sel(noise=["coloured", "biased"]) < covered["low"].sel(noise="white")).all()
-    # A tenth of the samples lost costs about a twentieth of the precision, and is told.
+    # Without 10 % of the samples the errors are about 5 % larger, and the intervals too.
     assert float(covered["high"].sel(noise="lossy")) > 0.95
 
 
 def test_scale(tmp_path):
     data = study("scale", tmp_path)
     efficiency, covered = metrics.efficiency(data), metrics.mean_coverage(data).sel(level=0.95)["coverage"]
-    # Of 128 flights, each of eight parameters within five Monte-Carlo errors of the bound.
+    # Each of eight parameters is within five Monte-Carlo errors of the bound.
     assert (abs(efficiency["efficiency"] - 1) < 5 / np.sqrt(2 * 128)).all()
     assert (abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 128)).all()
 
@@ -209,7 +169,7 @@ def test_frontier(tmp_path):
     # The published gyroscopic terms are far below any sensor's noise, the corrected ones are not.
     gyroscopic = frontier.sel(parameter="alpha2", excitation="multisine")
     assert float(gyroscopic.sel(model="published")) < 1e-4 < 1 < float(gyroscopic.sel(model="corrected"))
-    # A doublet moves one axis at a time: products of rates are not excited; alpha7 is 0.
+    # A doublet moves one axis at a time, so products of rates are not excited. alpha7 is 0.
     assert frontier.sel(excitation="doublet", parameter="alpha1").isnull().all()
     assert (frontier.sel(parameter="alpha7") == 0).all()
 
@@ -221,10 +181,10 @@ def test_rollout_budget(tmp_path):
     data = load_results(tmp_path / "out").squeeze()
     reached = load("rollout_budget", "plot").accuracy(data)
     assert (data["rollouts"].mean("flight").isel(limit=1) >= data["rollouts"].mean("flight").isel(limit=0)).all()
-    # A sweep of each stage is as good as the whole search; a step of output error is not.
+    # One sweep of each stage is as good as the complete search; one step of output error is not.
     assert float(reached.isel(limit=0).sel(search="IBSS, whitened")) < 1.2
     assert float(reached.isel(limit=0).sel(search="output error")) > 2
-    # Of 32 flights and eight parameters; both minimise the same cost.
+    # Both minimise the same cost.
     np.testing.assert_allclose(reached.isel(limit=1), 1, atol=0.2)
 
 
@@ -235,16 +195,16 @@ def test_published_corrected(tmp_path):
     rms = (data["error"] ** 2).mean("flight") ** 0.5
     rejected = (data["white_p"] < 0.01).mean("flight")
     own = [{"flown": model, "fitted": model} for model in ("published", "corrected")]
-    # Their own flights: at the bound, and noise is left.
+    # Each model is at the bound on its own flights, and the residuals are noise.
     for which in own:
-        assert data["told"].sel(which).all()
+        assert data["answered"].sel(which).all()
         np.testing.assert_allclose(rms.sel(which), 1, atol=0.6)
         assert float(rejected.sel(which)) < 0.2
-    # The published model has no term for what the rotors do to the corrected one, and its residuals say so.
+    # The published model lacks a term of the corrected one, and its residuals show it.
     alien = {"flown": "corrected", "fitted": "published"}
     assert float(rms.sel(alien).min()) > 2
     assert float(rejected.sel(alien)) == 1
-    # The corrected one holds the published one, with alpha2 and alpha5 of 0: the fit is sound, those two are not.
+    # With alpha2 = alpha5 = 0 the corrected model equals the published one: only these two estimates are wrong.
     alien = {"flown": "published", "fitted": "corrected"}
     assert float(rejected.sel(alien)) < 0.2
     assert (rms.sel(alien).sel(parameter=["alpha2", "alpha5"]) > 10).all()
@@ -285,14 +245,14 @@ def test_real_flight(shared_flights, tmp_path):
     plot("real_flight", tmp_path / "out", tmp_path / "figures")
     report = json.loads((tmp_path / "out" / "results.json").read_text())
     shot = report["estimators"]["ibss"]
-    # 5 s are fitted, the next 5 s predicted. A quarter of a second ahead that is better than no change in roll and
-    # pitch, and without the moment that goes with the air's flow it is worse.
+    # 5 s are fitted, the next 5 s predicted. 0.25 s ahead the skill of roll and pitch is positive, and better than
+    # without the `flapping` moment.
     at = int(np.argmin(np.abs(np.array(shot["skill"]["horizons"]) - 0.25)))
     without = report["estimators"]["ibss without flapping"]["skill"]
     for rate in "pq":
         assert shot["skill"][rate]["skill"][at] > 0
         assert shot["skill"][rate]["skill"][at] > without[rate]["skill"][at]
-    # The inertias lie between the authors' figures and twice regression's, and depend on the lag that is held.
+    # The inertias are between the authors' values and twice those of regression, and depend on the lag.
     for name, value in report["authors"].items():
         assert value < shot["inertias"][name]["estimate"] < 4.4e-5
         low, high = (row["inertias"][name] for row in report["lag"])

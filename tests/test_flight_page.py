@@ -20,7 +20,7 @@ EVIL = "</script><script>alert(1)</script>"
 def synthetic_report():
     row = {"unit": "1/(kg m^2)", "noise_limit": None}
     told = {"estimate": 57712.3, "std": 512.0, "bound": 130.0, "ci95": [56708.8, 58715.8], "note": ""}
-    untold = {"estimate": None, "std": None, "bound": 2e6, "ci95": None, "note": "not told by this flight"}
+    untold = {"estimate": None, "std": None, "bound": 2e6, "ci95": None, "note": "not identifiable from this flight"}
     each = {"skill": [0.91, 0.731, None], "std": [0.02, 0.14, None], "rmse": [0.2, 0.4, None]}
     return {
         "estimator": "ibss",
@@ -30,7 +30,7 @@ def synthetic_report():
         "cost": 1234.5,
         "seconds": 35.4,
         "parameters": {"alpha3": row | told, "alpha6": row | untold},
-        "held": {"alpha1": {"value": -0.8125, "note": "not told by these flights"}},
+        "held": {"alpha1": {"value": -0.8125, "note": "not identifiable from these flights"}},
         "constants": {"Ix": {"estimate": 1.733e-5, "std": 1.5e-7, "unit": "kg m^2"}, "consistency_p": 0.21},
         "skill": {
             "horizons": [0.1, 0.248, 0.5],
@@ -93,8 +93,8 @@ def test_it_says_what_the_report_holds(tmp_path):
     for words in (
         "ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230",
         "57710 56710 to 58720 130",
-        "alpha6 1/(kg m^2) – 2.0e6 not told by this flight",
-        "alpha1 -0.8125 held: not told by these flights",
+        "alpha6 1/(kg m^2) – 2.0e6 not identifiable from this flight",
+        "alpha1 -0.8125 held: not identifiable from these flights",
         "1.733e-5 1.704e-5 to 1.762e-5",
         "p = 0.21",
         "377 starts",

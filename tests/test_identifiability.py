@@ -1,4 +1,4 @@
-"""What a flight cannot tell is named, with the right reason and the right figure."""
+"""Parameters that are not identifiable are named, with the right reason and the right number."""
 
 import equinox as eqx
 import jax
@@ -21,17 +21,24 @@ def problem_of(omega, model_class=jaxos4.PublishedOS4, channels="rates", scale=1
     return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=flight.states[0], channels=channels)
 
 
-def notes_of(problem, report=False):
-    model = problem.model
-    found = jaxos4.identifiability(problem, jaxos4.Bracket.default(model), model.alpha)
-    return found if report else found.notes(model.parameter_names)
+def analysed(problem):
+    return jaxos4.identifiability(problem, jaxos4.Bracket.default(problem.model), problem.model.alpha)
 
 
-def test_a_hover_tells_nothing():
+def notes_of(problem):
+    return analysed(problem).notes(problem.model.parameter_names)
+
+
+def not_excited(problem):
+    reasons = analysed(problem).reasons(problem.model.parameter_names)
+    return {name for name, reason in reasons.items() if reason == "not excited"}
+
+
+def test_a_hover_excites_nothing():
     omega = jnp.full((301, 4), jaxos4.OS4.hover_speed)
     notes = notes_of(problem_of(omega, channels="all"))
     assert list(notes) == [f"alpha{i}" for i in range(1, 9)]
-    assert set(notes.values()) == {"not told: not excited"}
+    assert set(notes.values()) == {"not identifiable: not excited"}
 
 
 @pytest.mark.parametrize(
@@ -42,26 +49,23 @@ def test_a_hover_tells_nothing():
         ("pitch", {"alpha1", "alpha3", "alpha4", "alpha5", "alpha7", "alpha8"}),
     ],
 )
-def test_one_axis_excited_tells_of_that_axis_alone(axis, lost):
-    """Eqs. (1)-(3): alpha2 multiplies q in p', alpha5 multiplies r in q', so that pitch and yaw tell of those too."""
-    omega = jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=[axis])
-    notes = notes_of(problem_of(omega))
-    assert {name for name, note in notes.items() if note.startswith("not told: not excited")} == lost
+def test_one_axis_excites_its_own_parameters_only(axis, lost):
+    """Eqs. (1)-(3): alpha2 multiplies q in p', alpha5 multiplies r in q', so pitch and yaw excite those too."""
+    assert not_excited(problem_of(jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=[axis]))) == lost
 
 
-def test_without_yaw_what_needs_yaw_is_named():
+def test_without_yaw_the_parameters_that_need_yaw_are_named():
     omega = jaxos4.multisine(jaxos4.OS4, duration=5.0, dt=DT, tones=((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), ()))
-    published, corrected = (notes_of(problem_of(omega, m)) for m in MODELS)
-    # p q alpha7 drives a little yaw by itself only where alpha7 is not 0; it is 0 for the OS4.
-    untold = {"alpha1", "alpha4", "alpha5", "alpha8"}
-    assert {name for name, note in published.items() if note.startswith("not told")} == untold
-    assert {"alpha1", "alpha4", "alpha8"} <= {n for n, note in corrected.items() if note.startswith("not told")}
+    published, corrected = (set(analysed(problem_of(omega, m)).reasons(m(jaxos4.OS4).parameter_names)) for m in MODELS)
+    # p q alpha7 would excite yaw a little, but alpha7 is 0 for the OS4.
+    assert published == {"alpha1", "alpha4", "alpha5", "alpha8"}
+    assert {"alpha1", "alpha4", "alpha8"} <= corrected
 
 
-def test_what_is_told_only_together_is_named_with_its_partner():
+def test_a_parameter_that_is_identifiable_only_together_is_named_with_its_partner():
     """Roll torque and the product q r in one rhythm: neither alone, only their sum."""
     problem = problem_of(standard_flight().omega)
-    found = notes_of(problem, report=True)
+    found = analysed(problem)
     trade = jnp.zeros((8, 8)).at[0, 0].set(1.0).at[3, 3].set(1.0).at[0, 3].set(1.0).at[3, 0].set(1.0)
     information = 1e6 * (jnp.eye(8) - jnp.diag(jnp.eye(8)[0] + jnp.eye(8)[3]) + trade) + 1e-4 * jnp.eye(8)
     values, vectors = jnp.linalg.eigh(information)
@@ -72,41 +76,36 @@ def test_what_is_told_only_together_is_named_with_its_partner():
         (jnp.ones(8), std, 1e-3 * jnp.ones(8), values, vectors),
     )
     notes = degenerate.notes(problem.model.parameter_names)
-    assert notes["alpha1"] == "not told: only together with alpha4"
-    assert notes["alpha4"] == "not told: only together with alpha1"
+    assert notes["alpha1"] == "not identifiable: only together with alpha4"
+    assert notes["alpha4"] == "not identifiable: only together with alpha1"
     assert "alpha3" not in notes
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
 def test_the_published_gyroscopic_parameters_lie_below_the_noise_and_the_figure_is_right(scale):
     problem = problem_of(standard_flight().omega, channels="all", scale=scale)
-    found = notes_of(problem, report=True)
+    found = analysed(problem)
     notes = found.notes(problem.model.parameter_names)
     below = {name for name, note in notes.items() if note.startswith("below the noise floor")}
-    assert below == {"alpha2", "alpha5"}  # alpha7 is 0 for the OS4: no noise would tell it from that
-    # At that noise the bound is what it must be to tell the parameter from 0.
+    assert below == {"alpha2", "alpha5"}  # not alpha7, which is 0 for the OS4
+    # At the limit, the 95 % interval of the parameter just reaches 0.
     limit = float(found.noise_limit[1])
-    quieter = notes_of(problem_of(standard_flight().omega, channels="all", scale=scale * limit), report=True)
+    quieter = analysed(problem_of(standard_flight().omega, channels="all", scale=scale * limit))
     np.testing.assert_allclose(1.959964 * quieter.std[1], abs(problem.model.alpha[1]), rtol=1e-6)
-    # The noise of sigma = 1 at which alpha2 = 6e-9 appears does not depend on the noise that one has.
-    np.testing.assert_allclose(
-        scale * limit,
-        float(notes_of(problem_of(standard_flight().omega, channels="all"), True).noise_limit[1]),
-        rtol=1e-9,
-    )
+    # The limit in absolute units does not depend on the problem's noise.
+    standard = analysed(problem_of(standard_flight().omega, channels="all"))
+    np.testing.assert_allclose(scale * limit, float(standard.noise_limit[1]), rtol=1e-9)
 
 
 def test_the_corrected_models_gyroscopic_parameters_lie_above_it():
     problem = problem_of(standard_flight(jaxos4.CorrectedOS4).omega, jaxos4.CorrectedOS4, channels="all")
-    notes = notes_of(problem)
-    assert "alpha2" not in notes
-    assert "alpha5" not in notes
+    assert not {"alpha2", "alpha5"} & set(notes_of(problem))
 
 
 @pytest.mark.parametrize("model_class", MODELS)
 def test_the_scaled_informations_inverse_is_the_bound(model_class):
     problem = standard_problem(model_class, "all", free=True)
-    found = notes_of(problem, report=True)
+    found = analysed(problem)
     rebuilt = (found.directions / found.eigenvalues) @ found.directions.T
     bound = jaxos4.cramer_rao_bound(problem, problem.model.alpha)
     np.testing.assert_allclose(rebuilt * np.outer(found.half_width, found.half_width), bound, rtol=1e-6)
@@ -128,7 +127,7 @@ def test_a_profile_is_the_parabola_of_the_bound(estimator):
 
 
 def residual_noise(flights, correlation_time):
-    """Errors of flights with Gauss-Markov noise, in naive and in robust standard deviations."""
+    """Errors of flights with Gauss-Markov noise, in standard deviations of the bound and of the robust covariance."""
     problem = standard_problem(channels="rates")
     truth, noise = problem.flight, jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, correlation_time)
     keys = jax.random.split(jax.random.key(11), flights)
@@ -145,46 +144,48 @@ def residual_noise(flights, correlation_time):
     return (np.asarray(x) for x in one(keys))
 
 
-def test_robust_intervals_hold_under_coloured_noise_where_naive_ones_do_not():
+def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_not():
     flights = 256
     naive, robust = residual_noise(flights, 0.05)
     covered = [(np.abs(x) < 1.96).mean() for x in (naive, robust)]
     assert covered[0] < 0.6
-    # Residuals hold less slow noise than the measurements did: what the fit took for motion.
+    # The fit explains some slow noise as motion, so it is missing in the residuals.
     assert 0.85 < covered[1] < 0.98
 
 
-def test_robust_is_the_bound_under_white_noise():
-    problem = standard_problem(channels="attitude", states=noisy_states(1, seed=9)[0], duration=5.0, free=True)
+def robust_ratio(problem):
+    """A fit, its robust covariance, and the ratio of robust standard deviations to those of the bound."""
     found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
     robust = jaxos4.robust_covariance(problem, found.parameters, found.initial_state)
-    ratio = np.sqrt(np.diagonal(robust)) / found.std
+    return found, robust, np.sqrt(np.diagonal(robust)) / found.std
+
+
+def test_robust_is_the_bound_under_white_noise():
+    problem = standard_problem(channels="attitude", states=noisy_states(1, seed=9)[0], free=True)
+    found, robust, ratio = robust_ratio(problem)
     assert np.all((ratio > 0.7) & (ratio < 1.3))
-    # Where sigma is wrong by three, the robust one stays with the truth.
+    # The robust covariance does not depend on sigma: here it is wrong by a factor of three.
     wrong = eqx.tree_at(lambda p: p.sigma, problem, problem.sigma / 3)
     again = jaxos4.robust_covariance(wrong, found.parameters, found.initial_state)
     np.testing.assert_allclose(again, robust, rtol=1e-6)
 
 
 def test_robust_is_honest_where_most_samples_are_missing():
-    """Dropouts scale the number of pairs of residuals by another factor than that of samples."""
-    whole = standard_problem(channels="rates", states=noisy_states(1, seed=9)[0])
+    """Dropouts reduce the number of pairs of residuals by another factor than the number of samples."""
     kept = np.random.default_rng(0).random(501) < 0.3
-    sparse = eqx.tree_at(lambda p: p.flight.states, whole, jnp.where(kept[:, None], whole.flight.states, jnp.nan))
-    found = jaxos4.IBSS()(sparse, jaxos4.Bracket.default(whole.model))
-    robust = jaxos4.robust_covariance(sparse, found.parameters, found.initial_state)
-    ratio = np.sqrt(np.diagonal(robust)) / found.std
+    states = jnp.where(kept[:, None], noisy_states(1, seed=9)[0], jnp.nan)
+    _, _, ratio = robust_ratio(standard_problem(channels="rates", states=states))
     assert np.all((ratio > 0.6) & (ratio < 1.4))
 
 
-def test_robust_tells_nothing_from_nothing():
+def test_robust_is_infinite_without_measurements_or_a_trajectory():
     problem = standard_problem(channels="rates")
     blank = eqx.tree_at(lambda p: p.flight.states, problem, jnp.full((501, 12), jnp.nan))
     for broken, alpha in ((blank, problem.model.alpha), (problem, problem.model.alpha.at[2].set(1e9))):
         assert np.isposinf(jaxos4.robust_covariance(broken, alpha)).all()
 
 
-def test_where_the_model_cannot_fly_nothing_is_told():
+def test_nothing_is_identifiable_without_a_trajectory_or_a_bracket():
     problem = standard_problem(channels="rates")
     names, bracket = problem.model.parameter_names, jaxos4.Bracket.default(problem.model)
     upside_down = jaxos4.Bracket(bracket.upper, bracket.lower)
@@ -192,7 +193,8 @@ def test_where_the_model_cannot_fly_nothing_is_told():
     for where, alpha in ((bracket, runaway), (upside_down, problem.model.alpha)):
         found = jaxos4.identifiability(problem, where, alpha)
         assert np.isposinf(found.std).all()
-        assert set(found.notes(names).values()) == {"not told: no trajectory, or no bracket, to judge by"}
+        reason = "the trajectory is not finite, or the bracket is not valid"
+        assert found.reasons(names) == dict.fromkeys(names, reason)
     with pytest.raises(ValueError, match="`parameters` must hold 8"):
         jaxos4.identifiability(problem, bracket, problem.model.alpha[:4])
     with pytest.raises(ValueError, match="`bracket` must hold 8"):

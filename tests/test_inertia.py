@@ -1,4 +1,4 @@
-"""The constants of a rigid body: from alphas, and estimated in place of them."""
+"""The constants of a rigid body: fitted to alphas, and estimated instead of them."""
 
 import equinox as eqx
 import jax
@@ -53,7 +53,7 @@ def test_it_is_the_weighted_least_squares_that_another_minimiser_finds(model_cla
     assert np.abs((fit.constants - best.x * constants()) / fit.std).max() < 1e-4
     spread = np.linalg.inv(best.jac.T @ best.jac) * np.outer(constants(), constants())
     np.testing.assert_allclose(fit.std, np.sqrt(np.diagonal(spread)), rtol=1e-3)
-    # Unweighted, another answer: the weights matter, and a comparison that left them out would be seen.
+    # The weights matter: an unweighted fit gives another answer.
     plain = jaxos4.fit_inertia(model, jnp.asarray(alpha), jnp.diag(jnp.square(model.half_width)))
     assert np.abs((fit.constants - plain.constants) / fit.std).max() > 0.3
 

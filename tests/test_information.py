@@ -11,7 +11,7 @@ from jaxos4.models.state import CHANNELS
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
 known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
 
-# Standard deviations in % of alpha, for alpha2, 5 and 7 absolute x 100: of the standard flight, known start.
+# Standard flight, known initial state: standard deviations in % of alpha (alpha2, 5 and 7: absolute x 100).
 PRINTED = {
     "rates": ("0.81", "0.11", "0.11", "0.80", "0.19", "0.11", "0.52", "0.11"),
     "attitude": ("0.35", "0.040", "0.098", "0.38", "0.092", "0.099", "0.13", "0.090"),
@@ -33,7 +33,7 @@ def test_the_standard_flights_bounds_are_the_known_figures(channels):
 
 
 def jacobian(problem, parameters, start):
-    """Of the weighted residuals in parameters and start, by central differences."""
+    """Derivatives of the weighted residuals in parameters and initial state, by central differences."""
     residuals = eqx.filter_jit(eqx.filter_vmap(problem.residuals))
     point = np.concatenate([parameters, start])
     step = np.concatenate([1e-4 * jaxos4.DEFAULT_HALF_WIDTH, np.full(problem.size, 1e-4)])
@@ -45,18 +45,13 @@ def jacobian(problem, parameters, start):
 @pytest.mark.parametrize("model_class", [jaxos4.PublishedOS4, jaxos4.CorrectedOS4])
 @every_channels
 def test_information_is_the_jacobians_square(model_class, channels):
-    """Where the start is free, of what is left of the joint one, whose inverse has the bound in its corner."""
+    """A free initial state is eliminated: the bound is a corner of the inverse of the joint information."""
     alpha = model_class().alpha
     for free in (False, True):
         problem = standard_problem(model_class, channels, free=free)
-        start = problem.first_state()[0]
-        if not free:
-            slopes = jacobian(problem, alpha, start)[:, :8]
-            information = slopes.T @ slopes
-        else:
-            slopes = jacobian(problem, alpha, start)
-            joint = slopes.T @ slopes
-            information = np.linalg.inv(np.linalg.inv(joint)[:8, :8])
+        slopes = jacobian(problem, alpha, problem.first_state()[0])
+        joint = slopes.T @ slopes
+        information = np.linalg.inv(np.linalg.inv(joint)[:8, :8]) if free else joint[:8, :8]
         scale = np.sqrt(np.diagonal(information))
         actual = jaxos4.fisher_information(problem, alpha)
         np.testing.assert_allclose(actual / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-6)
@@ -162,14 +157,14 @@ def test_a_marginal_is_the_inverses_corner():
 
 
 def arrow(blocks, count):
-    """The information of all windows' unknowns at once: what is shared, then each window's own."""
+    """The joint information of all windows: the shared unknowns first, then each window's own."""
     windows, size, _ = blocks.shape
     own = size - count
-    whole = np.zeros((count + windows * own,) * 2)
+    joint = np.zeros((count + windows * own,) * 2)
     for w, block in enumerate(np.asarray(blocks)):
         places = np.concatenate([np.arange(count), count + w * own + np.arange(own)])
-        whole[np.ix_(places, places)] += block
-    return whole
+        joint[np.ix_(places, places)] += block
+    return joint
 
 
 @pytest.mark.parametrize("windows", [1, 2, 7])
@@ -177,9 +172,9 @@ def test_block_elimination_is_the_inverse_of_the_whole(windows):
     rng = np.random.default_rng(windows)
     slopes = rng.normal(size=(windows, 40, 11)) * 10.0 ** rng.uniform(-6, 6, 11)
     blocks = jnp.asarray(np.swapaxes(slopes, 1, 2) @ slopes)
-    whole = arrow(blocks, 8)
-    unit = np.sqrt(np.diagonal(whole))
-    inverse = np.linalg.inv(whole / np.outer(unit, unit)) / np.outer(unit, unit)
+    joint = arrow(blocks, 8)
+    unit = np.sqrt(np.diagonal(joint))
+    inverse = np.linalg.inv(joint / np.outer(unit, unit)) / np.outer(unit, unit)
     scale = np.sqrt(np.diagonal(inverse))
     found = np.asarray(covariances(blocks, 8))
     for w in range(windows):
@@ -192,7 +187,7 @@ def test_block_elimination_is_the_inverse_of_the_whole(windows):
     np.testing.assert_allclose(np.swapaxes(basis, 1, 2) @ factor, identity, atol=1e-9)
 
 
-def test_a_flight_that_hovers_tells_nothing():
+def test_no_parameter_is_identifiable_in_a_hover():
     model = jaxos4.PublishedOS4()
     omega = jaxos4.multisine(model.airframe, amplitude=0.0)
     flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)

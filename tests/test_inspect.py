@@ -58,7 +58,7 @@ def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):
     (tmp_path / "hover.csv").write_text("\n".join(["t,omega1,omega2,omega3,omega4,p,q,r", *rows]))
     code, out, err = run("inspect", "hover.csv", "--airframe", "os4")
     assert (code, err) == (0, "")
-    for words in ("none (0)", "identifiable: nothing", "alpha3: not told: not excited"):
+    for words in ("none (0)", "identifiable: nothing", "alpha3: not identifiable: not excited"):
         assert words in out
 
 

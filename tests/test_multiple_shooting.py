@@ -183,7 +183,7 @@ def test_equation_error_is_the_same_whatever_the_windows():
 
 
 def test_the_cost_of_each_estimator_is_that_of_its_answer():
-    """A doublet seen from a bracket that is off: some parameters are not told."""
+    """A doublet seen from a bracket that is off: some parameters are not identifiable."""
     model = jaxos4.PublishedOS4()
     flight = jaxos4.simulate(model, model.alpha, jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT), dt=DT)
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))

@@ -1,4 +1,4 @@
-"""Huber's estimate by modified residuals: against a reference written otherwise, and against outliers."""
+"""Huber's estimate by modified residuals, compared with an independent reference and tested with outliers."""
 
 import equinox as eqx
 import jax
@@ -15,20 +15,13 @@ RATE_COLUMNS = CASCADE_ORDER[:3]
 
 
 def problem_with(states, *, force=None, model=None, windows=1, **arguments):
-    flight = standard_flight()
-    flight = jaxos4.Flight(flight.time, flight.omega, states, force)
-    return jaxos4.ShootingProblem(
-        jaxos4.PublishedOS4() if model is None else model,
-        flight,
-        sigma=jaxos4.SENSOR_SIGMA,
-        channels="rates",
-        windows=windows,
-        **arguments,
-    )
+    flight = jaxos4.Flight(standard_flight().time, standard_flight().omega, states, force)
+    arguments = {"sigma": jaxos4.SENSOR_SIGMA, "channels": "rates", "windows": windows} | arguments
+    return jaxos4.ShootingProblem(jaxos4.PublishedOS4() if model is None else model, flight, **arguments)
 
 
 def spoiled(states, share=0.05, size=50.0, seed=0):
-    """`share` of the rates 50 standard deviations up."""
+    """The states with a `share` of the rates increased by 50 standard deviations, and which of them."""
     rng = np.random.default_rng(seed)
     states = np.array(states)
     hit = rng.uniform(size=(states.shape[0], 3)) < share
@@ -59,26 +52,26 @@ def test_measurements_are_cut_as_written():
     errors = measured - predicted
     kept = total = 0
     for column in range(3):
-        there = np.isfinite(errors[:, column])
-        scale = np.median(np.abs(errors[there, column])) / 0.6745
+        finite = np.isfinite(errors[:, column])
+        scale = np.median(np.abs(errors[finite, column])) / 0.6745
         assert float(used.problem.sigma[RATE_COLUMNS[column]]) == pytest.approx(scale, rel=1e-10)
         for k in range(states.shape[0]):
             new = float(used.problem.flight.states[k, RATE_COLUMNS[column]])
-            if not there[k]:
+            if not finite[k]:
                 assert np.isnan(new)
                 continue
             expected = predicted[k, column] + min(max(errors[k, column], -CUT * scale), CUT * scale)
             assert new == pytest.approx(expected, rel=1e-9, abs=1e-12)
             kept, total = kept + (abs(errors[k, column]) <= CUT * scale), total + 1
     assert float(used.share) == pytest.approx(kept / total, rel=1e-12)
-    # What is not compared stays.
+    # Channels that are not compared do not change.
     others = np.setdiff1d(np.arange(12), RATE_COLUMNS)
     np.testing.assert_array_equal(used.problem.flight.states[:, others], problem.flight.states[:, others])
     np.testing.assert_array_equal(used.problem.sigma[others], problem.sigma[others])
 
 
 def test_it_is_hubers_estimate_of_a_reference():
-    """Iteratively reweighted least squares on the same Jacobian: another algorithm for the same loss."""
+    """The reference is iteratively reweighted least squares: another algorithm for the same loss."""
     states, _ = spoiled(noisy_states(1)[0])
     problem = problem_with(states, initial_state=np.zeros(12))
     found, used = iterate(problem, jaxos4.Bracket.default(problem.model))
@@ -98,12 +91,12 @@ def test_it_is_hubers_estimate_of_a_reference():
             break
     else:
         pytest.fail("the reference did not converge")
-    # Both fixed points: the scale is that of the residuals' median at the answer.
+    # Both have the same fixed point, because the scale comes from the median of the residuals there.
     assert np.all(np.abs(found.parameters - alpha) < 2e-2 * found.std)
 
 
 def test_outliers_move_least_squares_and_not_this():
-    """By 1.12 bounds where 5 % are outliers: Huber's asymptotic variance; four standard errors are allowed for."""
+    """With 5 % outliers the errors are 1.12 bounds (Huber's asymptotic variance); allow four standard errors."""
     flights = 24
     clean = noisy_states(flights, seed=3)
     spoiled_states, hit = (np.stack(x) for x in zip(*(spoiled(clean[i], seed=i) for i in range(flights)), strict=True))
@@ -123,7 +116,7 @@ def test_outliers_move_least_squares_and_not_this():
         return plain.parameters, robust.parameters, shares[-1]
 
     plain, robust, share = eqx.filter_jit(eqx.filter_vmap(identify))(jnp.asarray(spoiled_states))
-    # Outliers make the median 1.063 times that of the noise: of this 84.7 % are within 1.345 times as much.
+    # Outliers increase the median by 1.063, and 84.7 % of the noise is within 1.345 times that scale.
     assert np.all(np.abs(share - (1 - hit.reshape(flights, -1).mean(axis=1)) * 0.847) < 0.04)
     plain, robust = (np.sqrt(np.square((x - base.model.alpha) / bound).mean()) for x in (plain, robust))
     assert plain > 6

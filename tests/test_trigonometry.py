@@ -38,7 +38,7 @@ def test_is_odd_and_even_and_on_the_circle():
     np.testing.assert_allclose(sin**2 + cos**2, 1, rtol=0, atol=5e-16)
 
 
-def test_what_is_no_angle_is_not_a_number():
+def test_nan_and_infinity_give_nan():
     for value in sincos(jnp.array([jnp.nan, jnp.inf, -jnp.inf])):
         assert np.isnan(value).all()
     for value in jax.jvp(lambda x: sincos(x)[0], (jnp.array([jnp.nan, jnp.inf]),), (jnp.ones(2),)):

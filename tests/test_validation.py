@@ -1,4 +1,4 @@
-"""Predictions tenths of a second ahead: exact where the model is, worth nothing where it says that nothing moves."""
+"""Predictions of the rates: exact if the model is exact, without skill if the model says that nothing moves."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,8 +25,8 @@ def spread(model, flight):
     return jaxos4.predictions(problem_of(model, flight), model.alpha, horizons=HORIZONS)
 
 
-def made(errors, changes):
-    """Predictions with these errors of rates that changed by so much."""
+def synthetic(errors, changes):
+    """Predictions with these errors, of rates that change by `changes`."""
     errors, changes = np.broadcast_arrays(np.asarray(errors, float), np.asarray(changes, float))
     starts = errors.shape[0]
     measured = np.zeros((starts, 1, 3)) + changes
@@ -39,7 +39,7 @@ def test_a_flight_without_noise_is_predicted(model):
     found = spread(model, flight)
     skill = jaxos4.skill(found)
     np.testing.assert_allclose(found.horizons, HORIZONS)
-    # The start is a mean over 0.02 s: what it is off by is the curvature of the rates, and nothing else.
+    # The initial rates are a mean over 0.02 s, which is wrong by the curvature of the rates only.
     off = np.abs(found.initial - np.asarray(flight.states)[found.start][:, RATES]).max()
     assert off < 0.01
     assert np.abs(found.predicted - found.measured).max() < 3 * off
@@ -60,7 +60,7 @@ def test_at_a_step_so_long_that_the_start_is_one_sample_predictions_are_exact():
     np.testing.assert_allclose(found.horizons, np.rint(np.array(HORIZONS) / 0.025) * 0.025)
 
 
-def test_rates_that_stay_as_they_are_are_worth_nothing():
+def test_a_model_without_motion_has_no_skill():
     model = jaxos4.CorrectedOS4()
     still = jnp.zeros(8)
     found = jaxos4.predictions(problem_of(model, flown(model)), still, horizons=HORIZONS)
@@ -84,32 +84,32 @@ def test_windows_and_channels_do_not_matter():
     model = jaxos4.CorrectedOS4()
     flight = flown(model)
     one = spread(model, flight)
-    for arguments in ({"windows": 5}, {"windows": 1}):
-        other = jaxos4.predictions(
-            jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="all", method="rk4", **arguments),
-            model.alpha,
+    for windows in (5, 1):
+        other = jaxos4.ShootingProblem(
+            model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="all", method="rk4", windows=windows
         )
+        other = jaxos4.predictions(other, model.alpha)
         np.testing.assert_allclose(other.predicted, one.predicted, rtol=1e-12, atol=1e-13)
 
 
 def test_no_prediction_crosses_into_another_stretch():
     model = jaxos4.FlightModel()
     rest = flown(model, seconds=4.0)
-    # The second stretch is flown from elsewhere: whatever crosses is far off.
+    # The second stretch has other states: a prediction across the border would be far off.
     away = jaxos4.Flight(rest.time, rest.omega, rest.states + 5.0)
     flight = jaxos4.join([rest, away, rest], length=90)
     stretch = np.asarray(flight.stretch)
     found = spread(model, flight)
     ahead = int(round(max(HORIZONS) / DT))
     assert np.all(stretch[found.start - 1] == stretch[found.start + ahead])
-    # And all that could be are there, 0.05 s apart.
+    # No possible start is omitted; they are 0.05 s apart.
     grid = np.arange(1, stretch.size - ahead - 1, 5)
     np.testing.assert_array_equal(found.start, grid[stretch[grid - 1] == stretch[grid + ahead]])
     for i in range(3):
         assert np.count_nonzero(stretch[found.start] == i) > 50
 
 
-def test_what_was_not_measured_is_not_counted():
+def test_missing_measurements_do_not_count():
     model = jaxos4.CorrectedOS4()
     flight = flown(model)
     states = np.array(flight.states)
@@ -123,27 +123,27 @@ def test_what_was_not_measured_is_not_counted():
     at = found.start[:, None] + np.rint(found.horizons / DT).astype(int)
     np.testing.assert_array_equal(found.measured, states[at][:, :, RATES])
     skill = jaxos4.skill(found)
-    told = np.isfinite(found.measured)
-    assert told.sum() < told.size
-    errors = np.where(told, found.predicted - found.measured, np.nan)
+    measured = np.isfinite(found.measured)
+    assert measured.sum() < measured.size
+    errors = np.where(measured, found.predicted - found.measured, np.nan)
     np.testing.assert_allclose(skill.rmse, np.sqrt(np.nanmean(errors**2, axis=0)), rtol=1e-12)
     assert np.all(skill.skill > 1 - 1e-3)
 
 
-def test_a_prediction_that_diverges_is_worth_less_than_any():
-    skill = jaxos4.skill(made(np.where(np.arange(40) == 7, np.nan, 0.1)[:, None, None], 1.0))
-    # It counts as what no gyro measures.
+def test_a_prediction_that_diverges_has_a_very_bad_skill():
+    skill = jaxos4.skill(synthetic(np.where(np.arange(40) == 7, np.nan, 0.1)[:, None, None], 1.0))
+    # It counts as an error that no gyro could measure.
     assert np.all(np.isfinite(skill.skill) & (skill.skill < -1e4))
     np.testing.assert_allclose(skill.rmse, np.sqrt((1e6 + 39 * 0.01) / 40), rtol=1e-2)
 
 
-def test_where_nothing_moves_any_error_is_worse_than_persistence():
-    skill = jaxos4.skill(made(np.full((30, 1, 3), 0.1), 0.0))
+def test_any_error_is_worse_than_persistence_if_nothing_moves():
+    skill = jaxos4.skill(synthetic(np.full((30, 1, 3), 0.1), 0.0))
     assert np.all(np.isneginf(skill.skill))
 
 
-def test_what_was_never_measured_has_no_skill():
-    nothing = made(np.zeros((30, 1, 3)), 1.0)
+def test_a_rate_that_was_never_measured_has_no_skill():
+    nothing = synthetic(np.zeros((30, 1, 3)), 1.0)
     measured = np.ones((30, 1, 3))
     measured[:, :, 2] = np.nan
     skill = jaxos4.skill(nothing._replace(measured=measured))
@@ -151,14 +151,16 @@ def test_what_was_never_measured_has_no_skill():
 
 
 def test_the_jackknife_is_the_spread_of_the_skill():
-    """Of independent errors, over many flights; and by its formula on one."""
+    """For independent errors over many flights, and by its formula for one flight."""
     rng = np.random.default_rng(0)
-    skills = [jaxos4.skill(made(0.5 * rng.normal(size=(200, 1, 3)), rng.normal(size=(200, 1, 3)))) for _ in range(300)]
+    skills = [
+        jaxos4.skill(synthetic(0.5 * rng.normal(size=(200, 1, 3)), rng.normal(size=(200, 1, 3)))) for _ in range(300)
+    ]
     actual = np.std([s.skill for s in skills], axis=0)
     claimed = np.sqrt(np.mean([np.square(s.std) for s in skills], axis=0))
-    # Of 300 flights the spread itself is told to 4 %; the jackknife is a little wide.
+    # The spread of 300 flights is known to 4 %, and the jackknife is a little wide.
     np.testing.assert_allclose(claimed, actual, rtol=0.2)
-    one = made(rng.normal(size=(20, 1, 3)), rng.normal(size=(20, 1, 3)))
+    one = synthetic(rng.normal(size=(20, 1, 3)), rng.normal(size=(20, 1, 3)))
     errors, changes = one.predicted - one.measured, one.initial[:, None] - one.measured
     without = []
     for part in range(10):
@@ -169,7 +171,7 @@ def test_the_jackknife_is_the_spread_of_the_skill():
 
 
 def test_a_single_start_has_a_skill_without_a_spread():
-    skill = jaxos4.skill(made(np.full((1, 1, 3), 0.1), 1.0))
+    skill = jaxos4.skill(synthetic(np.full((1, 1, 3), 0.1), 1.0))
     np.testing.assert_allclose(skill.skill, 0.99)
     assert np.isnan(skill.std).all()
     assert skill.starts == 1
@@ -178,7 +180,7 @@ def test_a_single_start_has_a_skill_without_a_spread():
 def test_flights_that_are_too_short_or_without_rates_are_refused():
     model = jaxos4.CorrectedOS4()
     flight = flown(model, seconds=0.4)
-    with pytest.raises(ValueError, match=r"`flight` holds no stretch .* longer than 0.5 s"):
+    with pytest.raises(ValueError, match=r"`flight` has no stretch .* longer than 0.5 s"):
         spread(model, flight)
     long = flown(model, seconds=3.0)
     with pytest.raises(ValueError, match="no stretch with measured rates"):

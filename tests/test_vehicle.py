@@ -80,7 +80,7 @@ def test_what_a_hover_does_not_tell_is_held_and_named():
     assert {"alpha1", "alpha4"} <= set(fit.held)
     for name, (value, why) in fit.held.items():
         assert value == pytest.approx(float(BRACKET.center[NAMES.index(name)]), abs=1e-12)
-        assert why == "not told by these flights"
+        assert why == "not identifiable from these flights"
     assert {"alpha3", "alpha6"}.isdisjoint(fit.held)
     # And rightly: the bound of the whole model is wider than the bracket there, and narrower for what is left.
     whole = eqx.tree_at(lambda p: p.model, fit.problem, MODEL)

@@ -1,4 +1,4 @@
-"""The runtime type checker of the tests: beartype, for which an int is a float as in Python's own typing rules."""
+"""The runtime type checker of the tests: beartype. It accepts an int for a float, as Python's typing rules do."""
 
 import beartype
 

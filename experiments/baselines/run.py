@@ -1,8 +1,8 @@
-"""Every estimator on the standard flight: RMSE / bound, bias, coverage, rollouts, seconds; by kind and scale of noise.
+"""How do all estimators perform on the standard flight, for each kind and scale of noise?
 
-Each flight starts its search anywhere within 80 % of the default bracket. The bound is that of white noise of the same
-standard deviation, so that what coloured and biased noise cost shows. Without noise errors are in units of the bound at
-scale 1.
+The table shows RMSE / bound, bias, coverage, rollouts and time. Each bracket's center is drawn within 80 % of the
+default half-widths around the truth. The bound is always the one for white noise of the same standard deviation, so
+that the cost of coloured and biased noise is visible. Without noise, errors are in units of the bound at scale 1.
 """
 
 import json
@@ -36,7 +36,7 @@ def row_of(
     flights: int,
     seed: int,
 ) -> dict:
-    """One row of the table."""
+    """The results of one estimator with one noise: a row of the table."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     exact = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
     problem = jaxos4.ShootingProblem(
@@ -50,37 +50,32 @@ def row_of(
     seconds = (time.perf_counter() - begin) / flights
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
     results = jaxos4.result_names(found.result)
-    told = np.isin(results, ["successful", "unidentifiable"])
-    errors = np.asarray(found.parameters - model.alpha)[told] / bound
+    answered = np.isin(results, ["successful", "unidentifiable"])
+    errors = np.asarray(found.parameters - model.alpha)[answered] / bound
     inside = np.abs(np.asarray(found.parameters - model.alpha)) < np.asarray(found.half_width(0.95))
     return {
         "flights": flights,
-        "answers": int(told.sum()),
+        "answers": int(answered.sum()),
         "results": count_results(results),
-        "efficiency": np.sqrt(np.mean(errors**2, axis=0)).tolist() if told.any() else None,
-        "bias": np.mean(errors, axis=0).tolist() if told.any() else None,
-        "monte_carlo_error": float(1 / np.sqrt(2 * max(told.sum(), 1))),
-        "covered": inside[told].mean(axis=0).tolist() if told.any() else None,
+        "efficiency": np.sqrt(np.mean(errors**2, axis=0)).tolist() if answered.any() else None,
+        "bias": np.mean(errors, axis=0).tolist() if answered.any() else None,
+        "monte_carlo_error": float(1 / np.sqrt(2 * max(answered.sum(), 1))),
+        "covered": inside[answered].mean(axis=0).tolist() if answered.any() else None,
         "rollouts": float(np.mean(found.rollouts)),
         "seconds": seconds,
     }
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Flights for a row.")] = 200,
-    seed: Annotated[int, typer.Option(help="Of noise and starts.")] = 5,
-    channels: Annotated[str, typer.Option(help="What the estimators that can do so look at.")] = "rates",
-    estimators: Annotated[list[str], typer.Option(help="Which ones.")] = tuple(ESTIMATORS),
-    noises: Annotated[list[str], typer.Option(help="Which kinds of noise.")] = tuple(NOISES),
-    scales: Annotated[list[float], typer.Option(help="Multiples of the standard noise; 0: none.")] = (
-        0.0,
-        0.1,
-        1.0,
-        10.0,
-    ),
-    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+    flights: Annotated[int, typer.Option(help="Number of flights for each row.")] = 200,
+    seed: Annotated[int, typer.Option(help="Random seed for noise and brackets.")] = 5,
+    channels: Annotated[str, typer.Option(help="Channels that are compared: rates, attitude or all.")] = "rates",
+    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = tuple(ESTIMATORS),
+    noises: Annotated[list[str], typer.Option(help="Kinds of noise.")] = tuple(NOISES),
+    scales: Annotated[list[float], typer.Option(help="Noise / standard noise; 0: no noise.")] = (0.0, 0.1, 1.0, 10.0),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
 ) -> None:
-    """Every estimator at its documented settings on the standard flight."""
+    """Compare all estimators, with their default settings, on the standard flight."""
     headings = "noise", "scale", "estimator", *PARAMETERS, "bias", "95 %", "rollouts", "ms", "results"
     table = table_of(f"RMSE / Cramer-Rao bound of white noise, {channels}, {flights} flights", headings)
     rows = []

@@ -1,4 +1,4 @@
-"""RMSE / bound, hits and rollouts against the width of the bracket; a line a seed."""
+"""Plots RMSE / bound, hit rate and rollouts against the width of the bracket, with one line for each seed."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from jaxos4.study import metrics
 
 
 def draw(studies: list[xr.Dataset]) -> Figure:
-    """`studies`: of different seeds."""
+    """One panel for each quantity. `studies`: one for each seed."""
     figure, (above, middle, right) = grid(3, columns=3, height=2.8)
     above.axhline(1, color=INK, linewidth=1.0)
     for seed, data in enumerate(studies):
@@ -51,7 +51,7 @@ def draw(studies: list[xr.Dataset]) -> Figure:
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote."""
+    """Draw the results of run.py."""
     folders = [path.parent for path in sorted(results.glob("*/results.nc"))]
     write_figure(lambda: draw([read_results(folder) for folder in folders]), figures, "bracket_and_seeds")
 

@@ -1,4 +1,4 @@
-"""What network and hybrid owe to the width of the bracket, and to the seed of the training: a folder for each seed."""
+"""How do the network and the hybrid depend on the width of the bracket and on the random seed of the training?"""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,10 +12,10 @@ from jaxos4.study import load_study
 
 def main(
     specification: Path,
-    out: Annotated[Path, typer.Option(help="Folder for the studies: new, or to be resumed.")],
-    seeds: Annotated[list[int], typer.Option(help="Of the networks.")] = (0, 1, 2),
+    out: Annotated[Path, typer.Option(help="Folder for the studies, new or to be resumed.")],
+    seeds: Annotated[list[int], typer.Option(help="Random seeds for training the networks.")] = (0, 1, 2),
 ) -> None:
-    """Runs the study once for each seed of the networks; the flights are the same."""
+    """Run the study once for each training seed, on the same flights, in a folder for each seed."""
     study = load_study(specification)
     run_studies({f"seed {s}": replace(study, network=replace(study.network, seed=s)) for s in seeds}, out)
 

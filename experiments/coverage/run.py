@@ -1,7 +1,8 @@
-"""How often 95 % intervals hold the truth: IBSS, hybrid, output error; of alphas and of the rigid body's constants.
+"""How often do 95 % intervals contain the truth, for the alphas and for the constants of the rigid body?
 
-Noisy standard flights of one truth; each search begins anywhere within 80 % of the default bracket. The constants Ix,
-Iy, Iz, J_R come from each flight's alphas and their covariance.
+IBSS, the hybrid and output error identify noisy standard flights with one true vehicle. Each bracket's center is drawn
+within 80 % of the default half-widths around the truth. The constants Ix, Iy, Iz, J_R are fitted to the alphas of each
+flight and their covariance.
 """
 
 import json
@@ -13,33 +14,33 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 import typer
 from rich.console import Console
 
 import jaxos4
 from jaxos4.cli.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 from jaxos4.models import MODELS
+from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)
 
 ESTIMATORS = {"ibss": jaxos4.IBSS, "hybrid": jaxos4.Hybrid, "output-error": jaxos4.OutputError}
 CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
-# Flights in one call: what fits in memory beside the residuals' derivatives.
+# Flights in one call, limited by the memory for the derivatives of the residuals.
 CHUNK = 250
 
 
 @eqx.filter_jit
 @eqx.filter_vmap(in_axes=(None, 0, 0))
 def constants(model: jaxos4.AbstractModel, parameters: jax.Array, covariance: jax.Array) -> jaxos4.InertiaFit:
-    """Those of the rigid body, of each flight."""
+    """The rigid body of each flight."""
     return jaxos4.fit_inertia(model, parameters, covariance)
 
 
 def cover(
     estimator: jaxos4.AbstractEstimator, problem: jaxos4.ShootingProblem, scale: float, flights: int, seed: int
 ) -> dict:
-    """One row of the table; `problem` holds the exact flight."""
+    """The coverage of one estimator at one noise scale: a row of the table. `problem` has the flight without noise."""
     model, exact, noise = problem.model, problem.flight, jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
     noise_keys, start_keys = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(jax.random.key(seed), flights))
     brackets, begin = brackets_around(model, start_keys), time.perf_counter()
@@ -53,16 +54,16 @@ def cover(
     seconds = time.perf_counter() - begin
     rigid = constants(model, found.parameters, found.covariance)
     results = count_results(jaxos4.result_names(found.result))
-    # A flight without an estimate has an infinite interval: it counts as not covered.
+    # A flight without an estimate has an infinite interval, and counts as not covered.
     errors, half_width = np.abs(found.parameters - model.alpha), np.asarray(found.half_width(0.95))
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model.alpha)))
     truth = np.append(np.asarray(model.airframe.inertia), model.airframe.rotor_inertia)
-    outside = np.abs(rigid.constants - truth) > scipy.stats.norm.ppf(0.975) * np.asarray(rigid.std)
-    told = np.isfinite(half_width)
+    outside = np.abs(rigid.constants - truth) > NINETY_FIVE * np.asarray(rigid.std)
+    finite = np.isfinite(half_width)
     return {
         "results": results,
         "std": np.median(found.std / bound, axis=0).tolist(),
-        "covered": (told & (errors < half_width)).mean(axis=0).tolist(),
+        "covered": (finite & (errors < half_width)).mean(axis=0).tolist(),
         "constants_covered": (np.isfinite(rigid.std) & ~outside).mean(axis=0).tolist(),
         "inconsistent": float((rigid.p_value < 0.05).mean()),
         "seconds": seconds,
@@ -70,22 +71,22 @@ def cover(
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Flights for a row.")] = 2000,
-    seed: Annotated[int, typer.Option(help="Of noise and starts.")] = 11,
-    model: Annotated[str, typer.Option(help="published or corrected.")] = "published",
-    channels: Annotated[str, typer.Option(help="rates, attitude or all.")] = "all",
-    estimators: Annotated[list[str], typer.Option(help="Which ones.")] = tuple(ESTIMATORS),
-    scales: Annotated[list[float], typer.Option(help="Multiples of the standard noise.")] = (0.1, 1.0, 10.0),
-    steps: Annotated[int, typer.Option(help="Training of the hybrid's network.")] = jaxos4.NetworkEstimator.steps,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+    flights: Annotated[int, typer.Option(help="Number of flights for each row.")] = 2000,
+    seed: Annotated[int, typer.Option(help="Random seed for noise and brackets.")] = 11,
+    model: Annotated[str, typer.Option(help="Model: published or corrected.")] = "published",
+    channels: Annotated[str, typer.Option(help="Channels that are compared: rates, attitude or all.")] = "all",
+    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = tuple(ESTIMATORS),
+    scales: Annotated[list[float], typer.Option(help="Noise / standard noise.")] = (0.1, 1.0, 10.0),
+    steps: Annotated[int, typer.Option(help="Training steps of the hybrid's network.")] = jaxos4.NetworkEstimator.steps,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
 ) -> None:
-    """Coverage of 95 % intervals."""
+    """Measure the coverage of 95 % intervals."""
     vehicle = MODELS[model](jaxos4.OS4)
     exact = jaxos4.simulate(vehicle, vehicle.alpha, jaxos4.multisine(vehicle.airframe), dt=0.01)
     rows, network = [], None
     error = np.sqrt(0.95 * 0.05 / flights)
     headings = "scale", "estimator", *PARAMETERS, *CONSTANTS, "p < 5 %", "s", "results"
-    table = table_of(f"95 % intervals that hold the truth [%], {flights} flights, {model}, {channels}", headings)
+    table = table_of(f"95 % intervals that contain the truth [%], {flights} flights, {model}, {channels}", headings)
 
     def problem(scale: float) -> jaxos4.ShootingProblem:
         sigma = scale * jaxos4.SENSOR_SIGMA
@@ -112,7 +113,7 @@ def main(
                 out.write_text(json.dumps(report | {"flights": flights, "model": model}, indent=2) + "\n")
     console = Console(width=170)
     console.print(table)
-    console.print(f"Monte-Carlo error of each {100 * error:.2f} %.")
+    console.print(f"Monte-Carlo error of each number: {100 * error:.2f} %.")
 
 
 if __name__ == "__main__":

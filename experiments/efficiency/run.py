@@ -1,6 +1,7 @@
-"""How close IBSS comes to the Cramer-Rao bound: RMSE / bound of many noisy standard flights, identified in one call.
+"""How close does IBSS come to the Cramer-Rao bound?
 
-The truth is simulated with the model that is fitted (the inverse crime), so that the bound is the right yardstick.
+Many noisy standard flights are identified in one call. They are simulated with the model that is fitted (the inverse
+crime), so that the bound applies.
 """
 
 import json
@@ -17,6 +18,7 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.cli.experiment import PARAMETERS, count_results, in_words, table_of
+from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)
 
@@ -30,7 +32,7 @@ CASES = {
 
 
 def study(model: jaxos4.AbstractModel, channels: str, flights: int, seed: int, *, scale: float, known: bool) -> dict:
-    """Identifies `flights` noisy standard flights from random starts within 80 % of the default bracket."""
+    """Identify noisy standard flights, each from a random start within 80 % of the default bracket."""
     flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
     bracket = jaxos4.Bracket.default(model)
     sigma = scale * jaxos4.SENSOR_SIGMA
@@ -60,7 +62,7 @@ def study(model: jaxos4.AbstractModel, channels: str, flights: int, seed: int, *
         "efficiency": np.sqrt(np.mean(error**2, axis=0)).tolist(),
         "bias": error.mean(axis=0).tolist(),
         "monte_carlo_error": 1 / np.sqrt(2 * flights),
-        "covered": float(np.mean(np.abs(error * bound) < 1.96 * np.asarray(estimates.std))),
+        "covered": float(np.mean(np.abs(error * bound) < NINETY_FIVE * np.asarray(estimates.std))),
         "results": count_results(jaxos4.result_names(estimates.result)),
         "rollouts": float(np.mean(estimates.rollouts)),
         "compile_seconds": built - begin,
@@ -69,13 +71,13 @@ def study(model: jaxos4.AbstractModel, channels: str, flights: int, seed: int, *
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="For each case.")] = 512,
-    seed: Annotated[int, typer.Option()] = 0,
-    scale: Annotated[float, typer.Option(help="Of the standard sensor noise.")] = 1.0,
-    cases: Annotated[list[str], typer.Option(help="Which cases.")] = tuple(CASES),
-    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+    flights: Annotated[int, typer.Option(help="Number of flights for each case.")] = 512,
+    seed: Annotated[int, typer.Option(help="Random seed for noise and starts.")] = 0,
+    scale: Annotated[float, typer.Option(help="Noise scale, in multiples of the standard sensor noise.")] = 1.0,
+    cases: Annotated[list[str], typer.Option(help="Names of the cases.")] = tuple(CASES),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
 ) -> None:
-    """RMSE / Cramer-Rao bound of IBSS, parameter by parameter."""
+    """Measure RMSE / Cramer-Rao bound of IBSS for each parameter."""
     report = {"flights": flights, "seed": seed, "scale": scale, "version": jaxos4.__version__, "cases": {}}
     title = f"RMSE / bound, {flights} flights, noise {scale:g}, Monte-Carlo error {1 / np.sqrt(2 * flights):.3f}"
     table = table_of(title, ("case", *PARAMETERS, "covered", "results", "rollouts", "s"))

@@ -1,6 +1,7 @@
-"""A panel a model and an input, a row a parameter: the noise below which it is told from 0.
+"""Plots the largest noise at which each parameter can be distinguished from 0.
 
-The upright line is the noise of the standard sensors: a parameter left of it is not told with them.
+One panel for each model and input, one row for each parameter. The vertical line is the noise of the standard sensors:
+a parameter to its left cannot be distinguished from 0 with them.
 """
 
 from pathlib import Path
@@ -16,7 +17,7 @@ from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """Colour and marker: channels; larger markers: longer flights."""
+    """Colour and marker show the channels. Larger markers show longer flights."""
     frontier = data["frontier"]
     excitations, parameters = frontier["excitation"].values, frontier["parameter"].values
     looks = dict(zip(frontier["channels"].values, styles(["ibss", "network", "hybrid"]).values(), strict=False))
@@ -60,7 +61,7 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote."""
+    """Draw the results of run.py."""
     data = load_results(results)
     write_figure(lambda: draw(data), figures, "frontier")
 

@@ -1,6 +1,7 @@
-"""The noise below which each parameter is told from 0: by model, input, duration and channels.
+"""What is the largest noise at which each parameter can be distinguished from 0?
 
-Nothing is drawn at random: it is |alpha| / (1.96 Cramer-Rao bound) of the airframe's parameters, initial state known.
+The answer is |alpha| / (1.96 Cramer-Rao bound), in multiples of the standard noise, for the parameters of the airframe
+and a known initial state. It depends on the model, the input, the duration and the channels. There is no randomness.
 """
 
 import itertools
@@ -25,7 +26,7 @@ DIMS = ("model", "excitation", "duration", "channels", "parameter")
 
 
 def limits(study: Study, model_name: str, excitation: str, duration: float, channels: str) -> np.ndarray:
-    """Multiples of the standard noise below which each parameter is told; 0: its truth is 0; NaN: not excited."""
+    """The largest noise for each parameter, in multiples of the standard noise. 0: the truth is 0. NaN: not excited."""
     model = MODELS[model_name](study.vehicle(study.airframes[0]))
     omega = EXCITATIONS[excitation](model.airframe, duration=duration, dt=study.dt)
     flight = jaxos4.simulate(model, model.alpha, omega, dt=study.dt)
@@ -37,7 +38,7 @@ def limits(study: Study, model_name: str, excitation: str, duration: float, chan
 
 
 def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for the Dataset.")]) -> None:
-    """Frontiers of every combination of a specification's models, excitations, durations and channels."""
+    """Compute the largest noise for all models, excitations, durations and channels of a specification."""
     study = load_study(specification)
     axes = (study.models, study.excitations, study.durations, study.channels)
     values = np.stack([limits(study, *which) for which in itertools.product(*axes)])

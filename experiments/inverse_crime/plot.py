@@ -1,4 +1,7 @@
-"""A column a way to fit, a line a way to simulate: RMSE / bound above, the largest bias of any parameter below."""
+"""Plots RMSE / bound (above) and the largest bias of any parameter (below).
+
+One column for each method of the fit, one line for each method of the simulation.
+"""
 
 from pathlib import Path
 
@@ -12,17 +15,17 @@ from jaxos4.report import read_results
 from jaxos4.report.style import FAINT, INK, grid, log_axis, scale_axis, styles
 from jaxos4.study import metrics
 
-# The largest of eight Gaussians is below this many standard deviations in 95 % of all draws.
+# 95 % quantile of the largest of eight Gaussian magnitudes, in standard deviations.
 LARGEST_OF_EIGHT = 2.73
 
 
 def bias(data: xr.Dataset) -> xr.DataArray:
-    """The mean error of that parameter whose mean error is largest, in bounds."""
+    """The largest mean error of any parameter, in bounds."""
     return abs(metrics.normalised_error(data).mean("flight")).max("parameter")
 
 
 def draw(studies: dict[str, xr.Dataset]) -> Figure:
-    """`studies`: by how they were fitted."""
+    """`studies`: one for each method of the fit."""
     figure, axes = grid(2 * len(studies), columns=len(studies), height=2.4)
     rows = axes[: len(studies)], axes[len(studies) :]
     for above, below, (name, data) in zip(*rows, studies.items(), strict=True):
@@ -50,7 +53,7 @@ def draw(studies: dict[str, xr.Dataset]) -> Figure:
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote; dashed: the bias that chance alone passes in 5 % of all cases."""
+    """Draw the results of run.py. Dashed line: chance alone exceeds this bias in 5 % of all cases."""
     folders = [path.parent for path in sorted(results.glob("*/results.nc"))]
     write_figure(lambda: draw({folder.name: read_results(folder) for folder in folders}), figures, "inverse_crime")
 

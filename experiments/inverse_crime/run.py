@@ -1,6 +1,7 @@
-"""What is lost where true flights are not made by the estimator's own steps: Euler and Runge-Kutta, at two rates.
+"""How large is the error if the simulation and the fit integrate the equations with different methods?
 
-A folder for each way to fit; in it, flights made by each way to simulate.
+The script writes a folder for each method and sample time of the fit. Each folder has flights from all methods of
+simulation.
 """
 
 from pathlib import Path
@@ -15,11 +16,11 @@ from jaxos4.study import load_study
 
 def main(
     specification: Path,
-    out: Annotated[Path, typer.Option(help="Folder for the studies: new, or to be resumed.")],
-    fit_methods: Annotated[list[str], typer.Option(help="Steps of the fit.")] = ("euler", "rk4"),
+    out: Annotated[Path, typer.Option(help="Folder for the studies, new or to be resumed.")],
+    fit_methods: Annotated[list[str], typer.Option(help="Integration methods of the fit.")] = ("euler", "rk4"),
     dts: Annotated[list[float], typer.Option(help="Sample times [s].")] = (0.01, 0.002),
 ) -> None:
-    """Runs the study once for each way to fit and each sample time."""
+    """Run the study once for each integration method of the fit and each sample time."""
     study = load_study(specification)
     variants = {
         f"{method} {dt:g} s": msgspec.structs.replace(study, fit_method=method, dt=dt)

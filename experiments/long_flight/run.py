@@ -1,7 +1,8 @@
-"""Long flights that drift away from their model: one shot against windows with an initial state each.
+"""How many windows does a long flight need if it drifts away from its model?
 
-The rotors turn a little off what was recorded, a constant factor for each rotor and flight. The model has no term for
-that: body rates run away from what it makes of the recorded speeds, the more the longer it is simulated in one piece.
+The true rotor speeds differ from the recorded ones by a constant factor for each rotor and flight. The model has no
+term for this factor. The simulated body rates drift away from the measured ones, and the drift grows with the length of
+a window.
 """
 
 import json
@@ -22,12 +23,12 @@ from jaxos4.cli.experiment import PARAMETERS, count_results, in_words, table_of
 jax.config.update("jax_enable_x64", True)
 
 SHOOTING = {"ibss": jaxos4.IBSS, "output-error": jaxos4.OutputError}
-# What every estimator is judged on: the parameters whose size the flight tells.
-TOLD = (0, 2, 3, 5, 7)
+# The parameters that are compared: those that are identifiable and not 0.
+COMPARED = (0, 2, 3, 5, 7)
 
 
 def drifting(duration: float, drift: float, flights: int, seed: int) -> tuple[jaxos4.Flight, jax.Array]:
-    """What was recorded, with the model's own flight, and the states of the flights as they were measured."""
+    """A recorded flight without drift, and the noisy states of flights that drift."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     recorded = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe, duration=duration), dt=0.01)
     noise = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)
@@ -43,7 +44,7 @@ def drifting(duration: float, drift: float, flights: int, seed: int) -> tuple[ja
 
 
 def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int, steps: int) -> dict:
-    """One row of the table."""
+    """The results of one estimator with one number of windows: a row of the table."""
     model, flights = jaxos4.PublishedOS4(jaxos4.OS4), states.shape[0]
     bracket = jaxos4.Bracket.default(model)
     bracket = jaxos4.Bracket.around(bracket.center + 0.3 * bracket.half_width, bracket.half_width)
@@ -53,7 +54,7 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
         return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", windows=windows)
 
     if name == "hybrid":
-        # Windows begin where this flight was measured to be: a network of windows serves the flight that it is for.
+        # Windows start at the measured states of this flight, so the network serves this flight only.
         begin = time.perf_counter()
         found = []
         for flown in states:
@@ -70,7 +71,7 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
         seconds = (time.perf_counter() - begin) / flights
     results = jaxos4.result_names(found.result)
     answered = results == "successful"
-    errors = np.asarray(found.parameters / model.alpha - 1)[:, TOLD]
+    errors = np.asarray(found.parameters / model.alpha - 1)[:, COMPARED]
     return {
         "windows": windows,
         "estimator": name,
@@ -83,17 +84,17 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
 
 
 def main(
-    duration: Annotated[float, typer.Option(help="Of each flight [s].")] = 60.0,
-    flights: Annotated[int, typer.Option(help="For a row.")] = 8,
-    seed: Annotated[int, typer.Option(help="Of drifts and noise.")] = 3,
-    drifts: Annotated[list[float], typer.Option(help="Standard deviation of the rotors' factors.")] = (0.0, 1e-4, 1e-3),
-    windows: Annotated[list[int], typer.Option(help="How many.")] = (1, 6, 30, 120),
-    estimators: Annotated[list[str], typer.Option(help="Or hybrid: it trains for each flight.")] = tuple(SHOOTING),
-    steps: Annotated[int, typer.Option(help="Training of the hybrid's networks.")] = 1000,
-    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+    duration: Annotated[float, typer.Option(help="Duration of each flight [s].")] = 60.0,
+    flights: Annotated[int, typer.Option(help="Number of flights for each row.")] = 8,
+    seed: Annotated[int, typer.Option(help="Random seed for drifts and noise.")] = 3,
+    drifts: Annotated[list[float], typer.Option(help="Standard deviations of the factors.")] = (0.0, 1e-4, 1e-3),
+    windows: Annotated[list[int], typer.Option(help="Numbers of windows.")] = (1, 6, 30, 120),
+    estimators: Annotated[list[str], typer.Option(help="Names; also hybrid (slow).")] = tuple(SHOOTING),
+    steps: Annotated[int, typer.Option(help="Training steps of the hybrid's networks.")] = 1000,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
 ) -> None:
-    """One shot against windows."""
-    headings = "drift", "windows", "estimator", *(PARAMETERS[i] for i in TOLD), "rollouts", "s", "results"
+    """Compare one window with many on long flights."""
+    headings = "drift", "windows", "estimator", *(PARAMETERS[i] for i in COMPARED), "rollouts", "s", "results"
     rows, table = [], table_of(f"RMS error [%] on {flights} flights of {duration:g} s, rates", headings)
     for drift in drifts:
         recorded, states = drifting(duration, drift, flights, seed)
@@ -105,7 +106,7 @@ def main(
                     f"{drift:g}",
                     str(count),
                     name,
-                    *((f"{x:.2g}" for x in row["percent"]) if row["percent"] else "-" * len(TOLD)),
+                    *((f"{x:.2g}" for x in row["percent"]) if row["percent"] else "-" * len(COMPARED)),
                     f"{row['rollouts']:.0f}",
                     f"{row['seconds']:.2g}",
                     in_words(row["results"]),

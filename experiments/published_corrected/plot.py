@@ -1,4 +1,4 @@
-"""A row for what is seen: what each model can tell, how far off its fits are, and what their residuals say."""
+"""Plots what each model can identify, the errors of its fits, and the tests of their residuals."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ TESTS = {"white_p": "white", "input_p": "free of\ninputs", "level_p": "of the\nn
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """Colour: the fitted model; filled: on its own flights, open: on the other's."""
+    """Colour shows the fitted model. Filled markers: flights of the same model; open markers: of the other model."""
     figure, axes = grid(3 * data.sizes["channels"], columns=3, height=2.7, width=10.0)
     looks = dict(zip(data["fitted"].values, styles(["ibss", "network"]).values(), strict=True))
     rms, names = (data["error"] ** 2).mean("flight") ** 0.5, data["parameter"].values
@@ -53,7 +53,7 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote."""
+    """Draw the results of run.py."""
     data = load_results(results)
     write_figure(lambda: draw(data), figures, "published_corrected")
 

@@ -1,7 +1,8 @@
-"""What the published and the corrected model tell of their own flights, and of each other's.
+"""How well do the published and the corrected model explain their own flights, and each other's?
 
-Rotor speeds are the same; flights are made by one model with its airframe's parameters, and fitted by IBSS with the
-published or the corrected model. Errors are against the fitted model's own parameters.
+One model simulates the flights, with the parameters of its airframe. IBSS fits the same or the other model to them. All
+flights have the same rotor speeds. Errors are differences from the parameters that the airframe implies for the fitted
+model.
 """
 
 import itertools
@@ -25,10 +26,10 @@ jax.config.update("jax_enable_x64", True)
 
 
 class Fits(NamedTuple):
-    """Of each flight: the estimate, the half-width of its 95 % interval, how it ended, and the diagnostics.
+    """For each flight: the estimate, the half-width of its 95 % interval, the result, and the diagnostics.
 
-    The least p-value over the channels, times their number (Bonferroni): of white residuals, of residuals that have
-    nothing to do with the inputs, and of residuals as large as the noise.
+    The p-values are of white residuals, of residuals that do not depend on the inputs, and of residuals as large as the
+    noise. Each is the smallest of all channels, times the number of channels (Bonferroni).
     """
 
     estimate: jax.Array
@@ -40,26 +41,26 @@ class Fits(NamedTuple):
 
 
 def model_of(study: Study, name: str) -> jaxos4.AbstractModel:
-    """The model of that name and of the study's airframe."""
+    """The model of this name, with the airframe of the study."""
     return MODELS[name](study.vehicle(study.airframes[0]))
 
 
 @eqx.filter_jit
 def identify(exact: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, states: jax.Array) -> Fits:
-    """Fits to noisy flights: those of `exact` but for their measured states."""
+    """Fit noisy flights. They differ from the flight of `exact` in their measured states."""
 
     def one(states: jax.Array) -> Fits:
         problem = eqx.tree_at(lambda p: p.flight.states, exact, states)
         found = jaxos4.IBSS()(problem, bracket)
-        said = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
-        least = [jnp.minimum(p.size * p.min(), 1.0) for p in (said.white_p, said.input_p, said.level_p)]
+        tests = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+        least = [jnp.minimum(p.size * p.min(), 1.0) for p in (tests.white_p, tests.input_p, tests.level_p)]
         return Fits(found.parameters, found.half_width(0.95), found.result, *least)
 
     return jax.vmap(one)(states)
 
 
 def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
-    """All flights that `flown` made, as `fitted` explains them."""
+    """Fit the model `fitted` to flights of the model `flown`."""
     truth, model = model_of(study, flown), model_of(study, fitted)
     omega = EXCITATIONS[study.excitations[0]](model.airframe, duration=study.durations[0], dt=study.dt)
     sigma = study.scales[0] * jaxos4.SENSOR_SIGMA
@@ -71,13 +72,13 @@ def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
     keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(study.seed), i))(jnp.arange(study.flights))
     bracket = jaxos4.Bracket.around(model.alpha + 0.3 * model.half_width, model.half_width)
     found = identify(exact, bracket, jax.vmap(lambda key: noise(flight, key=key).states)(keys))
-    told = np.isin(jaxos4.result_names(found.result), ["successful", "unidentifiable"])
+    answered = np.isin(jaxos4.result_names(found.result), ["successful", "unidentifiable"])
     error = np.asarray(found.estimate - model.alpha)
     return xr.Dataset(
         {
             "error": (("flight", "parameter"), error / bound, {"units": "bounds of the fitted model's own flight"}),
             "covered": (("flight", "parameter"), np.abs(error) < found.half_width),
-            "told": ("flight", told),
+            "answered": ("flight", answered),
             "white_p": ("flight", np.asarray(found.white_p)),
             "input_p": ("flight", np.asarray(found.input_p)),
             "level_p": ("flight", np.asarray(found.level_p)),
@@ -89,7 +90,7 @@ def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
 
 
 def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for the Dataset.")]) -> None:
-    """Every model fitted to flights of every model."""
+    """Fit each model to flights of each model."""
     study = load_study(specification)
     cases = [study.channels, study.models, study.models]
     parts = [

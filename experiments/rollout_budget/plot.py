@@ -1,4 +1,4 @@
-"""RMS error in bounds, all parameters together, against rollouts: a panel for what is seen, a line a search."""
+"""Plots RMSE / bound, averaged over the parameters, against rollouts. One line for each search."""
 
 from pathlib import Path
 
@@ -15,12 +15,12 @@ LOOKS = dict(zip(SEARCHES, styles(["ibss", "kalman", "output-error", "hybrid"]).
 
 
 def accuracy(data: xr.Dataset) -> xr.DataArray:
-    """RMSE / bound, the geometric mean over the parameters."""
+    """RMSE / bound, as the geometric mean of the parameters."""
     return np.exp(np.log((data["error"] ** 2).mean("flight") ** 0.5).mean("parameter"))
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """A marker for each limit of sweeps, or steps."""
+    """One marker for each limit of sweeps or steps."""
     figure, axes = grid(data.sizes["channels"], columns=2, height=3.2, width=4.2 * data.sizes["channels"] + 0.6)
     reached, spent = accuracy(data), data["rollouts"].mean("flight")
     for panel, channels in zip(axes, data["channels"].values, strict=True):
@@ -42,7 +42,7 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what run.py wrote."""
+    """Draw the results of run.py."""
     data = load_results(results)
     write_figure(lambda: draw(data), figures, "rollout_budget")
 

@@ -1,7 +1,8 @@
-"""What accuracy costs: each search is stopped after so many sweeps, or steps, of each of its stages.
+"""How many rollouts does an accuracy cost?
 
-The flights are those of one truth; each search begins anywhere within 80 % of the default bracket. Estimates count
-whether the search had come to its end or not.
+Each search stops after a limited number of sweeps (or steps) of each stage, and its estimate counts, converged or not.
+All flights have the same true vehicle. Each bracket's center is drawn within 80 % of the default half-widths around
+the truth.
 """
 
 from collections.abc import Callable
@@ -55,7 +56,7 @@ def identify(study: Study, channels: str, names: list[str], limits: list[int]) -
         return jax.vmap(one)(numbers)
 
     def train() -> jaxos4.TrainedNetwork:
-        """For twice the bracket, so that it knows all flights of searches that begin off their truth."""
+        """A network for twice the default bracket, which contains the brackets of all searches."""
         return jaxos4.NetworkEstimator(
             channels=channels, steps=study.network.steps, held_out=study.network.held_out, noise=(study.scales[0],) * 2
         ).fit(
@@ -79,10 +80,10 @@ def identify(study: Study, channels: str, names: list[str], limits: list[int]) -
 def main(
     specification: Path,
     out: Annotated[Path, typer.Option(help="Folder for the Dataset.")],
-    limits: Annotated[list[int], typer.Option(help="Sweeps, or steps, of each stage.")] = (1, 2, 3, 4, 6, 10),
-    names: Annotated[list[str], typer.Option(help="Which searches.")] = (*SEARCHES, HYBRID),
+    limits: Annotated[list[int], typer.Option(help="Limits of sweeps or steps.")] = (1, 2, 3, 4, 6, 10),
+    names: Annotated[list[str], typer.Option(help="Names of the searches.")] = (*SEARCHES, HYBRID),
 ) -> None:
-    """Errors and rollouts of every search, by channels and limit."""
+    """Measure errors and rollouts of each search, by channels and limit."""
     study = load_study(specification)
     found = [identify(study, channels, list(names), list(limits)) for channels in study.channels]
     dims = ("channels", "search", "limit", "flight")

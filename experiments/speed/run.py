@@ -1,6 +1,6 @@
-"""How fast it is: shots and slopes, simulation by each method, identification; growth with flights and steps; memory.
+"""How fast are shots, slopes, simulation and identification, and how do time and memory grow with their size?
 
-Double precision, on whatever device JAX finds. Every figure is the median of warm, blocked runs.
+Double precision, on the device that JAX finds. Each time is the median of runs after a warm-up.
 """
 
 import json
@@ -26,7 +26,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 def timed(function: Callable, *arguments, repeats: int) -> tuple[float, float, float, float]:
-    """Compile time, then the median, least and largest time of a run [s]."""
+    """Compile time, and the median, smallest and largest time of a run [s]."""
     begin = time.perf_counter()
     compiled = eqx.filter_jit(function).lower(*arguments).compile()
     compile_seconds = time.perf_counter() - begin
@@ -40,7 +40,7 @@ def timed(function: Callable, *arguments, repeats: int) -> tuple[float, float, f
 
 
 def standard_problem(channels: str, steps: int) -> jaxos4.ShootingProblem:
-    """The standard flight, of so many steps of 10 ms, without noise."""
+    """The standard flight with this number of steps of 10 ms, without noise."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     omega = jaxos4.multisine(model.airframe, duration=steps * 0.01)
     flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)
@@ -50,7 +50,7 @@ def standard_problem(channels: str, steps: int) -> jaxos4.ShootingProblem:
 
 
 def identify(problem: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, keys) -> jaxos4.RESULTS:
-    """Identifies one noisy copy of the problem's flight for each key."""
+    """Identify one noisy copy of the problem's flight for each key."""
 
     def one(key):
         flight = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(problem.flight, key=key)
@@ -60,22 +60,19 @@ def identify(problem: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, keys) -> 
 
 
 def main(
-    batch: Annotated[int, typer.Option(help="Shots at once.")] = 4096,
-    steps: Annotated[int, typer.Option(help="Steps of a flight.")] = 500,
-    flights: Annotated[list[int], typer.Option(help="Flights identified at once.")] = (64, 256, 1024),
-    repeats: Annotated[int, typer.Option()] = 7,
-    channels: Annotated[list[str], typer.Option(help="Which; of the first, the growth with the steps.")] = (
-        "all",
-        "rates",
-    ),
-    methods: Annotated[list[str], typer.Option(help="Of simulation.")] = tuple(METHODS),
-    out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
+    batch: Annotated[int, typer.Option(help="Number of shots in one call.")] = 4096,
+    steps: Annotated[int, typer.Option(help="Number of steps of a flight.")] = 500,
+    flights: Annotated[list[int], typer.Option(help="Numbers of flights in one call.")] = (64, 256, 1024),
+    repeats: Annotated[int, typer.Option(help="Number of runs for each time.")] = 7,
+    channels: Annotated[list[str], typer.Option(help="Channels; growth is timed with the first.")] = ("all", "rates"),
+    methods: Annotated[list[str], typer.Option(help="Integration methods of the simulation.")] = tuple(METHODS),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
 ) -> None:
-    """Benchmarks; every row is measured afresh."""
+    """Measure computing times."""
     table = Table(
         title=f"batch {batch}, {steps} steps, float64, {jax.devices()[0].device_kind}, {os.cpu_count()} cores"
     )
-    for heading in ("what", "compile [s]", "median [s]", "least", "largest", "rate"):
+    for heading in ("measurement", "compile [s]", "median [s]", "smallest [s]", "largest [s]", "rate"):
         table.add_column(heading)
     rows = []
 
@@ -132,7 +129,7 @@ def main(
             measured = timed(identify, problem, jaxos4.Bracket.default(problem.model), keys, repeats=1)
             add(f"IBSS, {looked_at}, {count} flights", measured, count, "flights/s")
 
-    # In chunks, the memory of a study does not depend on how many flights it holds.
+    # In chunks: the memory of a study should not depend on its number of flights.
     problem, chunk = standard_problem("rates", steps), min(256, flights[-1])
     step = eqx.filter_jit(identify)
     for count in (4 * chunk, 16 * chunk):

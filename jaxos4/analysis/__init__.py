@@ -1,1 +1,1 @@
-"""What a fit is worth: information, bounds, covariances, residuals, predictions."""
+"""How good a fit is: information, bounds, covariances, residuals, predictions."""

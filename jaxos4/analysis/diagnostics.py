@@ -1,4 +1,6 @@
-"""What the residuals of a fit say about it: their size, whether they are white, and whether inputs are left in them."""
+"""Diagnostics of the residuals of a fit: their size, whether they are white, and whether they depend on the inputs."""
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,8 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Parameters, Scalar, as_float
 from ..shooting import ROUNDING, ShootingProblem
 
-# Residuals below this share of a channel's largest value are rounding, whatever their correlation; in single precision
-# below as many rounding errors as add up over a flight.
+# Residuals below this share of a channel's largest value are rounding errors. In single precision the limit is higher:
+# the rounding errors that add up over a flight.
 _ROUNDING = 1e-9
 # A channel with fewer measurements than this has no diagnostics.
 _FEWEST = 3
@@ -18,24 +20,24 @@ _FEWEST = 3
 class Diagnostics(eqx.Module):
     """Residuals of each simulated channel, in cascade order: p, q, r, then phi, theta, psi, then x, vx, y, vy, z, vz.
 
-    p-values are what is left of the null hypothesis: near 0, residuals are not what they should be. Where fewer than
-    three samples were measured, or residuals are rounding alone, nothing speaks against them: 1.
+    A p-value is the probability of residuals like these, or worse, if the fit were perfect: near 0, something is wrong.
+    It is 1 for a channel with fewer than three measurements, or with rounding errors as its only residuals.
 
-    - `sound`: whether the trajectory stayed sound to its end; nothing else means anything where it did not.
-    - `count`: measured samples.
+    - `sound`: whether the trajectory stayed finite to its end. If not, the other fields mean nothing.
+    - `count`: number of measured samples.
     - `rms`: of the residuals, in the channel's unit.
-    - `percent`: 100 (1 - |y - x| / |y - mean y|): 100 is a perfect prediction, 0 is as good as the mean. 0 where the
-      channel does not move.
-    - `level`: mean square of the weighted residuals: 1 where they are as large as the problem's sigma says. The
-      *normalised innovation level* of a model without process noise.
-    - `level_p`: of that being so, two-sided (chi-squared).
-    - `autocorrelation`: of neighbouring residuals, of those two samples apart, and so on.
-    - `colour`: the first of those that any two measured samples tell.
-    - `white_p`: of all those being 0 (Ljung and Box 1978; with missing samples each lag counts its pairs, Stoffer
-      and Toloi 1992). Of one window only, 1 of several: an initial state fitted to each correlates what is left of it.
-    - `input_correlation`: with the roll, pitch and yaw torques, each at the lag where it is largest.
-    - `input_p`: of there being none at any lag and torque, with the residuals' own colour allowed for
-      (Ljung, System Identification, chapter 16) and Bonferroni's correction: on the safe side.
+    - `percent`: 100 (1 - |y - x| / |y - mean y|). 100 is a perfect prediction, 0 is as good as the mean, or the channel
+      does not move.
+    - `level`: mean square of the weighted residuals. 1: they are as large as the problem's sigma. For a model without
+      process noise this is the *normalised innovation level*.
+    - `level_p`: p-value of a level of 1, two-sided (chi-squared).
+    - `autocorrelation`: of residuals 1, 2, ... samples apart.
+    - `colour`: the autocorrelation at the first lag that has pairs of measured samples.
+    - `white_p`: p-value of white residuals (Ljung and Box 1978; each lag counts its pairs of measured samples, Stoffer
+      and Toloi 1992). 1 for several windows, whose fitted initial states correlate the residuals.
+    - `input_correlation`: with the roll, pitch and yaw torques, each at the lag with the largest correlation.
+    - `input_p`: p-value of residuals that depend on no torque at any lag. It allows for coloured residuals (Ljung,
+      System Identification, chapter 16) and is conservative (Bonferroni).
     """
 
     sound: Bool[Array, ""]
@@ -63,12 +65,12 @@ def residual_diagnostics(
 
     **Arguments:**
 
-    - `initial_state`: the measured one by default.
-    - `fitted`: whether the parameters were fitted to this flight, which takes degrees of freedom.
-    - `lags`: how many sample times apart correlations are looked at, at most.
+    - `parameters`, `initial_state`: of a fit. The initial state is by default the measured one.
+    - `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom.
+    - `lags`: the largest lag of the correlations, in samples.
 
-    **Raises:** `ValueError` for a number of lags that the flight has not, or parameters or an initial state of another
-    length than the problem's.
+    **Raises:** `ValueError` if the flight has too few samples for `lags`, or if the problem has another number of
+    parameters or initial states.
     """
     parameters = as_float(parameters)
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
@@ -92,61 +94,102 @@ def _diagnostics(
     fitted: bool,
     lags: int,
 ) -> Diagnostics:
-    sigma, measured = problem.sigma[problem.columns], problem.measured()
-    there = ~jnp.isnan(measured)
-    errors = problem.residuals(parameters, initial_state).reshape(measured.shape)
-    # A trajectory that diverges leaves nothing to judge.
-    sound = jnp.isfinite(problem.cost(parameters, initial_state)) & jnp.isfinite(errors).all()
-    there &= sound
-    errors = jnp.where(there, errors, 0.0)
-    count = there.sum(axis=0)
-    known = count >= _FEWEST
-    most = jnp.maximum(count, 1)
-    squares = jnp.square(errors).sum(axis=0)
-    values = jnp.where(there, measured, 0.0)
-    motion = jnp.where(there, measured - values.sum(axis=0) / most, 0.0)
-    size = jnp.abs(values).max(axis=0)
+    sigma = problem.sigma[problem.columns]
+    residuals = _residuals(problem, parameters, initial_state)
+    _, errors, measured, values, count, most, squares = residuals
+    known, size = count >= _FEWEST, jnp.abs(values).max(axis=0)
     rounding = max(_ROUNDING, ROUNDING * float(jnp.finfo(sigma.dtype).eps))
     trivial = ~known | (sigma * jnp.abs(errors).max(axis=0) <= rounding * size)
 
     unknowns = problem.windows * problem.free_size + (parameters.shape[0] if fitted else 0)
+    level, level_p = _level(residuals, unknowns)
+    motion = jnp.where(measured, values - values.sum(axis=0) / most, 0.0)
+    spread = jnp.sqrt(jnp.square(motion).sum(axis=0))
+    moved = known & (spread > rounding * size * jnp.sqrt(most))
+    autocorrelation, colour, white_p = _whiteness(residuals, lags)
+    input_correlation, input_p = _dependence(problem, parameters, residuals, autocorrelation, rounding, lags)
+    return Diagnostics(
+        sound=residuals.sound,
+        count=count,
+        rms=jnp.where(known, sigma * jnp.sqrt(squares / most), 0.0),
+        percent=jnp.where(moved, 100 * (1 - sigma * jnp.sqrt(squares) / jnp.where(moved, spread, 1.0)), 0.0),
+        level=jnp.where(known, level, 1.0),
+        level_p=jnp.where(known, level_p, 1.0),
+        autocorrelation=jnp.where(trivial[:, None], 0.0, autocorrelation),
+        colour=jnp.where(trivial, 0.0, colour),
+        white_p=jnp.where(trivial | (problem.windows > 1), 1.0, white_p),
+        input_correlation=jnp.where(trivial[:, None], 0.0, input_correlation),
+        input_p=jnp.where(trivial, 1.0, input_p),
+    )
+
+
+class _Residuals(NamedTuple):
+    """Weighted residuals `errors` and measured `values`, 0 for missing samples; `most`: `count`, or 1 if it is 0."""
+
+    sound: Bool[Array, ""]
+    errors: Float[Array, "samples size"]
+    measured: Bool[Array, "samples size"]
+    values: Float[Array, "samples size"]
+    count: Int[Array, " size"]
+    most: Int[Array, " size"]
+    squares: Float[Array, " size"]
+
+
+def _residuals(problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"]) -> _Residuals:
+    observed = problem.measured()
+    errors = problem.residuals(parameters, initial_state).reshape(observed.shape)
+    # A diverged trajectory counts as nothing measured.
+    sound = jnp.isfinite(problem.cost(parameters, initial_state)) & jnp.isfinite(errors).all()
+    measured = ~jnp.isnan(observed) & sound
+    errors, count = jnp.where(measured, errors, 0.0), measured.sum(axis=0)
+    values = jnp.where(measured, observed, 0.0)
+    return _Residuals(sound, errors, measured, values, count, jnp.maximum(count, 1), jnp.square(errors).sum(axis=0))
+
+
+def _level(residuals: _Residuals, unknowns: int) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
+    """Mean square of the residuals by degree of freedom, and its p-value."""
+    count, squares = residuals.count, residuals.squares
     freedom = jnp.maximum(count * (1 - unknowns / jnp.maximum(count.sum(), 1)), 1.0)
     below, above = (
         tail(freedom / 2, squares / 2) for tail in (jax.scipy.special.gammainc, jax.scipy.special.gammaincc)
     )
-    spread = jnp.sqrt(jnp.square(motion).sum(axis=0))
-    moved = known & (spread > rounding * size * jnp.sqrt(most))
+    return squares / freedom, 2 * jnp.minimum(below, above)
 
-    correlation, pairs = jax.vmap(lambda e, t: _correlations(e, e, t, t, lags), in_axes=1)(errors, there)
+
+def _whiteness(
+    residuals: _Residuals, lags: int
+) -> tuple[Float[Array, "size lags"], Float[Array, " size"], Float[Array, " size"]]:
+    """Autocorrelation at positive lags, its value at the first lag with pairs, and the p-value of white residuals."""
+    errors, measured, most = residuals.errors, residuals.measured, residuals.most
+    correlation, pairs = jax.vmap(lambda e, m: _correlations(e, e, m, m, lags), in_axes=1)(errors, measured)
     after, pairs = correlation[:, lags + 1 :], pairs[:, lags + 1 :]
     box = ((most + 2) / most) * (pairs * jnp.square(after)).sum(axis=1)
-    told = pairs > 0
-    colour = jnp.take_along_axis(after, jnp.argmax(told, axis=1)[:, None], axis=1)[:, 0]
-    # Nothing to test is nothing against it.
-    whitish = jax.scipy.special.gammaincc(jnp.maximum(told.sum(axis=1), 1) / 2, box / 2)
+    has_pairs = pairs > 0
+    colour = jnp.take_along_axis(after, jnp.argmax(has_pairs, axis=1)[:, None], axis=1)[:, 0]
+    # Without any pairs the statistic is 0 and the p-value 1.
+    return after, colour, jax.scipy.special.gammaincc(jnp.maximum(has_pairs.sum(axis=1), 1) / 2, box / 2)
+
+
+def _dependence(
+    problem: ShootingProblem,
+    parameters: Parameters,
+    residuals: _Residuals,
+    autocorrelation: Float[Array, "size lags"],
+    rounding: float,
+    lags: int,
+) -> tuple[Float[Array, "size 3"], Float[Array, " size"]]:
+    """The largest correlation with each torque, and the p-value of residuals that depend on no torque."""
     torques = jnp.stack(problem.forcing(parameters)[:3], axis=1)
     # The last row of rotor speeds drives nothing.
     driving = jnp.arange(torques.shape[0]) < torques.shape[0] - 1
     moves = jnp.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
     moving = jnp.abs(moves).max(axis=0) > rounding * jnp.abs(torques[:-1]).max(axis=0)
     torques = jnp.where(moving, moves, 0.0)
-    strongest, least_p = jax.vmap(
-        lambda e, t, own: jax.vmap(lambda u: _with_input(e, t, own, u, driving, lags), in_axes=1)(torques),
+    correlation, p = jax.vmap(
+        lambda e, m, own: jax.vmap(lambda u: _with_input(e, m, own, u, driving, lags), in_axes=1)(torques),
         in_axes=(1, 1, 0),
-    )(errors, there, after)
-    return Diagnostics(
-        sound=sound,
-        count=count,
-        rms=jnp.where(known, sigma * jnp.sqrt(squares / most), 0.0),
-        percent=jnp.where(moved, 100 * (1 - sigma * jnp.sqrt(squares) / jnp.where(moved, spread, 1.0)), 0.0),
-        level=jnp.where(known, squares / freedom, 1.0),
-        level_p=jnp.where(known, 2 * jnp.minimum(below, above), 1.0),
-        autocorrelation=jnp.where(trivial[:, None], 0.0, after),
-        colour=jnp.where(trivial, 0.0, colour),
-        white_p=jnp.where(trivial | (problem.windows > 1), 1.0, whitish),
-        input_correlation=jnp.where(trivial[:, None], 0.0, strongest),
-        input_p=jnp.where(trivial, 1.0, jnp.minimum(3 * least_p.min(axis=1), 1.0)),
-    )
+    )(residuals.errors, residuals.measured, autocorrelation)
+    return correlation, jnp.minimum(3 * p.min(axis=1), 1.0)
 
 
 def _correlations(
@@ -156,7 +199,10 @@ def _correlations(
     of_b: Bool[Array, " samples"],
     lags: int,
 ) -> tuple[Float[Array, " both"], Float[Array, " both"]]:
-    """Correlation of a(t + lag) with b(t) for lags from -`lags` to `lags`, and the pairs that it is a mean over."""
+    """Correlation of a(t + lag) with b(t) for lags from -`lags` to `lags`, and the number of pairs at each lag.
+
+    `of_a`, `of_b`: which samples were measured; the others are 0.
+    """
     samples = a.shape[0]
 
     def sums(x: Float[Array, " samples"], y: Float[Array, " samples"]) -> Float[Array, " both"]:
@@ -171,17 +217,17 @@ def _correlations(
 
 def _with_input(
     errors: Float[Array, " samples"],
-    there: Bool[Array, " samples"],
+    measured: Bool[Array, " samples"],
     colour: Float[Array, " lags"],
     torque: Float[Array, " samples"],
     driving: Bool[Array, " samples"],
     lags: int,
 ) -> tuple[Scalar, Scalar]:
-    """The largest correlation of residuals with one input over all lags, and the p-value of its being none."""
-    correlation, pairs = _correlations(errors, torque, there, driving, lags)
+    """The largest correlation of residuals with one input over all lags, and the p-value of no correlation."""
+    correlation, pairs = _correlations(errors, torque, measured, driving, lags)
     own, _ = _correlations(torque, torque, driving, driving, lags)
     taper = 1 - jnp.arange(1, lags + 1) / (lags + 1)
-    # The variance of a correlation of two coloured series, in that of white ones; never taken as less.
+    # Variance of the correlation of two coloured series, relative to white ones; at least 1.
     inflation = jnp.maximum(1 + 2 * (taper * colour * own[lags + 1 :]).sum(), 1.0)
     deviations = jnp.abs(correlation) * jnp.sqrt(pairs / inflation)
     at = jnp.argmax(deviations)

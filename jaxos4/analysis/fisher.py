@@ -1,4 +1,4 @@
-"""What a flight can tell: Fisher information and the Cramer-Rao bound."""
+"""Fisher information of a flight in the parameters, and the Cramer-Rao bound."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -12,10 +12,11 @@ from ..shooting import ShootingProblem
 def fisher_information(
     problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
 ) -> Float[Array, "parameters parameters"]:
-    """J^T W^2 J in the parameters, at `parameters`.
+    """J^T W^2 J in the parameters, with the Jacobian J at `parameters` and the weights W = 1 / sigma.
 
-    Where the initial state is free it is eliminated (a Schur complement): what is left is what the flight tells about
-    the parameters without knowing where it began.
+    A free initial state is unknown too and is eliminated (Schur complement): the result is the information about the
+    parameters if the initial state is estimated with them. `initial_state` is where J is computed, by default the
+    measured one.
     """
     count = parameters.shape[0]
     factor = joint_factor(_information(problem, parameters, initial_state), count)[0, :count, -count:]
@@ -26,9 +27,9 @@ def fisher_information(
 def cramer_rao_bound(
     problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
 ) -> Float[Array, "parameters parameters"]:
-    """The least covariance that an unbiased estimate can have: the inverse of `fisher_information`.
+    """The smallest covariance that an unbiased estimate can have: the inverse of `fisher_information`.
 
-    Parameters that the flight does not tell have a variance that is huge, not infinite.
+    A parameter that is not excited has a huge variance, but not an infinite one.
     """
     return covariance_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
 

@@ -1,4 +1,4 @@
-"""Huber's loss: measurements far off the fit count for no more than a few standard deviations."""
+"""Huber's robust loss: limits the influence of outliers on a fit."""
 
 from typing import NamedTuple
 
@@ -10,18 +10,18 @@ from .._custom_types import Parameters, Scalar
 from ..flight import STATE_NAMES
 from ..shooting import ShootingProblem
 
-# Where residuals are cut, in standard deviations: of Gaussian noise the estimate keeps 95 % of its efficiency.
+# Residuals are limited to this many standard deviations. With Gaussian noise the estimate keeps 95 % efficiency.
 CUT = 1.345
-# The median of the magnitude of Gaussian noise is this many standard deviations.
+# The median magnitude of Gaussian noise, in standard deviations.
 _MEDIAN = 0.6745
 
 
 class Winsorised(NamedTuple):
-    """A problem whose outliers are moved to where they count no more than Huber's loss lets them.
+    """A problem whose outliers were moved towards the fit.
 
-    - `problem`: to be fitted by least squares; the noise levels are those of the residuals' medians.
-    - `share`: of the measurements that were left as they are.
-    - `residuals`: in the noise levels told, none beyond the cut; 0 where nothing was measured.
+    - `problem`: to be fitted by least squares. Its noise levels come from the medians of the residuals.
+    - `share`: the fraction of the measurements that did not move.
+    - `residuals`: the limited residuals, in the new noise levels; 0 for missing measurements.
     """
 
     problem: ShootingProblem
@@ -31,20 +31,22 @@ class Winsorised(NamedTuple):
 
 @eqx.filter_jit
 def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Winsorised:
-    """Measurements whose residual at a fit is beyond 1.345 standard deviations, moved to there.
+    """Move each measurement whose residual exceeds 1.345 standard deviations to 1.345 standard deviations.
 
-    Fitted by least squares and repeated, this is Huber's estimate by his method of modified residuals (Huber, Robust
-    Statistics, section 7.8). The noise of each channel is told by the median of its residuals, which outliers move
-    little; a channel that was not measured keeps its own.
+    Repeat this and a least-squares fit until the parameters stand still: the result is Huber's estimate by the method
+    of modified residuals (Huber, Robust Statistics, section 7.8).
+
+    **Arguments:** `parameters` and `initial_state` of a fit. The standard deviation of each channel is estimated from
+    the median of its residuals, which outliers change little. A channel without measurements keeps its sigma.
     """
-    measured, sigma = problem.measured(), problem.sigma[problem.columns]
-    errors = problem.residuals(parameters, initial_state).reshape(measured.shape) * sigma
-    there = ~jnp.isnan(measured)
-    medians = jnp.nanmedian(jnp.where(there, jnp.abs(errors), jnp.nan), axis=0)
-    scale = jnp.where(there.sum(axis=0) > 1, medians / _MEDIAN, sigma)
+    observed, sigma = problem.measured(), problem.sigma[problem.columns]
+    errors = problem.residuals(parameters, initial_state).reshape(observed.shape) * sigma
+    measured = ~jnp.isnan(observed)
+    medians = jnp.nanmedian(jnp.where(measured, jnp.abs(errors), jnp.nan), axis=0)
+    scale = jnp.where(measured.sum(axis=0) > 1, medians / _MEDIAN, sigma)
     scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, sigma)
     cut = jnp.clip(errors, -CUT * scale, CUT * scale)
-    share = (there & (cut == errors)).sum() / jnp.maximum(there.sum(), 1)
+    share = (measured & (cut == errors)).sum() / jnp.maximum(measured.sum(), 1)
     channels = problem.flight.channels.at[:, problem.columns].add(cut - errors)
     states, force = channels[:, : len(STATE_NAMES)], channels[:, len(STATE_NAMES) :]
     has_force = problem.flight.specific_force is not None
@@ -55,5 +57,5 @@ def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: 
             (states, problem.sigma.at[problem.columns].set(scale)) + ((force,) if has_force else ()),
         ),
         share,
-        jnp.where(there, cut / scale, 0.0),
+        jnp.where(measured, cut / scale, 0.0),
     )

@@ -1,4 +1,4 @@
-"""What a flight can tell about each parameter, what it cannot, and why."""
+"""Which parameters a flight can identify, and for each of the others the reason why not."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,25 +6,25 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Parameters, as_float
-from ..bracket import Bracket
+from ..bracket import Bracket, is_identifiable
 from ..results import NINETY_FIVE
 from ..shooting import ShootingProblem
 from .fisher import cramer_rao_bound, fisher_information
 
-# Parameters that share more than this of a direction that the flight does not tell are named as partners.
+# Smallest share of a weakly determined direction for a parameter to be named as a partner.
 _PARTNER = 0.2
 
 
 class Identifiability(eqx.Module):
-    """The information of a flight in the parameters, in units of the bracket's half-widths.
+    """The information that a flight contains about each parameter, compared with its bracket.
 
-    - `nominal`: the size that each parameter is expected to have: what the airframe implies.
+    - `nominal`: the expected value of each parameter: what the airframe implies.
     - `half_width`: of the bracket.
-    - `std`: the Cramer-Rao bound, as standard deviations in the parameters' units.
-    - `std_alone`: the same if all other parameters were known.
-    - `eigenvalues`: of the scaled information, rising: below 1, the flight tells less about that direction than the
-      bracket did.
-    - `directions`: the eigenvectors, one a column, in half-widths.
+    - `std`: the Cramer-Rao bound, as standard deviations in the units of the parameters.
+    - `std_alone`: the Cramer-Rao bound if all other parameters were known.
+    - `eigenvalues`: of the information in units of half-widths, in increasing order. Below 1 the flight contains less
+      information about that direction than the bracket.
+    - `directions`: the eigenvectors in half-widths, one in each column.
     """
 
     nominal: Parameters
@@ -36,38 +36,44 @@ class Identifiability(eqx.Module):
 
     @property
     def identifiable(self) -> Bool[Array, " parameters"]:
-        """Whether the flight tells more about each parameter than its bracket did."""
-        return self.std <= self.half_width
+        """Whether each parameter is identifiable, by the rule of `jaxos4.bracket.is_identifiable`."""
+        return is_identifiable(self.std, self.half_width)
 
     @property
     def excited(self) -> Bool[Array, " parameters"]:
-        """Whether it would, if all other parameters were known."""
-        return self.std_alone <= self.half_width
+        """Whether each parameter would be identifiable if all others were known."""
+        return is_identifiable(self.std_alone, self.half_width)
 
     @property
     def noise_limit(self) -> Parameters:
-        """Multiples of the problem's sigma below which a parameter of nominal size is told apart from 0, with 95 %."""
+        """The largest noise, in multiples of sigma, at which the 95 % interval of the nominal value excludes 0."""
         return jnp.abs(self.nominal) / (NINETY_FIVE * self.std)
 
-    def notes(self, names: tuple[str, ...]) -> dict[str, str]:
-        """For each parameter of which something must be said, what it is. Of one flight, not of a batch."""
-        notes = {}
-        told, excited, limit = (np.asarray(x) for x in (self.identifiable, self.excited, self.noise_limit))
-        nominal = np.asarray(self.nominal)
-        for i, name in enumerate(names):
-            if not np.isfinite(self.std[i]):
-                notes[name] = "not told: no trajectory, or no bracket, to judge by"
+    def reasons(self, names: tuple[str, ...]) -> dict[str, str]:
+        """For each parameter of one flight that is not identifiable, the reason."""
+        excited, std, reasons = np.asarray(self.excited), np.asarray(self.std), {}
+        for i in np.flatnonzero(~np.asarray(self.identifiable)).tolist():
+            if not np.isfinite(std[i]):
+                reasons[names[i]] = "the trajectory is not finite, or the bracket is not valid"
             elif not excited[i]:
-                notes[name] = "not told: not excited"
-            elif not told[i]:
-                partners = ", ".join(names[j] for j in self._partners(i))
-                notes[name] = f"not told: only together with {partners}"
+                reasons[names[i]] = "not excited"
+            else:
+                reasons[names[i]] = f"only together with {', '.join(names[j] for j in self._partners(i))}"
+        return reasons
+
+    def notes(self, names: tuple[str, ...]) -> dict[str, str]:
+        """For each parameter of one flight that is not identifiable or below the noise floor, a note to the user."""
+        limit, nominal = np.asarray(self.noise_limit), np.asarray(self.nominal)
+        reasons, notes = self.reasons(names), {}
+        for i, name in enumerate(names):
+            if name in reasons:
+                notes[name] = f"not identifiable: {reasons[name]}"
             elif limit[i] < 1 and nominal[i] != 0:
-                notes[name] = f"below the noise floor at this noise; identifiable below {limit[i]:.2g} of it"
+                notes[name] = f"below the noise floor: identifiable below {limit[i]:.2g} times this noise"
         return notes
 
     def _partners(self, i: int) -> list[int]:
-        """The parameters with which `i` can be traded without the flight telling."""
+        """The parameters that can change together with parameter `i` with the least effect on the flight."""
         vectors = np.asarray(self.directions) / np.sqrt(np.maximum(np.asarray(self.eigenvalues), 1e-300))
         weakest = vectors[:, np.argmax(np.abs(vectors[i]))]
         share = np.abs(weakest) / np.abs(weakest).max()
@@ -80,16 +86,17 @@ def identifiability(
     parameters: Parameters,
     initial_state: Float[Array, " starts"] | None = None,
 ) -> Identifiability:
-    """What a problem's flight tells about its model's parameters near `parameters`, with the problem's sigma.
+    """Analyse which parameters of the problem's model its flight can identify, at the problem's sigma.
 
     **Arguments:**
 
     - `bracket`: its half-widths say how well each parameter is known without the flight.
-    - `initial_state`: where it is free, it is unknown too, and eliminated.
+    - `parameters`, `initial_state`: where the information is computed. A free initial state is estimated too.
 
-    Standard deviations are infinite where the trajectory diverges at `parameters` or the bracket is not valid.
+    **Returns:** an `Identifiability`. Its standard deviations are infinite if the trajectory diverges at `parameters`
+    or the bracket is not valid.
 
-    **Raises:** `ValueError` for parameters or a bracket of another length than the model's parameters.
+    **Raises:** `ValueError` if the model has another number of parameters than `parameters` or `bracket`.
     """
     parameters, names = as_float(parameters), problem.model.parameter_names
     for name, shape in (("parameters", parameters.shape), ("bracket", bracket.lower.shape)):

@@ -1,4 +1,4 @@
-"""From alpha_1..8 and their covariance to the constants of a rigid body: Ix, Iy, Iz, J_R with theirs."""
+"""The constants Ix, Iy, Iz, J_R of a rigid body, fitted to alpha_1..8 and their covariance."""
 
 import equinox as eqx
 import jax
@@ -11,9 +11,9 @@ from ..linalg import cholesky, invert, invert_factor
 from ..models.abstract import AbstractModel
 from ..models.inertial import InertialOS4
 
-# Gauss-Newton converges quadratically here: the alphas are nearly linear in the constants over their errors.
+# Gauss-Newton steps. They converge fast, because the alphas are nearly linear in the constants over their errors.
 _STEPS = 20
-# Reciprocals of alpha3, 6, 8 within this factor of the airframe's inertia are where the fit starts.
+# The fit starts at the reciprocals of alpha3, 6, 8 if they are within this factor of the airframe's inertia.
 _FAR = 100.0
 
 
@@ -21,12 +21,12 @@ class InertiaFit(eqx.Module):
     """The rigid body that explains eight alphas best.
 
     - `constants`: Ix, Iy, Iz, J_R [kg m^2].
-    - `covariance`: of these.
-    - `mismatch`: (alpha - alpha(constants))^T C^-1 (alpha - alpha(constants)): chi-squared with four degrees of freedom
-      where the alphas are those of a rigid body.
-    - `p_value`: how often a rigid body's alphas would be as far off or farther.
-    - `triangle`: Iy + Iz - Ix, Iz + Ix - Iy, Ix + Iy - Iz [kg m^2]: none is negative for a rigid body.
-    - `triangle_std`: their standard deviations.
+    - `covariance`: of the constants.
+    - `mismatch`: (alpha - alpha(constants))^T C^-1 (alpha - alpha(constants)). If the alphas are those of a rigid body,
+      it is chi-squared distributed with four degrees of freedom.
+    - `p_value`: the probability that the alphas of a rigid body have this mismatch or a larger one.
+    - `triangle`: Iy + Iz - Ix, Iz + Ix - Iy, Ix + Iy - Iz [kg m^2]. No rigid body has a negative one.
+    - `triangle_std`: the standard deviations of `triangle`.
     """
 
     constants: Float[Array, "4"]
@@ -43,7 +43,7 @@ class InertiaFit(eqx.Module):
 
     @property
     def is_rigid_body(self) -> Bool[Array, "*batch"]:
-        """Whether no triangle inequality is broken by more than two standard deviations."""
+        """Whether every triangle inequality holds within two standard deviations."""
         return (self.triangle > -2 * self.triangle_std).all(axis=-1)
 
 
@@ -51,15 +51,17 @@ class InertiaFit(eqx.Module):
 def fit_inertia(
     model: AbstractModel, alpha: Parameters, covariance: Float[Array, "parameters parameters"]
 ) -> InertiaFit:
-    """Eight alphas, four constants: weighted least squares, by Gauss-Newton from the reciprocals of alpha3, 6, 8.
+    """Fit four constants to eight alphas by weighted least squares (Gauss-Newton).
 
     **Arguments:**
 
-    - `model`: says what stands above Ix and Iy in alpha2 and alpha5, see `gyroscopic_factor`.
-    - `alpha`, `covariance`: an estimate's. Where they are not finite, or no positive inertias fit them, the airframe's
-      constants are returned with an infinite covariance and mismatch, and a `p_value` of 0.
+    - `model`: its `gyroscopic_factor` times J_R is the numerator of alpha2 and alpha5.
+    - `alpha`, `covariance`: of an estimate.
 
-    **Raises:** `ValueError` for other shapes, or a model that is not one in alpha_1..8.
+    **Returns:** the fit. If the inputs are not finite, or no positive inertias fit them: the constants of the airframe,
+    with an infinite covariance and mismatch and a `p_value` of 0.
+
+    **Raises:** `ValueError` for other shapes, or a model whose parameters are not alpha_1..8.
     """
     inertial, alpha, covariance = InertialOS4(model), as_float(alpha), as_float(covariance)
     if alpha.shape != (8,) or covariance.shape != (8, 8):
@@ -85,15 +87,15 @@ def fit_inertia(
     spread = invert(jacobian.T @ jacobian) * scale[:, None] * scale[None, :]
     mismatch = jnp.square(residuals(u)).sum()
     constants = u * scale
-    told = jnp.isfinite(spread).all() & jnp.isfinite(mismatch) & (constants[:3] > 0).all()
-    constants = jnp.where(told, constants, inertial.alpha)
-    spread, mismatch = jnp.where(told, spread, jnp.inf), jnp.where(told, mismatch, jnp.inf)
+    fitted = jnp.isfinite(spread).all() & jnp.isfinite(mismatch) & (constants[:3] > 0).all()
+    constants = jnp.where(fitted, constants, inertial.alpha)
+    spread, mismatch = jnp.where(fitted, spread, jnp.inf), jnp.where(fitted, mismatch, jnp.inf)
     sums = jnp.ones((3, 3)) - 2 * jnp.eye(3)
     return InertiaFit(
         constants=constants,
         covariance=spread,
         mismatch=mismatch,
-        p_value=jnp.where(told, jax.scipy.special.gammaincc(2.0, mismatch / 2), 0.0),
+        p_value=jnp.where(fitted, jax.scipy.special.gammaincc(2.0, mismatch / 2), 0.0),
         triangle=sums @ constants[:3],
-        triangle_std=jnp.where(told, jnp.sqrt(jnp.diagonal(sums @ spread[:3, :3] @ sums.T)), jnp.inf),
+        triangle_std=jnp.where(fitted, jnp.sqrt(jnp.diagonal(sums @ spread[:3, :3] @ sums.T)), jnp.inf),
     )

@@ -1,4 +1,4 @@
-"""Predictions some tenths of a second ahead, over a flight that was not fitted, and what they are worth."""
+"""Predictions of the body rates some tenths of a second ahead, and their skill."""
 
 from typing import NamedTuple
 
@@ -15,19 +15,19 @@ from ..shooting import FASTEST, ShootingProblem
 
 HORIZONS = (0.1, 0.25, 0.5)
 RATES = CASCADE_ORDER[:3]
-# Seconds from one start to the next, and around a start over which the measured rates are averaged.
+# Time between starts, and time around a start over which the measured rates are averaged [s].
 _EVERY, _AROUND = 0.05, 0.02
-# Parts of the flight, one of which at a time is left out, to tell how certain a skill is.
+# Number of parts of the flight for the jackknife, which omits one part at a time.
 _PARTS = 10
 
 
 class Predictions(NamedTuple):
-    """Body rates p, q, r [rad/s], predicted from many starts.
+    """Predictions of the body rates p, q, r [rad/s] from many starts.
 
-    - `start`: the sample at which each begins.
-    - `horizons`: how far ahead [s].
-    - `initial`: the rates at the start, measured around it.
-    - `predicted`, `measured`: at each horizon; NaN where not measured.
+    - `start`: the sample at which each prediction starts.
+    - `horizons`: time from the start to the prediction [s].
+    - `initial`: the measured rates at the start.
+    - `predicted`, `measured`: the rates at each horizon. NaN: not measured.
     """
 
     start: Int[np.ndarray, " starts"]
@@ -38,14 +38,15 @@ class Predictions(NamedTuple):
 
 
 class Skill(NamedTuple):
-    """What predictions are worth.
+    """The skill of predictions, compared with persistence: "the rates stay as they are".
 
-    - `rmse`: of the predictions [rad/s], by horizon and rate.
-    - `persistence`: that of "the rates stay as they are".
-    - `skill`: 1 - (rmse / persistence)^2: 1 is perfect, 0 as good as persistence, below 0 worse; NaN where nothing was
-      measured, or neither errs.
-    - `std`: of the skill: the jackknife's, over ten parts of the flight, so that neighbours may be alike.
-    - `starts`: how many.
+    - `rmse`: root mean square error of the predictions [rad/s].
+    - `persistence`: root mean square error of persistence [rad/s].
+    - `skill`: 1 - (rmse / persistence)^2. 1 is perfect, 0 is as good as persistence, negative is worse. NaN: nothing
+      was measured, or both errors are 0.
+    - `std`: standard error of the skill, from a jackknife over ten parts of the flight. Neighbouring predictions may be
+      correlated.
+    - `starts`: number of starts.
     """
 
     rmse: Float[np.ndarray, "horizons 3"]
@@ -58,17 +59,17 @@ class Skill(NamedTuple):
 def predictions(
     problem: ShootingProblem, parameters: Parameters, *, horizons: tuple[float, ...] = HORIZONS
 ) -> Predictions:
-    """The rates that a model predicts from each start, 0.05 s apart, with the rotor speeds that were recorded.
+    """Predict the body rates from many starts, with the recorded rotor speeds.
 
-    A start is the mean of the rates measured within 0.01 s of it; none lies where that or the longest horizon leaves
-    its stretch, or where a rate was not measured.
+    Starts are 0.05 s apart. The initial rates are the mean of the rates measured within 0.01 s of the start. A start is
+    omitted if one of these rates is missing, or if the longest horizon reaches beyond the stretch.
 
     **Arguments:**
 
-    - `problem`: its model, flight and method; windows and channels do not matter.
+    - `problem`: gives model, flight and method. Its windows and channels have no effect.
     - `horizons`: [s], positive.
 
-    **Raises:** `ValueError` for a flight that is shorter than the longest horizon, or measured no rates.
+    **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """
     flight = problem.flight
     dt, ahead = float(flight.dt), _ahead(flight, horizons)
@@ -83,9 +84,9 @@ def predictions(
 def starts(
     flight: Flight, horizons: tuple[float, ...] = HORIZONS
 ) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 3"]]:
-    """The samples from which `predictions` predicts a flight, and the rates there.
+    """The samples at which `predictions` starts, and the measured rates there [rad/s].
 
-    **Raises:** as `predictions` does.
+    **Raises:** the errors of `predictions`.
     """
     dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
     around = int(_AROUND / 2 / dt)
@@ -97,7 +98,7 @@ def starts(
     initial = rates[near].mean(axis=1)
     start, initial = start[np.isfinite(initial).all(axis=1)], initial[np.isfinite(initial).all(axis=1)]
     if not start.size:
-        raise ValueError(f"`flight` holds no stretch with measured rates that is longer than {max(horizons)} s.")
+        raise ValueError(f"`flight` has no stretch with measured rates that is longer than {max(horizons)} s.")
     return start, initial
 
 
@@ -118,7 +119,7 @@ def _predict(
     def fly(first: Int[Array, ""], measured: Float[Array, "3"]) -> Float[Array, "steps_and_one 3"]:
         rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
         row = jax.tree.map(lambda leaf: leaf[0], rows)
-        # What the gyro adds to the rates is not part of the state.
+        # A gyro bias is part of the measurement, not of the state.
         added = jnp.stack(model.observe(unstack(measured), row, scalars)[:3]) - measured
 
         def step(state: State, row) -> tuple[State, Float[Array, "3"]]:
@@ -130,22 +131,22 @@ def _predict(
 
 
 def skill(predicted: Predictions) -> Skill:
-    """What predictions are worth against "the rates stay as they are"."""
-    told = np.isfinite(predicted.measured)
-    errors = np.where(told, predicted.predicted - predicted.measured, 0.0)
-    changes = np.where(told, predicted.initial[:, None] - predicted.measured, 0.0)
-    # A prediction that diverged errs by as much as no gyro measures, so that one of many shows, and stays a number.
+    """The skill of predictions, compared with persistence."""
+    measured = np.isfinite(predicted.measured)
+    errors = np.where(measured, predicted.predicted - predicted.measured, 0.0)
+    changes = np.where(measured, predicted.initial[:, None] - predicted.measured, 0.0)
+    # A diverged prediction counts as an error that no gyro could measure: large, but finite.
     squares = np.square(np.clip(np.nan_to_num(errors, nan=FASTEST), -FASTEST, FASTEST))
     parts = np.array_split(np.arange(errors.shape[0]), min(_PARTS, errors.shape[0]))
 
-    def worth(kept: np.ndarray) -> np.ndarray:
+    def skill_of(kept: np.ndarray) -> np.ndarray:
         reference = np.square(changes[kept]).sum(axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             return 1 - squares[kept].sum(axis=0) / reference
 
     everything = np.arange(errors.shape[0])
-    without = np.stack([worth(np.setdiff1d(everything, part)) for part in parts])
-    count = np.maximum(told.sum(axis=0), 1)
+    without = np.stack([skill_of(np.setdiff1d(everything, part)) for part in parts])
+    count = np.maximum(measured.sum(axis=0), 1)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt((len(parts) - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
     if len(parts) == 1:
@@ -153,7 +154,7 @@ def skill(predicted: Predictions) -> Skill:
     return Skill(
         rmse=np.sqrt(squares.sum(axis=0) / count),
         persistence=np.sqrt(np.square(changes).sum(axis=0) / count),
-        skill=worth(everything),
+        skill=skill_of(everything),
         std=spread,
         starts=errors.shape[0],
     )

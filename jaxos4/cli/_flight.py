@@ -161,15 +161,14 @@ def _parameters(
             "ci95": [value - half_width[i], value + half_width[i]] if told else None,
             "unit": unit,
             "noise_limit": None if known is None else finite(known.noise_limit[i]),
-            "note": _note(found, i, half_width[i], lower, upper) if told else _why_untold(known, name, model),
+            "note": _note(found, i, half_width[i], lower, upper) if told else _why_not_identifiable(known, name, model),
         }
     return table
 
 
-def _why_untold(known: Identifiability | None, name: str, model: AbstractModel) -> str:
-    reasons = {} if known is None else known.notes(model.parameter_names)
-    reason = reasons.get(name, "")
-    return reason if reason.startswith("not told") else "not told by this flight"
+def _why_not_identifiable(known: Identifiability | None, name: str, model: AbstractModel) -> str:
+    reasons = {} if known is None else known.reasons(model.parameter_names)
+    return f"not identifiable: {reasons[name]}" if name in reasons else "not identifiable from this flight"
 
 
 def _note(found: Estimate, i: int, half_width: float, lower: float, upper: float) -> str:
@@ -184,7 +183,7 @@ def _note(found: Estimate, i: int, half_width: float, lower: float, upper: float
 
 
 def _constants(model: AbstractModel, found: Estimate) -> dict[str, Any]:
-    """Ix, Iy, Iz, J_R of the rigid body that explains the alphas best; empty where they are not told."""
+    """Ix, Iy, Iz, J_R of the rigid body that explains the alphas best; empty if they are not identifiable."""
     if model.parameter_names != PARAMETER_NAMES:
         return {}
     rigid = fit_inertia(model, found.parameters, found.covariance)

@@ -43,8 +43,8 @@ def print_flight(console: Console, report: dict[str, Any]) -> None:
     ]
     if below:
         console.print(
-            f"below noise: not told from 0. The airframe's values would show below this share of the noise found: "
-            f"{', '.join(below)}.",
+            "below noise: cannot be distinguished from 0. The airframe's values would show below this share of the "
+            f"noise found: {', '.join(below)}.",
             highlight=False,
         )
     fit = report["fit"]

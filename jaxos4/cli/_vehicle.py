@@ -269,7 +269,7 @@ def _parameters(fit: VehicleFit, bracket: Bracket, model: FlightModel) -> dict[s
             "std": finite(std),
             "bound": finite(fit.bound[i]),
             "ci95": [value - half_width[i], value + half_width[i]] if told else None,
-            "note": "; ".join(notes) if told else "not told by these flights",
+            "note": "; ".join(notes) if told else "not identifiable from these flights",
             "unit": unit,
         }
     return table

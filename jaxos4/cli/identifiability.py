@@ -42,7 +42,7 @@ def identifiability(
     window: WindowOption = None,
     out: OutOption = None,
 ) -> None:
-    """What a flight tells of alpha_1..8, and why not of others: not excited, not told apart, below the noise."""
+    """Which of alpha_1..8 a flight can identify, and for the others the reason why not."""
     console = Console()
     if out is not None:
         check_output(out, flight, Path(airframe), bracket)

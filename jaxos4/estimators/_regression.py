@@ -219,7 +219,8 @@ def answer(
 ) -> Estimate:
     """A regression's parameters as an estimate: the initial state and the cost are those of shooting with them.
 
-    What is not told may be anything: where the flight cannot be simulated with it, the bracket's center is returned.
+    A parameter that is not identifiable may have any value. If the flight cannot be simulated with it, the bracket's
+    center is returned.
     """
     usable = bracket.usable
     told = (jnp.sqrt(jnp.diagonal(covariance)) <= usable.half_width).all()

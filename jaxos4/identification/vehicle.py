@@ -102,7 +102,7 @@ def fit_vehicle(
 
     progress("asking what else can be told")
     values[_free(whole, held)] = np.asarray(first.estimate.parameters)
-    held = _untold(eqx.tree_at(lambda p: p.model, first.problem, whole), values, first, bracket)
+    held = _not_identifiable(eqx.tree_at(lambda p: p.model, first.problem, whole), values, first, bracket)
 
     progress("fitting all that can be told")
     start = eqx.tree_at(lambda p: p.sigma, problem, first.problem.sigma)
@@ -181,7 +181,7 @@ def _left(bracket: Bracket, whole: AbstractModel, held: dict[str, tuple[float, s
     return Bracket(bracket.lower[free], bracket.upper[free])
 
 
-def _untold(
+def _not_identifiable(
     problem: ShootingProblem, values: np.ndarray, first: _Fit, bracket: Bracket
 ) -> dict[str, tuple[float, str]]:
     """What these flights cannot tell at the noise found, and damping that came out negative.
@@ -195,7 +195,7 @@ def _untold(
     held = {}
     for i, name in enumerate(names):
         if not std[i] <= half_width[i]:
-            held[name] = (float(center[i]), "not told by these flights")
+            held[name] = (float(center[i]), "not identifiable from these flights")
         elif name in _DAMPING and values[i] < -_NEGATIVE * std[i]:
             held[name] = (0.0, "came out negative, which no air does")
     # Something is left to estimate, whatever the flights tell.

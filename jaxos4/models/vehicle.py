@@ -12,7 +12,7 @@ from jaxtyping import Array, Int, Num
 
 from .._custom_types import Parameters, RotorSpeeds, Scalar, as_float
 from ..airframe import OS4, Airframe
-from ..flight import STATE_NAMES, Flight, Inputs, held_values
+from ..flight import STATE_NAMES, Flight, Inputs, fill_gaps
 from ..trigonometry import sincos
 from .abstract import PARAMETER_NAMES, AbstractModel, attitude_rates
 from .corrected import CorrectedOS4
@@ -340,7 +340,7 @@ def with_body_velocity(flight: Flight) -> Flight:
     columns = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "vx", "vy", "vz")]
     if bool(jnp.isnan(flight.states[:, columns]).all(axis=0).any()):
         return flight
-    *angles, vx, vy, vz = held_values(flight.states[:, columns]).T
+    *angles, vx, vy, vz = fill_gaps(flight.states[:, columns]).T
     velocity = _turned_back(_rotation(Attitude(*angles)), (vx, vy, vz))
     return eqx.tree_at(lambda f: f.body_velocity, flight, jnp.stack(velocity, axis=1), is_leaf=lambda x: x is None)
 

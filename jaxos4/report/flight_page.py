@@ -46,7 +46,7 @@ def write_flight_page(
     **Arguments:**
 
     - `report`: what `jaxos4 estimate` writes as JSON: `estimator`, `model`, `result`, `cost`, `rollouts`, `seconds`,
-      `parameters`, `held`, `constants`, `skill`, `provenance`. What it lacks, the page leaves out; `None`: not told.
+      `parameters`, `held`, `constants`, `skill`, `provenance`. What it lacks, the page omits; `None`: not identifiable.
       `skill` holds `horizons` [s], `starts`, and for p, q and r `skill`, `std`, `rmse`, `persistence` by horizon, and
       `equation_error` where its skill was computed; `provenance["command"]` is how to run it again, its `sample_time`
       gives the chart its seconds.
