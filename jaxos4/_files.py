@@ -91,5 +91,5 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     except RecursionError:
         raise InputError(f"{path}: its tables are nested too deeply; use fewer levels.") from None
     except ValueError as error:
-        what = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: not a TOML file ({what}); correct that place.") from None
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: not a TOML file ({reason}); correct that place.") from None

@@ -51,7 +51,7 @@ def _with_states(flight: Flight, states: States) -> Flight:
 
 
 class AbstractNoise(eqx.Module):
-    """The difference between measured and true states. A number for "each state" is one number or an array of 12."""
+    """Sensor noise. A setting "for each state" is one number for all states, or an array of 12 numbers."""
 
     @abc.abstractmethod
     def __call__(self, flight: Flight, *, key: Key) -> Flight:

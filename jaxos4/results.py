@@ -19,7 +19,7 @@ class RESULTS(eqx.Enumeration):
         "a parameter is no better known after the flight than from its bracket: fly with more excitation, or hold it"
     )
     nonfinite_trajectory = "the simulated trajectory or its input is not finite: check the input and the bracket"
-    attitude_singularity = "the pitch angle passed +-90 degrees, where Euler angles fail: use a flight without loops"
+    attitude_singularity = "the pitch angle passed +-90 degrees, where Euler angles are singular: fly no loops"
     bracket_invalid = "a bracket is not finite, or its lower end is not below its upper end: correct the bracket"
     network_mismatch = (
         "the flight differs from the network's training in inputs, sampling or start, or has more noise or gaps: "

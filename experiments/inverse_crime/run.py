@@ -18,7 +18,7 @@ def main(
     specification: Path,
     out: Annotated[Path, typer.Option(help="Folder for the studies, new or to be resumed.")],
     fit_methods: Annotated[list[str], typer.Option(help="Integration methods of the fit.")] = ("euler", "rk4"),
-    dts: Annotated[list[float], typer.Option(help="Sample times [s].")] = (0.01, 0.002),
+    dts: Annotated[list[float], typer.Option(help="Sample times, in seconds.")] = (0.01, 0.002),
 ) -> None:
     """Run the study once for each integration method of the fit and each sample time."""
     study = load_study(specification)

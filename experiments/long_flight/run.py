@@ -84,7 +84,7 @@ def identify(name: str, recorded: jaxos4.Flight, states: jax.Array, windows: int
 
 
 def main(
-    duration: Annotated[float, typer.Option(help="Duration of each flight [s].")] = 60.0,
+    duration: Annotated[float, typer.Option(help="Duration of each flight, in seconds.")] = 60.0,
     flights: Annotated[int, typer.Option(help="Number of flights for each row.")] = 8,
     seed: Annotated[int, typer.Option(help="Random seed for drifts and noise.")] = 3,
     drifts: Annotated[list[float], typer.Option(help="Standard deviations of the factors.")] = (0.0, 1e-4, 1e-3),

@@ -115,7 +115,7 @@ def _window_by_window(
     moves = moves.reshape(windows, -1, parameters)
 
     def contribution(apart: int) -> Float[Array, "parameters parameters"]:
-        """What windows that are `apart` windows apart contribute."""
+        """The contribution of all pairs of windows that are `apart` windows apart."""
         count = windows - apart
         pairs = measured[:count].T @ measured[apart:]
         covariance = errors[:count].T @ errors[apart:] / jnp.maximum(pairs, 1)
