@@ -23,27 +23,15 @@ def standard_flight(model_class=jaxos4.PublishedOS4, duration=5.0):
 
 
 def standard_problem(
-    model_class=jaxos4.PublishedOS4,
-    channels="all",
-    *,
-    free=False,
-    states=None,
-    duration=5.0,
-    method="euler",
+    model_class=jaxos4.PublishedOS4, channels="all", *, free=False, states=None, duration=5.0, method="euler"
 ):
     """The problem of the standard flight without noise, or with other measured `states`."""
     flight = standard_flight(model_class, duration)
     start = None if free else flight.states[0]
     if states is not None:
         flight = eqx.tree_at(lambda f: f.states, flight, states)
-    return jaxos4.ShootingProblem(
-        model_class(jaxos4.OS4),
-        flight,
-        channels=channels,
-        sigma=jaxos4.SENSOR_SIGMA,
-        initial_state=start,
-        method=method,
-    )
+    arguments = {"channels": channels, "sigma": jaxos4.SENSOR_SIGMA, "initial_state": start, "method": method}
+    return jaxos4.ShootingProblem(model_class(jaxos4.OS4), flight, **arguments)
 
 
 def noisy_states(count, model_class=jaxos4.PublishedOS4, *, seed=0, scale=1.0, duration=5.0):

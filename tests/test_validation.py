@@ -85,10 +85,8 @@ def test_windows_and_channels_do_not_matter():
     flight = flown(model)
     one = spread(model, flight)
     for windows in (5, 1):
-        other = jaxos4.ShootingProblem(
-            model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="all", method="rk4", windows=windows
-        )
-        other = jaxos4.predictions(other, model.alpha)
+        arguments = {"sigma": jaxos4.SENSOR_SIGMA, "channels": "all", "method": "rk4", "windows": windows}
+        other = jaxos4.predictions(jaxos4.ShootingProblem(model, flight, **arguments), model.alpha)
         np.testing.assert_allclose(other.predicted, one.predicted, rtol=1e-12, atol=1e-13)
 
 
