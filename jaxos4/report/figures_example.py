@@ -1,4 +1,4 @@
-"""Figures of one flight and of the trainings: the search, trajectories, the path in space, the loss."""
+"""Figures of the example flight and of the training: search, trajectories, path in space, loss."""
 
 import numpy as np
 import xarray as xr
@@ -9,13 +9,13 @@ from .legend import legend
 from .scenario import names
 from .style import FAINT, INK, estimator_gid, grid, log_axis, styles
 
-# Of the searches by parameter, whose lines are no estimators.
+# Styles of lines that belong to a parameter, not to an estimator.
 _LOOKS = ("o-", "s--", "D-.", "^:", "v-", "P--", "X-.", "*:")
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#c46a9b", "#b97f00", "#3b97ce", "#7f7f7f", "#8e5ea8")
 
 
 def search(data: xr.Dataset) -> Figure | None:
-    """Half-widths of the brackets of IBSS after each sweep, and how far their middle moves, in the first ones."""
+    """Half-widths and centres of the brackets of IBSS after each sweep, in units of the first half-widths."""
     if "search_half_width" not in data:
         return None
     width = data["search_half_width"].transpose("sweep", "parameter")
@@ -38,7 +38,7 @@ def search(data: xr.Dataset) -> Figure | None:
 
 
 def trajectories(data: xr.Dataset) -> Figure | None:
-    """The example flight: what was measured, what was true, and what each estimate simulates."""
+    """The example flight: measured, true, and simulated with each estimate."""
     shown = _measured_states(data)
     if not shown:
         return None
@@ -53,7 +53,7 @@ def trajectories(data: xr.Dataset) -> Figure | None:
 
 
 def deviations(data: xr.Dataset) -> Figure | None:
-    """The same flight: how far each simulation is from the truth."""
+    """The example flight: deviation of each simulation from the truth."""
     shown = _measured_states(data)
     if not shown:
         return None
@@ -91,7 +91,7 @@ def path(data: xr.Dataset) -> Figure | None:
 
 
 def training(data: xr.Dataset) -> Figure | None:
-    """The loss of each network on what it trains on and on what it does not."""
+    """The training loss and the validation loss of each network."""
     if "training_loss" not in data:
         return None
     labels = names(data, "training")
@@ -115,8 +115,8 @@ def training(data: xr.Dataset) -> Figure | None:
 def _measured_states(data: xr.Dataset) -> list[int]:
     if "example_measured" not in data:
         return []
-    there = data["example_measured"].notnull() & data["example_true"].notnull()
-    return [int(place) for place in np.flatnonzero(there.any("sample").values)]
+    known = data["example_measured"].notnull() & data["example_true"].notnull()
+    return [int(place) for place in np.flatnonzero(known.any("sample").values)]
 
 
 def _time(data: xr.Dataset) -> np.ndarray:
