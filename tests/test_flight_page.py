@@ -1,6 +1,6 @@
 """An identification as a page and as text: what they say, with and without predictions, with and without an answer."""
 
-import html.parser
+import html
 import io
 import re
 
@@ -18,29 +18,11 @@ from jaxos4.report.style import styles
 EVIL = "</script><script>alert(1)</script>"
 
 
-class Words(html.parser.HTMLParser):
-    """The page's text, without scripts and styles."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.said, self.inside = [], ""
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self.inside = tag if tag in ("script", "style") else self.inside
-
-    def handle_endtag(self, tag):
-        self.inside = "" if tag == self.inside else self.inside
-
-    def handle_data(self, data):
-        if not self.inside:
-            self.said.append(data)
-
-
 def written(path, title="A flight", **changes):
     write_flight_page(path, identified_vehicle(**changes), title=title)
     text = path.read_text(encoding="utf-8")
-    return text, " ".join(" ".join(Words(text).said).split())
+    said = re.sub(r"<(script|style).*?</\1>|<[^>]+>", " ", text, flags=re.DOTALL)
+    return text, " ".join(html.unescape(said).split())
 
 
 def printed(found):

@@ -58,8 +58,8 @@ OF_SCENARIOS = (
     Kind(
         "distribution",
         "Distribution of the errors",
-        "Error / bound: median, quartiles, and 95 % of the flights. The box of an efficient estimator reaches from one "
-        "dashed line to the other. The file shows the noise scale nearest 1.",
+        "Error / bound: median, quartiles, and 95 % of the flights. The line of an efficient estimator reaches from "
+        "one dashed line to the other. The file shows the noise scale nearest 1.",
         "estimate, truth, bound, result",
         figures_spread.distribution,
         of_scale=True,
@@ -94,7 +94,7 @@ OF_EXAMPLE = (
     Kind(
         "trajectories",
         "Measured and simulated",
-        "Dots: measured; black: the truth; coloured: simulated with each estimate.",
+        "Dots: measured. Black, or white on a dark page: true. Coloured: simulated with each estimate.",
         "example_measured, example_true, example_simulated",
         figures_example.trajectories,
     ),
@@ -108,7 +108,7 @@ OF_EXAMPLE = (
     Kind(
         "path",
         "The path in space",
-        "Dots: measured; black: the truth; coloured: simulated with each estimate.",
+        "Dots: measured. Black, or white on a dark page: true. Coloured: simulated with each estimate.",
         "example_measured, example_true, example_simulated",
         figures_example.path,
     ),

@@ -1,7 +1,10 @@
 """Figures of the example flight and of the training: search, trajectories, path in space, loss."""
 
+from collections.abc import Callable
+
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -39,31 +42,23 @@ def search(data: xr.Dataset) -> Figure | None:
 
 def trajectories(data: xr.Dataset) -> Figure | None:
     """The example flight: measured, true, and simulated with each estimate."""
-    shown = _measured_states(data)
-    if not shown:
-        return None
-    figure, axes = grid(len(shown), columns=3, height=1.75)
-    for panel, place in zip(axes, shown, strict=True):
-        panel.plot(_time(data), data["example_measured"].isel(state=place), ".", color=FAINT, markersize=2)
-        panel.plot(_time(data), data["example_true"].isel(state=place), color=INK, linewidth=1.0)
-        _simulated(panel, data, data["example_simulated"].isel(state=place))
-        _title(panel, data, place, place in shown[-3:])
-    legend(figure, data, markers=False)
-    return figure
+
+    def draw(panel: Axes, state: int) -> None:
+        panel.plot(data["time"], data["example_measured"].isel(state=state), ".", color=FAINT, markersize=2)
+        panel.plot(data["time"], data["example_true"].isel(state=state), color=INK, linewidth=1.0)
+        _draw_simulations(panel, data, data["example_simulated"].isel(state=state))
+
+    return _each_state(data, draw)
 
 
 def deviations(data: xr.Dataset) -> Figure | None:
     """The example flight: deviation of each simulation from the truth."""
-    shown = _measured_states(data)
-    if not shown:
-        return None
-    figure, axes = grid(len(shown), columns=3, height=1.75)
-    for panel, place in zip(axes, shown, strict=True):
+
+    def draw(panel: Axes, state: int) -> None:
         panel.axhline(0, color=INK, linewidth=0.8)
-        _simulated(panel, data, (data["example_simulated"] - data["example_true"]).isel(state=place))
-        _title(panel, data, place, place in shown[-3:])
-    legend(figure, data, markers=False)
-    return figure
+        _draw_simulations(panel, data, (data["example_simulated"] - data["example_true"]).isel(state=state))
+
+    return _each_state(data, draw)
 
 
 def path(data: xr.Dataset) -> Figure | None:
@@ -112,26 +107,27 @@ def training(data: xr.Dataset) -> Figure | None:
     return figure
 
 
-def _measured_states(data: xr.Dataset) -> list[int]:
+def _each_state(data: xr.Dataset, draw: Callable[[Axes, int], None]) -> Figure | None:
+    """A panel for each state that was measured."""
     if "example_measured" not in data:
-        return []
+        return None
     known = data["example_measured"].notnull() & data["example_true"].notnull()
-    return [int(place) for place in np.flatnonzero(known.any("sample").values)]
+    shown = [int(state) for state in np.flatnonzero(known.any("sample").values)]
+    if not shown:
+        return None
+    figure, axes = grid(len(shown), columns=3, height=1.75)
+    for panel, state in zip(axes, shown, strict=True):
+        draw(panel, state)
+        one = data["state"].isel(state=state)
+        panel.set_title(f"{one.item()} [{data['state_unit'].isel(state=state).item()}]")
+        if state in shown[-3:]:
+            panel.set_xlabel("time [s]")
+    legend(figure, data, markers=False)
+    return figure
 
 
-def _time(data: xr.Dataset) -> np.ndarray:
-    return data["time"].values
-
-
-def _simulated(panel, data: xr.Dataset, values: xr.DataArray) -> None:
+def _draw_simulations(panel: Axes, data: xr.Dataset, values: xr.DataArray) -> None:
     for place, look in enumerate(styles(names(data, "estimator")).values()):
         y = values.isel(estimator=place).values
         if np.isfinite(y).any():
-            panel.plot(_time(data), y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=estimator_gid(place))
-
-
-def _title(panel, data: xr.Dataset, place: int, last: bool) -> None:
-    one = data["state"].isel(state=place)
-    panel.set_title(f"{one.item()} [{data['state_unit'].isel(state=place).item()}]")
-    if last:
-        panel.set_xlabel("time [s]")
+            panel.plot(data["time"], y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=estimator_gid(place))

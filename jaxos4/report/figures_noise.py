@@ -122,7 +122,9 @@ def frontier(data: xr.Dataset) -> Figure | None:
     panel.set_xlabel("noise scale below which |truth| exceeds 1.96 bounds (dashed: the scales of this study)")
     if len(seen) > 1:
         handles, labels = panel.get_legend_handles_labels()
-        figure.legend(handles, [f"{label} seen" for label in labels], loc="outside lower center", ncols=len(seen))
+        figure.legend(
+            handles, [f"bound of channels: {label}" for label in labels], loc="outside lower center", ncols=len(seen)
+        )
     return figure
 
 
