@@ -7,8 +7,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from jaxos4.cli.experiment import load_results, run_studies
 from jaxos4.report import read_results
+from jaxos4.report.experiment import load_results, run_studies
 from jaxos4.study import load_study, metrics
 
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"

@@ -10,6 +10,8 @@ from test_logs_blackbox import T as BLACKBOX_TIME, recorded
 from test_logs_crazyflie import one_event
 from test_logs_ulog import everything
 
+import jaxos4
+
 VEHICLE = """
 mass = 0.65
 inertia = [7.5e-3, 7.5e-3, 1.3e-2]
@@ -44,7 +46,7 @@ def test_each_format_is_inspected(kind, run, tmp_path):
     assert list(report["identifiable"]["parameters"]) == [f"alpha{i}" for i in range(1, 9)]
     code, out, err = run("inspect", "log")
     assert (code, err) == (0, "")
-    assert "told with --airframe" in out
+    assert "give --airframe to see which parameters are identifiable" in out
 
 
 def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):
@@ -97,3 +99,7 @@ def test_an_output_that_would_overwrite_the_log_is_refused(run, tmp_path):
     refused(run("inspect", "log", "--out", "log"), "would overwrite an input")
     assert (tmp_path / "log").read_bytes() == LOGS["Crazyflie"]
     refused(run("inspect", "log", "--airframe", "nothing.toml"), "nothing.toml")
+
+
+def test_the_version_is_shown(run):
+    assert run("--version") == (0, f"jaxos4 {jaxos4.__version__}\n", "")

@@ -18,7 +18,7 @@ from synthetic_study import ESTIMATORS, LEVELS, RESULTS, SCENARIO, UNITS, synthe
 from jaxos4.cli import main
 from jaxos4.report import error_table, figures, read_results, write_report, writing
 from jaxos4.report.numbers import MISSING, plain
-from jaxos4.report.style import drawing, log_axis
+from jaxos4.report.style import drawing, log_axis, styles
 
 OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
 OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
@@ -232,7 +232,7 @@ def test_trouble_is_named(page):
         "noise x 10, ibss, flight 2: max sweeps",
     ):
         assert flight in text
-    assert "3 flights are left out" in text
+    assert "3 flights without numbers" in text
     assert "† absolute error, in the parameter's unit: the truth is 0" in text
     assert "‡ absolute error, in the parameter's unit: below the noise floor" in text
     assert "jaxos4 study synthetic.toml --out synthetic" in text
@@ -262,7 +262,7 @@ def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypa
     assert {path.stem for path in written[1:]} == {f"{name}-1" for name in OF_SCENARIO}
     page = Page(written[0].read_text(encoding="utf-8"))
     assert {"error-1", "error-2"} <= page.tables.keys()
-    assert "Figures are drawn of the first 1 scenarios; tables are of all 2." in " ".join(page.text.split())
+    assert "The first 1 scenarios have figures; all 2 have tables." in " ".join(page.text.split())
     assert "corrected model" in page.text
 
 
@@ -279,7 +279,7 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
     study.attrs |= {"title": evil, "specification": f"</pre>{evil}", "command": evil, "failures": failures}
     text = write_report(study, tmp_path)[0].read_text(encoding="utf-8")
     assert "<script>alert" not in text
-    assert text.count("<script") == text.count("</script") == 3
+    assert text.count("<script") == text.count("</script") == 1
     shown = Page(text).text
     assert shown.count("alert(1)") >= 6
     assert "{{ 1 }}" in shown
@@ -325,6 +325,15 @@ def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
         settings = dict(matplotlib.rcParams)
         assert list(figures.of_example(study)) == before
         assert dict(matplotlib.rcParams) == settings
+
+
+def test_a_new_estimator_gets_a_style_of_its_own_and_the_known_ones_keep_theirs():
+    known = styles(list(ESTIMATORS))
+    assert styles(["svsf"])["svsf"] == known["svsf"]
+    for others in (["new"], ["new", "newer"], list(ESTIMATORS)):
+        both = styles([*others, "newest"])
+        assert len(set(both.values())) == len(both)
+        assert all(both[name] == known[name] for name in others if name in known)
 
 
 @pytest.mark.parametrize("low", [0.04, 0.3, 0.62, 0.84, 0.95, 0.99])

@@ -17,9 +17,9 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.cli.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 from jaxos4.estimators import ESTIMATORS as ALL
 from jaxos4.noise import NOISES
+from jaxos4.report.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
-from jaxos4.cli.experiment import run_studies, use_all_cores
+from jaxos4.report.experiment import run_studies, use_all_cores
 from jaxos4.study import load_study
 
 

@@ -9,8 +9,8 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from jaxos4.cli.experiment import write_figure
 from jaxos4.report import read_results
+from jaxos4.report.experiment import write_figure
 from jaxos4.report.figures_noise import error_unit
 from jaxos4.report.numbers import plain
 from jaxos4.report.style import INK, PAPER, grid

@@ -18,9 +18,8 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.cli.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 from jaxos4.models import MODELS
-from jaxos4.results import NINETY_FIVE
+from jaxos4.report.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 

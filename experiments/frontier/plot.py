@@ -12,7 +12,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxos4.cli.experiment import load_results, write_figure
+from jaxos4.report.experiment import load_results, write_figure
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from jaxos4.cli.experiment import run_studies, use_all_cores
+from jaxos4.report.experiment import run_studies, use_all_cores
 from jaxos4.study import load_study
 
 

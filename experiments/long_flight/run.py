@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.cli.experiment import PARAMETERS, count_results, in_words, table_of
+from jaxos4.report.experiment import PARAMETERS, count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 

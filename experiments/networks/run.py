@@ -20,7 +20,7 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.cli.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
+from jaxos4.report.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -7,8 +7,8 @@ import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxos4.cli.experiment import draw_spread, write_figure
 from jaxos4.report import read_results
+from jaxos4.report.experiment import draw_spread, write_figure
 from jaxos4.report.style import INK, grid, log_axis, styles
 from jaxos4.study import metrics
 

@@ -7,7 +7,7 @@ import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxos4.cli.experiment import load_results, write_figure
+from jaxos4.report.experiment import load_results, write_figure
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
 from jaxos4.study.metrics import NOISE_FLOOR
 

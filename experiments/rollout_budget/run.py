@@ -17,9 +17,9 @@ import typer
 import xarray as xr
 
 import jaxos4
-from jaxos4.cli.experiment import save_results
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
+from jaxos4.report.experiment import save_results
 from jaxos4.study import Study, load_study
 
 jax.config.update("jax_enable_x64", True)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import typer
 
-from jaxos4.cli.experiment import write_figure
 from jaxos4.report import read_results
+from jaxos4.report.experiment import write_figure
 from jaxos4.report.figures_noise import efficiency
 from jaxos4.report.figures_spread import coverage
 from jaxos4.study import metrics

@@ -1,3 +1,3 @@
-"""The command line: `jaxos4 simulate`, `estimate`, `identifiability`, `train`, `report`."""
+"""The command line: parses arguments, calls the library, prints."""
 
 from ._app import main as main

@@ -1,7 +1,8 @@
-"""The application: precision, and exit codes."""
+"""The application: its commands, the precision, and exit codes."""
 
 import os
 import sys
+from typing import Annotated
 
 import jax
 import typer
@@ -18,20 +19,26 @@ from .train import train
 
 _INTERRUPTED = 130
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    help="Identify the parameters of a quadrotor from its flights.",
-)
-app.command()(simulate)
-app.command()(estimate)
-app.command()(train)
-app.command()(inspect)
-app.command()(identifiability)
-app.command()(compare)
-app.command()(study)
-app.command()(report)
+app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+for command in (simulate, estimate, train, inspect, identifiability, compare, study, report):
+    app.command()(command)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from .. import __version__
+
+        typer.echo(f"jaxos4 {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _jaxos4(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Identify the parameters of a quadrotor from its flights."""
 
 
 def main() -> None:
@@ -47,11 +54,11 @@ def main() -> None:
             raise
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(_INTERRUPTED)  # now, and not when threads that compile or train come to their end; files are whole
+        os._exit(_INTERRUPTED)  # do not wait for threads that compile or train: no file is half-written
+    except BrokenPipeError:  # the reader of our output has gone
+        sys.stderr.close()
+        raise SystemExit(1) from None
     except (InputError, OSError) as error:
-        if isinstance(error, BrokenPipeError):  # whoever read our output has gone: not worth a word
-            sys.stderr.close()
-            raise SystemExit(1) from None
         typer.echo(f"jaxos4: {_one_line(error)}", err=True)
         raise SystemExit(2) from None
     except TrainingError as error:

@@ -1,4 +1,4 @@
-"""What the options choose from, and the options that commands share."""
+"""The values of options, and the options that several commands share."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -27,15 +27,15 @@ VehicleModel = StrEnum("VehicleModel", list((*MODELS, "flight")))
 Loss = StrEnum("Loss", ["huber", "squares"])
 
 FlightFile = Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
-ModelOption = Annotated[Model, typer.Option(help="The equations: as printed, or corrected.")]
+ModelOption = Annotated[Model, typer.Option(help="Equations of motion: as published, or corrected.")]
 AirframeOption = Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")]
 BracketOption = Annotated[Path | None, typer.Option(help="TOML file: alpha1 = \\[lower, upper], ...")]
-ChannelsOption = Annotated[Channels | None, typer.Option(help="What to compare; all that was measured without it.")]
+ChannelsOption = Annotated[Channels | None, typer.Option(help="Channels to fit. Default: all that were measured.")]
 InitialStateOption = Annotated[
-    InitialState, typer.Option(help="free: estimated too; known: the first sample is exact.")
+    InitialState, typer.Option(help="free: estimated too; known: equal to the first sample.")
 ]
 WindowOption = Annotated[
     float | None,
-    typer.Option(metavar="SECONDS", help="Multiple shooting: windows of this length, each from a state of its own."),
+    typer.Option(metavar="SECONDS", help="Multiple shooting: windows of this length, each with its own initial state."),
 ]
-OutOption = Annotated[Path | None, typer.Option(help="A JSON file to write.")]
+OutOption = Annotated[Path | None, typer.Option(help="JSON file to write.")]

@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..estimate import AbstractEstimator, Estimate, fit_start
 from ..estimators import ESTIMATORS, IBSS, Hybrid
 from ..flight import STATE_NAMES, STATE_UNITS
+from ..identification.quality import COLOURED
 from ..identification.vehicle import NO_ANSWER
 from ..logs import read_flight_and_notes
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
@@ -30,7 +31,6 @@ from ..shooting import ShootingProblem
 from ._choices import Channels, Estimator, InitialState, Model
 from ._fitting import fit, fit_network, load_job, problem_of, seen_channels
 from ._json import finite
-from ._page import COLOURED
 
 # How long a network is trained that only has to say where to look.
 SEED_STEPS = 2000

@@ -7,15 +7,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from ..estimators import ESTIMATORS
-from ..study import Study, Training, run_here
-from ._studies import carry_out, device_name, summary, use_all_cores
+from ..study import Study, Training, use_all_cores
+from ._choices import Estimator
 
-# Shorter training than a network takes at its best: it costs the network, and not the hybrid, which needs no more than
-# the rates' network to know where to look.
+# The training is shorter than the best one. The network loses accuracy, the hybrid does not: its search starts from a
+# network of the rates, and a short training is enough for that.
 STANDARD = Study(
     title="IBSS, network, hybrid and baselines under sensor noise",
-    estimators=tuple(ESTIMATORS),
+    estimators=tuple(estimator.value for estimator in Estimator),
     flights=256,
     network=Training(steps=2000, held_out=5000, hybrid_channels="rates"),
 )
@@ -30,22 +29,23 @@ QUICK = Study(
 
 def compare(
     out: Annotated[
-        Path | None, typer.Option(help="The folder to write; comparison, or comparison-quick, without it.")
+        Path | None, typer.Option(help="The folder to write. Default: comparison, or comparison-quick.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Body rates alone, 128 flights, of the baselines kalman, figures as SVG.")
+        bool, typer.Option("--quick", help="Only body rates, 128 flights, four estimators, and SVG figures.")
     ] = False,
 ) -> None:
-    """Compare IBSS, network, hybrid and baselines on the standard flight at three noises: table, figures, report."""
+    """Compare all estimators on the standard flight at three noise levels: table, figures, report."""
     begin = time.perf_counter()
     use_all_cores()
     wanted, folder = (QUICK, "comparison-quick") if quick else (STANDARD, "comparison")
     directory = Path(folder) if out is None else out
-    dataset = carry_out(wanted, directory, device_name(), run_here)
-    from ..report import error_table, write_report  # here: drawing takes seconds to import
+    from ..report import error_table, write_report  # here, because matplotlib is slow to import
+    from ..report.progress import count_outcomes, run_with_bar
 
+    dataset = run_with_bar(wanted, directory)
     Console(highlight=False).print(error_table(dataset))
     with Console(stderr=True).status("drawing the report"):
         page, *_ = write_report(dataset, directory, with_pdf=not quick)
-    typer.echo(f"{summary(dataset)}; {time.perf_counter() - begin:.0f} s")
+    typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")

@@ -10,7 +10,9 @@ import typer
 from rich.console import Console
 
 from ..errors import InputError
+from ..identification.results import VehicleIdentification
 from ..report.flight_page import write_flight_page
+from ..report.identification_page import print_identification
 from ..results import RESULTS
 from ._check_output import check_output
 from ._choices import (
@@ -28,7 +30,7 @@ from ._choices import (
 )
 from ._flight import identify_flight
 from ._json import write_json
-from ._page import print_flight, print_vehicle
+from ._page import typed
 from ._recordings import HOLDOUT, WINDOW, Part
 from ._vehicle import identify_vehicle
 
@@ -88,7 +90,6 @@ def estimate(
         if initial_state == "known":
             raise InputError("--initial-state known: each window begins in a state of its own; leave it out.")
         kept_back = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
-        print_page = print_vehicle
         found, predicted = identify_vehicle(
             console,
             flights,
@@ -106,7 +107,7 @@ def estimate(
         _refuse(only, f"is for --model flight, not {model}")
         if len(flights) > 1:
             raise InputError(f"{flights[1]}: --model {model} explains one flight; use --model flight for several.")
-        print_page, predicted = print_flight, None
+        predicted = None
         found = identify_flight(
             console,
             flights[0],
@@ -123,9 +124,10 @@ def estimate(
     found["provenance"] |= _provenance()
     if out is not None:
         write_json(found, out)
-    print_page(console, found)
-    if report is not None:
-        write_flight_page(report, report=found, predicted=predicted, title=", ".join(path.name for path in flights))
+    identified = typed(found, predicted)
+    print_identification(console, identified)
+    if report is not None and isinstance(identified, VehicleIdentification):
+        write_flight_page(report, identified, title=", ".join(path.name for path in flights))
         console.print(f"report: {report}", markup=False, highlight=False)
     if found["result"] != "successful":
         typer.echo(f"jaxos4: {found['result']}: {RESULTS[getattr(RESULTS, found['result'])]}", err=True)

@@ -10,8 +10,8 @@ from rich.console import Console
 def report(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a study, with its results.nc.")],
 ) -> None:
-    """Write the report of a study: report.html, which needs no network, and figures/ as SVG and PDF."""
-    from ..report import read_results, write_report  # here: drawing takes seconds to import, other commands do not draw
+    """Write the report of a study: report.html and figures/ as SVG and PDF."""
+    from ..report import read_results, write_report  # here, because matplotlib is slow to import
 
     with Console(stderr=True).status("drawing"):
         written = write_report(read_results(directory), directory)

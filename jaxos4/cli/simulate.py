@@ -1,4 +1,4 @@
-"""`jaxos4 simulate`: a flight to try things on."""
+"""`jaxos4 simulate`: a simulated flight as CSV."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,19 +17,19 @@ from ..simulation import simulate as fly
 from ._check_output import check_output
 from ._choices import AirframeOption, Excitation, Method, Model, ModelOption
 
-MOST_SAMPLES = 5_000_000  # more no longer fit an ordinary machine's memory
+MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
 
 
 def simulate(
     out: Annotated[Path, typer.Option(help="The flight file to write (CSV).")],
     model: ModelOption = Model["published"],
     airframe: AirframeOption = "os4",
-    excitation: Annotated[Excitation, typer.Option(help="The shape of the inputs.")] = Excitation["multisine"],
-    duration: Annotated[float, typer.Option(help="Length [s].")] = 5.0,
+    excitation: Annotated[Excitation, typer.Option(help="Shape of the inputs.")] = Excitation["multisine"],
+    duration: Annotated[float, typer.Option(help="Duration [s].")] = 5.0,
     dt: Annotated[float, typer.Option(help="Sample time [s].")] = 0.01,
-    method: Annotated[Method, typer.Option(help="The integrator.")] = Method["euler"],
-    noise: Annotated[float, typer.Option(help="White sensor noise, as a multiple of the standard one.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    method: Annotated[Method, typer.Option(help="Integrator of the equations of motion.")] = Method["euler"],
+    noise: Annotated[float, typer.Option(help="White sensor noise, in multiples of the standard noise.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Random seed for the noise.")] = 0,
 ) -> None:
     """Simulate a flight and write it as CSV."""
     check_output(out, Path(airframe))

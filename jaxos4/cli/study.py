@@ -12,36 +12,37 @@ from rich.console import Console
 from rich.table import Table
 
 from ..errors import InputError
-from ..study import Study, check_store, load_study, plan, run_here, run_on_cluster
-from ._studies import carry_out, device_name, summary, use_all_cores
+from ..study import Study, check_store, load_study, plan, run_on_cluster, use_all_cores
 
 Executor = StrEnum("Executor", ["local", "dask"])
 
 
 def study(
-    specification: Annotated[Path, typer.Argument(metavar="SPEC.toml", help="What is flown, measured and identified.")],
-    out: Annotated[Path, typer.Option(help="The study's folder: new, or to be resumed.")],
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what there is to do.")] = False,
-    executor: Annotated[Executor, typer.Option(help="This machine's devices, or a Dask cluster.")] = Executor["local"],
-    scheduler: Annotated[str | None, typer.Option(help="Address of the Dask scheduler.")] = None,
+    specification: Annotated[Path, typer.Argument(metavar="SPEC.toml", help="The specification of the study.")],
+    out: Annotated[Path, typer.Option(help="Folder of the study: a new one, or one to resume.")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show the plan.")] = False,
+    executor: Annotated[Executor, typer.Option(help="local: this machine; dask: a cluster.")] = Executor["local"],
+    scheduler: Annotated[str | None, typer.Option(help="Address of the Dask scheduler, for dask.")] = None,
 ) -> None:
-    """Run a noise study, or go on with it: cells that are there are kept."""
-    use_all_cores()  # before an airframe's table computes anything
+    """Run a noise study, or resume it: finished cells are kept."""
+    use_all_cores()  # before anything is computed
     wanted = load_study(specification)
     if (executor is Executor["dask"]) != (scheduler is not None):
         raise InputError("--executor dask and --scheduler ADDRESS: give both, or neither.")
     if dry_run:
-        _say_plan(wanted, out)
+        _print_plan(wanted, out)
         return
+    from ..report.progress import count_outcomes, run_with_bar  # here, because matplotlib is slow to import
+
     if scheduler is None:
-        dataset = carry_out(wanted, out, device_name(), run_here)
+        dataset = run_with_bar(wanted, out)
     else:
         with _connected(scheduler) as client:
-            dataset = carry_out(wanted, out, "Dask cluster", partial(run_on_cluster, client=client))
-    typer.echo(f"{out}: {summary(dataset)}; `jaxos4 report {out}` shows them.")
+            dataset = run_with_bar(wanted, out, device="Dask cluster", run=partial(run_on_cluster, client=client))
+    typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
 
 
-def _say_plan(wanted: Study, out: Path) -> None:
+def _print_plan(wanted: Study, out: Path) -> None:
     missing, devices = check_store(out, wanted), len(jax.local_devices())
     rows = plan(wanted, missing, devices)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -61,9 +62,9 @@ def _connected(address: str):
     try:
         from distributed import Client
     except ImportError:
-        raise InputError("--executor dask: needs the package distributed; install jaxos4[dask].") from None
+        raise InputError("--executor dask: the package distributed is missing; install jaxos4[dask].") from None
     try:
         return Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:
         what = " ".join(str(error).split())[:120]
-        raise InputError(f"--scheduler {address}: no Dask scheduler answers there ({what}).") from None
+        raise InputError(f"--scheduler {address}: no Dask scheduler answers ({what}); give another address.") from None

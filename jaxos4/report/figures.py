@@ -1,4 +1,4 @@
-"""All figures of a study: what each is called, what it shows, and which variables of the Dataset it is drawn from."""
+"""All figures of a study: their names, captions, and the variables of the Dataset that they show."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -12,68 +12,78 @@ from .style import drawing, pdf, svg
 
 
 class Kind(NamedTuple):
-    """A figure that a study can have; `draw` gives nothing where its data are absent."""
+    """A figure that a study can have.
+
+    - `draw`: returns nothing if the data are absent.
+    - `of_scale`: it shows one noise scale. The files show the scale nearest 1, the page lets the reader choose.
+    """
 
     name: str
     title: str
     caption: str
     source: str
     draw: Callable[[xr.Dataset], Figure | None]
+    of_scale: bool = False
 
 
 class Drawn(NamedTuple):
-    """A figure of one study, as the bytes of its two files."""
+    """A figure of one study as the bytes of its two files.
+
+    - `choices`: the figures among which the page lets the reader choose, by label; `svg` is one of them.
+    """
 
     stem: str
     kind: Kind
     svg: bytes
     pdf: bytes | None
+    choices: dict[str, bytes]
 
 
 OF_SCENARIOS = (
     Kind(
         "error",
         "Error against noise",
-        "Root-mean-square error over the flights told, with the Cramer-Rao bound of what each estimator looks at.",
+        "Root-mean-square error over the converged flights, with the Cramer-Rao bound of the channels used.",
         "estimate, truth, bound, seen, result",
         figures_noise.errors,
     ),
     Kind(
         "efficiency",
         "Efficiency against noise",
-        "RMSE / bound, each estimator against its own bound, with 95 % Monte-Carlo intervals; 1 is the best that an "
-        "unbiased estimator can do.",
+        "RMSE / bound, each estimator relative to its own bound, with 95 % Monte-Carlo intervals. 1 is the best that "
+        "an unbiased estimator can do.",
         "estimate, truth, bound, result",
         figures_noise.efficiency,
     ),
     Kind(
         "distribution",
         "Distribution of the errors",
-        "Errors in bounds: median, quartiles, and 95 % of the flights; an efficient estimator fills the space between "
-        "the dashed lines. The file shows the noise scale nearest 1.",
+        "Error / bound: median, quartiles, and 95 % of the flights. The line of an efficient estimator reaches from "
+        "one dashed line to the other. The file shows the noise scale nearest 1.",
         "estimate, truth, bound, result",
         figures_spread.distribution,
+        of_scale=True,
     ),
     Kind(
         "rollouts",
         "Accuracy against rollouts",
-        "RMSE / least bound of any estimator (geometric mean over the parameters) against simulated flights spent.",
+        "RMSE / least bound of any estimator (geometric mean over the parameters) against simulated flights.",
         "estimate, truth, bound, rollouts, result",
         figures_spread.rollouts,
     ),
     Kind(
         "coverage",
         "Coverage by level",
-        "Intervals that hold the truth, averaged over the parameters, against what they claim (long lines), with 95 % "
-        "Monte-Carlo intervals.",
+        "Share of intervals that hold the truth, averaged over the parameters, with 95 % Monte-Carlo intervals. Long "
+        "lines: the level that the intervals claim.",
         "estimate, truth, half_width, result",
         figures_spread.coverage,
     ),
     Kind(
         "frontier",
-        "The noise below which a parameter can be told from 0",
-        "Below its noise scale a parameter is larger than 1.96 Cramer-Rao bounds; above it no estimator can tell it "
-        "from 0.",
+        "The noise below which a parameter can be distinguished from 0",
+        "Below its noise scale, a parameter is larger than 1.96 Cramer-Rao bounds. Above it, no estimator can "
+        "distinguish the parameter from 0.",
         "truth, bound, seen",
         figures_noise.frontier,
     ),
@@ -84,35 +94,35 @@ OF_EXAMPLE = (
     Kind(
         "trajectories",
         "Measured and simulated",
-        "Dots: measured; black: the truth; coloured: simulated with each estimate.",
+        "Dots: measured. Black, or white on a dark page: true. Coloured: simulated with each estimate.",
         "example_measured, example_true, example_simulated",
         figures_example.trajectories,
     ),
     Kind(
         "deviations",
-        "Simulated less true",
-        "The same flight, less the truth.",
+        "Simulated minus true",
+        "Deviation of each simulation from the truth, on the same flight.",
         "example_simulated, example_true",
         figures_example.deviations,
     ),
     Kind(
         "path",
         "The path in space",
-        "Dots: measured; black: the truth; coloured: simulated with each estimate.",
+        "Dots: measured. Black, or white on a dark page: true. Coloured: simulated with each estimate.",
         "example_measured, example_true, example_simulated",
         figures_example.path,
     ),
     Kind(
         "search",
         "The search of IBSS",
-        "Brackets of the example flight after each sweep.",
+        "Half-widths and centres of the brackets after each sweep, on the example flight.",
         "search_half_width, search_estimate",
         figures_example.search,
     ),
     Kind(
         "training",
         "Training",
-        "Loss of the networks while they were trained.",
+        "Loss of the networks during training.",
         "training_loss, validation_loss, training_step",
         figures_example.training,
     ),
@@ -121,7 +131,7 @@ OF_EXAMPLE = (
 
 
 def of_scenario(scenario: Scenario, *, numbered: bool, with_pdf: bool = True) -> Iterator[Drawn]:
-    """The figures of one scenario; `numbered`: there are others, and the files say which one this is."""
+    """The figures of one scenario. `numbered`: file names hold the number of the scenario."""
     for kind in OF_SCENARIOS:
         drawn = _draw(kind, scenario.data, f"{kind.name}-{scenario.number}" if numbered else kind.name, with_pdf)
         if drawn is not None:
@@ -129,7 +139,7 @@ def of_scenario(scenario: Scenario, *, numbered: bool, with_pdf: bool = True) ->
 
 
 def of_example(dataset: xr.Dataset, *, with_pdf: bool = True) -> Iterator[Drawn]:
-    """The figures that a study has once."""
+    """The figures that do not belong to a scenario."""
     for kind in OF_EXAMPLE:
         drawn = _draw(kind, dataset, kind.name, with_pdf)
         if drawn is not None:
@@ -142,5 +152,14 @@ def _draw(kind: Kind, data: xr.Dataset, stem: str, with_pdf: bool) -> Drawn | No
         if figure is None:
             return None
         as_svg = svg(figure)
-        figure.set_layout_engine("none")  # it has its place now; to find it takes as long as to draw
-        return Drawn(stem, kind, as_svg, pdf(figure) if with_pdf else None)
+        as_pdf = pdf(figure) if with_pdf else None
+        choices = dict(_of_each_scale(kind, data, as_svg)) if kind.of_scale else {"": as_svg}
+        return Drawn(stem, kind, as_svg, as_pdf, choices)
+
+
+def _of_each_scale(kind: Kind, data: xr.Dataset, nearest: bytes) -> Iterator[tuple[str, bytes]]:
+    for place, scale in enumerate(data["scale"].values):
+        chosen = place == figures_spread.nearest_scale(data)
+        figure = None if chosen else kind.draw(data.isel(scale=[place]))
+        if chosen or figure is not None:
+            yield f"noise x {scale:g}", nearest if figure is None else svg(figure)

@@ -1,7 +1,10 @@
-"""Figures of one flight and of the trainings: the search, trajectories, the path in space, the loss."""
+"""Figures of the example flight and of the training: search, trajectories, path in space, loss."""
+
+from collections.abc import Callable
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -9,13 +12,13 @@ from .legend import legend
 from .scenario import names
 from .style import FAINT, INK, estimator_gid, grid, log_axis, styles
 
-# Of the searches by parameter, whose lines are no estimators.
+# Styles of lines that belong to a parameter, not to an estimator.
 _LOOKS = ("o-", "s--", "D-.", "^:", "v-", "P--", "X-.", "*:")
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#c46a9b", "#b97f00", "#3b97ce", "#7f7f7f", "#8e5ea8")
 
 
 def search(data: xr.Dataset) -> Figure | None:
-    """Half-widths of the brackets of IBSS after each sweep, and how far their middle moves, in the first ones."""
+    """Half-widths and centres of the brackets of IBSS after each sweep, in units of the first half-widths."""
     if "search_half_width" not in data:
         return None
     width = data["search_half_width"].transpose("sweep", "parameter")
@@ -38,32 +41,24 @@ def search(data: xr.Dataset) -> Figure | None:
 
 
 def trajectories(data: xr.Dataset) -> Figure | None:
-    """The example flight: what was measured, what was true, and what each estimate simulates."""
-    shown = _measured_states(data)
-    if not shown:
-        return None
-    figure, axes = grid(len(shown), columns=3, height=1.75)
-    for panel, place in zip(axes, shown, strict=True):
-        panel.plot(_time(data), data["example_measured"].isel(state=place), ".", color=FAINT, markersize=2)
-        panel.plot(_time(data), data["example_true"].isel(state=place), color=INK, linewidth=1.0)
-        _simulated(panel, data, data["example_simulated"].isel(state=place))
-        _title(panel, data, place, place in shown[-3:])
-    legend(figure, data, markers=False)
-    return figure
+    """The example flight: measured, true, and simulated with each estimate."""
+
+    def draw(panel: Axes, state: int) -> None:
+        panel.plot(data["time"], data["example_measured"].isel(state=state), ".", color=FAINT, markersize=2)
+        panel.plot(data["time"], data["example_true"].isel(state=state), color=INK, linewidth=1.0)
+        _draw_simulations(panel, data, data["example_simulated"].isel(state=state))
+
+    return _each_state(data, draw)
 
 
 def deviations(data: xr.Dataset) -> Figure | None:
-    """The same flight: how far each simulation is from the truth."""
-    shown = _measured_states(data)
-    if not shown:
-        return None
-    figure, axes = grid(len(shown), columns=3, height=1.75)
-    for panel, place in zip(axes, shown, strict=True):
+    """The example flight: deviation of each simulation from the truth."""
+
+    def draw(panel: Axes, state: int) -> None:
         panel.axhline(0, color=INK, linewidth=0.8)
-        _simulated(panel, data, (data["example_simulated"] - data["example_true"]).isel(state=place))
-        _title(panel, data, place, place in shown[-3:])
-    legend(figure, data, markers=False)
-    return figure
+        _draw_simulations(panel, data, (data["example_simulated"] - data["example_true"]).isel(state=state))
+
+    return _each_state(data, draw)
 
 
 def path(data: xr.Dataset) -> Figure | None:
@@ -91,7 +86,7 @@ def path(data: xr.Dataset) -> Figure | None:
 
 
 def training(data: xr.Dataset) -> Figure | None:
-    """The loss of each network on what it trains on and on what it does not."""
+    """The training loss and the validation loss of each network."""
     if "training_loss" not in data:
         return None
     labels = names(data, "training")
@@ -112,26 +107,27 @@ def training(data: xr.Dataset) -> Figure | None:
     return figure
 
 
-def _measured_states(data: xr.Dataset) -> list[int]:
+def _each_state(data: xr.Dataset, draw: Callable[[Axes, int], None]) -> Figure | None:
+    """A panel for each state that was measured."""
     if "example_measured" not in data:
-        return []
-    there = data["example_measured"].notnull() & data["example_true"].notnull()
-    return [int(place) for place in np.flatnonzero(there.any("sample").values)]
+        return None
+    known = data["example_measured"].notnull() & data["example_true"].notnull()
+    shown = [int(state) for state in np.flatnonzero(known.any("sample").values)]
+    if not shown:
+        return None
+    figure, axes = grid(len(shown), columns=3, height=1.75)
+    for panel, state in zip(axes, shown, strict=True):
+        draw(panel, state)
+        one = data["state"].isel(state=state)
+        panel.set_title(f"{one.item()} [{data['state_unit'].isel(state=state).item()}]")
+        if state in shown[-3:]:
+            panel.set_xlabel("time [s]")
+    legend(figure, data, markers=False)
+    return figure
 
 
-def _time(data: xr.Dataset) -> np.ndarray:
-    return data["time"].values
-
-
-def _simulated(panel, data: xr.Dataset, values: xr.DataArray) -> None:
+def _draw_simulations(panel: Axes, data: xr.Dataset, values: xr.DataArray) -> None:
     for place, look in enumerate(styles(names(data, "estimator")).values()):
         y = values.isel(estimator=place).values
         if np.isfinite(y).any():
-            panel.plot(_time(data), y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=estimator_gid(place))
-
-
-def _title(panel, data: xr.Dataset, place: int, last: bool) -> None:
-    one = data["state"].isel(state=place)
-    panel.set_title(f"{one.item()} [{data['state_unit'].isel(state=place).item()}]")
-    if last:
-        panel.set_xlabel("time [s]")
+            panel.plot(data["time"], y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=estimator_gid(place))

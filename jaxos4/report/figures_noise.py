@@ -1,4 +1,4 @@
-"""Figures against the noise scale: errors with the bound, efficiency, and what can be known below which noise."""
+"""Figures against the noise scale: errors and bounds, efficiency, and the noise limits of the parameters."""
 
 import numpy as np
 import xarray as xr
@@ -11,19 +11,19 @@ from .scenario import bounds, names
 from .style import BOUND_DASHES, FAINT, INK, estimator_gid, grid, log_axis, scale_axis, styles
 
 _COLUMNS = 4
-# Of the gap between two noise scales, what the markers of all estimators are spread over.
+# The markers of all estimators are spread over this share of the gap between two noise scales.
 _DODGE = 0.3
 
 
 def positive_scales(data: xr.Dataset) -> xr.Dataset:
-    """Without the scale 0, which has no place on a logarithmic axis."""
+    """The data without the noise scale 0, which a logarithmic axis cannot show."""
     return data.isel(scale=np.flatnonzero(data["scale"].values > 0))
 
 
 def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
-    """What the errors of a parameter are drawn in: "percent" or "absolute", its unit, and why not in percent.
+    """The scale of a parameter's errors: "percent" or "absolute", the unit, and why not percent.
 
-    Absolute as soon as the percentage of one point means nothing, so that a panel has one scale.
+    Absolute if the percentage of any point is meaningless, so that a panel has one scale.
     """
     one = data.isel(parameter=parameter)
     reason = metrics.no_percentage(data).isel(parameter=parameter)
@@ -37,7 +37,7 @@ def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
 
 
 def errors(data: xr.Dataset) -> Figure | None:
-    """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bound drawn in."""
+    """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
     data = positive_scales(data)
     found, best = metrics.estimator_error(data), metrics.bound_error(data)
     if not data.sizes["scale"] or not found["absolute"].notnull().any():
@@ -92,7 +92,7 @@ def efficiency(data: xr.Dataset) -> Figure | None:
 
 
 def frontier(data: xr.Dataset) -> Figure | None:
-    """The noise scale below which each parameter can be told from 0, beside the scales that were studied."""
+    """The noise scale below which each parameter can be distinguished from 0, and the scales of the study."""
     limits = metrics.frontier(data)
     if not (limits > 0).any():
         return None
@@ -106,13 +106,13 @@ def frontier(data: xr.Dataset) -> Figure | None:
     for row, (channels, estimator) in enumerate(seen.items()):
         y = np.arange(len(parameters)) + 0.36 * (row - (len(seen) - 1) / 2)
         x = limits.isel(estimator=estimator).values
-        there = x > 0
-        panel.plot(x[there], y[there], "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=channels)
-        for a, b in zip(x[there], y[there], strict=True):
+        finite = x > 0
+        panel.plot(x[finite], y[finite], "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=channels)
+        for a, b in zip(x[finite], y[finite], strict=True):
             panel.annotate(plain(a, 2), (a, b), (6, 0), textcoords="offset points", va="center", fontsize=7)
     zero = (limits == 0).any("estimator").values
     for y in np.flatnonzero(zero):
-        panel.text(least, float(y), "its truth is 0: told at no noise", va="center", fontsize=7.5)
+        panel.text(least, float(y), "the truth is 0: no noise is small enough", va="center", fontsize=7.5)
     panel.set_xscale("log")
     log_axis(panel, "x")
     low, high = panel.get_xlim()
@@ -122,12 +122,14 @@ def frontier(data: xr.Dataset) -> Figure | None:
     panel.set_xlabel("noise scale below which |truth| exceeds 1.96 bounds (dashed: the scales of this study)")
     if len(seen) > 1:
         handles, labels = panel.get_legend_handles_labels()
-        figure.legend(handles, [f"{label} seen" for label in labels], loc="outside lower center", ncols=len(seen))
+        figure.legend(
+            handles, [f"bound of channels: {label}" for label in labels], loc="outside lower center", ncols=len(seen)
+        )
     return figure
 
 
 def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
-    """The scales, moved a little sideways for one of `count` estimators so that its markers do not cover others."""
+    """The noise scales, shifted for the estimator `place` of `count`, so that markers do not cover each other."""
     gap = np.diff(np.log(np.sort(scales))).min() if len(scales) > 1 else np.log(3.0)
     return scales * np.exp(_DODGE * gap * (place / max(count - 1, 1) - 0.5))
 
@@ -142,4 +144,4 @@ def _draw_estimators(panel, data: xr.Dataset, values: xr.DataArray, interval: xr
             low, high = (interval[end].isel(estimator=place).values for end in ("low", "high"))
             panel.vlines(x, low, high, color=look.color, linewidth=1.0, gid=estimator_gid(place))
     if not np.isfinite(values.values).any():
-        panel.text(0.5, 0.5, "nothing told", transform=panel.transAxes, ha="center")
+        panel.text(0.5, 0.5, "no estimates", transform=panel.transAxes, ha="center")

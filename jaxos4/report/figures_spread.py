@@ -1,4 +1,4 @@
-"""Figures of how estimates scatter: errors, coverage of their intervals, accuracy for its price."""
+"""Figures of the scatter of estimates: distribution of errors, coverage of intervals, accuracy against rollouts."""
 
 from typing import Any
 
@@ -10,17 +10,18 @@ from matplotlib.ticker import FuncFormatter
 from ..study import metrics
 from .figures_noise import positive_scales
 from .legend import legend
+from .numbers import plain
 from .scenario import names
 from .style import FAINT, INK, estimator_gid, grid, log_axis, styles
 
-# The quantiles that a box shows: its whiskers hold 95 %, as two bounds to either side do of a Gaussian at the bound.
+# The quantiles that a box shows. The whiskers hold 95 % of the flights.
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
-# Where an estimator that spends no rollouts stands on a logarithmic axis.
+# The place on a logarithmic axis for an estimator without rollouts.
 NO_ROLLOUTS = 0.5
 
 
 def nearest_scale(data: xr.Dataset) -> int:
-    """The place of the noise scale nearest 1 by ratio, which pictures of one scale show."""
+    """The index of the noise scale nearest 1 (by ratio). Figures of one scale show it."""
     scales = data["scale"].values
     positive = np.where(scales > 0, scales, np.finfo(float).tiny)
     return int(np.argmin(np.abs(np.log(positive))))
@@ -47,10 +48,11 @@ def distribution(data: xr.Dataset) -> Figure | None:
         panel.axvline(0, color=INK, linewidth=0.8)
         for row, look in enumerate(style.values()):
             low, first, middle, third, high = found.isel(parameter=place, estimator=row).values
-            marks: dict[str, Any] = {"color": look.color, "gid": estimator_gid(row)}
             if not np.isfinite(middle):
-                panel.text(0, row, "nothing told", va="center", ha="center", fontsize=7, gid=marks["gid"])
+                panel.text(0, row, "no estimates", va="center", ha="center", fontsize=7, gid=estimator_gid(row))
                 continue
+            tip = f"median {middle:.2g}, quartiles {first:.2g} to {third:.2g}, 95 % {low:.2g} to {high:.2g}"
+            marks: dict[str, Any] = {"color": look.color, "gid": estimator_gid(row, tip)}
             panel.plot([low, high], [row, row], linewidth=1.2, solid_capstyle="butt", **marks)
             panel.plot([first, third], [row, row], linewidth=7, solid_capstyle="butt", alpha=0.55, **marks)
             panel.plot([middle], [row], marker=look.marker, markersize=4.5, **marks)
@@ -65,7 +67,7 @@ def distribution(data: xr.Dataset) -> Figure | None:
 
 
 def coverage(data: xr.Dataset) -> Figure | None:
-    """Share of intervals that hold the truth against the share that they claim, at each noise scale."""
+    """Share of intervals that hold the truth against the level that they claim, at each noise scale."""
     found = metrics.mean_coverage(data)
     if not found["coverage"].notnull().any():
         return None
@@ -95,21 +97,22 @@ def coverage(data: xr.Dataset) -> Figure | None:
 
 
 def rollouts(data: xr.Dataset) -> Figure | None:
-    """RMSE / least bound over all parameters against the rollouts that an identification takes; a line joins scales."""
+    """RMSE / least bound (mean of all parameters) against rollouts; a line joins the noise scales of an estimator."""
     data = positive_scales(data)
-    x, y = metrics.mean_rollouts(data), metrics.accuracy(data)
-    there = (x.notnull() & y.notnull()).transpose("scale", "estimator").values
-    if not there.any():
+    x, y = (of(data).transpose("scale", "estimator") for of in (metrics.mean_rollouts, metrics.accuracy))
+    known = (x.notnull() & y.notnull()).values
+    if not known.any():
         return None
     figure, (panel,) = grid(1, columns=1, width=7.0, height=3.6)
     panel.axhline(1, color=INK, linewidth=1.1)
     for row, look in enumerate(styles(names(data, "estimator")).values()):
-        at = there[:, row]
+        at = known[:, row]
         across, up = price(x.isel(estimator=row).values[at]), y.isel(estimator=row).values[at]
-        gid = estimator_gid(row)
-        panel.plot(across, up, color=look.color, linestyle=look.dash, linewidth=1.0, gid=gid)
-        sizes = 26 + 30 * np.flatnonzero(at)
-        panel.scatter(across, up, s=sizes, color=look.color, marker=look.marker, alpha=0.8, linewidths=0, gid=gid)
+        panel.plot(across, up, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(row))
+        for place, a, b in zip(np.flatnonzero(at), across, up, strict=True):
+            tip = f"noise x {data['scale'].values[place]:g}: {plain(float(x[place, row]))} rollouts, {plain(float(b))}"
+            marks = {"color": look.color, "marker": look.marker, "alpha": 0.8, "linewidths": 0}
+            panel.scatter(a, b, s=26 + 30 * place, gid=estimator_gid(row, tip), **marks)
     log_axis(panel, "x")
     log_axis(panel, "y")
     _rollout_ticks(panel, x.values[x.notnull().values])
@@ -121,24 +124,19 @@ def rollouts(data: xr.Dataset) -> Figure | None:
 
 
 def price(spent: np.ndarray) -> np.ndarray:
-    """Rollouts as places on a logarithmic axis, on which none stand at `NO_ROLLOUTS`."""
+    """Rollouts on a logarithmic axis; no rollouts at all are drawn at `NO_ROLLOUTS`."""
     return np.where(spent > 0, np.maximum(spent, NO_ROLLOUTS), NO_ROLLOUTS)
 
 
-def rollout_ticks(spent: np.ndarray) -> dict[float, str]:
-    """The ticks that suit these numbers of rollouts."""
+def _rollout_ticks(panel, spent: np.ndarray) -> None:
     top = int(np.ceil(np.log10(max(float(spent.max()), 10.0))))
     ticks = {NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
-    return ticks | {10.0**power: f"{10**power:,}" for power in range(top + 1)}
-
-
-def _rollout_ticks(panel, spent: np.ndarray) -> None:
-    ticks = rollout_ticks(spent)
+    ticks |= {10.0**power: f"{10**power:,}" for power in range(top + 1)}
     panel.set_xticks(list(ticks), list(ticks.values()))
     panel.set_xlim(min(ticks) / 1.5 if 0 in np.floor(spent) else None, max(ticks) * 1.2)
 
 
 def _reach(found: xr.DataArray) -> float:
-    """Half the width of the panels: what all boxes need, but not what a hopeless estimator would make of it."""
+    """Half the width of the panels: wide enough for the boxes, but limited in case one estimator is very bad."""
     largest = np.nanmax(np.abs(found.values), initial=0.0)
     return float(np.clip(1.08 * largest, 3.0, 12.0))

@@ -1,4 +1,4 @@
-"""The legend below a figure, whose entries the page can hide with what they name."""
+"""The legend below a figure. The page hides an entry together with the estimator that it names."""
 
 import xarray as xr
 from matplotlib.figure import Figure
@@ -7,14 +7,14 @@ from matplotlib.lines import Line2D
 from .scenario import bounds, names
 from .style import BOUND_DASHES, INK, estimator_gid, styles
 
-# Of an entry [inch].
+# Width of an entry [inch].
 _WIDTH = 1.4
 
 
 def legend(
     figure: Figure, data: xr.Dataset, *, with_bounds: bool = False, lines: bool = True, markers: bool = True
 ) -> None:
-    """An entry for each estimator, after those of the bounds; drawn as `lines`, `markers` or both."""
+    """Adds an entry for each bound and each estimator, drawn with lines, with markers or with both."""
     handles, labels, gids = [], [], []
     if with_bounds:
         for dash, seen in zip(BOUND_DASHES, bounds(data), strict=False):

@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them: as many digits as they are worth, in powers of ten only where they must be."""
+"""Numbers as text: significant digits, and powers of ten only for very small and very large numbers."""
 
 import math
 
@@ -6,7 +6,7 @@ MISSING = "–"
 
 
 def plain(value: float, digits: int = 3) -> str:
-    """`value` to `digits` significant digits; a dash where it is missing."""
+    """`value` with so many significant digits; a dash if it is NaN."""
     if not math.isfinite(value):
         return MISSING if math.isnan(value) else f"{value:g}"
     if value == 0:
@@ -19,5 +19,5 @@ def plain(value: float, digits: int = 3) -> str:
 
 
 def percent(share: float, digits: int = 1) -> str:
-    """A share as a percentage without its sign."""
+    """A share in percent, without the sign %; a dash if it is NaN."""
     return MISSING if math.isnan(share) else f"{100 * share:.{digits}f}"

@@ -1,24 +1,21 @@
-"""The report as one HTML page that needs nothing but itself."""
+"""The report of a study as one HTML page that needs no other file."""
 
 import json
 from typing import Any
 
 import jinja2
 import xarray as xr
-from markupsafe import Markup, escape
-from plotly.offline import get_plotlyjs
 
 from . import tables
-from .charts import charts
 from .figures import Drawn
-from .inline import inline
+from .inline import drawings
 from .scenario import Scenario, names
 from .style import styles
 
 MOST_DRAWN = 12
-"""So many scenarios have figures; the tables are of all."""
+"""At most so many scenarios have figures. All scenarios have tables."""
 
-# What is known of a run, and how it is called on the page.
+# Attributes of the Dataset, and their labels on the page.
 _PROVENANCE = (
     ("version", "jaxos4"),
     ("jax", "jax"),
@@ -29,11 +26,10 @@ _PROVENANCE = (
 
 
 def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once: list[Drawn]) -> str:
-    """The page. `sections`: each scenario with its figures; `once`: the figures of the study as a whole."""
+    """The page. `sections`: each scenario with its figures; `once`: figures that belong to no scenario."""
     attributes = {name: str(value) for name, value in dataset.attrs.items()}
     known = styles(names(dataset, "estimator"))
-    interactive: dict[str, Any] = {}
-    shown = [_section(scenario, drawn, interactive) for scenario, drawn in sections]
+    shown = [_section(scenario, drawn) for scenario, drawn in sections]
     missing, cells = tables.cells_not_run(dataset)
     return (
         environment()
@@ -45,24 +41,19 @@ def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once
             provenance=[(label, attributes[name]) for name, label in _PROVENANCE if name in attributes],
             estimators=[(place, name, look.color) for place, (name, look) in enumerate(known.items())],
             sections=shown,
-            once=[_figure(drawn) for drawn in once],
+            once=[_figure(drawn, list(known)) for drawn in once],
             failed=tables.failed_cells(dataset),
             missing=missing,
             cells=cells,
             drawn=sum(bool(drawn) for _, drawn in sections),
             zero_scale=bool((dataset["scale"] == 0).any()),
-            charts=script_json(interactive),
-            plotly=Markup(get_plotlyjs().replace("</script", "<\\/script")),  # noqa: S704, the package's own script
         )
     )
 
 
-def _section(scenario: Scenario, drawn: list[Drawn], interactive: dict[str, Any]) -> dict[str, Any]:
-    data, figures = scenario.data, {figure.kind.name: _figure(figure) for figure in drawn}
-    for name, chart in charts(data) if drawn else ():
-        if name in figures:
-            figures[name] |= {"chart": f"{name}-{scenario.number}", "svg": ""}
-            interactive[f"{name}-{scenario.number}"] = chart
+def _section(scenario: Scenario, drawn: list[Drawn]) -> dict[str, Any]:
+    data = scenario.data
+    figures = {figure.kind.name: _figure(figure, names(data, "estimator")) for figure in drawn}
     return {
         "number": scenario.number,
         "label": scenario.label,
@@ -81,18 +72,23 @@ def _section(scenario: Scenario, drawn: list[Drawn], interactive: dict[str, Any]
     }
 
 
-def _figure(drawn: Drawn) -> dict[str, Any]:
-    label = str(escape(f"{drawn.kind.title}: {drawn.kind.caption}"))
+def _figure(drawn: Drawn, estimators: list[str]) -> dict[str, Any]:
     return {
         "stem": drawn.stem,
         "kind": drawn.kind,
-        "svg": Markup(inline(drawn.svg, drawn.stem, label)),  # noqa: S704, drawn by us: names in it are outlines
-        "chart": "",
+        "drawings": drawings(
+            list(drawn.choices.values()),
+            list(drawn.choices),
+            list(drawn.choices.values()).index(drawn.svg),
+            stem=drawn.stem,
+            description=f"{drawn.kind.title}: {drawn.kind.caption}",
+            estimators=estimators,
+        ),
     }
 
 
 def _indented(specification: str) -> str:
-    """For reading: a JSON object with a line for each of its names; anything else as it is."""
+    """A JSON object with one line for each name; any other text unchanged."""
     try:
         table = json.loads(specification)
     except ValueError:
@@ -103,14 +99,8 @@ def _indented(specification: str) -> str:
     return "{\n" + ",\n".join(lines) + "\n}"
 
 
-def script_json(x: Any) -> Markup:
-    """JSON that cannot end the script that it stands in."""
-    text = json.dumps(x, allow_nan=False, ensure_ascii=True, separators=(",", ":"))
-    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))  # noqa: S704
-
-
 def environment() -> jinja2.Environment:
-    """Of the templates beside this file."""
+    """The environment of the templates in this folder."""
     return jinja2.Environment(
         loader=jinja2.PackageLoader("jaxos4.report", "."),
         autoescape=True,

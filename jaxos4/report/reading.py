@@ -1,4 +1,4 @@
-"""The Dataset of a study, read back from the folder that it was written to."""
+"""Reads the Dataset of a study from its folder."""
 
 from pathlib import Path
 
@@ -23,13 +23,13 @@ _VARIABLES = {
 
 
 def read_results(directory: Path) -> xr.Dataset:
-    """The Dataset in a study's folder.
+    """Reads the Dataset in a study's folder.
 
-    **Raises:** `InputError` where there is none, or the file is something else.
+    **Raises:** `InputError` if there is no Dataset, or if the file is not the results of a study.
     """
     path = directory / RESULTS_FILE
     if not directory.is_dir():
-        raise InputError(f"{directory}: there is no such folder; give one that `jaxos4 study` wrote.")
+        raise InputError(f"{directory}: no such folder; give one that `jaxos4 study` wrote.")
     if not path.is_file():
         raise InputError(f"{directory}: holds no {RESULTS_FILE}; give a folder that `jaxos4 study` wrote.")
     try:
@@ -45,7 +45,7 @@ def read_results(directory: Path) -> xr.Dataset:
 
 
 def what_is_missing(dataset: xr.Dataset) -> str:
-    """What keeps a Dataset from being a study's, or nothing."""
+    """Why a Dataset is not the results of a study, or an empty string."""
     for name, dimensions in _VARIABLES.items():
         if name not in dataset.variables:
             return f"no variable `{name}`"

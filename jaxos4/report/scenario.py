@@ -1,4 +1,4 @@
-"""A study cut into pieces that a table or a figure can show: everything fixed but noise scale, estimator and flight."""
+"""A study divided into scenarios: one table or figure shows one scenario."""
 
 import itertools
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ import xarray as xr
 
 from ..study.metrics import SCENARIO
 
-# What one table or figure shows side by side.
+# A table or figure compares along these dimensions.
 _SHOWN = ("scale", "estimator")
 
 _PHRASES = {
@@ -24,7 +24,7 @@ _PHRASES = {
 
 
 class Scenario(NamedTuple):
-    """One value of every dimension but noise scale and estimator."""
+    """One value of each dimension except noise scale and estimator."""
 
     number: int
     label: str
@@ -32,7 +32,7 @@ class Scenario(NamedTuple):
 
 
 def scenarios(dataset: xr.Dataset) -> Iterator[Scenario]:
-    """All of them, numbered from 1; the label names what differs, or everything where there is only one."""
+    """All scenarios, numbered from 1. The label names the dimensions that differ, or all if there is one scenario."""
     fixed = [name for name in SCENARIO if name not in _SHOWN]
     varied = [name for name in fixed if dataset.sizes[name] > 1] or fixed
     for number, at in enumerate(itertools.product(*(range(dataset.sizes[name]) for name in fixed)), start=1):
@@ -41,7 +41,7 @@ def scenarios(dataset: xr.Dataset) -> Iterator[Scenario]:
 
 
 def count(dataset: xr.Dataset) -> int:
-    """How many scenarios there are."""
+    """The number of scenarios."""
     return sum(1 for _ in scenarios(dataset))
 
 
@@ -51,13 +51,13 @@ def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
 
 
 def bounds(data: xr.Dataset) -> dict[str, int]:
-    """The bounds to compare with: what some estimator looks at, and the place of the first one that does.
+    """The bounds to compare with: the channels that estimators use, each with the index of one estimator that does.
 
-    Of those, one whose cells are there is taken.
+    Estimators whose cells were run come first.
     """
     found: dict[str, int] = {}
-    there = data["bound"].notnull().any([name for name in data["bound"].dims if name != "estimator"])
-    order = sorted(range(data.sizes["estimator"]), key=lambda i: not there[i])
+    known = data["bound"].notnull().any([name for name in data["bound"].dims if name != "estimator"])
+    order = sorted(range(data.sizes["estimator"]), key=lambda i: not known[i])
     for place in order:
         found.setdefault(str(data["seen"].isel(estimator=place).item()), place)
     return dict(sorted(found.items(), key=lambda item: item[1]))

@@ -1,7 +1,8 @@
-"""How figures look: colours that the colour-blind tell apart, with markers and dashes; bytes that do not vary."""
+"""The style of figures: colours for colour-blind readers, markers and dashes, and files that are reproducible."""
 
 import contextlib
 import io
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ FAINT = "#8a9099"
 
 
 Dash = tuple[float, tuple[float, ...]]
-"""Where a dash pattern begins, and its lengths of ink and gap, in line widths."""
+"""A dash pattern: its offset, then lengths of ink and gap, in line widths."""
 
 SOLID: Dash = (0, ())
 _DASHED: Dash = (0, (4, 1.6))
@@ -27,27 +28,27 @@ _DASH_DOT: Dash = (0, (6.4, 1.6, 1, 1.6))
 
 
 class Style(NamedTuple):
-    """How one series is drawn: in matplotlib, and in plotly's words."""
+    """How one series is drawn."""
 
     color: str
     marker: str
     dash: Dash
-    symbol: str
-    plotly_dash: str
 
 
-# After Okabe and Ito (2008), darkened where a light one would vanish on white; each at least 3:1 on white and on dark.
+# After Okabe and Ito (2008), some darkened. The contrast is at least 3:1 on white and on dark paper.
 _STYLES = (
-    Style("#0072b2", "o", SOLID, "circle", "solid"),
-    Style("#d55e00", "s", _DASHED, "square", "dash"),
-    Style("#009e73", "D", _DASH_DOT, "diamond", "dashdot"),
-    Style("#c46a9b", "^", _DOTTED, "triangle-up", "dot"),
-    Style("#b97f00", "v", (0, (5, 1)), "triangle-down", "longdash"),
-    Style("#3b97ce", "P", (0, (3, 1, 1, 1)), "cross", "longdashdot"),
-    Style("#7f7f7f", "X", (0, (1, 1)), "x", "dot"),
-    Style("#8e5ea8", "*", (0, (7, 2, 1, 2)), "star", "dashdot"),
+    Style("#0072b2", "o", SOLID),
+    Style("#d55e00", "s", _DASHED),
+    Style("#009e73", "D", _DASH_DOT),
+    Style("#c46a9b", "^", _DOTTED),
+    Style("#b97f00", "v", (0, (5, 1))),
+    Style("#3b97ce", "P", (0, (3, 1, 1, 1))),
+    Style("#7f7f7f", "X", (0, (1, 1))),
+    Style("#8e5ea8", "*", (0, (7, 2, 1, 2))),
 )
 _KNOWN = ("ibss", "network", "hybrid", "output-error", "equation-error", "rls", "svsf", "kalman")
+# For more estimators than styles: each colour again, with the marker and the dash of other styles.
+_MIXED = [Style(one.color, _STYLES[i - 3].marker, _STYLES[i - 5].dash) for i, one in enumerate(_STYLES)]
 BOUND_DASHES = (SOLID, _DOTTED, _DASHED)
 
 _RC: dict[Any, Any] = {
@@ -89,7 +90,7 @@ _RC: dict[Any, Any] = {
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Inside, figures look the same whatever the user's matplotlib settings; outside, these are untouched."""
+    """Applies the style of this library inside the context, and restores the user's matplotlib settings after it."""
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(_RC)
@@ -97,20 +98,20 @@ def drawing() -> Iterator[None]:
 
 
 def styles(estimators: Sequence[str]) -> dict[str, Style]:
-    """A style for each estimator: the same in every study for those of this library, the unused ones for others."""
-    free = [style for name, style in zip(_KNOWN, _STYLES, strict=True) if name not in estimators] or list(_STYLES)
+    """A style for each estimator. Estimators of this library always have the same style; others get unused styles."""
+    unused = [style for name, style in zip(_KNOWN, _STYLES, strict=True) if name not in estimators]
     others = [name for name in estimators if name not in _KNOWN]
-    chosen = {name: free[i % len(free)] for i, name in enumerate(others)}
+    chosen = dict(zip(others, itertools.cycle([*unused, *_MIXED]), strict=False))
     return {name: chosen.get(name) or _STYLES[_KNOWN.index(name)] for name in estimators}
 
 
-def estimator_gid(place: int) -> str:
-    """The id of what belongs to one estimator in a drawing, by which the page hides it."""
-    return f"estimator-{place}"
+def estimator_gid(place: int, tip: str = "") -> str:
+    """The id of a drawing's parts that belong to one estimator. The page hides them, and shows `tip` as a tooltip."""
+    return f"estimator-{place}: {tip}" if tip else f"estimator-{place}"
 
 
 def grid(panels: int, *, columns: int, width: float = 9.0, height: float = 2.1) -> tuple[Figure, list[Axes]]:
-    """A figure of small multiples; `height` is that of one row [inch], without the legend."""
+    """A figure with a grid of panels. `height`: of one row of panels [inch]."""
     columns = min(columns, panels)
     rows = -(-panels // columns)
     figure = Figure(figsize=(width, height * rows + 0.5), layout="constrained")
@@ -124,15 +125,15 @@ def log_axis(axes: Axes, which: str) -> None:
     axis = axes.xaxis if which == "x" else axes.yaxis
     low, high = sorted(axes.get_xlim() if which == "x" else axes.get_ylim())
     if low > 0 and high / low < 5:
-        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))  # multiples that 1 is among, where it is in sight
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))  # 1 is a tick if it is in the range
     elif low > 0 and high / low < 30:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("e-0", "e-")))
-    axis.set_minor_locator(NullLocator())  # each tick takes its time, and nobody reads them
+    axis.set_minor_locator(NullLocator())  # minor ticks are slow to draw
 
 
 def scale_axis(axes: Axes, scales: np.ndarray) -> None:
-    """The noise scales along x, each with its tick."""
+    """A logarithmic x axis with a tick at each noise scale."""
     axes.set_xscale("log")
     axes.set_xticks(list(scales), [f"{scale:g}" for scale in scales])
     axes.xaxis.set_minor_locator(NullLocator())
@@ -140,15 +141,15 @@ def scale_axis(axes: Axes, scales: np.ndarray) -> None:
 
 
 def svg(figure: Figure) -> bytes:
-    """The figure as SVG, the same bytes each time."""
+    """The figure as SVG. The same figure gives the same bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    figure.set_layout_engine("none")  # what it is written as next has the layout that it now has
+    figure.set_layout_engine("none")  # keeps the layout for the next format
     return buffer.getvalue()
 
 
 def pdf(figure: Figure) -> bytes:
-    """The figure as PDF, the same bytes each time."""
+    """The figure as PDF. The same figure gives the same bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""The tables of a study, as rows of text: for the page and for the terminal alike."""
+"""The tables of a study as rows of text, for the page and for the terminal."""
 
 import json
 from collections.abc import Iterator
@@ -12,16 +12,16 @@ from .numbers import MISSING, percent, plain
 from .scenario import bounds, names
 
 MARKS = ("", "†", "‡")
-"""What follows a number that is no percentage, by the codes of `metrics.no_percentage`."""
+"""The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`."""
 
 LEVEL = 0.95
-"""The level whose coverage is told parameter by parameter, or the nearest that there is."""
+"""The table of coverage by parameter shows this level, or the nearest one in the study."""
 
 _MOST_LISTED = 20
 
 
 class Cell(NamedTuple):
-    """A number as text, with its interval, and the mark of what is unusual about it."""
+    """A number as text, with its interval and its mark."""
 
     text: str
     interval: str = ""
@@ -29,7 +29,7 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """`estimator`: the place of the one that it belongs to, if any, with which the page hides it."""
+    """One row. `estimator`: the index of its estimator, if any; the page hides the row with the estimator."""
 
     label: str
     cells: tuple[Cell, ...]
@@ -46,9 +46,9 @@ class Group(NamedTuple):
 class Table(NamedTuple):
     """Groups of rows under headings.
 
-    - `source`: the variables and the functions that its numbers come from.
-    - `units`: of the columns, where they have some.
-    - `notes`: what its marks mean.
+    - `source`: the variables and functions that the numbers come from.
+    - `units`: of the columns; empty if they have none.
+    - `notes`: the meaning of the marks.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Table(NamedTuple):
 
 
 def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
-    """RMS errors in percent of the truth, with rows for the bounds and for the bracket's centre alone."""
+    """RMS errors in percent of the truth, with rows for the bounds and for the centre of the bracket."""
     found, best, middle = metrics.estimator_error(data), metrics.bound_error(data), metrics.center_error(data)
     used: set[int] = set()
 
@@ -93,8 +93,8 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         tuple(groups),
         units=tuple(names(data, "unit")),
         notes=tuple(
-            f"{MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, where a percentage "
-            "means nothing."
+            f"{MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, so a percentage is "
+            "meaningless."
             for code in sorted(used)
         ),
     )
@@ -143,7 +143,7 @@ def levels_table(data: xr.Dataset) -> Table:
 
 
 def result_table(data: xr.Dataset) -> Table:
-    """How many flights ended with each result that occurs, the rollouts that they took, and hits of the seeds."""
+    """The number of flights by result, mean rollouts, and the share of seed brackets that hold the truth."""
     counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
     known = names(counts, "code")
     occurs = [place for place in range(len(known)) if bool((counts.isel(code=place) > 0).any())]
@@ -156,7 +156,7 @@ def result_table(data: xr.Dataset) -> Table:
 
     return Table(
         "results",
-        "Flights by result, mean rollouts of those identified, and seed brackets of the hybrid that held the truth [%]",
+        "Flights by result, mean rollouts, and the hybrid's seed brackets that hold the truth [%]",
         "result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)",
         (*(known[place].replace("_", " ") for place in occurs), "rollouts", "seed hits"),
         _groups(data, cells),
@@ -164,7 +164,7 @@ def result_table(data: xr.Dataset) -> Table:
 
 
 class Trouble(NamedTuple):
-    """Flights without numbers: at most 20 of them by place and result, and how many there are."""
+    """Flights or cells without numbers: a description of the first 20, and the total."""
 
     listed: tuple[str, ...]
     total: int
@@ -186,14 +186,14 @@ def troubled_flights(data: xr.Dataset) -> Trouble:
 
 
 def failed_cells(dataset: xr.Dataset) -> Trouble:
-    """The cells of a study that raised an error, with its message; and how many there are."""
+    """The cells of a study that raised an error, with the error's message."""
     failures: list[dict[str, Any]] = json.loads(dataset.attrs.get("failures", "[]"))
     listed = tuple(f"{_cell_name(failure['cell'])}: {failure['message']}" for failure in failures[:_MOST_LISTED])
     return Trouble(listed, len(failures))
 
 
 def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
-    """How many cells of the study are not there yet, and of how many."""
+    """The number of cells that have not been run, and the number of all cells."""
     missing = (dataset["result"] == metrics.codes(dataset)["not_run"]).all("flight")
     return int(missing.sum()), missing.size
 

@@ -1,4 +1,4 @@
-"""The headline table of a study, for a terminal."""
+"""The table of a study's errors, for a terminal."""
 
 import rich.box
 import xarray as xr
@@ -11,10 +11,10 @@ from .scenario import scenarios
 
 
 def error_table(dataset: xr.Dataset) -> RenderableType:
-    """RMS errors in percent of the truth by parameter, estimator and noise scale, a table for each scenario.
+    """RMS errors in percent of the truth by parameter, estimator and noise scale, one table for each scenario.
 
-    With rows for the Cramer-Rao bound and for the bracket's centre alone; absolute errors are marked, and below the
-    tables it says why.
+    The tables have rows for the Cramer-Rao bound and for the centre of the bracket. Marks show absolute errors, and
+    notes below the tables explain the marks.
     """
     parts: list[RenderableType] = []
     notes: dict[str, None] = {}

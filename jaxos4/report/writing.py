@@ -15,14 +15,14 @@ FIGURES_FOLDER = "figures"
 
 
 def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
-    """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; gives their paths, the page first.
+    """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; returns their paths, the page first.
 
     **Arguments:**
 
-    - `with_pdf`: or the figures as SVG alone, in half the time.
+    - `with_pdf`: if false, figures are SVG only, which takes half the time.
 
-    Everything is drawn before anything is written, each file is written whole or not at all, and figures that an older
-    report had and this one has not are removed.
+    All figures are drawn before the first file is written. Each file is written completely or not at all. Figures of an
+    older report that this report does not have are removed.
     """
     target = directory / REPORT_FILE
     check_writable(target)

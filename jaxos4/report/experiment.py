@@ -1,4 +1,4 @@
-"""What the scripts in `experiments/` share: many flights identified in one call, tables, Datasets, figures as files."""
+"""Functions that the scripts in `experiments/` share: batched identification, tables, Datasets and figure files."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -19,34 +19,34 @@ from ..estimate import AbstractEstimator, Estimate
 from ..flight import Flight
 from ..models.abstract import AbstractModel
 from ..noise import AbstractNoise
-from ..report.style import Style, drawing, pdf, svg
 from ..shooting import ShootingProblem
-from ..study import RESULTS_FILE, Study, provenance, run_here, save_dataset
-from ._studies import carry_out, device_name, use_all_cores as use_all_cores
+from ..study import RESULTS_FILE, Study, device_name, provenance, save_dataset, use_all_cores as use_all_cores
+from .progress import run_with_bar
+from .style import Style, drawing, pdf, svg
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
-"""Headings of the eight alphas."""
+"""Column headings of the eight alphas."""
 
 
 def run_studies(studies: dict[str, Study], out: Path) -> None:
-    """Runs each study into a folder of that name in `out`, or goes on with it. Raises as `open_store` does."""
+    """Runs or resumes each study in the folder of its name in `out`. Raises what `open_store` raises."""
     for name, study in studies.items():
-        carry_out(study, out / name, device_name(), run_here)
+        run_with_bar(study, out / name)
 
 
 def save_results(dataset: xr.Dataset, study: Study, out: Path) -> None:
-    """Writes what was computed without a study's cells, with its provenance, into a folder."""
+    """Writes a Dataset that was not computed by the cells of `study`, with the provenance of `study`, into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     save_dataset(dataset.assign_attrs(provenance(study, device_name())), out)
 
 
 def load_results(directory: Path) -> xr.Dataset:
-    """What `save_results` wrote into a folder."""
+    """Reads the Dataset that `save_results` wrote."""
     return xr.load_dataset(directory / RESULTS_FILE, engine="h5netcdf")
 
 
 def table_of(title: str, headings: Iterable[str]) -> Table:
-    """An empty table for the terminal. Its columns keep to one line, but for that of `results`."""
+    """An empty table for the terminal. Only the column `results` wraps its lines."""
     table = Table(title=title)
     for heading in headings:
         table.add_column(heading, no_wrap=heading != "results")
@@ -55,7 +55,7 @@ def table_of(title: str, headings: Iterable[str]) -> Table:
 
 @eqx.filter_jit
 def measure(noise: AbstractNoise, exact: Flight, keys: Keys[Array, " flights"]) -> Float[Array, "flights samples 12"]:
-    """What noisy sensors make of a flight, for each key."""
+    """The states of a flight as noisy sensors measure them, once for each key."""
     return jax.lax.map(lambda key: noise(exact, key=key).states, keys)
 
 
@@ -66,9 +66,9 @@ def identify(
     brackets: Bracket,
     states: Float[Array, "flights samples 12"],
 ) -> Estimate:
-    """Identifies flights that differ in what was measured, each in a bracket of its own, all in one call.
+    """Identifies many flights in one call; flight i has the measurements `states[i]` and the bracket `brackets[i]`.
 
-    One program for an estimator and these shapes, whatever the noise, the start and the experiment.
+    The program is compiled once for an estimator and these shapes; noise and start do not matter.
     """
 
     def one(bracket: Bracket, states: States) -> Estimate:
@@ -78,7 +78,7 @@ def identify(
 
 
 def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: float = 0.8) -> Bracket:
-    """For each key a bracket of the default width whose middle lies within a share of that of the truth."""
+    """For each key, a bracket of the default width. Its centre lies within `share` half-widths of the truth."""
 
     def one(key: Key) -> Bracket:
         offset = jax.random.uniform(key, model.alpha.shape, minval=-share, maxval=share, dtype=float)
@@ -88,18 +88,18 @@ def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: 
 
 
 def count_results(names: np.ndarray) -> dict[str, int]:
-    """How many estimates ended in which way, from their `result_names`."""
+    """The number of estimates by result, from their `result_names`."""
     names, counts = np.unique(names, return_counts=True)
     return dict(zip(names.tolist(), counts.tolist(), strict=True))
 
 
 def in_words(counts: dict[str, int]) -> str:
-    """What `count_results` counted, for a cell of a table."""
+    """The counts of `count_results` as the text of a table cell."""
     return ", ".join(f"{count} {what}" for what, count in counts.items())
 
 
 def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) -> None:
-    """Draws a figure in the house style, and writes it as SVG and PDF. Where there is nothing to draw, nothing."""
+    """Draws a figure in the style of this library and writes it as SVG and PDF, or nothing if `draw` gives nothing."""
     directory.mkdir(parents=True, exist_ok=True)
     with drawing():
         figure = draw()
@@ -111,16 +111,16 @@ def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) 
 
 
 def draw_spread(panel: Axes, x: np.ndarray, values: xr.DataArray, look: Style, label: str) -> None:
-    """The geometric mean over the parameters at each x, with a bar from the least parameter to the largest."""
+    """Draws the geometric mean over the parameters at each x, with a bar from the smallest to the largest."""
     values = values.transpose(..., "parameter")
-    there = values.notnull().any("parameter").values
+    finite = values.notnull().any("parameter").values
     logarithm = xr.apply_ufunc(np.log, values.where(values > 0))
     mean = np.exp(logarithm.mean("parameter").values)
     panel.plot(x, mean, color=look.color, marker=look.marker, linestyle=look.dash, label=label)
     panel.vlines(
-        x[there],
-        values.min("parameter").values[there],
-        values.max("parameter").values[there],
+        x[finite],
+        values.min("parameter").values[finite],
+        values.max("parameter").values[finite],
         color=look.color,
         linewidth=1.0,
     )

@@ -1,0 +1,190 @@
+"""Inspection of a log: its contents, the stretches in flight, their excitation, and the identifiable parameters."""
+
+import math
+from pathlib import Path
+from typing import Any, SupportsFloat
+
+import msgspec
+import numpy as np
+
+from ..airframe import Airframe
+from ..analysis.identifiability import identifiability
+from ..bracket import Bracket
+from ..flight import STATE_NAMES, Flight
+from ..logs import log_format, read_log
+from ..models.corrected import CorrectedOS4
+from ..noise import SENSOR_SIGMA
+from ..shooting import ShootingProblem
+from .excited import RATE_COLUMNS, excitation
+from .stretches import Stretch, cut, stretches
+
+RATES = ("p", "q", "r")
+# The identifiability is computed from this much of a stretch [s], in windows of this length [s].
+_LONGEST, _WINDOW = 20.0, 0.5
+
+
+class Channel(msgspec.Struct, frozen=True):
+    """A measured channel: samples a second, the longest time between samples [s], and the range in SI units."""
+
+    rate: float
+    longest_gap: float
+    least: float
+    most: float
+
+
+class AxisExcitation(msgspec.Struct, frozen=True):
+    """Excitation about one axis, see `jaxos4.recording.Excitation`; `None`: not known."""
+
+    torque: float | None
+    rate: float | None
+    noise: float | None
+    verdict: str
+
+
+class Part(msgspec.Struct, frozen=True):
+    """A stretch of the log [s]: whether it can be used, why not, and the excitation by axis if it can."""
+
+    begin: float
+    end: float
+    usable: bool
+    reason: str
+    excitation: dict[str, AxisExcitation]
+
+
+class ParameterBound(msgspec.Struct, frozen=True):
+    """One alpha: the airframe's value, the Cramer-Rao bound (`None`: infinite), their unit.
+
+    `note`: why the parameter is not identifiable, or an empty string.
+    """
+
+    airframe: float
+    bound: float | None
+    unit: str
+    note: str
+
+
+class IdentifiableParameters(msgspec.Struct, frozen=True):
+    """The bounds of alpha_1..8 from the body rates of one stretch [s], at the noise `sigma` of p, q, r [rad/s]."""
+
+    begin: float
+    end: float
+    sigma: dict[str, float]
+    parameters: dict[str, ParameterBound]
+
+
+class Inspection(msgspec.Struct, frozen=True):
+    """The inspection of one log.
+
+    - `log`, `format`: the file, and "CSV", "ULog", "blackbox" or "Crazyflie".
+    - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
+    - `measured`: by channel; `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
+    - `notes`: remarks of the reader.
+    - `parts`: the stretches in order of time.
+    - `identifiable`: `None` without an airframe, without p, q and r, or without a usable stretch.
+    """
+
+    log: str
+    format: str
+    samples: int
+    begin: float
+    end: float
+    sample_time: float
+    measured: dict[str, Channel]
+    notes: tuple[str, ...]
+    parts: tuple[Part, ...]
+    identifiable: IdentifiableParameters | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Dictionaries, lists, numbers and strings, ready for JSON."""
+        return msgspec.to_builtins(self)
+
+
+def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
+    """Reads a log of any known format and describes it.
+
+    **Arguments:**
+
+    - `airframe`: of the vehicle that was flown. Without it, torques and the identifiable parameters are unknown.
+
+    **Raises:** `InputError` for a file that cannot be read as a log.
+    """
+    kind = log_format(path)
+    flight, notes = read_log(path, airframe, full_scale=1.0)
+    found = stretches(flight, airframe)
+    usable = [stretch for stretch in found if not stretch.reason]
+    longest = max(usable, key=lambda stretch: stretch.length, default=None)
+    rates_measured = not np.isnan(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=0).any()
+    identifiable = None
+    if longest is not None and airframe is not None and rates_measured:
+        identifiable = _identifiable(flight, longest, airframe)
+    return Inspection(
+        log=str(path),
+        format=kind,
+        samples=int(flight.time.shape[0]),
+        begin=float(flight.time[0]),
+        end=float(flight.time[-1]),
+        sample_time=float(flight.dt),
+        measured=_measured(flight),
+        notes=tuple(notes),
+        parts=tuple(_part(flight, stretch, airframe) for stretch in found),
+        identifiable=identifiable,
+    )
+
+
+def _measured(flight: Flight) -> dict[str, Channel]:
+    columns = dict(zip(STATE_NAMES, np.asarray(flight.states).T, strict=True))
+    if flight.specific_force is not None:
+        columns |= dict(zip(("ax", "ay", "az"), np.asarray(flight.specific_force).T, strict=True))
+    columns |= {f"rotor{i + 1}": speed for i, speed in enumerate(np.asarray(flight.omega).T)}
+    time, channels = np.asarray(flight.time), {}
+    for name, values in columns.items():
+        at = np.flatnonzero(np.isfinite(values))
+        if at.size == 0:
+            continue
+        edges = np.concatenate([time[:1], time[at], time[-1:]])
+        channels[name] = Channel(
+            rate=at.size / float(flight.time[-1] - flight.time[0]),
+            longest_gap=float(np.diff(edges).max()),
+            least=float(values[at].min()),
+            most=float(values[at].max()),
+        )
+    return channels
+
+
+def _part(flight: Flight, stretch: Stretch, airframe: Airframe | None) -> Part:
+    axes = () if stretch.reason else excitation(cut(flight, stretch), airframe)
+    return Part(
+        stretch.begin,
+        stretch.end,
+        not stretch.reason,
+        stretch.reason,
+        {
+            axis.axis: AxisExcitation(_finite(axis.torque), _finite(axis.rate), _finite(axis.noise), axis.verdict)
+            for axis in axes
+        },
+    )
+
+
+def _identifiable(flight: Flight, stretch: Stretch, airframe: Airframe) -> IdentifiableParameters:
+    stretch = Stretch(stretch.begin, min(stretch.end, stretch.begin + _LONGEST))
+    part, model = cut(flight, stretch), CorrectedOS4(airframe)
+    sigma = np.asarray(SENSOR_SIGMA, dtype=float).copy()
+    for axis, column in zip(excitation(part), RATE_COLUMNS, strict=True):
+        sigma[column] = max(float(np.nan_to_num(axis.noise)), sigma[column])
+    windows = min(max(round(stretch.length / _WINDOW), 1), part.time.shape[0] // 2)
+    problem = ShootingProblem(model, part, sigma=sigma, channels="rates", windows=windows)
+    known = identifiability(problem, Bracket.default(model), model.alpha)
+    notes = known.notes(model.parameter_names)
+    return IdentifiableParameters(
+        stretch.begin,
+        stretch.end,
+        {name: float(sigma[column]) for name, column in zip(RATES, RATE_COLUMNS, strict=True)},
+        {
+            name: ParameterBound(float(model.alpha[i]), _finite(known.std[i]), unit, notes.get(name, ""))
+            for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True))
+        },
+    )
+
+
+def _finite(x: SupportsFloat) -> float | None:
+    return float(x) if math.isfinite(float(x)) else None

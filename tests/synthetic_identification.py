@@ -1,0 +1,88 @@
+"""Identifications that nobody computed: a flight's and a vehicle's, with everything that a page can show."""
+
+import msgspec
+import numpy as np
+
+from jaxos4 import Predictions
+from jaxos4.identification.results import (
+    ChannelFit,
+    Constant,
+    FlightIdentification,
+    HeldParameter,
+    ParameterEstimate,
+    PredictionSkill,
+    RateSkill,
+    RigidBody,
+    Validation,
+    VehicleIdentification,
+)
+
+INERTIA = "1/(kg m^2)"
+KNOWN = ParameterEstimate(57712.3, 512.0, 130.0, (56708.8, 58715.8), INERTIA, "", 431.0)
+UNKNOWN = ParameterEstimate(None, None, 2e6, None, INERTIA, "not identifiable: not excited", 0.1)
+SMALL = ParameterEstimate(0.0011, 0.001, 0.001, (-0.0009, 0.0031), "1/s", "below noise", 0.25)
+WHITE = ChannelFit(0.01, "rad/s", 97.53, 1.0, 0.5, 0.02, 0.4, {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}, 0.3)
+COLOURED = msgspec.structs.replace(WHITE, percent=81.26, level=4.0, correlation=0.8, white_p=1e-9, input_p=1e-5)
+BODY = RigidBody(
+    {
+        "Ix": Constant(1.733e-5, 1.5e-7, "kg m^2", "if arms and mass are right"),
+        "J_R": Constant(1e-8, 1e-7, "kg m^2"),
+    },
+    0.21,
+    True,
+)
+COMMON = {"result": "successful", "rollouts": 812, "cost": 1234.5, "seconds": 35.4, "estimate": None, "problem": None}
+
+
+def identified_flight(**changes) -> FlightIdentification:
+    settings = {"channels": "rates", "windows": 1}
+    given = {
+        "estimator": "ibss",
+        "model": "published",
+        "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN, "alpha2": SMALL},
+        "rigid_body": BODY,
+        "fit": {"p": WHITE, "q": COLOURED},
+        "validation": Validation("other.csv", 10.0, {"p": COLOURED}),
+        "provenance": settings | changes.pop("provenance", {}),
+    }
+    return FlightIdentification(**COMMON | given | changes)
+
+
+def identified_vehicle(**changes) -> VehicleIdentification:
+    rate = RateSkill(
+        [0.91, 0.731, None], [0.02, 0.14, None], [0.2, 0.4, None], [0.7, 0.8, 0.9], equation_error=[0.5, 0.41, None]
+    )
+    settings = {
+        "command": "jaxos4 estimate flight.csv --model flight --report flight.html",
+        "flights": ["flight.csv"],
+        "sample_time": 0.004,
+        "window": 0.25,
+        "terms": ["offset", "damping"],
+        "fitted_seconds": 32.0,
+        "notes": ["t is not uniform"],
+    }
+    given = {
+        "estimator": "ibss",
+        "model": "flight",
+        "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN},
+        "rigid_body": BODY,
+        "held": {"alpha1": HeldParameter(-0.8125, "1", "not identifiable")},
+        "cut": 0.22,
+        "noise": {"p": 0.41},
+        "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
+        "predictions": synthetic_predictions(),
+        "provenance": settings | changes.pop("provenance", {}),
+    }
+    return VehicleIdentification(**COMMON | given | changes)
+
+
+def synthetic_predictions(starts=160) -> Predictions:
+    """Of two stretches; one measurement is missing."""
+    start = 5 + 12 * np.arange(starts)
+    start[starts // 2 :] += 300
+    horizons = np.array([0.1, 0.248, 0.5])
+    time = 0.004 * start[:, None, None] + horizons[:, None] + 0.7 * np.arange(3)
+    measured = np.sin(3 * time)
+    measured[3, 1, 0] = np.nan
+    predicted = np.sin(3 * time) + 0.3 * horizons[:, None] * np.cos(40 * time)
+    return Predictions(start, horizons, np.sin(3 * time[:, 0]), predicted, measured)
