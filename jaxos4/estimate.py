@@ -1,4 +1,4 @@
-"""What every estimator returns, and what makes it one."""
+"""`AbstractEstimator`, and the `Estimate` that every estimator returns."""
 
 import abc
 import functools
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractClassVar
 
-# How many half-widths around its bracket's center an answer may lie.
+# How many half-widths an answer may lie away from the center of its bracket.
 REACH = 4.0
-# Towards an initial state with the parameters known: the trajectory is nearly linear in it.
+# Gauss-Newton steps to an initial state, with the parameters known: the trajectory is nearly linear in that state.
 _START_STEPS = 4
 
 
 class Calibration(eqx.Module):
-    """How many standard deviations an interval needs to hold the truth as often as its level says.
+    """How wide an interval must be to hold the truth as often as its level says.
 
-    - `levels`: rising, between 0 and 1.
-    - `factors`: for each level and parameter, the half-width in standard deviations.
-    - `simultaneous`: for each level, the factor with which all parameters' intervals hold at once.
+    - `levels`: between 0 and 1, rising.
+    - `factors`: half-width of the interval in standard deviations, for each level and parameter.
+    - `simultaneous`: the same, for intervals that hold all parameters at once.
     """
 
     levels: Float[Array, " levels"]
@@ -42,21 +42,21 @@ class Calibration(eqx.Module):
 class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
-    - `parameters`: the estimate; where `result` says that there is none, the bracket's center, or 0 without one.
-    - `covariance`: of `parameters`. Shooting takes it from the Fisher information at the estimate and the problem's
-      `sigma`, a network from its errors on simulated flights.
-    - `initial_state`: the estimated, or known, state at the first sample, in cascade order; of several windows, one
-      after the other.
-    - `cost`: 1/2 |W (y - x)|^2 there, of the channels that the estimator looks at; infinite without an estimate.
-    - `rollouts`: simulated flights that it took, whatever their channels: one for a shot with its slope, one for each
+    - `parameters`: the estimate. If `result` says that there is no estimate: the bracket's center, or 0 if the bracket
+      is invalid.
+    - `covariance`: of `parameters`; infinite without an estimate. An estimator that shoots takes it from the Fisher
+      information at the estimate and the problem's `sigma`, a network from its errors on simulated flights.
+    - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels; infinite without an estimate.
+    - `rollouts`: number of simulated flights, on whatever channels: one for a shot with its slope, one for each
       unknown of a Fisher information.
-    - `sweeps`: iterations over all directions, summed over the stages.
-    - `result`: how it ended.
-    - `calibration`: of the intervals, where they were calibrated on simulated flights; `None`: Gaussian.
-    - `seed`: the bracket that the search began from, where another estimator gave one.
-    - `history`: of a recursive estimator, the parameters after each sample.
-    - `brackets`: of a search that records them, from where to where each sweep looked in each parameter; NaN where
-      there were fewer sweeps.
+    - `sweeps`: number of iterations, summed over the stages.
+    - `result`: how the search ended.
+    - `calibration`: of the intervals, if they were calibrated on simulated flights; `None` means Gaussian.
+    - `seed`: the bracket that the search began from, if another estimator gave one.
+    - `history`: the parameters after each sample, from a recursive estimator.
+    - `brackets`: the lower and upper end of each parameter's bracket in each sweep, from an estimator that records
+      them; NaN after the last sweep.
     """
 
     parameters: Parameters
@@ -73,18 +73,18 @@ class Estimate(eqx.Module):
 
     @property
     def std(self) -> Float[Array, "*batch parameters"]:
-        """Standard deviation of each parameter, of one estimate or of a batch of them."""
+        """Standard deviation of each parameter, for one estimate or a batch."""
         return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def half_width(self, level: float, *, simultaneous: bool = False) -> Float[Array, "*batch parameters"]:
-        """Half the width of an interval around each parameter that holds the truth in a share `level` of all flights.
+        """Half-width of an interval around each parameter that holds the truth in a share `level` of all flights.
 
         **Arguments:**
 
-        - `level`: between 0 and 1; calibrated intervals reach from 50 to 99.9 %, and beyond grow no further.
-        - `simultaneous`: all parameters at once, instead of each for itself.
+        - `level`: between 0 and 1. Calibrated intervals cover 50 to 99.9 %; they do not change outside this range.
+        - `simultaneous`: whether the intervals hold all parameters at once; by default each holds its own.
 
-        **Raises:** `ValueError` for another level.
+        **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
         if not 0 < level < 1:
             raise ValueError(f"`level` must lie between 0 and 1, got {level}.")
@@ -102,7 +102,7 @@ class Estimate(eqx.Module):
 
 
 def _deviations(level: Float[Array, "*levels"]) -> Float[Array, "*levels"]:
-    """How many standard deviations to either side hold a share `level` of a Gaussian."""
+    """Half-width, in standard deviations, of the interval that holds a share `level` of a Gaussian."""
     return jax.scipy.special.ndtri((1 + level) / 2)
 
 
@@ -121,45 +121,45 @@ def conclude(
     prior: float = NO_PRIOR,
     history: Float[Array, "samples parameters"] | None = None,
 ) -> Estimate:
-    """What an algorithm found, as an estimate: its result told, and nothing that is not a number passed on.
+    """The `Estimate` of what an algorithm found, with its result code; it never holds a parameter that is not finite.
 
     **Arguments:**
 
-    - `sound`: whether the trajectory stayed sound to its end.
+    - `sound`: whether the trajectory is sound to its end.
     - `done`: whether the search ended by itself.
-    - `reach`: how many half-widths around the bracket's center an answer may lie.
+    - `reach`: how many half-widths an answer may lie away from the bracket's center.
     - `prior`: how the estimator uses the bracket, see `Bracket.identifies`.
     """
     valid, center = bracket.valid, jnp.where(bracket.valid, bracket.center, 0.0)
-    std, half_width = jnp.sqrt(jnp.diagonal(covariance)), jnp.where(valid, bracket.half_width, 1.0)
-    limit = (reach - 1e-2) * half_width
+    std, limit = jnp.sqrt(jnp.diagonal(covariance)), (reach - 1e-2) * jnp.where(valid, bracket.half_width, 1.0)
     finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
     sound = sound & jnp.isfinite(cost) & finite
     result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
     result = RESULTS.where((jnp.abs(parameters - center) > limit).any(), RESULTS.at_bound, result)
-    result = RESULTS.where((std > prior * half_width).any(), RESULTS.unidentifiable, result)
+    result = RESULTS.where(~bracket.identifies(std, prior).all(), RESULTS.unidentifiable, result)
     result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
     result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
-    told = sound & valid
+    answered = sound & valid
     return Estimate(
-        parameters=jnp.where(told, parameters, center),
-        covariance=jnp.where(told, covariance, jnp.inf),
+        parameters=jnp.where(answered, parameters, center),
+        covariance=jnp.where(answered, covariance, jnp.inf),
         initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
-        cost=jnp.where(told, cost, jnp.inf),
+        cost=jnp.where(answered, cost, jnp.inf),
         rollouts=jnp.asarray(rollouts, dtype=int),
         sweeps=jnp.asarray(sweeps, dtype=int),
         result=result,
-        history=None if history is None else jnp.where(told, history, center),
+        history=None if history is None else jnp.where(answered, history, center),
     )
 
 
 def fit_start(
     problem: ShootingProblem, parameters: Parameters
 ) -> tuple[Float[Array, " starts"], Scalar, Bool[Array, ""], int]:
-    """The initial state that explains the flight best with these parameters, for algorithms that do not look for one.
+    """The initial state that explains the flight best with these parameters, for algorithms that do not search for it.
 
-    A few Gauss-Newton steps from the first measurements where it is free, held by how far off those may be. Returns it
-    with the cost there, whether the trajectory is sound, and how many rollouts it took.
+    A free initial state takes a few Gauss-Newton steps from the first measurements, with their errors as its prior.
+
+    Returns the initial state, the cost there, whether the trajectory is sound, and the number of rollouts.
     """
     first, off = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
@@ -167,9 +167,9 @@ def fit_start(
     def improve(start: Float[Array, " starts"], _) -> tuple[Float[Array, " starts"], None]:
         _, gradient, information = problem.curvatures(parameters, start)
         known = 1 / jnp.square(problem.split(off))
-        own = jax.vmap(invert)(information[:, count:, count:] + jax.vmap(jnp.diag)(known))
+        covariance = jax.vmap(invert)(information[:, count:, count:] + jax.vmap(jnp.diag)(known))
         slope = gradient[:, count:] + known * problem.split(start - first)
-        return start - (own * slope[:, None, :]).sum(axis=-1).ravel(), None
+        return start - (covariance * slope[:, None, :]).sum(axis=-1).ravel(), None
 
     start = jax.lax.scan(improve, first, length=_START_STEPS)[0] if free else first
     cost, sound = problem.shots(parameters, start)
@@ -177,11 +177,16 @@ def fit_start(
 
 
 def check_one_window(problem: ShootingProblem) -> None:
-    """Raises `ValueError` for a problem that a filter cannot walk through: windows, or sensors with their own terms."""
+    """Raises `ValueError` for a problem that a filter cannot process sample by sample."""
     if problem.windows > 1:
-        raise ValueError(f"`problem.windows` must be 1 for this estimator, got {problem.windows}: it shoots none.")
+        raise ValueError(
+            f"`problem.windows` must be 1 for this estimator, got {problem.windows}: use an estimator that shoots."
+        )
     if problem.model.forcing_parameters or not problem.model.observes_states:
-        raise ValueError("`problem.model` must be one without rotor lag, delay, thrust curve or sensor terms: shoot.")
+        raise ValueError(
+            "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
+            "use an estimator that shoots."
+        )
 
 
 def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
@@ -194,12 +199,13 @@ def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
 class AbstractEstimator(eqx.Module):
     """An algorithm that identifies parameters; its fields are its settings.
 
-    What an estimator can do is written on its class:
+    Class variables say what an estimator can do:
 
     - `looks_at`: the most channels that it compares: `"rates"`, `"attitude"` or `"all"`.
-    - `shoots`: whether it minimises the problem's cost. If so, it takes windows, and its errors follow from the noise.
-    - `prior`: how it uses the bracket, one of the constants in `jaxos4.bracket`.
-    - `needs_network`: whether it is made from a trained network.
+    - `shoots`: whether it minimises the problem's cost. If so, it can use windows, and its covariance follows from the
+      noise.
+    - `prior`: how it uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
+    - `needs_network`: whether it needs a trained network.
     """
 
     looks_at: AbstractClassVar[str]
@@ -207,6 +213,22 @@ class AbstractEstimator(eqx.Module):
     prior: AbstractClassVar[float]
     needs_network: AbstractClassVar[bool]
 
+    @classmethod
+    def of(cls, network: "AbstractEstimator | None" = None) -> "AbstractEstimator":
+        """The estimator with its default settings.
+
+        **Arguments:**
+
+        - `network`: a trained network, for an estimator that needs one: it is that network, or has a field `network`.
+
+        **Raises:** `ValueError` if the estimator needs a network and there is none.
+        """
+        if not cls.needs_network:
+            return cls()
+        if network is None:
+            raise ValueError(f"`network` must be a trained network for {cls.__name__}, got None.")
+        return network if isinstance(network, cls) else cls(**{"network": network})
+
     @abc.abstractmethod
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        """Identifies one flight. Batches are made by `eqx.filter_vmap`; a failing lane leaves the others alone."""
+        """Identifies one flight. For a batch use `eqx.filter_vmap`: a lane that fails does not change the others."""

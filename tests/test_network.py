@@ -13,6 +13,7 @@ from helpers import DT, standard_flight
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
+from jaxos4.estimators.hybrid import search_from_seed
 from jaxos4.networks.architecture import Regressor
 from jaxos4.networks.features import FEATURES, Coordinates
 from jaxos4.networks.network import _regressor
@@ -482,7 +483,7 @@ def seed_of(result, parameters=BRACKET.center, std=np.inf):
 
 @eqx.filter_jit
 def seeded(states, seeds):
-    return jax.vmap(lambda s, e: jaxos4.IBSS()(problem_of(s), BRACKET, seed=e))(states, seeds)
+    return jax.vmap(lambda s, e: search_from_seed(jaxos4.IBSS(), problem_of(s), BRACKET, e))(states, seeds)
 
 
 @pytest.mark.parametrize("name", ["network_mismatch", "nonfinite_trajectory", "at_bound", "unidentifiable"])
@@ -491,7 +492,7 @@ def test_a_seed_without_an_answer_is_never_passed_on(name):
     alpha, states = flights(4, seed=21)
     std = 1e-3 * BRACKET.half_width if name == "at_bound" else jnp.full(8, np.inf)
     seed = seed_of(getattr(jaxos4.RESULTS, name), std=std)
-    alone = jaxos4.IBSS()(problem_of(states[0]), BRACKET, seed=seed)
+    alone = search_from_seed(jaxos4.IBSS(), problem_of(states[0]), BRACKET, seed)
     sound = seed_of(jaxos4.RESULTS.successful, alpha[1], 1e-2 * BRACKET.half_width)
     stack = jax.tree.map(lambda *x: jnp.stack(x), seed, sound, seed, sound)
     many, best = seeded(states, stack), identify(jaxos4.IBSS(), states)

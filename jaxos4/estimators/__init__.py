@@ -1,4 +1,4 @@
-"""Estimators: a `ShootingProblem` and a `Bracket` in, an `Estimate` out; one algorithm a file."""
+"""Estimators: from a `ShootingProblem` and a `Bracket` to an `Estimate`. Each algorithm has its own file."""
 
 from ..estimate import AbstractEstimator
 from ..networks.network import TrainedNetwork
@@ -21,7 +21,7 @@ ESTIMATORS: dict[str, type[AbstractEstimator]] = {
     "svsf": SVSF,
     "kalman": JointEKF,
 }
-"""The estimators by the names that the command line, studies and figures use. A new estimator is one line here."""
+"""The estimators by name: what the command line, studies and figures offer. A new estimator is one line here."""
 
 
 def make_estimator(name: str, network: TrainedNetwork | None = None) -> AbstractEstimator:
@@ -35,9 +35,4 @@ def make_estimator(name: str, network: TrainedNetwork | None = None) -> Abstract
     """
     if name not in ESTIMATORS:
         raise ValueError(f"`name` must be one of {', '.join(ESTIMATORS)}, got {name!r}.")
-    kind = ESTIMATORS[name]
-    if not kind.needs_network:
-        return kind()
-    if network is None:
-        raise ValueError(f"`network` must be given for {name!r}.")
-    return network if kind is TrainedNetwork else kind(network)  # pyright: ignore[reportCallIssue]
+    return ESTIMATORS[name].of(network)

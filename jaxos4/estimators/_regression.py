@@ -1,10 +1,10 @@
-"""The rate equations as a linear regression on measured body rates: what equation-error methods share.
+"""The rate equations as a linear regression on measured body rates: shared by the equation-error methods.
 
-Between two samples the rates change by the integral of the rate equations, which are linear in the parameters. Noise
-makes the differences of measured rates coloured, a moving average of order one with a unit root. Its exact whitening
-is to integrate again: y_k = w_0 + sum_{j<k} T Phi_j alpha + e_k with white e and an unknown w_0, which `rows`
-eliminates recursively (each row less the mean of those before it, the Helmert transform), so that every row has white
-noise, unit variance, and no unknown but the parameters.
+Between two samples the rates change by the integral of the rate equations, which are linear in the parameters. The
+noise of measured rates makes their differences coloured. Integrating again whitens them exactly:
+y_k = w_0 + sum_{j<k} T Phi_j alpha + e_k, with white noise e and an unknown w_0. `Regression.rows` eliminates w_0
+recursively (it subtracts the mean of all rows before each row, the Helmert transform). Every row then has white noise,
+unit variance, and no unknown but the parameters.
 """
 
 from typing import NamedTuple
@@ -22,17 +22,17 @@ from ..linalg import invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
 
-# The standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It decides
-# what a flight says nothing about, and nothing else.
+# Standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It matters only
+# for parameters that are not excited.
 DIFFUSE = 1e6
 
 
 class Regression(NamedTuple):
-    """A flight as a regression for the parameters, in half-widths of the bracket from its center.
+    """A flight as a regression for the parameters, in half-widths from the bracket's center.
 
-    - `rates`: as measured, NaN where not, the first sample too where the initial state is known.
-    - `anchor`: the known initial rates, else NaN.
-    - `anchored`: whether they are known.
+    - `rates`: measured; NaN if not measured, and at the first sample if the initial state is known.
+    - `anchor`: the known initial rates; NaN if they are free. `anchored`: whether they are known.
+    - `memory`, `forgetting`, `bridge`: see `RecursiveLeastSquares`.
     """
 
     problem: ShootingProblem
@@ -45,9 +45,10 @@ class Regression(NamedTuple):
     bridge: int
 
     def rows(self, rates: Float[Array, "samples 3"]) -> Float[Array, "samples 3 columns"]:
-        """Regressors and, in the last column, what they explain: a row for p, q, r at every sample, of unit noise.
+        """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
 
-        A row of zeros says nothing. `rates` stands in for the measured rates where these are numbers.
+        A sample that was not measured gets a row of zeros. `rates` replaces the measured rates, with the same samples
+        missing.
         """
         measured, (filled, known) = ~jnp.isnan(self.rates), self._fill(rates)
         increments = self._increments(filled)
@@ -56,32 +57,32 @@ class Regression(NamedTuple):
             usable &= (jnp.diff(self.problem.flight.stretch, append=-1) == 0)[:, None]
         increments = jnp.where(usable[..., None], increments, 0.0)
         output = filled / self.problem.sigma[CASCADE_ORDER[:3]]
-        kept = self.memory * self.forgetting
+        decay = self.memory * self.forgetting
 
         def step(carry, sample):
             integral, mean, count = carry
             increment, usable, output, measured = sample
             row = integral.at[:, -1].add(output)
-            off, weight = row - mean, self.forgetting * count
+            deviation, weight = row - mean, self.forgetting * count
             scale = jnp.sqrt(1 / (1 + 1 / weight))
-            mean = jnp.where(measured[:, None], mean + off / (1 + kept * count)[:, None], mean)
-            count = jnp.where(usable, kept * count + measured, 0.0)
+            mean = jnp.where(measured[:, None], mean + deviation / (1 + decay * count)[:, None], mean)
+            count = jnp.where(usable, decay * count + measured, 0.0)
             integral = jnp.where(usable[:, None], integral + increment, 0.0)
-            return (integral, mean, count), jnp.where(measured[:, None], scale[:, None] * off, 0.0)
+            return (integral, mean, count), jnp.where(measured[:, None], scale[:, None] * deviation, 0.0)
 
-        exact = jnp.where(kept < 1, 1.0, jnp.inf)
+        exact = jnp.where(decay < 1, 1.0, jnp.inf)
         first = jnp.where(jnp.isnan(self.anchor), 0.0, self.anchor) / self.problem.sigma[CASCADE_ORDER[:3]]
-        nothing = jnp.zeros_like(increments[0])
-        start = (nothing, nothing.at[:, -1].set(first), jnp.where(self.anchored, exact, 0.0) * jnp.ones(3))
+        zero = jnp.zeros_like(increments[0])
+        start = (zero, zero.at[:, -1].set(first), jnp.where(self.anchored, exact, 0.0) * jnp.ones(3))
         return jax.lax.scan(step, start, (increments, usable, output, measured))[1]
 
     def weights(self) -> Float[Array, " samples"]:
-        """What forgetting leaves of each sample at the end of the flight."""
+        """The weight of each sample at the end of the flight."""
         age = jnp.arange(self.rates.shape[0])[::-1]
         return self.forgetting**age
 
     def _fill(self, rates) -> tuple[Float[Array, "samples 3"], Bool[Array, "samples 3"]]:
-        """Rates with short gaps bridged by straight lines, and where they are known."""
+        """Rates with short gaps bridged by straight lines and other gaps set to 0, and which of them are known."""
         samples = jnp.arange(rates.shape[0])[:, None]
         first = (samples == 0) & self.anchored
         rates = jnp.where(first, self.anchor, rates)
@@ -96,10 +97,10 @@ class Regression(NamedTuple):
         return jnp.where(known, before + share * (after - before), 0.0), known
 
     def _increments(self, rates: Float[Array, "samples 3"]) -> Float[Array, "samples 3 columns"]:
-        """What one sample adds to the integrated regressors and, negative, to what the bracket's center explains.
+        """The step of each integral from t_k to t_{k+1}: of the regressors, and of minus the center's acceleration.
 
-        The input of row k acts from t_k to t_{k+1}. Forward Euler takes the rates at t_k; another method the mean of
-        both ends of the interval (the trapezoidal rule), whose error is of the order T^2.
+        The input of row k acts from t_k to t_{k+1}. Forward Euler uses the rates at t_k; any other method uses the mean
+        of both ends (the trapezoidal rule), with an error of the order T^2.
         """
         model, sigma, dt = self.problem.model, self.problem.sigma[CASCADE_ORDER[:3]], self.problem.flight.dt
         center, half_width = self.bracket.center, self.bracket.half_width
@@ -122,11 +123,11 @@ class Regression(NamedTuple):
 def regression(
     problem: ShootingProblem, bracket: Bracket, *, memory: Scalar, forgetting: Scalar | float, bridge: int
 ) -> Regression:
-    """The regression of a flight's rates, whatever else the problem's channels are."""
+    """The regression of a flight's body rates; other channels of the problem are ignored."""
     if not problem.model.is_linear:
         raise ValueError(
-            "regression needs a model whose rate equations are linear in its parameters: identify alpha_1..8, then "
-            "`fit_inertia`, or shoot."
+            "`problem.model` must have rate equations that are linear in its parameters for a regression: identify "
+            "alpha1..8 and then call `fit_inertia`, or use an estimator that shoots."
         )
     rates = problem.restrict("rates")
     anchored = problem.initial_state is not None
@@ -139,7 +140,7 @@ def regression(
 def normal_equations(
     rows: Float[Array, "*rows columns"],
 ) -> tuple[Float[Array, "parameters parameters"], Float[Array, " parameters"]]:
-    """X^T X and X^T y of rows [X, y]: in plain sums, which a batch leaves as they are."""
+    """X^T X and X^T y of rows [X, y]. Plain sums give the same digits alone and in a batch."""
     rows = rows.reshape(-1, rows.shape[-1])
     regressors, output = rows[:, :-1], rows[:, -1]
     information = (regressors[:, :, None] * regressors[:, None, :]).sum(axis=0)
@@ -162,11 +163,11 @@ def prior(count: int) -> Float[Array, "parameters parameters"]:
 def propagated_covariance(
     regression: Regression, steps: Float[Array, " parameters"], inverse: Float[Array, "parameters parameters"]
 ) -> Float[Array, "parameters parameters"]:
-    """The covariance of the solution `steps` that white noise of the measured rates makes, to first order.
+    """The covariance of the solution `steps` from white noise in the measured rates, to first order.
 
-    The solution solves g(Y) = X(Y)^T (y(Y) - X(Y) steps) = 0. The derivative of g with respect to every measured rate
-    carries its variance through regressors and outputs alike: errors in variables are part of it, and neither the
-    colour of the differences nor the weights need to be right. What noise does in second order, a bias, is not.
+    The solution satisfies g(Y) = X(Y)^T (y(Y) - X(Y) steps) = 0. The derivative of g with respect to each measured rate
+    carries the noise through both the regressors and the outputs. So errors in variables are included, and the result
+    holds for coloured differences and any weights. The bias, a second-order effect of the noise, is not included.
     """
     root = jnp.sqrt(regression.weights())[:, None, None]
 
@@ -180,18 +181,18 @@ def propagated_covariance(
     sensitivity = jax.jacrev(score)(measured) * regression.problem.sigma[CASCADE_ORDER[:3]]
     sensitivity = sensitivity.reshape(steps.shape[0], -1)
     spread = (sensitivity[:, None, :] * sensitivity[None, :, :]).sum(axis=-1) + prior(steps.shape[0])
-    left = (inverse[:, :, None] * spread[None, :, :]).sum(axis=1)
-    covariance = (left[:, :, None] * inverse[None, :, :]).sum(axis=1)
+    half = (inverse[:, :, None] * spread[None, :, :]).sum(axis=1)
+    covariance = (half[:, :, None] * inverse[None, :, :]).sum(axis=1)
     return (covariance + covariance.T) / 2
 
 
 def parameters_of(bracket: Bracket, steps: Float[Array, "*samples parameters"]) -> Float[Array, "*samples parameters"]:
-    """Parameters from half-widths off the bracket's center."""
+    """Parameters from steps in half-widths from the bracket's center."""
     return bracket.center + bracket.half_width * steps
 
 
 def covariance_of(bracket: Bracket, covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A covariance in the parameters' units."""
+    """A covariance of steps in half-widths, in the parameters' units."""
     return bracket.half_width[:, None] * covariance * bracket.half_width[None, :]
 
 
@@ -204,7 +205,7 @@ def check_share(name: str, value: Scalar, *, open_below: bool) -> None:
 
 
 def check_bridge(value: int) -> None:
-    """Raises `ValueError` for another setting than a number of samples."""
+    """Raises `ValueError` unless the setting is a number of samples."""
     if not isinstance(value, int) or value < 0:
         raise ValueError(f"`bridge` must be an integer of at least 0, got {value!r}.")
 
@@ -217,15 +218,15 @@ def answer(
     *,
     history: Float[Array, "samples parameters"] | None = None,
 ) -> Estimate:
-    """A regression's parameters as an estimate: the initial state and the cost are those of shooting with them.
+    """A regression's parameters as an estimate, with the initial state and the cost of a simulation with them.
 
-    A parameter that is not identifiable may have any value. If the flight cannot be simulated with it, the bracket's
-    center is returned.
+    A parameter that is not identifiable can have any value. If the flight cannot be simulated with it, the estimate is
+    the bracket's center.
     """
     usable = bracket.usable
-    told = (jnp.sqrt(jnp.diagonal(covariance)) <= usable.half_width).all()
+    identifiable = usable.identifies(jnp.sqrt(jnp.diagonal(covariance))).all()
     flies = jnp.isfinite(problem.cost(parameters))
-    parameters = jnp.where(told | flies, parameters, usable.center)
+    parameters = jnp.where(identifiable | flies, parameters, usable.center)
     initial_state, cost, sound, rollouts = fit_start(problem, parameters)
     return conclude(
         bracket,

@@ -1,29 +1,42 @@
-"""The hybrid: a network says where to look, and shooting finds the answer there."""
+"""The hybrid: a network says where to look, and IBSS finds the answer there."""
 
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks.network import TrainedNetwork
+from ..results import RESULTS
 from ..shooting import ShootingProblem
 from .ibss import IBSS
 
+# The share of flights in which the seed's intervals hold all parameters at once.
+_LEVEL = 0.999
+# The seed was wrong if the answer is this many half-widths of these intervals away from the seed,
+_MISSED = 2.0
+# or if the cost is this many standard deviations above the cost of pure noise.
+_UNEXPLAINED = 5.0
+
 
 class Hybrid(AbstractEstimator):
-    """IBSS from brackets that a network seeds.
+    """IBSS near the answer of a network.
 
-    The network's answer and its covariance open the brackets, against all of the problem's channels at once. A seed
-    that does not hold the answer is noticed: brackets grow, and where the answer lies far from the seed, or does not
-    explain the flight, or the network had none, IBSS searches the whole bracket as it would alone. The estimate's
-    `seed` is the bracket that the network's intervals make (99.9 % for all parameters at once), so that hits can be
-    counted; `rollouts` are those of both.
+    The network's answer, the *seed*, and its covariance open the first brackets, against all of the problem's channels
+    at once. If the search shows that the seed was wrong, or if the network had no answer, IBSS searches the whole
+    bracket as it would alone, and the better answer is returned.
+
+    The estimate's `seed` is the bracket that the network's intervals make (99.9 % for all parameters at once), so that
+    hits can be counted. `rollouts` are those of network and search together.
 
     **Arguments:**
 
-    - `network`: a trained network. One that looks at all the channels of the problem makes the shortest search.
-    - `ibss`: how to shoot. A seed is close enough for one halving less than a wide bracket takes.
+    - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
+    - `ibss`: how to search. Near a seed one halving less is enough than in a wide bracket.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -36,4 +49,44 @@ class Hybrid(AbstractEstimator):
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight. Raises as the network does."""
-        return self.ibss(problem, bracket, seed=self.network(problem, bracket))
+        return search_from_seed(self.ibss, problem, bracket, self.network(problem, bracket))
+
+
+@eqx.filter_jit
+def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> Estimate:
+    """Searches near another estimator's answer, and in the whole bracket if that answer was wrong.
+
+    **Arguments:**
+
+    - `seed`: an estimate of the same flight, of whatever quality.
+    """
+    answered = jnp.isfinite(seed.covariance).all()
+    near = ibss.search(problem, bracket, start=seed.parameters, spread=seed.covariance, cascade=False, skip=~answered)
+    half_width = seed.half_width(_LEVEL, simultaneous=True)
+    hit = answered & _confirms(near, seed, half_width, problem)
+
+    def search_wide(carry: tuple[Estimate, Bool[Array, ""]]) -> tuple[Estimate, Bool[Array, ""]]:
+        near, hit = carry
+        wide = ibss.search(problem, bracket, skip=hit)
+        sound = answered & (near.result == RESULTS.successful)
+        better = ~sound | ((wide.result == RESULTS.successful) & (wide.cost < near.cost))
+        best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
+        spent = near.rollouts + wide.rollouts, near.sweeps + wide.sweeps
+        return eqx.tree_at(lambda e: (e.rollouts, e.sweeps), best, spent), jnp.ones_like(hit)
+
+    # A loop and not a condition: a batch in which all seeds are hits skips it.
+    best, _ = jax.lax.while_loop(lambda carry: ~carry[1], search_wide, (near, hit))
+    seeded = Bracket.around(seed.parameters, half_width)
+    return dataclasses.replace(best, rollouts=seed.rollouts + best.rollouts, seed=seeded)
+
+
+def _confirms(
+    near: Estimate, seed: Estimate, half_width: Float[Array, " parameters"], problem: ShootingProblem
+) -> Bool[Array, ""]:
+    """Whether the search near a seed ended well, close to the seed, and with residuals no larger than noise."""
+    far = jnp.abs(near.parameters - seed.parameters) > _MISSED * half_width
+    measurements = jnp.sum(~jnp.isnan(problem.measured()))
+    explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
+    # A parameter that is not identifiable near the seed is not identifiable elsewhere either.
+    ended = (near.result == RESULTS.successful) | (near.result == RESULTS.unidentifiable)
+    return ended & ~far.any() & explained

@@ -1,8 +1,8 @@
 """Extended Kalman filter of the states and the parameters together, in square-root form.
 
-Parameters and initial state are constants and the model is exact, so nothing is added to the covariance P = S S^T on
-the way: each column of S is a tangent that travels with the state, and a measurement only turns and shrinks them
-(Potter's update, one scalar at a time). No matrix is inverted, and P cannot lose its sign in single precision.
+Parameters and initial state are constants and the model is exact, so the covariance P = S S^T gains nothing between
+measurements: each column of S is a tangent that travels with the state. A measurement only rotates and shrinks the
+columns (Potter's update, one scalar at a time). No matrix is inverted, and P stays positive in single precision.
 """
 
 from typing import ClassVar, NamedTuple
@@ -18,14 +18,15 @@ from ..estimate import AbstractEstimator, Estimate, check_bracket, check_one_win
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
 
-# The passes end once none moves a parameter by more than this many standard deviations.
+# The passes end once one of them moves no parameter by more than this many standard deviations.
 _SETTLED = 0.1
 
 
 class _Filter(NamedTuple):
-    """The estimate z of states, parameters and, where it is free, the initial state; S with S S^T its covariance.
+    """The joint estimate of states, parameters and, if it is free, the initial state.
 
-    `nominal`: the states on the trajectory around which the model is linearised.
+    - `root`: S, with S S^T the covariance of the joint estimate.
+    - `nominal`: the states on the trajectory around which the model is linearised.
     """
 
     estimate: Float[Array, " joint"]
@@ -46,20 +47,17 @@ class JointEKF(AbstractEstimator):
 
     **Arguments:**
 
-    - `passes`: over the flight, at most. The first linearises the model around its own running estimate: the textbook
-      filter. Each later one starts from the same prior again and linearises around the trajectory of the answer
-      before it: a Gauss-Newton step on prior and flight together. They end once one has moved no parameter by more
-      than a tenth of its standard deviation; where the last of them still did, `max_sweeps` says so. With 1, the first
-      pass is taken as it is: from the default bracket that is efficient on the published model's rates, but leaves up
-      to 2 times the Cramer-Rao bound on all its channels, 1.7 times on the corrected model's rates, and 12 times on all
-      of those, with a covariance that knows nothing of it.
+    - `passes`: the most passes over the flight. The first pass linearises the model around its own running estimate:
+      the textbook filter. Each later pass starts from the same prior and linearises around the trajectory of the answer
+      before it: a Gauss-Newton step on prior and flight together. The passes end once one of them moves no parameter by
+      more than a tenth of its standard deviation; otherwise the result is `max_sweeps`. With `passes=1` the first
+      answer is accepted as it is; on more channels than the rates its covariance can be far too small.
 
-    The bracket is taken as a Gaussian prior: its center, its half-width as the standard deviation. It is in the answer
-    and in the covariance: from a center that is off by half of the half-width, the answer is off by half of
-    std^2 / half_width. A free initial state has the first measurements as its prior and is estimated along, as a
-    part of the joint state that stands still. There is no process noise: parameters do not drift. `history` is that
-    of the last pass, and its last row is the answer. A pass carries one tangent for each unknown beside the state,
-    and counts as that many rollouts and one; `sweeps` are the passes.
+    The bracket is a Gaussian prior: its center is the mean, its half-width the standard deviation. The prior is part of
+    the answer and of the covariance: if the center is off by half of the half-width, the answer is off by half of
+    std^2 / half_width. A free initial state has the first measurements as its prior, and is a constant part of the
+    joint state. There is no process noise: parameters do not drift. `history` is that of the last pass, and its last
+    row is the answer. A pass counts as one rollout for each unknown and one for the state; `sweeps` are the passes.
 
     Reference: Ljung 1979, IEEE Trans. Autom. Control 24(1), on the filter; Bierman 1977, Factorization Methods for
     Discrete Sequential Estimation, on Potter's update; Bell and Cathey 1993, IEEE Trans. Autom. Control 38(2), on
@@ -83,11 +81,11 @@ class JointEKF(AbstractEstimator):
 
         **Arguments:**
 
-        - `problem`: what is filtered; NaN is not measured.
+        - `problem`: the flight to filter; NaN means not measured.
         - `bracket`: the prior of the parameters.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a flight that
-        is cut into windows.
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
+        windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
         check_bracket(problem, bracket)
         check_one_window(problem)
@@ -103,7 +101,7 @@ class JointEKF(AbstractEstimator):
             joint, root, history = _run(problem, rows, prior, before)
             std = jnp.sqrt(jnp.square(root[size : size + count]).sum(axis=1))
             moved = (jnp.abs(split(joint)[0] - before[0]) / std).max()
-            # What is not a number does not get better.
+            # A NaN ends the passes: it stays NaN.
             return _Filtered(joint, root, history, filtered.passes + 1, ~(moved > _SETTLED))
 
         once = jnp.ones((), dtype=int)
@@ -139,12 +137,12 @@ def _run(
     count, size = prior.center.shape[0], problem.size
     start, off = problem.first_state()
     spread = jnp.concatenate([prior.half_width, off[: problem.free_size]])
-    still = jnp.diag(spread)
-    # Where the initial state is known, no tangent begins with a state of its own.
-    moving = jnp.zeros((size, spread.shape[0]), dtype=still.dtype).at[: problem.free_size].set(still[count:])
+    constants = jnp.diag(spread)
+    # A known initial state has no tangent of its own.
+    moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])
     filter_ = _Filter(
         estimate=jnp.concatenate([start, prior.center, start[: problem.free_size]]),
-        root=jnp.concatenate([moving, still]),
+        root=jnp.concatenate([moving, constants]),
         nominal=start if about is None else about[1],
     )
     variances = tuple(jnp.square(problem.sigma[CASCADE_ORDER[:size]]))
@@ -159,9 +157,9 @@ def _run(
         def advance(x: Float[Array, " size"], a: Parameters) -> Float[Array, " size"]:
             return stack(problem.step(unstack(x), row.forcing, tuple(a)))
 
-        following, push = jax.linearize(advance, *point)
-        predicted = following + push(states - point[0], parameters - point[1])
-        tangents = jax.vmap(push, in_axes=1, out_axes=1)(root[:size], root[size : size + count])
+        following, linear = jax.linearize(advance, *point)
+        predicted = following + linear(states - point[0], parameters - point[1])
+        tangents = jax.vmap(linear, in_axes=1, out_axes=1)(root[:size], root[size : size + count])
         root = jnp.concatenate([tangents, root[size:]])
         return _Filter(jnp.concatenate([predicted, constant]), root, following), parameters
 
@@ -176,7 +174,7 @@ def _update(
     measured: Scalar,
     variance: Scalar,
 ) -> tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]]:
-    """Potter's update with one measurement of one state; none where it is NaN."""
+    """Potter's update with one measurement of one state; a NaN changes nothing."""
     along = root[channel]
     total = (along * along).sum() + variance
     gain = jnp.where(jnp.isnan(measured), 0.0, root @ along / total)

@@ -1,8 +1,9 @@
 """Output error: nonlinear least squares of the simulated against the measured trajectory, by Levenberg-Marquardt.
 
-The prediction-error method of system identification for a model without process noise, and with white measurement
-noise maximum likelihood (Ljung, System Identification, chapter 7; Jategaonkar, Flight Vehicle System Identification,
-chapter 4). The minimiser is optimistix's.
+This is the prediction-error method for a model without process noise; for white measurement noise it is maximum
+likelihood. The minimiser is optimistix's.
+
+References: Ljung, System Identification, ch. 7; Jategaonkar, Flight Vehicle System Identification, ch. 4.
 """
 
 from typing import ClassVar
@@ -24,14 +25,14 @@ Unknowns = Float[Array, " unknowns"]
 
 
 class OutputError(AbstractEstimator):
-    """Levenberg-Marquardt on the weighted residuals, from the bracket's center, down the cascade of channels.
+    """Levenberg-Marquardt on the weighted residuals, from the bracket's center.
 
-    The rates are fitted first, then the attitude with them, then everything: from a wide bracket the residuals of all
-    channels alone lead to other minima. Unknowns are scaled by the bracket's half-widths (an initial state by how far
-    off it may be), so that the damping means the same for each.
+    The rates are fitted first, then the attitude with them, then all channels: from a wide bracket, a direct fit of all
+    channels can end in another minimum. Unknowns are scaled by the bracket's half-widths (an initial state by how far
+    off it may be), so that the damping treats all of them alike.
 
-    The Jacobian is dense: of a flight cut into windows it grows with the square of their number, where IBSS eliminates
-    them one by one.
+    The Jacobian is dense. If the flight is cut into windows, it grows with the square of their number; `IBSS`
+    eliminates the windows one by one instead.
 
     **Arguments:**
 
@@ -57,7 +58,7 @@ class OutputError(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight.
 
-        `rollouts` counts one for each trial and one for each of its tangents, `sweeps` the steps of all stages.
+        The estimate's `rollouts` count each trial and each of its tangents; `sweeps` are the steps of all stages.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters.
         """
@@ -94,7 +95,7 @@ class OutputError(AbstractEstimator):
         )
 
     def _minimise(self, problem: ShootingProblem, unknowns: Unknowns, scale: Unknowns) -> optx.Solution:
-        """In scaled unknowns."""
+        """The least-squares solution, in units of `scale`."""
         count = len(problem.model.parameter_names)
 
         def residuals(scaled: Unknowns, _) -> Float[Array, " residuals"]:
@@ -106,9 +107,9 @@ class OutputError(AbstractEstimator):
 
 
 class NormalCholesky(lx.AbstractLinearSolver):
-    """Least squares by the normal equations, in plain operations: LAPACK's batched kernels can wait for ever in a loop.
+    """Least squares by the normal equations, in plain operations: LAPACK's batched kernels can deadlock in a loop.
 
-    See `information.cholesky`. Damping keeps the equations regular.
+    The damping of Levenberg-Marquardt keeps the equations regular.
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict) -> tuple:
@@ -126,7 +127,7 @@ class NormalCholesky(lx.AbstractLinearSolver):
         return solution, lx.RESULTS.successful, {}
 
     def transpose(self, state, options):
-        """Not needed: what is minimised is not differentiated through."""
+        """Not needed: nothing is differentiated through the solution."""
         raise NotImplementedError("NormalCholesky solves forward only.")
 
     def conj(self, state, options):
@@ -134,5 +135,5 @@ class NormalCholesky(lx.AbstractLinearSolver):
         return state, options
 
     def assume_full_rank(self) -> bool:
-        """Of the columns: damping makes sure of it."""
+        """Damping makes the columns independent."""
         return True

@@ -1,4 +1,4 @@
-"""Profile likelihood: how much worse the best fit gets where one parameter is held away from its estimate."""
+"""Profile likelihood: how much worse the best fit gets when one parameter is held away from its estimate."""
 
 from typing import NamedTuple
 
@@ -14,14 +14,14 @@ from ..shooting import ShootingProblem
 
 
 class Profile(NamedTuple):
-    """One parameter held at a series of values, and all others fitted at each.
+    """One parameter held at a series of values, and all others fitted for each value.
 
-    - `values`: of the parameter.
+    - `values`: of the held parameter.
     - `whole`: the best fit, with no parameter held.
-    - `deviance`: twice the cost there above that of the whole model's best fit: where it is below 3.84, the value is in
-      the 95 % likelihood interval. Negative where a held fit found less than the whole one: its search had not ended.
-      Infinite where either of them has no answer.
-    - `estimates`: of the other parameters, a batch with a result for each value.
+    - `deviance`: twice the difference of the costs with and without the parameter held. Values with a deviance below
+      3.84 form the 95 % likelihood interval. A negative deviance shows that the search of `whole` had not converged;
+      an infinite one, that one of the two fits has no answer.
+    - `estimates`: of the other parameters, a batch with one estimate for each value.
     """
 
     values: Float[Array, " values"]
@@ -41,7 +41,7 @@ def profile_likelihood(
 
     **Arguments:**
 
-    - `estimator`: one that shoots, such as `IBSS` or `OutputError`; it is called with one parameter fewer.
+    - `estimator`: one that shoots, such as `IBSS` or `OutputError`; its problem has one parameter fewer.
     - `name`: of the parameter, as in `problem.model.parameter_names`.
 
     **Raises:** `ValueError` for an unknown name, or values that are not one-dimensional.

@@ -1,4 +1,4 @@
-"""Recursive least squares: equation error sample by sample, with the past forgotten at a chosen pace."""
+"""Recursive least squares: equation error sample by sample, with exponential forgetting."""
 
 from typing import ClassVar
 
@@ -24,28 +24,24 @@ from ._regression import (
 
 
 class RecursiveLeastSquares(AbstractEstimator):
-    """The regression of `EquationError`, updated at every sample with three rows: one each for p, q and r.
+    """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
 
-    What is carried is the information form: the normal matrix and its right-hand side, forgotten and added to. It needs
-    no initial covariance and cannot lose its symmetry or sign as the covariance form does in single precision: rows are
-    in units of the noise, parameters in half-widths off the bracket's center, and the matrix is scaled to unit diagonal
-    before it is solved, with a floor on its pivots. In single precision the standard flight is recovered within 0.001
-    of its Cramer-Rao bound. The prior, a million half-widths wide, is added only to solve and is not forgotten: without
-    excitation nothing winds up or overflows. A parameter is at the center until a sample tells of it.
+    The recursion carries the information form: the normal matrix and its right-hand side. It needs no initial
+    covariance, and unlike the covariance form it stays symmetric and positive in single precision. A diffuse prior (a
+    million half-widths) is added only to solve and is not forgotten, so that nothing overflows without excitation. A
+    parameter stays at the bracket's center until it is excited.
 
     **Arguments:**
 
-    - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1. The estimate is that of the
-      last 1 / (1 - forgetting) samples or so, and follows parameters that change, within this time. 1: nothing is
-      forgotten, and the last estimate is that of `EquationError` with the same settings.
-    - `memory`, `bridge`: as in `EquationError`. Below 1, `forgetting` forgets the means as well, and a known initial
-      state counts like a sample: it says nothing about a flight whose parameters have changed since.
+    - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1. The estimate describes the
+      last 1 / (1 - forgetting) samples or so, and follows parameters that change within this time. With the default of
+      1 nothing is forgotten, and the last estimate is that of `EquationError` with the same settings.
+    - `memory`, `bridge`: as in `EquationError`. A `forgetting` below 1 also forgets the means, and a known initial
+      state then counts like one sample.
 
-    The estimate's `history` holds the parameters after each sample; `parameters` are its last row. A bridged gap is
-    crossed with the sample at its end, so that rows within a gap are not known before it ends. The covariance is that
-    of the last estimate: it carries the noise of the measured rates through the weights, to first order, and holds no
-    lag behind parameters that change. With constant parameters, 64 standard flights, free initial state, a `forgetting`
-    of 0.995 gives 1.0 to 1.6 times the Cramer-Rao bound, 0.98 gives 2.2 to 5.2.
+    The estimate's `history` holds the parameters after each sample; its last row is `parameters`. A bridged gap needs
+    the sample at its end, so rows inside a gap are known only after the gap. The covariance is that of the last
+    estimate: the noise of the measured rates, to first order, without the lag behind parameters that change.
 
     Reference: Ljung, System Identification, section 11.2, with exponential forgetting.
     """
@@ -84,8 +80,8 @@ class RecursiveLeastSquares(AbstractEstimator):
             return carry, solve(*carry)[0]
 
         count = usable.center.shape[0]
-        nothing = jnp.zeros((count, count), dtype=float), jnp.zeros(count, dtype=float)
-        (information, moment), history = jax.lax.scan(update, nothing, rows)
+        zero = jnp.zeros((count, count), dtype=float), jnp.zeros(count, dtype=float)
+        (information, moment), history = jax.lax.scan(update, zero, rows)
         steps, inverse = solve(information, moment)
         history = parameters_of(usable, history)
         parameters = history[-1]

@@ -98,11 +98,15 @@ def drawing() -> Iterator[None]:
 
 
 def styles(estimators: Sequence[str]) -> dict[str, Style]:
-    """A style for each estimator. Estimators of this library always have the same style; others get unused styles."""
-    unused = [style for name, style in zip(_KNOWN, _STYLES, strict=True) if name not in estimators]
-    others = [name for name in estimators if name not in _KNOWN]
-    chosen = dict(zip(others, itertools.cycle([*unused, *_MIXED]), strict=False))
-    return {name: chosen.get(name) or _STYLES[_KNOWN.index(name)] for name in estimators}
+    """A style for each estimator: always the same for those in `_KNOWN`, an unused one for each other name."""
+    free = (place for place in itertools.count() if place >= len(_KNOWN) or _KNOWN[place] not in estimators)
+    return {name: _style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
+
+
+def _style(place: int) -> Style:
+    """Style number `place`. After the end of the table, a colour comes with the marker and dashes of another row."""
+    count = len(_STYLES)
+    return _STYLES[(place + place // count) % count]._replace(color=_STYLES[place % count].color)
 
 
 def estimator_gid(place: int, tip: str = "") -> str:

@@ -62,5 +62,5 @@ def _samples(study: Study, scenario: Scenario) -> float:
 
 def _cost(scenario: Scenario, which: int) -> float:
     """Of a sample of a flight; the attitude lies between the rates and all channels."""
-    rates, everything = _COSTS[scenario.estimator][which]
+    rates, everything = _COSTS.get(scenario.estimator, _COSTS["ibss"])[which]
     return {"rates": rates, "attitude": (rates + everything) / 2, "all": everything}[scenario.seen]

@@ -1,0 +1,60 @@
+"""How wide the search looks along each direction. All steps are in standard deviations."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..._custom_types import Scalar
+from .stage import Limits
+
+# The first sweep goes at most this many of the start's standard deviations, in brackets of this share of them.
+_OPENING = 4.0
+_FIRST = 0.05
+# A later bracket is this many times as wide as the last predictions were off; the least error is this share of the way.
+_SAFETY = 2.0
+_LEAST = 0.01
+# A bracket whose search ended at one of its ends grows by this factor.
+_GROWTH = 4.0
+
+
+class Brackets(NamedTuple):
+    """Along each direction: the half-width of the bracket around the predicted step, and the longest step allowed."""
+
+    half_width: Float[Array, "windows unknowns"]
+    longest: Float[Array, "windows unknowns"]
+
+
+def open_brackets(
+    factor: Float[Array, "windows n n"],
+    spread: Float[Array, "windows n n"],
+    *,
+    later: Float[Array, "windows n"],
+    first: Bool[Array, ""],
+) -> Brackets:
+    """The brackets of one sweep: in the first sweep from the covariance `spread` of the start, then `later`."""
+    opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", factor, spread, factor))
+    return Brackets(jnp.where(first, _FIRST * opening, later), jnp.where(first, opening, jnp.inf))
+
+
+def grow(growth: Float[Array, "windows n"], at_end: Bool[Array, "windows n"]) -> Float[Array, "windows n"]:
+    """The factor by which the next brackets are wider than the predictions' errors ask for."""
+    return jnp.where(at_end, _GROWTH * growth, 1.0)
+
+
+def relative_error(errors: Float[Array, "windows n"], steps: Float[Array, "windows n"], finest: Scalar) -> Scalar:
+    """How far the predicted steps were off, as a share of the longest step, with a margin for the next sweep."""
+    share = _SAFETY * jnp.abs(errors).max() / jnp.maximum(jnp.abs(steps).max(), finest)
+    return jnp.clip(share, _LEAST, 1.0)
+
+
+def room(
+    unknowns: Float[Array, "windows n"], direction: Float[Array, "windows n"], limits: Limits
+) -> tuple[Float[Array, " windows"], Float[Array, " windows"]]:
+    """How far each window can go against and along `direction` until an unknown reaches its limit."""
+    to_lower, to_upper = ((limit - unknowns) / jnp.where(direction == 0, 1.0, direction) for limit in limits)
+    ahead = jnp.where(direction > 0, to_upper, to_lower)
+    behind = jnp.where(direction > 0, to_lower, to_upper)
+    above = jnp.where(direction == 0, jnp.inf, ahead).min(axis=-1)
+    below = jnp.where(direction == 0, jnp.inf, -behind).min(axis=-1)
+    return jnp.maximum(below, 0.0), jnp.maximum(above, 0.0)

@@ -1,0 +1,263 @@
+"""Iterative Bi-Section Shooting: the settings, the stages, and one sweep.
+
+A *shot* simulates the flight at trial unknowns and returns the slope of the cost along one direction. The sign of the
+slope says which half of a bracket holds the minimum. A *sweep* bisects along every direction once, each time around the
+step that the cost's quadratic model predicts. A *stage* repeats sweeps on some channels until little is left to go.
+
+If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
+windows' slopes; initial states are bisected in all windows in parallel.
+"""
+
+import functools
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._custom_types import Parameters, Scalar, as_float
+from ...bracket import NO_PRIOR, Bracket
+from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
+from ...linalg import covariance_of_shared, covariances
+from ...models.state import CHANNELS
+from ...shooting import Curvature, ShootingProblem, Shot
+from .bisection import move_along_all
+from .brackets import grow, open_brackets, relative_error
+from .progress import Progress, Search, record_brackets
+from .stage import Limits, Stage, join, keep_first, make_stage, misfit, prior_std
+from .view import View, look_around
+
+DIRECTIONS = ("whitened", "coordinate")
+
+# The rates are first fitted to these shares of the flight. Errors grow with time, so the cost of a long flight has
+# other minima: without these stages CorrectedOS4 falls into one in a fifth of all cases.
+_HORIZONS = (0.1, 0.3)
+# A stage that is not the last ends once no direction has more than this many standard deviations to go.
+_COARSE = 0.5
+
+
+class IBSS(AbstractEstimator):
+    """Iterative Bi-Section Shooting.
+
+    **Arguments:**
+
+    - `directions`: `"whitened"`: the columns of L^-T, with L L^T the Fisher information at the current estimate; the
+      cost is nearly separable along them. The rates are fitted first, then the attitude with them, then all channels.
+      `"coordinate"`: the parameters themselves, against all of the problem's channels at once, in the manner of the
+      paper; good on the rates, slow on more channels.
+    - `halvings`: how often each bracket is halved in a sweep.
+    - `max_sweeps`: the most sweeps of each stage.
+    - `tolerance`: the search ends once no direction has more than this share of its standard deviation to go. The
+      standard deviation follows from the actual residuals, so that noise-free data are fitted to rounding.
+    - `reach`: the parameters stay within this many half-widths of the bracket's center.
+    - `record`: how many sweeps' brackets the estimate keeps, to show how the search went.
+
+    A free initial state is searched like the parameters, from the first measurement of each channel.
+    """
+
+    looks_at: ClassVar[str] = "all"
+    shoots: ClassVar[bool] = True
+    prior: ClassVar[float] = NO_PRIOR
+    needs_network: ClassVar[bool] = False
+
+    directions: str = eqx.field(static=True, default="whitened")
+    halvings: int = eqx.field(static=True, default=4)
+    max_sweeps: int = eqx.field(static=True, default=60)
+    tolerance: Scalar = eqx.field(converter=as_float, default=0.02)
+    reach: Scalar = eqx.field(converter=as_float, default=REACH)
+    record: int = eqx.field(static=True, default=0)
+
+    def __check_init__(self):
+        if self.directions not in DIRECTIONS:
+            raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
+        for name, least in (("halvings", 2), ("max_sweeps", 1), ("record", 0)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
+        for name in ("tolerance", "reach"):
+            value = getattr(self, name)
+            if not isinstance(value, Tracer) and not value > 0:
+                raise ValueError(f"`{name}` must be positive, got {value}.")
+
+    @eqx.filter_jit
+    def __call__(
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        *,
+        start: Parameters | None = None,
+        spread: Float[Array, "parameters parameters"] | None = None,
+    ) -> Estimate:
+        """Identifies one flight.
+
+        **Arguments:**
+
+        - `bracket`: where to look for the parameters; they may turn out to lie outside.
+        - `start`: where the search begins; the bracket's center by default.
+        - `spread`: the covariance of `start`, which sizes the first brackets; by default that of `bracket`, with its
+          half-width as two standard deviations.
+
+        **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
+        """
+        return self.search(problem, bracket, start=start, spread=spread)
+
+    def search(
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        *,
+        start: Parameters | None = None,
+        spread: Float[Array, "parameters parameters"] | None = None,
+        cascade: bool = True,
+        skip: Bool[Array, ""] | None = None,
+    ) -> Estimate:
+        """Identifies one flight, inside the program of another estimator.
+
+        **Arguments:** as of a call, and
+
+        - `cascade`: whether to fit the rates before the other channels. A `start` that is close needs no cascade.
+        - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
+        """
+        check_bracket(problem, bracket)
+        names = problem.model.parameter_names
+        if start is not None and jnp.shape(start) != (len(names),):
+            raise ValueError(f"`start` must hold {len(names)} parameters, got shape {jnp.shape(start)}.")
+        usable = bracket.usable
+        start = usable.center if start is None else as_float(start)
+        skip = jnp.zeros((), dtype=bool) if skip is None else skip
+        progress = self._begin(problem, usable, start, spread, skip=skip)
+
+        def fit(channels: str, progress: Progress, share: Scalar) -> tuple[Progress, Curvature]:
+            part = problem.restrict(channels)
+            stage = make_stage(part, keep_first(share, part.rows()), usable, self._limits(part, usable))
+            last = (channels == problem.channels) & (share == 1)
+            return self._fit(stage, progress._replace(done=skip), last=last)
+
+        everything = as_float(1.0)
+        if self.directions == "coordinate" or not cascade:
+            return self._finish(problem, bracket, *fit(problem.channels, progress, everything))
+        # A window is short enough as it is.
+        shares = jnp.asarray((*_HORIZONS, 1.0) if problem.windows == 1 else (1.0,), dtype=float)
+        # One scan, so that the search against the rates is compiled once.
+        progress, curvatures = jax.lax.scan(lambda p, share: fit("rates", p, share), progress, shares)
+        curvature = jax.tree.map(lambda c: c[-1], curvatures)
+        for channels, size in CHANNELS.items():
+            if CHANNELS["rates"] < size <= problem.size:
+                progress, curvature = fit(channels, progress, everything)
+        return self._finish(problem, bracket, progress, curvature)
+
+    def _begin(
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        start: Parameters,
+        spread: Float[Array, "parameters parameters"] | None,
+        *,
+        skip: Bool[Array, ""],
+    ) -> Progress:
+        lower, upper = self._limits(problem, bracket)
+        unknowns, count = join(problem, start, problem.first_state()[0]), start.shape[0]
+        covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem, bracket)))
+        if spread is not None:
+            known = jnp.where(skip, covariance[:, :count, :count], spread)
+            covariance = covariance.at[:, :count, :count].set(known)
+        none = jnp.zeros((), dtype=int)
+        brackets = jnp.full((self.record, 2, count), jnp.nan) if self.record else None
+        return Progress(jnp.clip(unknowns, lower, upper), covariance, none, none, skip, brackets)
+
+    def _limits(self, problem: ShootingProblem, bracket: Bracket) -> Limits:
+        """The least and the greatest value of each unknown: a free initial state has no limits."""
+        reach, far = self.reach * bracket.half_width, jnp.full(problem.free_size, jnp.inf)
+        return jnp.concatenate([bracket.center - reach, -far]), jnp.concatenate([bracket.center + reach, far])
+
+    def _fit(self, stage: Stage, progress: Progress, *, last: Bool[Array, ""]) -> tuple[Progress, Curvature]:
+        """One stage: sweeps until little is left to go; the last stage down to `tolerance`, the others coarsely."""
+        size, windows = stage.size, stage.problem.windows
+        zero, square = jnp.zeros((windows,), dtype=float), jnp.zeros((windows, size, size), dtype=float)
+        unknowns, spread = progress.unknowns[:, :size], progress.spread[:, :size, :size]
+        search = Search(
+            unknowns=unknowns,
+            curvature=Curvature(Shot(zero, zero > 0), jnp.zeros_like(unknowns), square),
+            basis=square,
+            off=jnp.ones((), dtype=float),
+            growth=jnp.ones_like(unknowns),
+            sweeps=jnp.zeros((), dtype=int),
+            done=progress.done,
+            ended=progress.done,
+            brackets=progress.brackets,
+        )
+        sweep = functools.partial(self._sweep, stage, spread=spread, before=progress.sweeps, last=last)
+        search = jax.lax.while_loop(lambda search: ~search.ended, sweep, search)
+        if self.directions == "coordinate":
+            covariance = covariances(search.curvature.information + stage.prior, stage.count)
+        else:
+            covariance = (search.basis[:, :, None, :] * search.basis[:, None, :, :]).sum(axis=-1)
+        noise = jnp.maximum(misfit(search.curvature.shot.cost.sum(), stage.rows), 1.0)
+        rollouts = jnp.where(progress.done, 0, size * (1 + search.sweeps * (self.halvings + 1)))
+        return Progress(
+            progress.unknowns.at[:, :size].set(search.unknowns),
+            progress.spread.at[:, :size, :size].set(jnp.square(noise) * covariance),
+            progress.sweeps + search.sweeps,
+            progress.rollouts + rollouts,
+            search.done,
+            search.brackets,
+        ), search.curvature
+
+    def _sweep(
+        self,
+        stage: Stage,
+        search: Search,
+        *,
+        spread: Float[Array, "windows unknowns unknowns"],
+        before: Int[Array, ""],
+        last: Bool[Array, ""],
+    ) -> Search:
+        """Looks around, and unless the search ends here moves along each direction. `before`: sweeps so far."""
+        whitened, first = self.directions == "whitened", search.sweeps == 0
+        view = look_around(stage, search.unknowns, whitened=whitened)
+        done = ~first & (view.ahead <= self._close_enough(stage, view, last=last))
+        finite = jnp.isfinite(view.curvature.shot.cost).all()
+        stay = done | ~finite | (search.sweeps >= self.max_sweeps)
+
+        later = jnp.maximum(search.off * view.ahead, stage.finest) * search.growth
+        brackets = open_brackets(view.factor, spread, later=later, first=first)
+        moves = move_along_all(stage, view, brackets, whitened=whitened, halvings=self.halvings, stay=stay)
+
+        sound = finite & jnp.isfinite(moves.unknowns).all()
+        cost, trusted = view.curvature.shot
+        return Search(
+            unknowns=jnp.where(sound, moves.unknowns, search.unknowns),
+            curvature=view.curvature._replace(shot=Shot(cost, trusted & sound)),
+            basis=view.basis,
+            off=relative_error(moves.errors, moves.steps, stage.finest),
+            growth=grow(search.growth, moves.at_end),
+            sweeps=search.sweeps + jnp.where(stay, 0, 1),
+            done=done | ~sound,
+            ended=stay | ~sound,
+            brackets=record_brackets(search.brackets, before + search.sweeps, view, brackets.half_width, skip=stay),
+        )
+
+    def _close_enough(self, stage: Stage, view: View, *, last: Bool[Array, ""]) -> Scalar:
+        """The longest predicted step with which a stage ends [standard deviations]."""
+        coarse = _COARSE * jnp.maximum(view.misfit, 1.0)
+        return jnp.where(last, jnp.maximum(self.tolerance * view.misfit, stage.finest), coarse)
+
+    def _finish(self, problem: ShootingProblem, bracket: Bracket, progress: Progress, curvature: Curvature) -> Estimate:
+        """The estimate, and how it ended."""
+        count = bracket.lower.shape[0]
+        initial_state = progress.unknowns[:, count:].ravel() if problem.free_size else problem.first_state()[0]
+        estimate = conclude(
+            bracket,
+            parameters=progress.unknowns[0, :count],
+            covariance=covariance_of_shared(curvature.information, count),
+            initial_state=initial_state,
+            cost=curvature.shot.cost.sum(),
+            rollouts=progress.rollouts,
+            sweeps=progress.sweeps,
+            sound=curvature.shot.sound.all(),
+            done=progress.done,
+            reach=self.reach,
+        )
+        return eqx.tree_at(lambda e: e.brackets, estimate, progress.brackets, is_leaf=lambda leaf: leaf is None)

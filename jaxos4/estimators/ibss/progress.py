@@ -1,0 +1,57 @@
+"""What the search remembers: from sweep to sweep, and from stage to stage."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._custom_types import Scalar
+from ...shooting import Curvature
+from .view import View
+
+
+class Progress(NamedTuple):
+    """What one stage hands to the next: where the search is, and the covariance `spread` of that."""
+
+    unknowns: Float[Array, "windows unknowns"]
+    spread: Float[Array, "windows unknowns unknowns"]
+    sweeps: Int[Array, ""]
+    rollouts: Int[Array, ""]
+    done: Bool[Array, ""]
+    brackets: Float[Array, "record 2 parameters"] | None
+
+
+class Search(NamedTuple):
+    """One stage between two sweeps; `curvature` and `basis` are those of the last look around.
+
+    - `off`: how far off the last sweep's predictions were, as a share of its longest step.
+    - `growth`: by how much the brackets of each direction are wider than `off` asks for.
+    - `done`: the search ended by itself. `ended`: it ended, for whatever reason.
+    """
+
+    unknowns: Float[Array, "windows unknowns"]
+    curvature: Curvature
+    basis: Float[Array, "windows unknowns unknowns"]
+    off: Scalar
+    growth: Float[Array, "windows unknowns"]
+    sweeps: Int[Array, ""]
+    done: Bool[Array, ""]
+    ended: Bool[Array, ""]
+    brackets: Float[Array, "record 2 parameters"] | None
+
+
+def record_brackets(
+    record: Float[Array, "record 2 parameters"] | None,
+    sweep: Int[Array, ""],
+    view: View,
+    half_width: Float[Array, "windows unknowns"],
+    *,
+    skip: Bool[Array, ""],
+) -> Float[Array, "record 2 parameters"] | None:
+    """The record with the bracket of each parameter in one more sweep; sweeps beyond its length are dropped."""
+    if record is None:
+        return None
+    count = record.shape[-1]
+    widest = jnp.abs(view.basis * half_width[:, None, :]).max(axis=(0, 2))[:count]
+    around = view.unknowns[0, :count] + jnp.stack([-widest, widest])
+    return record.at[jnp.where(skip, record.shape[0], sweep)].set(around, mode="drop")
