@@ -1,6 +1,6 @@
-"""`FlightModel`: each term against its equation written a second time, filter and delay, derivatives, estimates.
+"""`FlightModel`: each term against its equation written a second time, lag and delay, derivatives, estimates.
 
-The reference is plain NumPy in continuous time: commands held, rotors and body integrated together in small steps.
+The reference is plain NumPy in continuous time: held commands, and rotors and body integrated together in small steps.
 """
 
 import itertools
@@ -10,10 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import standard_flight
 
 import jaxos4
 from jaxos4.flight import Inputs, Stretches
-from jaxos4.models.state import CASCADE_ORDER
+from jaxos4.models import Term, TermParameter, default_terms
+from jaxos4.models.state import CASCADE_ORDER, Rates
+from jaxos4.models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE
 from jaxos4.models.vehicle import DEFAULT_TERMS
 
 ALL = tuple(jaxos4.TERMS)
@@ -32,7 +35,7 @@ NAMES = {
     "drag": ["x_drag", "y_drag"],
     "gyro_bias": ["p_bias", "q_bias", "r_bias"],
 }
-# A vehicle with all of it; its delay is a whole number of samples of the steps below.
+# A vehicle with all terms; its delay is a whole number of samples of the steps below.
 VALUES = {
     **dict(roll_offset=0.3, pitch_offset=-0.2, yaw_offset=0.1, roll_damping=1.5, pitch_damping=0.8, yaw_damping=0.4),
     **dict(roll_velocity=0.3, pitch_velocity=-0.4, roll_flapping=0.2, pitch_flapping=-0.1, rotor_lag=0.06),
@@ -129,14 +132,12 @@ def seen(model, omega, dt, *, method="rk4"):
 def test_without_terms_it_is_the_corrected_model():
     model, plain = jaxos4.FlightModel(terms=()), jaxos4.CorrectedOS4()
     omega = jaxos4.multisine(jaxos4.OS4, duration=2.0)
-    driven, forced = model.forcing(Inputs(omega, jnp.asarray(0.01)), model.alpha), plain.rotor_forcing(omega)
-    for name in forced._fields[:5]:
-        atol = 1e-13 * np.abs(getattr(forced, name)).max()
-        np.testing.assert_allclose(getattr(driven, name), getattr(forced, name), rtol=1e-13, atol=atol)
+    inputs = Inputs(omega, jnp.asarray(0.01))
+    for one, other in zip(model.forcing(inputs, model.alpha)[:5], plain.forcing(inputs, plain.alpha)[:5], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13 * np.abs(other).max())
     np.testing.assert_array_equal(model.alpha, plain.alpha)
     np.testing.assert_array_equal(model.half_width, plain.half_width)
-    assert model.parameter_names == plain.parameter_names
-    assert model.parameter_units == plain.parameter_units
+    assert model.parameters == plain.parameters
     assert (model.is_linear, model.forcing_parameters, model.force_axes, model.observes_states) == (True, (), (), True)
     for method in ("euler", "rk4"):
         flights = [jaxos4.simulate(m, plain.alpha, omega, dt=0.01, method=method).states for m in (model, plain)]
@@ -174,18 +175,18 @@ def test_flapping_is_the_measured_force_as_an_input():
     model = jaxos4.FlightModel(terms=("flapping",))
     omega, rng = commands(1.0, 0.01), np.random.default_rng(0)
     force = rng.normal(size=(omega.shape[0], 3))
-    force[10:14, 0] = np.nan  # is what it was before
-    force[:3, 1] = np.nan  # and at the beginning what it will be
+    force[10:14, 0] = np.nan  # replaced by the previous value
+    force[:3, 1] = np.nan  # replaced by the next value
     blank = jaxos4.Flight(0.01 * np.arange(101), omega, np.full((101, 12), np.nan), force)
     problem = jaxos4.ShootingProblem(model, blank, sigma=np.ones(12), channels="rates", initial_state=np.zeros(12))
     found = np.asarray(problem.predict(truth(model), jnp.zeros(3)))
     filled = force.copy()
     filled[10:14, 0], filled[:3, 1] = force[9, 0], force[3, 1]
     plain = jaxos4.CorrectedOS4()
-    rates, forcing = np.zeros((101, 3)), plain.rotor_forcing(jnp.asarray(omega))
+    rates, forcing = np.zeros((101, 3)), plain.forcing(Inputs(jnp.asarray(omega), jnp.asarray(0.01)), plain.alpha)
     for k in range(100):
         at = jax.tree.map(lambda leaf, k=k: leaf[k], forcing)
-        slope = np.array(plain.angular_acceleration(jaxos4.models.state.Rates(*rates[k]), at, plain.alpha))
+        slope = np.array(plain.angular_acceleration(Rates(*rates[k]), at, plain.alpha))
         slope[:2] += VALUES["roll_flapping"] * filled[k, 1], VALUES["pitch_flapping"] * filled[k, 0]
         rates[k + 1] = rates[k] + 0.01 * slope
     np.testing.assert_allclose(found, rates, rtol=1e-10, atol=1e-12)
@@ -209,13 +210,17 @@ def test_a_measured_velocity_takes_the_place_of_the_simulated_one():
             rtol=1e-9,
             atol=1e-15,
         )
-    with pytest.raises(ValueError, match=r"velocity and drag need `Flight.body_velocity`"):
-        jaxos4.ShootingProblem(model, jaxos4.Flight(*rows), sigma=np.ones(12), channels="rates").cost(truth(model))
-    flapping = jaxos4.FlightModel(terms=("flapping",))
-    with pytest.raises(ValueError, match=r"flapping needs `Flight.specific_force`"):
-        jaxos4.ShootingProblem(flapping, jaxos4.Flight(*rows), sigma=np.ones(12), channels="rates").cost(
-            truth(flapping)
-        )
+
+
+@pytest.mark.parametrize(
+    ("term", "need"),
+    [("velocity", "velocity, drag need `Flight.body_vel"), ("flapping", "need `Flight.specific_force")],
+)
+def test_a_missing_measurement_is_named(term, need):
+    model = jaxos4.FlightModel(terms=(term,))
+    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan))
+    with pytest.raises(ValueError, match=need):
+        jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates").cost(truth(model))
 
 
 @pytest.mark.parametrize("counts", [(1,), (2,), (37,), (5, 1, 20, 11), (1, 1, 1), (64, 64)])
@@ -246,14 +251,15 @@ def test_the_filter_is_the_recursion(counts):
         np.testing.assert_allclose(value, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max() + 1e-15)
 
 
-def test_a_lag_too_short_to_show_is_as_short_as_can_be_told():
+def test_a_lag_below_the_shortest_is_the_shortest():
     model = jaxos4.FlightModel(terms=("lag",))
     omega = jnp.asarray(commands(0.5, 0.01))
+    inputs, plain = Inputs(omega, jnp.asarray(0.01)), jaxos4.CorrectedOS4()
+    plain = plain.forcing(inputs, plain.alpha)
     for lag in (-1.0, 0.0, 1e-6):
-        found = model.forcing(Inputs(omega, jnp.asarray(0.01)), model.alpha.at[8].set(lag))
-        plain = jaxos4.CorrectedOS4().rotor_forcing(omega)
+        found = model.forcing(inputs, model.alpha.at[8].set(lag))
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found) if leaf is not None)
-        # What is left is the straight line over the sample in which the command changes.
+        # The difference is the straight line over the sample in which the command changes.
         assert np.abs(found.thrust - plain.thrust)[5:].max() < 0.1 * np.ptp(np.asarray(plain.thrust))
 
 
@@ -315,26 +321,21 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     for terms in SUBSETS:
         model = jaxos4.FlightModel(FULL, terms=terms, recordings=recordings)
         names = model.parameter_names
-        size = 8 + sum(
-            len(NAMES[term]) * (count if term in ("offset", "gyro_bias") else 1) for term in terms
-        ) + 2 * ({"accelerometer", "drag"} <= set(terms))  # fmt: skip
-        assert len(names) == len(set(names)) == size
-        assert len(model.parameter_units) == size
-        assert model.alpha.shape == model.half_width.shape == (size,)
-        assert np.isfinite(model.alpha).all()
-        assert np.all(np.isfinite(model.half_width) & (model.half_width > 0))
-        assert model.alpha.dtype == model.half_width.dtype == jnp.float64
-        driving = {"rotor_lag", "rotor_delay", "thrust_curve"} & set(names)
-        assert {names[i] for i in model.forcing_parameters} == driving
-        assert model.is_linear == (not driving)
-        each = [name for name in names if name.startswith("roll_offset")]
-        assert each == ([] if "offset" not in terms else ["roll_offset"] if count == 1 else [f"roll_offset_{i + 1}" for i in range(count)])  # fmt: skip  # noqa: E501
-    # The order is that of TERMS, however they were given.
-    assert jaxos4.FlightModel(terms=("lag", "offset")).parameter_names == (
-        *jaxos4.CorrectedOS4().parameter_names,
-        *NAMES["offset"],
-        *NAMES["lag"],
-    )
+        own = [name for term in terms if term in ("offset", "gyro_bias") for name in NAMES[term]]
+        shared = [name for term in terms if term not in ("offset", "gyro_bias") for name in NAMES[term]]
+        shared += ["ax_bias", "ay_bias"] * ({"accelerometer", "drag"} <= set(terms))
+        numbered = own if count == 1 else [f"{name}_{i + 1}" for name in own for i in range(count)]
+        assert sorted(names) == sorted([*jaxos4.CorrectedOS4().parameter_names, *shared, *numbered])
+        assert len(model.parameter_units) == len(names)
+        assert model.alpha.shape == model.half_width.shape == (len(names),)
+        assert np.all(np.isfinite(model.half_width) & (model.half_width > 0) & np.isfinite(model.alpha))
+        chain = {"rotor_lag", "rotor_delay", "thrust_curve"} & set(names)
+        assert {names[i] for i in model.forcing_parameters} == chain
+        assert model.is_linear == (not chain)
+    # The order is that of TERMS, in whatever order they were given, and within a term recording by recording.
+    assert jaxos4.FlightModel(terms=("lag", "offset")).parameter_names[8:] == (*NAMES["offset"], "rotor_lag")
+    two = jaxos4.FlightModel(terms=("offset",), recordings=(0, 1)).parameter_names[8:]
+    assert two == tuple(f"{name}_{i}" for i in (1, 2) for name in NAMES["offset"])
 
 
 def test_a_thrust_curve_needs_a_full_scale():
@@ -375,10 +376,6 @@ def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="
     return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels=channels, windows=windows)
 
 
-def with_gyro(terms, recordings):
-    return jaxos4.FlightModel(FULL, terms=terms, recordings=recordings)
-
-
 @pytest.mark.parametrize("recordings", [(0, 0), (0, 1)])
 def test_gradient_and_information_are_the_residuals_derivatives(recordings):
     terms = ("offset", "lag", "delay", "curve", "accelerometer", "gyro_bias")
@@ -407,8 +404,8 @@ def test_gradient_and_information_are_the_residuals_derivatives(recordings):
 
 @pytest.mark.parametrize("estimator", [jaxos4.IBSS(), jaxos4.OutputError()], ids=["ibss", "output error"])
 def test_the_truth_is_found_without_noise(estimator):
-    """The offsets of two recordings differ, and are told apart."""
-    known = dict.fromkeys(("alpha1", "alpha2", "alpha4", "alpha5", "alpha7"))
+    """The offsets of two recordings differ, and each is found."""
+    known = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7")
     model = jaxos4.FlightModel(FULL, terms=("offset", "lag", "delay"), recordings=(0, 1))
     whole = truth(model)
     held = jaxos4.hold(model, {name: whole[model.parameter_names.index(name)] for name in known})
@@ -419,7 +416,7 @@ def test_the_truth_is_found_without_noise(estimator):
     np.testing.assert_array_less(np.abs(found.parameters - values) / held.half_width, 1e-4)
 
 
-def test_a_gyros_bias_is_told_from_an_offset_by_the_attitude():
+def test_the_attitude_distinguishes_a_gyro_bias_from_an_offset():
     model = jaxos4.FlightModel(FULL, terms=("offset", "gyro_bias"))
     problem = two_flights(model, seconds=3.0, channels="attitude", windows=2)
     values = truth(model)
@@ -428,16 +425,40 @@ def test_a_gyros_bias_is_told_from_an_offset_by_the_attitude():
     assert np.all(np.abs(found.parameters - values)[8:] < 1e-5 * model.half_width[8:])
 
 
-def test_batches_are_loops_and_trace_once():
-    model = jaxos4.FlightModel(FULL, terms=DEFAULT_TERMS)
-    omega = jnp.asarray(commands(0.5, 0.01))
-    batch = truth(model) * jnp.linspace(0.9, 1.1, 5)[:, None]
+def brake(total, values, rates, forcing):
+    """Damping that grows with the square of the rate."""
+    coefficients = (values[f"{axis}_brake"] for axis in ("roll", "pitch", "yaw"))
+    return Rates(*(x - c * jnp.abs(rate) * rate for x, c, rate in zip(total, coefficients, rates, strict=True)))
 
-    @jax.jit
-    @eqx.debug.assert_max_traces(max_traces=1)
-    def fly(parameters):
-        return jaxos4.simulate(model, parameters, omega, dt=0.01).states
 
-    each = jnp.stack([fly(parameters) for parameters in batch])
-    together = jax.vmap(lambda parameters: jaxos4.simulate(model, parameters, omega, dt=0.01).states)(batch)
-    np.testing.assert_allclose(together, each, rtol=1e-12, atol=1e-12)
+def test_a_new_term_is_one_object(monkeypatch):
+    """One `Term` in the registry is all that a vehicle needs to be simulated and estimated with it."""
+    parameters = tuple(TermParameter(f"{axis}_brake", "1/rad", 2.0) for axis in ("roll", "pitch", "yaw"))
+    term = Term("a moment against the square of each body rate", parameters, angular_acceleration=brake)
+    monkeypatch.setitem(jaxos4.TERMS, "brake", term)
+    model = jaxos4.FlightModel(terms=("brake", "offset"))
+    assert model.parameter_names[8:] == (*NAMES["offset"], "roll_brake", "pitch_brake", "yaw_brake")
+    values = model.alpha.at[-3:].set(jnp.array([0.5, 0.3, 0.8]))
+    flight = jaxos4.simulate(model, values, standard_flight().omega[:201], dt=0.01)
+    held = jaxos4.hold(model, dict(zip(model.parameter_names[:8], values, strict=False)))
+    problem = jaxos4.ShootingProblem(held, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
+    found = jaxos4.OutputError()(problem, jaxos4.Bracket.default(held))
+    np.testing.assert_allclose(found.parameters[-3:], [0.5, 0.3, 0.8], atol=1e-4)
+    with pytest.raises(ValueError, match="acts on the forcing"):
+        Term("", (TermParameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda speeds, values, grid: speeds)
+
+
+def test_an_estimate_uses_the_terms_that_the_logs_allow():
+    basic, rotors = ("offset", "damping", "reaction"), ("offset", "damping", "lag", "delay", "reaction")
+    assert default_terms(frozenset()) == default_terms(frozenset({FULL_SCALE})) == basic
+    assert default_terms(frozenset({COMMANDS, FULL_SCALE})) == rotors == DEFAULT_TERMS
+    force = frozenset({LATERAL_FORCE, VERTICAL_FORCE})
+    for available, terms in (
+        (force, (*basic, "flapping", "accelerometer")),
+        (force | {BODY_VELOCITY, FULL_SCALE}, (*basic, "velocity", "accelerometer")),
+        (force | {COMMANDS}, (*rotors, "flapping", "accelerometer")),
+        (force | {COMMANDS, FULL_SCALE}, (*rotors, "flapping", "curve", "accelerometer")),
+    ):
+        assert set(default_terms(available)) == set(terms)
+        assert list(default_terms(available)) == [name for name in jaxos4.TERMS if name in terms]
+    assert all(term.description for term in jaxos4.TERMS.values())

@@ -16,13 +16,13 @@ once = eqx.debug.assert_max_traces(max_traces=1)
 
 @pytest.fixture
 def counted():
-    """A model that no program knows yet, and the count of how often one was traced: each calls `forcing`."""
+    """A new model class, and the number of times that a program of it was traced: each calls `forcing`."""
     count = [0]
 
     class Counted(jaxos4.PublishedOS4):
-        def rotor_forcing(self, omega):
+        def forcing(self, inputs, parameters):
             count[0] += 1
-            return super().rotor_forcing(omega)
+            return super().forcing(inputs, parameters)
 
     return Counted, count
 

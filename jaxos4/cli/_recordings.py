@@ -12,8 +12,8 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import Flight, join
 from ..logs import read_log
+from ..models.rotation import with_body_velocity
 from ..models.state import CASCADE_ORDER
-from ..models.vehicle import with_body_velocity
 from ..recording import stretches
 from ..recording.averaging import averaged
 from ..recording.stretches import Stretch, cut

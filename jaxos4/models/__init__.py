@@ -1,4 +1,4 @@
-"""Models of a quadrotor: states, equations of motion, parameters."""
+"""Models of a quadrotor: state, equations of motion, parameters."""
 
 from .abstract import (
     DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH,
@@ -6,7 +6,11 @@ from .abstract import (
     AbstractModel as AbstractModel,
 )
 from .corrected import CorrectedOS4 as CorrectedOS4
+from .held import HeldParameters as HeldParameters, hold as hold
 from .inertial import InertialOS4 as InertialOS4
 from .published import PublishedOS4 as PublishedOS4
+from .rotation import with_body_velocity as with_body_velocity
+from .terms import TERMS as TERMS, Term as Term, TermParameter as TermParameter, default_terms as default_terms
+from .vehicle import FlightModel as FlightModel
 
 MODELS = {"published": PublishedOS4, "corrected": CorrectedOS4}

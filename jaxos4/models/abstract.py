@@ -1,6 +1,7 @@
-"""What makes a model: rate equations with parameters, on the kinematics that all quadrotors share."""
+"""The interface of a quadrotor model, and the base class of the two OS4 models."""
 
 import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,98 +9,175 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, RotorSpeeds, Scalar, StateVector
+from .._custom_types import Parameters, Scalar, StateVector
 from ..airframe import OS4, Airframe, alpha_from_inertia
 from ..flight import Inputs
-from ..trigonometry import sincos
+from .rotation import attitude_rates
 from .state import CASCADE_ORDER, Attitude, Forcing, Rates, State, Translation, stack, unstack
 
 PARAMETER_NAMES = tuple(f"alpha{i}" for i in range(1, 9))
 
-
-# How far from alpha a bracket reaches for the OS4: our choice, 45 % of alpha3, alpha6 and alpha8.
+# Half the width of a bracket around alpha_1..8 of the OS4: our choice, 45 % of alpha3, alpha6 and alpha8.
 DEFAULT_HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
 
 
+class Parameter(NamedTuple):
+    """One unknown of a model.
+
+    - `name`, `unit`.
+    - `in_forcing`: whether the forcing depends on the parameter.
+    - `linear`: whether the rate equations are linear in the parameter if the forcing does not depend on it.
+    """
+
+    name: str
+    unit: str
+    in_forcing: bool = False
+    linear: bool = True
+
+
 class AbstractModel(eqx.Module):
-    """A quadrotor whose unknown parameters stand in its rate equations."""
+    """A quadrotor: a table of unknown parameters, a forcing, equations of motion and sensors.
+
+    `parameters` below means the values of the unknowns, as an array or as a tuple of its scalars.
+    """
 
     airframe: eqx.AbstractVar[Airframe]
 
     @property
     @abc.abstractmethod
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The table of the unknown parameters. The order of the table is the order of all arrays of parameters."""
+
+    @property
+    @abc.abstractmethod
     def alpha(self) -> Parameters:
-        """The parameters that the airframe's constants imply."""
+        """The value of each parameter that follows from the airframe's constants: the centre of the default bracket."""
+
+    @property
+    @abc.abstractmethod
+    def half_width(self) -> Parameters:
+        """Half the width of the default bracket of each parameter."""
 
     @property
     @abc.abstractmethod
     def gyroscopic_factor(self) -> Scalar:
-        """What multiplies J_R above Ix and Iy in alpha2 and alpha5."""
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether the rate equations are linear in the parameters, as regression needs them."""
-        return True
-
-    @property
-    def forcing_parameters(self) -> tuple[int, ...]:
-        """Which parameters the forcing depends on. On none for an OS4: its forcing is prepared once for all shots."""
-        return ()
-
-    @property
-    def force_axes(self) -> tuple[int, ...]:
-        """Which axes of the measured specific force the model predicts."""
-        return ()
-
-    @property
-    def observes_states(self) -> bool:
-        """Whether what is measured are the states themselves, with nothing added, and no specific force."""
-        return True
+        """The factor of J_R in alpha2 = factor J_R / Ix and alpha5 = factor J_R / Iy."""
 
     @property
     @abc.abstractmethod
-    def parameter_units(self) -> tuple[str, ...]:
-        """The unit of each parameter."""
+    def force_axes(self) -> tuple[int, ...]:
+        """The axes along which the model predicts the measured specific force: 0, 1, 2 for x, y, z."""
+
+    @property
+    @abc.abstractmethod
+    def observes_states(self) -> bool:
+        """Whether the sensors show the states alone: no bias, no specific force."""
+
+    @abc.abstractmethod
+    def forcing(self, inputs: Inputs, parameters) -> Forcing:
+        """The forcing of a whole flight. Row k acts from sample k to sample k + 1."""
+
+    @abc.abstractmethod
+    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
+        """p', q', r' [rad/s^2]: the rate equations at one sample."""
+
+    @abc.abstractmethod
+    def cascade(self, state: State, forcing: Forcing, parameters) -> State:
+        """The time derivative of the part of the cascade that `state` holds."""
+
+    @abc.abstractmethod
+    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
+        """The output of noise-free sensors: the states in cascade order, then the specific force along `force_axes`."""
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """The name of each parameter."""
-        return PARAMETER_NAMES
+        return tuple(parameter.name for parameter in self.parameters)
 
     @property
-    def half_width(self) -> Parameters:
-        """Half the width of a bracket for each parameter: `DEFAULT_HALF_WIDTH`, scaled to the airframe's inertia."""
+    def parameter_units(self) -> tuple[str, ...]:
+        """The unit of each parameter."""
+        return tuple(parameter.unit for parameter in self.parameters)
+
+    @property
+    def forcing_parameters(self) -> tuple[int, ...]:
+        """The positions of the parameters on which the forcing depends."""
+        return tuple(i for i, parameter in enumerate(self.parameters) if parameter.in_forcing)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the rate equations are linear in all parameters: regression needs this."""
+        return all(parameter.linear and not parameter.in_forcing for parameter in self.parameters)
+
+    def derivative(self, state: StateVector, omega: Float[Array, "4"], parameters: Parameters) -> StateVector:
+        """dX/dt of the whole state in the paper's order, Eq. (14).
+
+        **Arguments:**
+
+        - `state`: X in the order of `jaxos4.STATE_NAMES`, SI units.
+        - `omega`: rotor speeds [rad/s].
+        - `parameters`: in the order of `parameter_names`.
+        """
+        rows = self.forcing(Inputs(omega[None], jnp.ones(())), parameters)
+        forcing = jax.tree.map(lambda leaf: leaf[0], rows)
+        derivative = stack(self.cascade(unstack(state[CASCADE_ORDER]), forcing, parameters))
+        return jnp.zeros_like(derivative).at[CASCADE_ORDER].set(derivative)
+
+
+class AbstractOS4(AbstractModel):
+    """The part that the two OS4 models share. Their parameters are alpha_1..8, and their sensors show the states."""
+
+    airframe: eqx.AbstractVar[Airframe]
+
+    @property
+    @abc.abstractmethod
+    def gyroscopic_unit(self) -> str:
+        """The unit of alpha2 and alpha5."""
+
+    @abc.abstractmethod
+    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+        """x'', y'', z'' [m/s^2]."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """alpha_1..8."""
+        ratio, gyroscopic, inverse_inertia = "1", self.gyroscopic_unit, "1/(kg m^2)"
+        units = (ratio, gyroscopic, inverse_inertia) * 2 + (ratio, inverse_inertia)
+        return tuple(map(Parameter, PARAMETER_NAMES, units))
+
+    @property
+    def alpha(self) -> Float[Array, "8"]:
+        """alpha_1..8 by the definitions below Eq. (13)."""
+        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
+
+    @property
+    def half_width(self) -> Float[Array, "8"]:
+        """`DEFAULT_HALF_WIDTH`. The widths of alpha3, alpha6 and alpha8 are scaled to the airframe's inertia."""
         os4, own = (alpha_from_inertia(airframe.inertia, jnp.zeros(())) for airframe in (OS4, self.airframe))
         inverse_inertia = jnp.zeros(8, dtype=bool).at[jnp.array([2, 5, 7])].set(True)
         return jnp.asarray(DEFAULT_HALF_WIDTH) * jnp.where(
             inverse_inertia, own / jnp.where(inverse_inertia, os4, 1.0), 1.0
         )
 
-    def rotor_forcing(self, omega: RotorSpeeds) -> Forcing:
-        """What rotor speeds `omega` [rad/s] do, row by row: Eqs. (10)-(13) and Omega_r = sum s_i omega_i."""
-        roll, pitch, yaw, thrust = (jnp.square(omega) @ self.airframe.mixer.T).T
-        return Forcing(roll, pitch, yaw, thrust / self.airframe.mass, omega @ jnp.asarray(self.airframe.rotor_spins))
+    @property
+    def force_axes(self) -> tuple[int, ...]:
+        """None: the OS4 has no accelerometer."""
+        return ()
+
+    @property
+    def observes_states(self) -> bool:
+        """True."""
+        return True
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The forcing of a whole flight, a row from each sample to the next, with `parameters`."""
+        """Torques and thrust by Eqs. (10)-(13), and the residual speed Omega_r = sum s_i omega_i."""
         del parameters
-        return self.rotor_forcing(inputs.omega)
-
-    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
-        """What sensors without noise show: the states in cascade order, then specific force along `force_axes`."""
-        del forcing, parameters
-        return tuple(jax.tree.leaves(state))
-
-    @abc.abstractmethod
-    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
-        """p', q', r' [rad/s^2]: the only equations that hold the parameters (an array, or a tuple of its scalars)."""
-
-    @abc.abstractmethod
-    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """x'', y'', z'' [m/s^2]."""
+        omega, airframe = inputs.omega, self.airframe
+        roll, pitch, yaw, thrust = (jnp.square(omega) @ airframe.mixer.T).T
+        return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
-        """The time derivative of as much of the cascade as `state` holds."""
+        """The time derivative of the part of the cascade that `state` holds."""
         rates = self.angular_acceleration(state.rates, forcing, parameters)
         attitude = translation = None
         if state.attitude is not None:
@@ -110,24 +188,7 @@ class AbstractModel(eqx.Module):
             translation = Translation(t.vx, ax, t.vy, ay, t.vz, az)
         return State(rates, attitude, translation)
 
-    def derivative(self, state: StateVector, omega: Float[Array, "4"], parameters: Parameters) -> StateVector:
-        """dX/dt of the whole state, in the paper's order, Eq. (14).
-
-        **Arguments:**
-
-        - `state`: X in the order of `jaxos4.STATE_NAMES`, SI units.
-        - `omega`: rotor speeds [rad/s].
-        - `parameters`: as named in `parameter_names`.
-        """
-        one = self.forcing(Inputs(omega[None], jnp.ones(())), parameters)
-        forcing = jax.tree.map(lambda leaf: leaf[0], one)
-        derivative = stack(self.cascade(unstack(state[CASCADE_ORDER]), forcing, parameters))
-        return jnp.zeros_like(derivative).at[CASCADE_ORDER].set(derivative)
-
-
-def attitude_rates(rates: Rates, attitude: Attitude) -> Attitude:
-    """phi', theta', psi' [rad/s] from body rates; Eqs. (4)-(6). Singular at theta = +-90 degrees."""
-    sin_phi, cos_phi = sincos(attitude.phi)
-    sin_theta, cos_theta = sincos(attitude.theta)
-    yaw = (rates.q * sin_phi + rates.r * cos_phi) / cos_theta
-    return Attitude(rates.p + sin_theta * yaw, rates.q * cos_phi - rates.r * sin_phi, yaw)
+    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
+        """The states in cascade order."""
+        del forcing, parameters
+        return tuple(jax.tree.leaves(state))

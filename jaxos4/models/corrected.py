@@ -1,28 +1,22 @@
-"""The published model with its departures from rigid-body physics corrected."""
+"""The model of a rigid body: the published model without its departures from physics."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._custom_types import Scalar
-from ..airframe import OS4, Airframe, alpha_from_inertia
+from ..airframe import OS4, Airframe
 from ..trigonometry import sincos
-from .abstract import AbstractModel
+from .abstract import AbstractOS4
 from .state import Attitude, Forcing, Rates
 
 
-class CorrectedOS4(AbstractModel):
-    """The published model with its departures from rigid-body physics mended: x forward, y left, z up.
+class CorrectedOS4(AbstractOS4):
+    """The published model with the equations of a rigid body: x forward, y left, z up.
 
-    alpha2 = J_R / Ix and alpha5 = J_R / Iy are dimensionless and multiply Omega_r q and Omega_r p, so that a flight
-    can tell them. The reaction of accelerating rotors, -J_R Omega_r' in yaw, is left out.
+    alpha2 = J_R / Ix and alpha5 = J_R / Iy have no unit. They multiply Omega_r q and Omega_r p, so a flight excites
+    them. The model leaves out the reaction of accelerating rotors, -J_R Omega_r' / Iz in yaw.
     """
 
     airframe: Airframe = OS4
-
-    @property
-    def alpha(self) -> Float[Array, "8"]:
-        """alpha_1..8 with J_R in the place of J_R d."""
-        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
 
     @property
     def gyroscopic_factor(self) -> Scalar:
@@ -30,9 +24,9 @@ class CorrectedOS4(AbstractModel):
         return jnp.asarray(1.0)
 
     @property
-    def parameter_units(self) -> tuple[str, ...]:
-        """Units of alpha_1..8."""
-        return ("1", "1", "1/(kg m^2)", "1", "1", "1/(kg m^2)", "1", "1/(kg m^2)")
+    def gyroscopic_unit(self) -> str:
+        """None: alpha2 and alpha5 are ratios of inertias."""
+        return "1"
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """Euler's equations with the gyroscopic torque -omega x (0, 0, J_R Omega_r)."""
@@ -45,7 +39,7 @@ class CorrectedOS4(AbstractModel):
         )
 
     def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """Thrust along the body's z axis, turned into the earth frame, and gravity."""
+        """The thrust along the body's z axis, rotated into the earth frame, and gravity."""
         sin_phi, cos_phi = sincos(attitude.phi)
         sin_theta, cos_theta = sincos(attitude.theta)
         sin_psi, cos_psi = sincos(attitude.psi)

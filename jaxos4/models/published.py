@@ -1,39 +1,37 @@
 """The model as the paper prints it."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._custom_types import Scalar
-from ..airframe import OS4, Airframe, alpha_from_inertia
+from ..airframe import OS4, Airframe
 from ..trigonometry import sincos
-from .abstract import AbstractModel
+from .abstract import AbstractOS4
 from .state import Attitude, Forcing, Rates
 
 
-class PublishedOS4(AbstractModel):
-    """The model as the paper prints it, Eqs. (1)-(13), to the letter.
+class PublishedOS4(AbstractOS4):
+    """The model exactly as the paper prints it: Eqs. (1)-(13).
 
-    It departs from rigid-body physics, and is kept as the benchmark it is: the gyroscopic terms lack the rotor speed
-    (alpha2 = J_R d / Ix multiplies q alone, in 1/s), Eq. (2) has alpha5 r where physics has alpha5 p, Eqs. (7)-(9)
-    mix two earth frames. See `CorrectedOS4`.
+    The printed model departs from rigid-body physics in three places, and is kept as a benchmark:
+
+    - The gyroscopic terms lack the rotor speed: alpha2 = J_R d / Ix multiplies q alone, in 1/s.
+    - Eq. (2) has alpha5 r; physics has alpha5 p.
+    - Eqs. (7)-(9) mix two earth frames.
+
+    `CorrectedOS4` has the equations of a rigid body.
     """
 
     airframe: Airframe = OS4
 
     @property
-    def alpha(self) -> Float[Array, "8"]:
-        """alpha_1..8 as defined below Eq. (13)."""
-        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
-
-    @property
     def gyroscopic_factor(self) -> Scalar:
-        """The drag coefficient, as the paper prints alpha2 = J_R d / Ix."""
+        """The drag coefficient d: the paper prints alpha2 = J_R d / Ix."""
         return jnp.asarray(self.airframe.drag_coefficient)
 
     @property
-    def parameter_units(self) -> tuple[str, ...]:
-        """Units; alpha2 and alpha5 have the unit that Eqs. (1)-(2) need."""
-        return ("1", "1/s", "1/(kg m^2)", "1", "1/s", "1/(kg m^2)", "1", "1/(kg m^2)")
+    def gyroscopic_unit(self) -> str:
+        """The unit that Eqs. (1)-(2) need."""
+        return "1/s"
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """Eqs. (1)-(3)."""

@@ -1,8 +1,8 @@
-"""The state of a quadrotor as a cascade: rotor speeds -> torque -> rates -> attitude -> translation.
+"""The state of a quadrotor as a cascade, and the forcing: rotors -> torque -> rates -> attitude -> translation.
 
-The parameters enter only the rate equations; attitude follows from the rates, translation from the attitude, and
-neither feeds back. A `State` may therefore stop at any floor of the cascade: what is `None` is neither simulated nor
-needed. States are held as separate scalars, because a batch of scalars vectorises and a batch of 12-vectors does not.
+The parameters enter only the forcing and the rate equations. Attitude follows from the rates, translation from the
+attitude, and neither feeds back. So a `State` may stop at any level of the cascade: a level that is `None` is not
+simulated. States are separate scalars because a batch of scalars vectorises and a batch of 12-vectors does not.
 """
 
 from typing import NamedTuple
@@ -13,6 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Scalar
+
+# One value, or one for each sample.
+Samples = Float[Array, "*samples"]
+Vector = tuple[Samples, Samples, Samples]
 
 
 class Rates(NamedTuple):
@@ -43,7 +47,7 @@ class Translation(NamedTuple):
 
 
 class State(NamedTuple):
-    """The state down to some floor of the cascade."""
+    """The state down to some level of the cascade."""
 
     rates: Rates
     attitude: Attitude | None = None
@@ -51,34 +55,33 @@ class State(NamedTuple):
 
 
 class Forcing(NamedTuple):
-    """What the rotors do: torques [N m], specific thrust U_c/m [m/s^2], residual rotor speed Omega_r [rad/s].
+    """The action of the rotors: torques [N m], specific thrust U_c/m [m/s^2], residual rotor speed Omega_r [rad/s].
 
-    Of a `FlightModel`, and nothing of others:
+    Only a `FlightModel` has the other fields:
 
     - `spin_up`: Omega_r' [rad/s^2].
-    - `specific_thrust`: U_c / m at the sample itself [m/s^2], as an accelerometer there feels it.
-    - `recording`: for each recording, 1 where the sample belongs to it and 0 where not.
-    - `velocity`: along the body's axes [m/s], where that is an input.
-    - `lateral`: the measured specific force along x and y [m/s^2], where that is an input.
+    - `specific_thrust`: U_c / m at the sample itself [m/s^2], as an accelerometer measures it.
+    - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
+    - `velocity`: the measured velocity along the body's axes [m/s], if a log has it.
+    - `lateral`: the measured specific force along x and y [m/s^2], if a log has it and a term needs it.
     """
 
-    roll: Float[Array, "*samples"]
-    pitch: Float[Array, "*samples"]
-    yaw: Float[Array, "*samples"]
-    thrust: Float[Array, "*samples"]
-    residual_speed: Float[Array, "*samples"]
-    spin_up: Float[Array, "*samples"] | None = None
-    specific_thrust: Float[Array, "*samples"] | None = None
-    recording: tuple[Float[Array, "*samples"], ...] = ()
-    velocity: tuple[Float[Array, "*samples"], ...] | None = None
-    lateral: tuple[Float[Array, "*samples"], ...] | None = None
+    roll: Samples
+    pitch: Samples
+    yaw: Samples
+    thrust: Samples
+    residual_speed: Samples
+    spin_up: Samples | None = None
+    specific_thrust: Samples | None = None
+    recording: tuple[Samples, ...] = ()
+    velocity: Vector | None = None
+    lateral: tuple[Samples, Samples] | None = None
 
 
-# Where the leaves of a `State` stand in the paper's order, Eq. (14).
+# The positions of the leaves of a `State` in the paper's order, Eq. (14).
 CASCADE_ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])
 
-
-# How many of them each choice of channels needs.
+# The number of leaves that each choice of channels needs.
 CHANNELS = {"rates": 3, "attitude": 6, "all": 12}
 
 

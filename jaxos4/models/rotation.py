@@ -1,0 +1,59 @@
+"""Rotations between the body's axes and the earth's, and the kinematics of the Euler angles."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..flight import STATE_NAMES, Flight, held_values
+from ..trigonometry import sincos
+from .state import Attitude, Forcing, Rates, Samples, State, Vector
+
+
+def attitude_rates(rates: Rates, attitude: Attitude) -> Attitude:
+    """phi', theta', psi' [rad/s] from body rates: Eqs. (4)-(6). Singular at theta = +-90 degrees."""
+    sin_phi, cos_phi = sincos(attitude.phi)
+    sin_theta, cos_theta = sincos(attitude.theta)
+    yaw = (rates.q * sin_phi + rates.r * cos_phi) / cos_theta
+    return Attitude(rates.p + sin_theta * yaw, rates.q * cos_phi - rates.r * sin_phi, yaw)
+
+
+def to_earth(attitude: Attitude, body: Vector) -> Vector:
+    """A vector from the body's axes to the earth's: R_z(psi) R_y(theta) R_x(phi)."""
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = _sines_and_cosines(attitude)
+    x, y, z = body
+    y, z = y * cos_phi - z * sin_phi, y * sin_phi + z * cos_phi
+    x, z = x * cos_theta + z * sin_theta, -x * sin_theta + z * cos_theta
+    return x * cos_psi - y * sin_psi, x * sin_psi + y * cos_psi, z
+
+
+def to_body(attitude: Attitude, earth: Vector) -> Vector:
+    """A vector from the earth's axes to the body's: the inverse of `to_earth`."""
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = _sines_and_cosines(attitude)
+    x, y, z = earth
+    x, y = x * cos_psi + y * sin_psi, -x * sin_psi + y * cos_psi
+    x, z = x * cos_theta - z * sin_theta, x * sin_theta + z * cos_theta
+    return x, y * cos_phi + z * sin_phi, -y * sin_phi + z * cos_phi
+
+
+def with_body_velocity(flight: Flight) -> Flight:
+    """Add `body_velocity` to a flight that measured velocity and attitude. Other flights are returned unchanged.
+
+    A missing measurement is replaced by the previous one.
+    """
+    columns = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "vx", "vy", "vz")]
+    if bool(jnp.isnan(flight.states[:, columns]).all(axis=0).any()):
+        return flight
+    *angles, vx, vy, vz = held_values(flight.states[:, columns]).T
+    velocity = to_body(Attitude(*angles), (vx, vy, vz))
+    return eqx.tree_at(lambda f: f.body_velocity, flight, jnp.stack(velocity, axis=1), is_leaf=lambda x: x is None)
+
+
+def with_simulated_velocity(forcing: Forcing, state: State) -> Forcing:
+    """Take the body velocity from `state` if it was not measured and `state` holds a velocity and an attitude."""
+    t, attitude = state.translation, state.attitude
+    if forcing.velocity is not None or attitude is None or t is None:
+        return forcing
+    return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
+
+
+def _sines_and_cosines(attitude: Attitude) -> tuple[Samples, ...]:
+    return (*sincos(attitude.phi), *sincos(attitude.theta), *sincos(attitude.psi))

@@ -1,0 +1,288 @@
+"""The terms of the vehicle model: one object for each effect that real vehicles show beyond the corrected OS4.
+
+A new term is one more `Term` in `TERMS`: `FlightModel` and the identification find everything else in that object.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from .._custom_types import RotorSpeeds, Scalar
+from ..airframe import Airframe
+from .rotors import Grid, Speeds, SquaredSpeeds, delayed, lagged
+from .state import Forcing, Rates, Samples, Vector
+
+# What a term can need from the logs or from the airframe.
+COMMANDS = "commands"
+BODY_VELOCITY = "body velocity"
+LATERAL_FORCE = "lateral specific force"
+VERTICAL_FORCE = "vertical specific force"
+FULL_SCALE = "full scale"
+
+# Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a body velocity of 5 m/s.
+_AUTHORITY, _FAST = 0.2, 5.0
+# The yaw torque of the rotors as a share of their roll torque.
+_YAW = 0.2
+_AXES = ("roll", "pitch", "yaw")
+_FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
+
+T = TypeVar("T")
+Values = Mapping[str, Samples]
+Constant = float | Callable[[Airframe], Scalar]
+
+
+class TermParameter(NamedTuple):
+    """One parameter of a term.
+
+    - `name`, `unit`.
+    - `half_width`, `center`: of the default bracket: a number, or a function of the airframe.
+    - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
+    - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
+    """
+
+    name: str
+    unit: str
+    half_width: Constant
+    center: Constant = 0.0
+    each_recording: bool = False
+    force_axis: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One effect of the vehicle model.
+
+    - `description`: the effect, its parameters and their units.
+    - `parameters`: the table of its parameters.
+    - `needs`: the constants above without which the term cannot be estimated.
+    - `by_default`: whether an estimate uses the term if the user names none, given what is available.
+    - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
+
+    The other fields are the contributions, at least one. Each is a function that takes the quantity without the term
+    as its first argument and the values of the term's parameters by name as its second, and returns the quantity with
+    the term. They act in this order:
+
+    - `command(omega, values, grid)`: the commands [rad/s].
+    - `speed(speeds, values, grid)`: the rotor speeds that follow from the commands.
+    - `thrust(squares, values, speeds, airframe)`: the thrust that follows from the speeds.
+    - `angular_acceleration(total, values, rates, forcing)`: p', q', r' [rad/s^2].
+    - `specific_force(force, values, forcing)`: along the body's axes [m/s^2].
+    - `gyro(rates, values)`: the measured body rates [rad/s].
+    - `accelerometer(force, values)`: the measured specific force [m/s^2]. It makes specific force a measurement.
+
+    If each recording has its own value of a parameter, `values` holds that of the sample's recording. The first three
+    contributions act on a whole flight at once: their parameters cannot differ between recordings.
+
+    **Raises:** `ValueError` for such parameters of such a contribution.
+    """
+
+    description: str
+    parameters: tuple[TermParameter, ...]
+    needs: frozenset[str] = frozenset()
+    by_default: Callable[[frozenset[str]], bool] = lambda available: False
+    force_axes: tuple[int, ...] = ()
+    command: Callable[[RotorSpeeds, Values, Grid], RotorSpeeds] | None = None
+    speed: Callable[[Speeds, Values, Grid], Speeds] | None = None
+    thrust: Callable[[SquaredSpeeds, Values, Speeds, Airframe], SquaredSpeeds] | None = None
+    angular_acceleration: Callable[[Rates, Values, Rates, Forcing], Rates] | None = None
+    specific_force: Callable[[Vector, Values, Forcing], Vector] | None = None
+    gyro: Callable[[Rates, Values], Rates] | None = None
+    accelerometer: Callable[[Vector, Values], Vector] | None = None
+
+    def __post_init__(self):
+        if self.in_forcing and any(parameter.each_recording for parameter in self.parameters):
+            raise ValueError("`parameters` of a term that acts on the forcing must be the vehicle's own.")
+
+    @property
+    def in_forcing(self) -> bool:
+        """Whether the forcing depends on the term's parameters."""
+        return any((self.command, self.speed, self.thrust))
+
+
+def _authority(axis: int, speed: float = 1.0) -> Callable[[Airframe], Scalar]:
+    """The share `_AUTHORITY` of the rotors' torque over the inertia [rad/s^2], divided by `speed`."""
+
+    def share(airframe: Airframe) -> Scalar:
+        arm = jnp.abs(jnp.asarray(airframe.rotor_positions)).mean()
+        torque = 2 * arm * airframe.mass * airframe.gravity / 4
+        limit = _AUTHORITY * torque * jnp.array([1.0, 1.0, _YAW]) / jnp.asarray(airframe.inertia)
+        return limit[axis] / speed
+
+    return share
+
+
+def _reaction(airframe: Airframe) -> Scalar:
+    return airframe.rotor_inertia / jnp.asarray(airframe.inertia)[2]
+
+
+def _add_offset(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
+    p, q, r = total
+    return Rates(p + values["roll_offset"], q + values["pitch_offset"], r + values["yaw_offset"])
+
+
+def _add_damping(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
+    return Rates(
+        total.p - values["roll_damping"] * rates.p,
+        total.q - values["pitch_damping"] * rates.q,
+        total.r - values["yaw_damping"] * rates.r,
+    )
+
+
+def _add_velocity(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
+    vx, vy, _ = body_velocity(forcing)
+    return Rates(total.p + values["roll_velocity"] * vy, total.q + values["pitch_velocity"] * vx, total.r)
+
+
+def _add_flapping(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
+    ax, ay = lateral_force(forcing)
+    return Rates(total.p + values["roll_flapping"] * ay, total.q + values["pitch_flapping"] * ax, total.r)
+
+
+def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
+    spin_up = required(forcing.spin_up, "`forcing` must come from `FlightModel.forcing`.")
+    return total._replace(r=total.r - values["rotor_reaction"] * spin_up)
+
+
+def _bend_thrust(squares: SquaredSpeeds, values: Values, speeds: Speeds, airframe: Airframe) -> SquaredSpeeds:
+    curve, full = values["thrust_curve"], jnp.asarray(airframe.max_rotor_speed)
+    mean = curve * squares.mean + (1 - curve) * full * (speeds.begin + speeds.end) / 2
+    return SquaredSpeeds(mean, curve * squares.begin + (1 - curve) * full * speeds.begin)
+
+
+def _scale_thrust(force: Vector, values: Values, forcing: Forcing) -> Vector:
+    x, y, z = force
+    return x, y, values["thrust_gain"] * z
+
+
+def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
+    vx, vy, _ = body_velocity(forcing)
+    x, y, z = force
+    return x - values["x_drag"] * vx, y - values["y_drag"] * vy, z
+
+
+def _add_gyro_bias(rates: Rates, values: Values) -> Rates:
+    p, q, r = rates
+    return Rates(p + values["p_bias"], q + values["q_bias"], r + values["r_bias"])
+
+
+def _add_force_bias(force: Vector, values: Values) -> Vector:
+    x, y, z = (a + values[name] if name in values else a for a, name in zip(force, _FORCE_BIASES, strict=True))
+    return x, y, z
+
+
+TERMS: dict[str, Term] = {
+    "offset": Term(
+        "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
+        tuple(TermParameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(_AXES)),
+        by_default=lambda available: True,
+        angular_acceleration=_add_offset,
+    ),
+    "damping": Term(
+        "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
+        tuple(TermParameter(f"{x}_damping", "1/s", 5.0) for x in _AXES),
+        by_default=lambda available: True,
+        angular_acceleration=_add_damping,
+    ),
+    "velocity": Term(
+        "a moment with the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
+        tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(_AXES[:2])),
+        needs=frozenset({BODY_VELOCITY}),
+        by_default=lambda available: True,
+        angular_acceleration=_add_velocity,
+    ),
+    "flapping": Term(
+        "a moment with the measured lateral specific force: roll_flapping, pitch_flapping [rad/m]",
+        tuple(TermParameter(f"{x}_flapping", "rad/m", _authority(i)) for i, x in enumerate(_AXES[:2])),
+        needs=frozenset({LATERAL_FORCE}),
+        # The drag of the rotors is proportional to the body velocity: the force replaces a missing velocity.
+        by_default=lambda available: BODY_VELOCITY not in available,
+        angular_acceleration=_add_flapping,
+    ),
+    "lag": Term(
+        "rotors follow their commands as first-order systems: rotor_lag [s]",
+        (TermParameter("rotor_lag", "s", 0.03, center=0.05),),  # small vehicles have 0.02 to 0.1 s
+        by_default=lambda available: COMMANDS in available,
+        speed=lambda speeds, values, grid: lagged(speeds.begin, values["rotor_lag"], grid),
+    ),
+    "delay": Term(
+        "commands act later than they are recorded: rotor_delay [s]",
+        (TermParameter("rotor_delay", "s", 0.02),),
+        by_default=lambda available: COMMANDS in available,
+        command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
+    ),
+    "reaction": Term(
+        "the body's answer to rotors that accelerate: rotor_reaction = J_R / Iz",
+        (TermParameter("rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction),),
+        by_default=lambda available: True,
+        angular_acceleration=_add_reaction,
+    ),
+    "curve": Term(
+        "thrust between linear (0) and quadratic (1) in the rotor speed: thrust_curve",
+        (TermParameter("thrust_curve", "1", 1.0, center=1.0),),
+        needs=frozenset({FULL_SCALE}),
+        # The proportion of commands to thrust is unknown, and a measured specific force identifies it.
+        by_default=lambda available: {COMMANDS, VERTICAL_FORCE} <= available,
+        thrust=_bend_thrust,
+    ),
+    "accelerometer": Term(
+        "specific force is measured: thrust_gain, and ax_bias, ay_bias, az_bias [m/s^2] along the predicted axes",
+        (
+            TermParameter("thrust_gain", "1", 0.5, center=1.0),
+            # A sensor that was levelled before take-off has a smaller bias.
+            *(TermParameter(name, "m/s^2", 0.3, force_axis=axis) for axis, name in enumerate(_FORCE_BIASES)),
+        ),
+        needs=frozenset({VERTICAL_FORCE}),
+        by_default=lambda available: True,
+        force_axes=(2,),
+        specific_force=_scale_thrust,
+        accelerometer=_add_force_bias,
+    ),
+    "drag": Term(
+        "a force against the body velocity: x_drag, y_drag [1/s]",
+        (TermParameter("x_drag", "1/s", 1.0), TermParameter("y_drag", "1/s", 1.0)),
+        needs=frozenset({BODY_VELOCITY, LATERAL_FORCE}),
+        force_axes=(0, 1),
+        specific_force=_add_drag,
+    ),
+    "gyro_bias": Term(
+        "rates are measured with an offset, of each recording: p_bias, q_bias, r_bias [rad/s]",
+        tuple(TermParameter(f"{rate}_bias", "rad/s", 0.1, each_recording=True) for rate in "pqr"),
+        gyro=_add_gyro_bias,
+    ),
+}
+
+
+def default_terms(available: frozenset[str]) -> tuple[str, ...]:
+    """The terms that an estimate uses if the user names none, given what the logs and the airframe provide."""
+    return tuple(name for name, term in TERMS.items() if term.needs <= available and term.by_default(available))
+
+
+def has_full_scale(airframe: Airframe) -> bool:
+    """Whether `max_rotor_speed` is known. A traced value counts as known."""
+    return isinstance(airframe.max_rotor_speed, Tracer) or bool(np.isfinite(airframe.max_rotor_speed))
+
+
+def body_velocity(forcing: Forcing) -> Vector:
+    """The body velocity [m/s]. Raises `ValueError` if it is neither measured nor simulated."""
+    return required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
+
+
+def lateral_force(forcing: Forcing) -> tuple[Samples, Samples]:
+    """The measured specific force along x and y [m/s^2]. Raises `ValueError` if it was not measured."""
+    return required(forcing.lateral, _missing(LATERAL_FORCE, "specific_force"))
+
+
+def required(value: T | None, message: str) -> T:
+    """`value`, or `ValueError` with `message` if there is none."""
+    if value is None:
+        raise ValueError(message)
+    return value
+
+
+def _missing(need: str, field: str) -> str:
+    names = ", ".join(name for name, term in TERMS.items() if need in term.needs)
+    return f"`terms`: {names} need `Flight.{field}`, which this flight does not have; leave them out."
