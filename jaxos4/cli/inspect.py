@@ -25,12 +25,6 @@ from ._check_output import check_output
 from ._choices import OutOption
 from ._json import finite, write_json
 
-FORMATS = {
-    "ULog": "PX4 ULog",
-    "Crazyflie": "Crazyflie micro-SD log",
-    "blackbox": "blackbox CSV",
-    "CSV": "flight CSV",
-}
 # Of the flight's parts, how many are shown.
 MOST_PARTS = 14
 # What can be identified is asked of this much of a stretch [s], in windows of that length [s].
@@ -67,7 +61,7 @@ def inspect(
 
     report: dict[str, Any] = {
         "log": str(log),
-        "format": kind,
+        "format": kind.name,
         "samples": int(flight.time.shape[0]),
         "begin": float(flight.time[0]),
         "end": float(flight.time[-1]),
@@ -77,7 +71,7 @@ def inspect(
         "parts": [_part(part, moved.get(part)) for part in parts],
         "identifiable": None,
     }
-    _print_contents(console, report, kind)
+    _print_contents(console, report, kind.label)
     _print_parts(console, parts, moved)
     longest = max(usable, key=lambda part: part.length, default=None)
     if longest is None:
@@ -128,10 +122,10 @@ def _part(part: Stretch, moved: tuple[Excitation, ...] | None) -> dict[str, Any]
     return {"begin": part.begin, "end": part.end, "usable": not part.reason, "reason": part.reason, "excitation": axes}
 
 
-def _print_contents(console: Console, report: dict[str, Any], kind: str) -> None:
+def _print_contents(console: Console, report: dict[str, Any], label: str) -> None:
     dt, measured = report["sample_time"], report["measured"]
     console.print(
-        f"{report['log']}: {FORMATS[kind]}, {report['begin']:.2f} to {report['end']:.2f} s, {report['samples']} "
+        f"{report['log']}: {label}, {report['begin']:.2f} to {report['end']:.2f} s, {report['samples']} "
         f"samples, one every {1e3 * dt:.4g} ms",
         markup=False,
         highlight=False,
