@@ -81,3 +81,15 @@ def run(monkeypatch, capsys, tmp_path):
         return stop.value.code or 0, out, err
 
     return call
+
+
+@pytest.fixture
+def save(tmp_path):
+    """Writes a file, by default one whose name says nothing of its format."""
+
+    def write(content: bytes | str, name: str = "flight.log") -> pathlib.Path:
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write

@@ -1,7 +1,7 @@
-"""A flight as matrices, and writers of the formats that flight controllers log in: written from their descriptions.
+"""A known flight, and writers of the log formats, made from their descriptions.
 
-Attitude is a rotation matrix from the body (x forward, y left, z up) to the earth (x north, y west, z up). What a
-format holds follows from matrices and vectors, without a sign written by hand.
+Attitude is a rotation matrix from the body (x forward, y left, z up) to the earth (x north, y west, z up). The values
+in a log follow from matrices and vectors, so that no sign is written by hand.
 """
 
 import struct
@@ -44,7 +44,7 @@ def velocity(t, h=1e-4):
 
 
 def force(t, h=1e-3):
-    """What an accelerometer measures: R^T (a + g)."""
+    """Specific force, as an accelerometer measures it: R^T (a + g)."""
     acceleration = (position(t + h) - 2 * position(t) + position(t - h)) / h**2
     return np.einsum("nji,nj->ni", attitude(t), acceleration + [0, 0, GRAVITY])
 
@@ -55,7 +55,7 @@ def speeds(t):
 
 
 def check(flight, *, names=STATE_NAMES, atol=2e-3, start=0.0, seconds=3.0, forces=True):
-    """That what was measured of the states is what was flown; the least number of samples of a channel."""
+    """Check the measured states against the known flight. Returns the smallest number of samples of a channel."""
     t = np.asarray(flight.time) + start
     truth = np.column_stack([rates(t), np.unwrap(euler(t), axis=0), position(t), velocity(t)])
     truth = dict(zip(("p", "q", "r", "phi", "theta", "psi", "x", "y", "z", "vx", "vy", "vz"), truth.T, strict=True))
@@ -70,7 +70,7 @@ def check(flight, *, names=STATE_NAMES, atol=2e-3, start=0.0, seconds=3.0, force
         fewest = min(fewest, np.count_nonzero(measured))
         off = (values - truth[name])[measured]
         if name in ("phi", "psi"):
-            assert np.abs(np.diff(values[measured])).max() < 1  # no turn is left in it
+            assert np.abs(np.diff(values[measured])).max() < 1  # no jump of 2 pi remains
             off -= 2 * np.pi * np.rint(np.median(off) / (2 * np.pi))
         np.testing.assert_allclose(off, 0, atol=atol, err_msg=name)
     if forces:
@@ -81,7 +81,7 @@ def check(flight, *, names=STATE_NAMES, atol=2e-3, start=0.0, seconds=3.0, force
 
 
 def outcome(read, path):
-    """The flight, or the refusal as a string; an `AssertionError` or what was raised otherwise."""
+    """The flight, or the one-line message of an `InputError`. Any other error, and an unusable flight, is a failure."""
     try:
         flight, notes = read(path)
     except InputError as error:
@@ -94,11 +94,14 @@ def outcome(read, path):
     assert isinstance(flight, Flight)
     time, omega, states = (np.asarray(a) for a in (flight.time, flight.omega, flight.states))
     assert np.isfinite(time).all()
-    assert (np.diff(time) > 0).all()
     assert np.isfinite(omega).all()
     assert (omega >= 0).all()
     assert not np.isinf(states).any()
     assert np.isfinite(states).any()
+    assert flight.specific_force is None or not np.isinf(np.asarray(flight.specific_force)).any()
+    dt = (time[-1] - time[0]) / (time.size - 1)
+    assert dt > 0
+    assert np.abs(np.diff(time) - dt).max() <= 1e-5 * dt + 4 * np.spacing(np.abs(time).max())
     assert all(note.isprintable() for note in notes)
     return flight
 
@@ -134,8 +137,8 @@ CODES = {"uint64_t": "Q", "float": "f", "int32_t": "i", "uint8_t": "B", "bool": 
 def ulog(topics, *, extra=b"", before=b""):
     """A ULog file.
 
-    `topics`: of each, its name, its format's text, the struct code of a sample, the columns, and times [s]; nested
-    formats stand in `before`.
+    `topics`: for each its name, the text of its format, the struct code of a sample, the rows, and times [s].
+    `before`: messages before the data, such as nested formats. `extra`: messages after the 20th sample.
     """
     out = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1_000_000))
     out += message("B", bytes(40)) + message("I", b"\x0cchar[4] sys_PX4!") + before
@@ -159,7 +162,7 @@ def ulog(topics, *, extra=b"", before=b""):
 
 
 def blackbox_csv(columns, *, settings=None):
-    """`columns`: name -> values, written as integers where they are; with `settings` as Explorer writes it."""
+    """`columns`: name -> values. With `settings`, in the style of Blackbox Explorer."""
     separator = "," if settings else ", "
     lines = [f'"{key}","{value}"' for key, value in (settings or {}).items()]
     names = [f'"{name}"' if settings else name for name in columns]
@@ -173,7 +176,7 @@ def blackbox_csv(columns, *, settings=None):
 
 
 def crazyflie(events, *, version=2, checksum=True):
-    """`events`: name, variables as `name(type)`, times [s], columns."""
+    """`events`: for each its name, variables as `name(type)`, times [s], columns."""
     out = bytearray(b"\xbc" + struct.pack("<HH", version, len(events)))
     for number, (name, variables, *_) in enumerate(events):
         out += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))

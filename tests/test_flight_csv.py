@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-import jaxos4.logs._table as table_module
-import jaxos4.logs._units as units_module
+import jaxos4.logs.csv_text as csv_module
+import jaxos4.logs.table as table_module
+import jaxos4.logs.units as units_module
 from jaxos4._files import write_atomically
 from jaxos4.airframe import OS4, Airframe
 from jaxos4.errors import InputError
@@ -47,16 +48,6 @@ def edited(row, column, cell, header=HEADER):
     cells = [line.split(",") for line in ROWS]
     cells[row - 2][header.split(",").index(column)] = cell
     return csv(header, [",".join(line) for line in cells])
-
-
-@pytest.fixture
-def save(tmp_path):
-    def write(content, name="flight.csv"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write
 
 
 def refusal(path, airframe=None):
@@ -263,7 +254,7 @@ def test_blocks_do_not_show(save, monkeypatch):
     bad = [save(edited(6, "q", "x"), "cell.csv"), save(csv(rows=[*ROWS[:3], "", *ROWS[3:]]), "blank.csv")]
     messages = [refusal(b) for b in bad]
     for size in (1, 7, 40, 200):
-        monkeypatch.setattr(table_module, "_BLOCK", size)
+        monkeypatch.setattr(csv_module, "_BLOCK", size)
         assert identical(read_flight(path), whole)
         assert [refusal(b) for b in bad] == messages
 
@@ -281,7 +272,7 @@ def test_commands_are_fractions_of_full_scale(save):
 
 def test_measured_rotor_speeds_are_preferred_and_it_is_said(save):
     text = csv(HEADER + ",command1,command2", [row + ",0.5,0.5" for row in ROWS])
-    with pytest.warns(UserWarning, match=r"measured omega1\.\.omega4 are used, command1, command2 are not"):
+    with pytest.warns(UserWarning, match=r"measured omega1\.\.omega4 are used; command1, command2 are ignored"):
         flight = read_flight(save(text))
     assert flight.omega[0, 0] == 100
 
@@ -297,7 +288,7 @@ def test_unknown_columns_are_named_with_what_they_may_mean(save):
     header = HEADER + ",P,roll,mode,Omega_1,mode,"
     flight, notes = read_flight_and_notes(save(csv(header, [row + ',1,2,"a, b",4,é_1,' for row in ROWS])))
     assert notes == (
-        "unknown columns are left out: 'P' (did you mean p?), 'roll' (did you mean phi?), 'mode', "
+        "unknown columns are ignored: 'P' (did you mean p?), 'roll' (did you mean phi?), 'mode', "
         "'Omega_1' (did you mean omega1?), 'mode', ''",
     )
     assert identical(flight, read_flight(save(csv())))
@@ -328,9 +319,9 @@ def test_units_that_may_be_wrong_are_noted(save):
 BAD = {
     "empty": ("", ["is empty"]),
     "blank": ("\n\n", ["row 1", "is empty", "header"]),
-    "header only": (csv(rows=[]), ["holds a header and no data"]),
-    "one row": (csv(rows=ROWS[:1]), ["holds one row of data"]),
-    "no header": (csv(header=ROWS[0]), ["row 1", "holds numbers where the header should be"]),
+    "header only": (csv(rows=[]), ["has a header and no data"]),
+    "one row": (csv(rows=ROWS[:1]), ["has a header and one row of data"]),
+    "no header": (csv(header=ROWS[0]), ["row 1", "contains numbers instead of the header"]),
     "semicolons": (csv().replace(",", ";"), ["row 1", "separated by ';'", "commas"]),
     "tabs": (csv().replace(",", "\t"), ["row 1", "separated by tabs", "commas"]),
     "no t": (csv(HEADER.replace("t,", "time,")), ["column t", "should 'time' be t?"]),
@@ -343,13 +334,16 @@ BAD = {
         ["column command3"],
     ),
     "all-empty rotor": (csv(rows=[row.replace(",102,", ",,") for row in ROWS]), ["column omega3"]),
-    "rotor without a first value": (edited(2, "omega2", ""), ["row 2, column omega2", "no value before it"]),
+    "rotor without a first value": (edited(2, "omega2", ""), ["row 2, column omega2", "no earlier value to hold"]),
     "no state": (csv("t,omega1,omega2,omega3,omega4,P,b,c"), ["no state was measured", "'P' be p"]),
     "nothing in the states": (csv(rows=[row.rsplit(",", 3)[0] + ",,," for row in ROWS]), ["no state was measured"]),
-    "twice the same": (csv(HEADER.replace("q", " p ")), ["row 1, column p", "stands 2 times"]),
-    "a cell short": (csv(rows=[*ROWS[:2], ROWS[2].rsplit(",", 1)[0], *ROWS[3:]]), ["row 4", "7 cells", "header has 8"]),
-    "a cell long": (csv(rows=[*ROWS[:2], ROWS[2] + ",0", *ROWS[3:]]), ["row 4", "9 cells", "header has 8"]),
-    "a cut line": (csv(rows=[*ROWS, "0.0"]), ["row 8", "has 1 cell "]),
+    "twice the same": (csv(HEADER.replace("q", " p ")), ["row 1, column p", "occurs 2 times"]),
+    "a cell short": (
+        csv(rows=[*ROWS[:2], ROWS[2].rsplit(",", 1)[0], *ROWS[3:]]),
+        ["row 4", "7 cells", "header has 8"],
+    ),
+    "a cell long": (csv(rows=[*ROWS[:2], ROWS[2] + ",0", *ROWS[3:]]), ["row 4", "9 cells", "the header has 8"]),
+    "a cut line": (csv(rows=[*ROWS, "0.0"]), ["row 8", "has 1 cell,"]),
     "a blank row": (csv(rows=[*ROWS[:2], "", *ROWS[2:]]), ["row 4", "is blank"]),
     "an open quote": (csv(rows=[*ROWS[:2], ROWS[2].replace(",-0.2", ',"-0.2'), *ROWS[3:]]), ["row 4", "7 cells"]),
     "text": (edited(3, "q", "fast"), ["row 3, column q", "'fast'", "not a number"]),
@@ -361,7 +355,7 @@ BAD = {
     "NaN in t": (edited(3, "t", "NaN"), ["row 3, column t", "'NaN'"]),
     "infinity": (edited(3, "omega1", "-Inf"), ["row 3, column omega1", "leave the cell empty"]),
     "N/A": (edited(3, "q", "N/A"), ["row 3, column q", "leave the cell empty"]),
-    "overflow": (edited(3, "q", "1e999"), ["row 3, column q", "more than a number can be", "leave the cell empty"]),
+    "overflow": (edited(3, "q", "1e999"), ["row 3, column q", "too large for a number", "leave the cell empty"]),
     "time back": (edited(4, "t", "0.001"), ["row 4, column t", "backward, from 0.01 s to 0.001 s"]),
     "time again": (edited(4, "t", "0.01"), ["row 4, column t", "repeats 0.01 s of row 3"]),
     "milliseconds": (csv(rows=[f"{5 * k},1,1,1,1,0,0,0" for k in range(5)]), ["column t", "divide"]),
@@ -386,8 +380,8 @@ BAD = {
     "latin-1": (edited(3, "q", "é").encode("latin-1"), ["row 3, column q", "not text in UTF-8"]),
     "utf-16": (csv().encode("utf-16"), ["row 1", "not text in UTF-8"]),
     "binary": (bytes(range(256)) * 4, ["row 1", "not text in UTF-8"]),
-    "endless header": (b"t" * (1 << 21), ["row 1", "no end within a million"]),
-    "endless row": ((csv() + "1" * (1 << 22)), ["row 8", "no end within a million"]),
+    "endless header": (b"t" * (1 << 21), ["row 1", "longer than a million"]),
+    "endless row": ((csv() + "1" * (1 << 22)), ["row 8", "longer than a million"]),
     "endless cell": (edited(3, "q", '"' + "1" * 200_000 + '"'), ["row 3", "too long"]),
     "long cell": (edited(3, "q", "x" * 1000), ["row 3, column q", "x...'"]),
 }
@@ -427,7 +421,7 @@ def test_paths_that_are_no_readable_file(tmp_path, monkeypatch):
 
 
 def test_too_many_rows_are_refused(save, monkeypatch):
-    monkeypatch.setattr(table_module, "MAX_ROWS", 5)
+    monkeypatch.setattr(csv_module, "MAX_ROWS", 5)
     assert "more than 5 rows" in refusal(save(csv()))
 
 
@@ -471,7 +465,7 @@ def test_noise_alone_is_no_degrees(save):
     rows = [f"{0.01 * k!r},9,9,9,9,{a!r},{b!r}" for k, (a, b) in enumerate(np.column_stack([angle, rate]).tolist())]
     path = save(csv("t,omega1,omega2,omega3,omega4,psi,r", rows))
     assert read_flight_and_notes(path)[1] == ()
-    with pytest.MonkeyPatch.context() as patch:  # it is the likeness of the two that tells
+    with pytest.MonkeyPatch.context() as patch:  # without the check that the two are similar
         patch.setattr(units_module, "_SIMILARITY", -1.0)
         assert "looks like degrees" in refusal(path)
 
@@ -579,7 +573,7 @@ def test_rows_that_are_missing_from_a_grid_are_not_measured(save):
     np.testing.assert_allclose(flight.omega[[4, 5, 6, 10, 11, 12, 13], 0], [4, 4, 6, 10, 10, 10, 13], rtol=1e-9)
     assert len(notes) == 1
     assert "17 rows were resampled to 20 samples, one every 10 ms" in notes[0]
-    assert "2 gaps of up to 30 ms: rotor speeds are held over 3 samples" in notes[0]
+    assert "2 gaps of up to 30 ms: the 3 samples in gaps hold the rotor speeds" in notes[0]
 
 
 def test_a_slow_sensor_keeps_one_sample_for_each_of_its_own():
@@ -616,7 +610,7 @@ def test_turns_are_taken_out_before_interpolation(save):
     flight, notes = read_flight_and_notes(save(csv(rows=rows)))
     got = np.asarray(flight.states)[:, STATE_NAMES.index("psi")]
     np.testing.assert_allclose(got, 7 * np.asarray(flight.time), atol=1e-9)
-    assert notes[0] == "psi: 4 jumps of a turn taken out"
+    assert notes[0] == "psi: 4 jumps of 2 pi removed"
 
 
 @given(

@@ -1,17 +1,14 @@
-"""Blackbox logs as CSV, of Betaflight and INAV: signs from what the axes mean, units from settings, or told."""
+"""Blackbox logs as CSV, of Betaflight and INAV: signs from the meaning of the axes, units from settings or defaults."""
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings, strategies as st
 from recorded_logs import (
     GRAVITY,
     RPM,
     attitude,
     blackbox_csv,
     check,
-    damaged,
     force,
-    outcome,
     position,
     rates,
     speeds,
@@ -59,25 +56,15 @@ def without(columns, *prefixes):
     return {name: values for name, values in columns.items() if not name.startswith(prefixes)}
 
 
-@pytest.fixture
-def save(tmp_path):
-    def write(content, name="LOG00001.01.csv"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return write
-
-
 def test_a_decoded_log_comes_back_in_our_frame_and_units(save):
     path = save(blackbox_csv(recorded(T)))
-    assert log_format(path) == "blackbox"
+    assert log_format(path).name == "blackbox"
     flight, notes = read_log(path)
     check(flight, names=RATES, atol=5e-3)
     np.testing.assert_allclose(flight.omega, speeds(np.asarray(flight.time)), atol=100 / 7 * RPM)
     assert float(flight.time[0]) == 0
     text = " ".join(notes)
-    for words in ("14 motor poles", "2048 units a g", "blackbox_high_resolution", "eRPM[0] is rotor 1"):
+    for words in ("14 motor poles", "2048 units for 1 g", "blackbox_high_resolution", "eRPM[0] is rotor 1"):
         assert words in text
 
 
@@ -97,7 +84,7 @@ def test_an_export_says_its_settings(save):
     flight, notes = read_log(save(blackbox_csv(columns, settings=fine)))
     check(flight, names=RATES, atol=5e-3)
     np.testing.assert_allclose(flight.omega, speeds(np.asarray(flight.time)), atol=100 / 6 * RPM)
-    assert not any("taken for" in note or "default" in note for note in notes)
+    assert not any("taken as" in note or "default" in note for note in notes)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [(" (deg/s)", 1.0), (" (rad/s)", np.pi / 180)])
@@ -107,7 +94,7 @@ def test_units_in_the_names_are_obeyed(unit, factor, save):
         columns[f"accSmooth[{i}] (g)"] = np.round(force(T)[:, i] / GRAVITY, 4)
     flight, notes = read_log(save(blackbox_csv(columns)))
     check(flight, names=RATES, atol=5e-3)
-    assert not any("units a g" in note for note in notes)
+    assert not any("units for 1 g" in note for note in notes)
 
 
 def test_the_unfiltered_gyro_is_preferred(save):
@@ -147,66 +134,25 @@ def replaced(row, old, new):
 
 BAD = {
     "raw": (b"H Product:Blackbox flight data recorder by Nicholas Sherlock\nH ...", "decode it by blackbox_decode"),
-    "header only": (LINES[0], "holds a header and no data"),
+    "header only": (LINES[0], "has a header and no data"),
     "a cut line": ("\n".join(LINES)[:-20], "row 51"),
     "text": (replaced(5, LINES[5].split(", ")[2], "fast"), "row 6, column gyroADC[0]"),
     "time backward": ("\n".join([*LINES[:5], LINES[2], *LINES[5:]]), "row 6, column time (us)"),
     "no time": (replaced(0, "time (us)", "elapsed"), "there is no time"),
-    "no gyro": (replaced(0, "gyroADC[1]", "other"), "no body rates"),
-    "no motors": (blackbox_csv(without(recorded(T[:50]), "motor", "eRPM")), "there is no motor[0]"),
+    "no gyro": (replaced(0, "gyroADC[1]", "other"), "there are no body rates"),
+    "no motors": (blackbox_csv(without(recorded(T[:50]), "motor", "eRPM")), "column motor[0]: is missing"),
     "six motors": (
         blackbox_csv(recorded(T[:50]) | {"motor[4]": np.arange(50), "motor[5]": np.arange(50)}),
         "more than four motors",
     ),
     "settings above": ('"acc_1G","2048"\n' + "\n".join(LINES[:5]) + "\n1,2", "row 7"),
-    "too fast": (blackbox_csv(recorded(T[:50], scale=200)), "beyond 60 rad/s; the units are not those"),
+    "too fast": (blackbox_csv(recorded(T[:50], scale=200)), "beyond 60 rad/s; its unit is not the one"),
 }
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_what_a_log_may_not_be(name, save):
-    content, words = BAD[name]
-    result = outcome(read_log, save(content))
-    assert isinstance(result, str)
-    assert words in result
-
-
 def test_commands_need_a_full_scale(save):
-    with pytest.raises(InputError, match=r"column motor\[0\]: commands say nothing without"):
+    with pytest.raises(InputError, match=r"column motor\[0\]: the rotor speed of full command is not known"):
         read_log(save(blackbox_csv(without(recorded(T), "eRPM"))))
 
 
-@pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    return tmp_path_factory.mktemp("blackbox") / "log.csv"
-
-
 SMALL = blackbox_csv(recorded(T[:30]), settings=SETTINGS).encode()
-ACCIDENTS = st.lists(
-    st.tuples(
-        st.sampled_from(["cut", "flip", "flip", "insert", "drop", "zeros"]), st.floats(0, 1), st.integers(0, 999)
-    ),
-    max_size=3,
-)
-
-
-@given(accidents=ACCIDENTS)
-@settings(max_examples=150)
-@example(accidents=[])
-def test_damaged_logs(accidents, path):
-    path.write_bytes(damaged(SMALL, accidents))
-    result = outcome(lambda p: read_log(p, CRAZYFLIE), path)
-    if not accidents:
-        assert not isinstance(result, str)
-
-
-@given(
-    lines=st.lists(
-        st.sampled_from([*LINES[:4], '"acc_1G","x"', '"motor_poles","0"', '"a,b', "gyroADC[0],1,2,3", "", "\0", "1,2"]),
-        max_size=8,
-    )
-)
-@settings(max_examples=80)
-def test_lines_in_any_order(lines, path):
-    path.write_text("\n".join([LINES[0], *lines]) if len(lines) % 2 else "\n".join(lines))
-    outcome(lambda p: read_log(p, CRAZYFLIE), path)

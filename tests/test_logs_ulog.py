@@ -1,4 +1,4 @@
-"""PX4's logs: our frame and units from theirs, whatever rates they were logged at, and a line for what is broken."""
+"""PX4's logs: our frame and units, any rates of logging, and one line for a damaged file."""
 
 import builtins
 import struct
@@ -7,13 +7,12 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings, strategies as st
+from hypothesis import given, settings, strategies as st
 from recorded_logs import (
     FRD,
     RPM,
     attitude,
     check,
-    damaged,
     force,
     message,
     outcome,
@@ -28,7 +27,7 @@ from test_flight_csv import CRAZYFLIE
 
 from jaxos4.errors import InputError
 from jaxos4.logs import read_log
-from jaxos4.logs._series import Series, driving, placed
+from jaxos4.logs.series import Series, at_rows, rotor_rms
 
 T = 2500.0  # the test airframe's full scale [rad/s]
 ESC = b"esc_report:uint64_t timestamp;int32_t esc_rpm;uint8_t actuator_function;uint8_t[3] _padding0;"
@@ -86,16 +85,6 @@ def pwm(t, output):
     return "actuator_outputs", "uint64_t timestamp;uint8_t noutputs;float[16] output;", "QB" + "f" * 16, rows, t
 
 
-@pytest.fixture
-def save(tmp_path):
-    def write(content, name="log.bin"):  # the name does not matter
-        path = tmp_path / name
-        path.write_bytes(content)
-        return path
-
-    return write
-
-
 def everything(**changes):
     parts = {
         "angular": angular_velocity(grid(0.005)),
@@ -143,7 +132,7 @@ def test_commands_are_held_and_scaled(save):
     np.testing.assert_allclose(np.asarray(flight.omega)[:-1][steady], T * held[:-1][steady], rtol=1e-6)
     assert any("actuator_motors.control" in note for note in notes)
     assert np.asarray(read_log(path, full_scale=1.0)[0].omega).max() < 1
-    with pytest.raises(InputError, match=r"field actuator_motors.control\[0\]: commands say nothing without"):
+    with pytest.raises(InputError, match=r"field actuator_motors.control\[0\]: the rotor speed of full command"):
         read_log(path)
 
 
@@ -175,7 +164,7 @@ def test_a_log_cut_by_a_loss_of_power_is_read_to_there(save):
     content = everything()
     for tail in (content[: len(content) * 2 // 3], content[: len(content) * 2 // 3] + bytes(5000)):
         flight, notes = read_log(save(tail))
-        assert any("cut while it was written" in note for note in notes)
+        assert any("ends abruptly" in note for note in notes)
         check(flight, seconds=1.9)
 
 
@@ -188,13 +177,13 @@ def test_what_was_appended_after_a_restart_does_not_break_it(save):
     assert content[18:19] == b"B"
     flight, notes = read_log(save(bytes(content) + message("L", b"6" + bytes(8) + b"hard fault")))
     check(flight, seconds=1.9)
-    assert not any("cut" in note for note in notes)
+    assert not any("abruptly" in note for note in notes)
     content[19 + 8] = 0
     assert isinstance(outcome(read_log, save(bytes(content) + message("L", b"6" + bytes(8) + b"hard fault") * 9)), str)
 
 
 BAD = {
-    "other magic": (b"ULog\x02" + bytes(40), "is no ULog"),
+    "other magic": (b"ULog\x02" + bytes(40), "is not a ULog"),
     "header": (everything()[:12], "ends within its header"),
     "nothing": (ulog([]), "no body rates"),
     "no motors": (everything(esc=None), "no rotor speeds or commands"),
@@ -211,20 +200,7 @@ BAD = {
     "no such message": (ulog([combined(grid(0.005))], extra=b"\x05\x00\x07hello"), "is corrupt at byte"),
     "unannounced": (ulog([combined(grid(0.005))], extra=message("D", b"\x63\0" + bytes(9))), "never announced"),
     "no format": (ulog([], before=message("A", b"\0\0\0sensor_combined")), "has no format"),
-    "backward": (everything(angular=None, combined=combined(grid(0.005)[::-1])), None),
 }
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_what_a_log_may_not_be(name, save):
-    content, words = BAD[name]
-    path = save(content)
-    result = outcome(read_log, path)
-    if words is None:
-        assert not isinstance(result, str)  # written in the order of time
-    else:
-        assert isinstance(result, str)
-        assert words in result
 
 
 def test_time_that_runs_backward_is_told(save):
@@ -279,11 +255,6 @@ def test_without_pyulog_it_is_said_what_to_install(save, monkeypatch):
         read_log(path)
 
 
-@pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    return tmp_path_factory.mktemp("ulog") / "log.ulg"
-
-
 SMALL = ulog(
     [
         combined(grid(0.02, 0.6)),
@@ -294,29 +265,6 @@ SMALL = ulog(
     ],
     before=message("F", ESC),
 )
-ACCIDENTS = st.lists(
-    st.tuples(
-        st.sampled_from(["cut", "flip", "flip", "insert", "drop", "zeros"]), st.floats(0, 1), st.integers(0, 999)
-    ),
-    max_size=4,
-)
-
-
-@given(accidents=ACCIDENTS)
-@settings(max_examples=150)
-@example(accidents=[])
-def test_damaged_logs(accidents, path):
-    path.write_bytes(damaged(SMALL, accidents))
-    result = outcome(lambda p: read_log(p, CRAZYFLIE), path)
-    if not accidents:
-        assert not isinstance(result, str)
-
-
-@given(junk=st.binary(max_size=400))
-@settings(max_examples=80)
-def test_arbitrary_bytes_after_the_magic(junk, path):
-    path.write_bytes(SMALL[:16] + junk)
-    assert isinstance(outcome(read_log, path), str)
 
 
 # Rates of their own
@@ -329,7 +277,7 @@ def test_impulse_is_conserved_whatever_the_rates(seed, measured):
     t = np.cumsum(rng.uniform(0.001, 0.1, 60))
     rows = np.sort(rng.uniform(t[0], t[-1], 40))
     values = rng.uniform(0, 900, (60, 4))
-    got = driving(rows, Series(t, values), measured=measured)
+    got = rotor_rms(rows, Series(t, values), measured=measured)
     fine = np.linspace(rows[0], rows[-1], 400_001)
     held = values[np.searchsorted(t, fine, side="right") - 1] ** 2
     if measured:
@@ -341,8 +289,8 @@ def test_impulse_is_conserved_whatever_the_rates(seed, measured):
 def test_a_slow_sensor_stands_at_its_nearest_row_and_not_across_its_gaps():
     rows = 0.01 * np.arange(200)
     t = np.delete(0.004 + 0.05 * np.arange(40), np.arange(10, 20))
-    out = placed(rows, Series(t, np.sin(3 * t)[:, None]))[:, 0]
-    there = np.isfinite(out)
-    np.testing.assert_allclose(out[there], np.sin(3 * rows[there]), atol=3 * 0.05**2)
-    assert abs(np.count_nonzero(there) - 29) <= 2
-    assert not there[(rows > t[9] + 0.01) & (rows < t[10] - 0.01)].any()
+    out = at_rows(rows, Series(t, np.sin(3 * t)[:, None]))[:, 0]
+    measured = np.isfinite(out)
+    np.testing.assert_allclose(out[measured], np.sin(3 * rows[measured]), atol=3 * 0.05**2)
+    assert abs(np.count_nonzero(measured) - 29) <= 2
+    assert not measured[(rows > t[9] + 0.01) & (rows < t[10] - 0.01)].any()

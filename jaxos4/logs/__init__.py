@@ -1,8 +1,9 @@
-"""Flight files to `Flight` and back."""
+"""Files of recorded flights to `Flight`, and back to CSV. Each log format is one file and one line in `FORMATS`."""
 
-from ._formats import log_format as log_format, read_log as read_log
 from .csv import (
     read_flight as read_flight,
     read_flight_and_notes as read_flight_and_notes,
     write_flight as write_flight,
 )
+from .formats import FORMATS as FORMATS, log_format as log_format, read_log as read_log
+from .table import LogFormat as LogFormat, Table as Table

@@ -1,29 +1,31 @@
-"""Flights in blackbox logs of Betaflight and INAV, as CSV: by `blackbox_decode`, or exported by Blackbox Explorer.
+"""Blackbox logs of Betaflight and INAV, as CSV: from `blackbox_decode`, or exported by Blackbox Explorer.
 
-Read are:
+| column | column of the log | unit in the log |
+| --- | --- | --- |
+| `t` | `time (us)`, `time (ms)`, `time (s)`, or Explorer's `time`; 0 at the first row | as named; Explorer: us |
+| `p, q, r` | `gyroUnfilt[0..2]`, or `gyroADC[0..2]` | deg/s, or as named: `(deg/s)`, `(rad/s)` |
+| `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g, or as named: `(g)`, `(m/s2)` |
+| `omega1..4` | `eRPM[0..3]`, measured | 100 electrical revolutions a minute |
+| `command1..4` | `motor[0..3]`, if there is no `eRPM` | DShot 48..2047, or PWM 1000..2000 |
+| `phi, theta, psi` | INAV's `attitude[0..2]` | 0.1 deg |
+| `x, y, z` | INAV's `navPos[0..2]` | cm |
+| `vx, vy, vz` | INAV's `navVel[0..2]` | cm/s |
 
-- time: `time (us)` (or `(ms)`, `(s)`); Explorer's `time` is in microseconds. `t` counts from the first row.
-- body rates: `gyroUnfilt[0..2]`, or where it was not logged `gyroADC[0..2]` [deg/s, or as the name says: `(deg/s)`,
-  `(rad/s)`]. The unfiltered signal is preferred: the flight controller's filters delay by some milliseconds, which
-  would be taken for a lag of the vehicle.
-- specific force: `accSmooth[0..2]`, in `acc_1G` units a g (or `(g)`, `(m/s2)` in the name).
-- rotors: `eRPM[0..3]`, measured, in units of 100 electrical revolutions a minute; otherwise commands `motor[0..3]`
-  from the idle to the full end of their protocol (DShot 48..2047 or PWM 1000..2000), taken for fractions of the
-  airframe's `max_rotor_speed`.
-- INAV: `attitude[0..2]` [0.1 deg], `navPos[0..2]` [cm], `navVel[0..2]` [cm/s].
+The unfiltered gyro is preferred: the filters of the flight controller delay the rates by some milliseconds, which the
+estimators would attribute to the vehicle. Commands count as fractions of the airframe's `max_rotor_speed`.
 
-Explorer writes the log's settings above the header: `acc_1G`, `motor_poles`, `motorOutput`, `minthrottle`,
-`maxthrottle`, `blackbox_high_resolution` (rates are ten times finer) are taken from there. `blackbox_decode` writes
-none: then 14 poles, 1 g from the accelerometer's median, the protocol from the commands' range, and coarse rates are
-assumed, and it is said.
+**Settings.** Explorer writes the settings of the log above the header. The reader uses `acc_1G`, `motor_poles`,
+`motorOutput`, `maxthrottle` and `blackbox_high_resolution` (rates are in tenths of a deg/s).
+`blackbox_decode` writes no settings. The reader then assumes 14 poles and rates in deg/s, takes 1 g from the median of
+the accelerometer and the protocol from the range of the commands, and notes each of these assumptions.
 
-The gyro and the accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose down,
-yaw counter-clockwise seen from above (the firmware's own telemetry negates pitch and yaw to forward, right, down).
-INAV's `attitude` is roll to the right, pitch nose down, and heading clockwise from north: psi = -heading. Its `navPos`
-is north, east, up: ours is north, west, up.
+**Frames.** Gyro and accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose
+down, yaw counter-clockwise seen from above. (The firmware's own telemetry has the opposite signs of pitch and yaw.)
+INAV's `attitude` is roll to the right, pitch nose down, and heading clockwise from north, so psi = -heading. INAV's
+`navPos` is north, east, up; ours is north, west, up.
 
-Rotors keep the log's order (Betaflight's quad X: 1 rear right, 2 front right, 3 rear left, 4 front left): the
-airframe's `rotor_positions` and `rotor_spins` must be in the same order.
+**Rotors.** They keep the log's numbers (Betaflight's quad X: 1 rear right, 2 front right, 3 rear left, 4 front left).
+The airframe's `rotor_positions` and `rotor_spins` must have the same order.
 
 Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight and INAV.
 """
@@ -31,13 +33,15 @@ Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight and IN
 import csv
 import math
 import os
-from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from ._table import Table, opened, printable, read_table, refuse
+from .csv_text import read_table
+from .table import LogFormat, Table, opened, refuse
 
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
+_RAW = b"H Product:Blackbox"
 _MOST_SETTINGS = 5000  # lines above the header
 _LONGEST_LINE = 1 << 16
 _DEGREE = math.pi / 180
@@ -48,67 +52,96 @@ _TIMES = {"time (us)": 1e-6, "time (ms)": 1e-3, "time (s)": 1.0, "time": 1e-6}
 _RATE_UNITS = {"": _DEGREE, " (deg/s)": _DEGREE, " (rad/s)": 1.0}
 _FORCE_UNITS = {"": None, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
-_REMEDY = "the units are not those this reader takes them for, or the log is broken: export it by Blackbox Explorer"
-_PLAIN = tuple(f"{name}[{i}]" for name in ("attitude", "navPos", "navVel") for i in range(3))
-_ROTORS = tuple(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8))
+_INAV = {  # column: column of the log, sign
+    "phi": ("attitude[0]", 1),
+    "theta": ("attitude[1]", 1),
+    "psi": ("attitude[2]", -1),
+    "x": ("navPos[0]", 1),
+    "y": ("navPos[1]", -1),
+    "z": ("navPos[2]", 1),
+    "vx": ("navVel[0]", 1),
+    "vy": ("navVel[1]", -1),
+    "vz": ("navVel[2]", 1),
+}
+_EXPORT = "export it as CSV by Blackbox Explorer"
+_REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _KNOWN = (
     *_TIMES,
     *(f"{name}[{i}]{unit}" for name in ("gyroUnfilt", "gyroADC") for i in range(3) for unit in _RATE_UNITS),
     *(f"accSmooth[{i}]{unit}" for i in range(3) for unit in _FORCE_UNITS),
-    *_PLAIN,
-    *_ROTORS,
+    *(name for name, _ in _INAV.values()),
+    *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
 
 
-def is_blackbox(start: str) -> bool:
-    """Whether a file that begins so is a blackbox log in CSV."""
-    return any(_is_header(line) for line in start.splitlines()[:_MOST_SETTINGS])
+class _Log(NamedTuple):
+    """A blackbox log: its own columns `raw` and `settings`, and our `columns`, the log's `names` of them, `notes`."""
+
+    path: str | os.PathLike[str]
+    header: int
+    settings: dict[str, str]
+    raw: dict[str, np.ndarray]
+    columns: dict[str, np.ndarray]
+    names: dict[str, str]
+    notes: list[str]
+
+    def add(self, column: str, name: str, values: np.ndarray) -> None:
+        self.columns[column], self.names[column] = values, name
+
+    def setting(self, name: str, least: float, most: float) -> float | None:
+        """A setting, if it is a number within these limits."""
+        return _number(self.settings.get(name, ""), least, most)
 
 
 def read_blackbox(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
-    """The columns of a blackbox log, and what was assumed of it; this module's docstring tells what is read.
+    """Read the columns of a blackbox log (listed in `jaxos4.logs.blackbox`), and notes on what was assumed.
 
     **Raises:** `InputError`, one line: file, row, column, what is wrong and what to do.
     """
-    shown = printable(os.fspath(path))
-    settings, skip = _settings(path, shown)
+    settings, skip = _settings(path)
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    notes: list[str] = []
-    columns: dict[str, np.ndarray] = {}
-    names: dict[str, str] = {}
+    log = _Log(path, skip + 1, settings, raw, {}, {}, [])
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
-        refuse(shown, "there is no time: export the column 'time (us)'")
-    columns["t"], names["t"] = (raw[time] - np.nan_to_num(raw[time][0])) * _TIMES[time], time
-    _add_rates(shown, raw, settings, columns, names, notes)
-    _add_rotors(table, raw, settings, columns, names, notes)
-    _add_force(raw, settings, columns, names, notes)
-    for i, (name, sign) in enumerate((("phi", 1), ("theta", 1), ("psi", -1))):
-        if f"attitude[{i}]" in raw:
-            columns[name], names[name] = sign * raw[f"attitude[{i}]"] * 0.1 * _DEGREE, f"attitude[{i}]"
-    for i, (name, sign) in enumerate((("x", 1), ("y", -1), ("z", 1))):
-        for field, column in (("navPos", name), ("navVel", f"v{name}")):
-            if f"{field}[{i}]" in raw:
-                columns[column], names[column] = sign * raw[f"{field}[{i}]"] / 100, f"{field}[{i}]"
-    notes.append(
-        f"rotors keep the log's order ({names.get('omega1', names.get('command1'))} is rotor 1): rotor_positions and "
-        "rotor_spins must be in the same order"
+        refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
+    log.add("t", time, (raw[time] - np.nan_to_num(raw[time][0])) * _TIMES[time])
+    _add_rates(log)
+    _add_rotors(log)
+    _add_force(log)
+    for column, (name, sign) in _INAV.items():
+        if name in raw:
+            values = sign * raw[name]
+            log.add(column, name, values * 0.1 * _DEGREE if name.startswith("attitude") else values / 100)
+    log.notes.append(
+        f"rotors keep the log's order ({log.names.get('omega1', log.names.get('command1'))} is rotor 1): "
+        "rotor_positions and rotor_spins must be in the same order"
     )
-    table = table._replace(columns=columns, unknown=(), names=names, remedy=_REMEDY)
-    return table, tuple(notes)
+    return table._replace(columns=log.columns, unknown=(), names=log.names, remedy=_REMEDY), tuple(log.notes)
+
+
+def _recognises(begin: bytes) -> bool:
+    if begin.startswith(_RAW):
+        return True
+    lines = begin.decode("utf-8-sig", errors="replace").splitlines()
+    return any(_is_header(line) for line in lines[:_MOST_SETTINGS])
+
+
+BLACKBOX = LogFormat("blackbox", "blackbox CSV", _recognises, read_blackbox)
 
 
 def _is_header(line: str) -> bool:
     return any(mark in line for mark in _HEADER_MARKS) and line.count(",") > 2
 
 
-def _settings(path: str | os.PathLike[str], shown: str) -> tuple[dict[str, str], int]:
-    """What stands above the header, and how many lines that is."""
+def _settings(path: str | os.PathLike[str]) -> tuple[dict[str, str], int]:
+    """The settings above the header, and the number of their lines."""
     settings: dict[str, str] = {}
     with opened(path) as file:
         for number in range(_MOST_SETTINGS):
             line = file.readline(_LONGEST_LINE)
+            if number == 0 and line.startswith(_RAW.decode()):
+                refuse(path, f"is a blackbox log that is not decoded; decode it by blackbox_decode, or {_EXPORT}")
             if _is_header(line):
                 return settings, number
             if not line:
@@ -119,110 +152,89 @@ def _settings(path: str | os.PathLike[str], shown: str) -> tuple[dict[str, str],
                 continue
             if len(cells) > 1:
                 settings.setdefault(cells[0].strip(), ",".join(cells[1:]).strip())
-    refuse(shown, "has no header of a blackbox log; decode it by blackbox_decode, or export it by Blackbox Explorer")
+    refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _number(settings: Mapping[str, str], name: str, least: float, most: float) -> float | None:
-    """A setting that is a number and can be one of its kind."""
+def _number(text: str, least: float, most: float) -> float | None:
     try:
-        value = float(settings.get(name, ""))
+        value = float(text)
     except ValueError:
         return None
     return value if least <= value <= most else None
 
 
-def _add_rates(
-    path: str,
-    raw: dict[str, np.ndarray],
-    settings: Mapping[str, str],
-    columns: dict[str, np.ndarray],
-    names: dict[str, str],
-    notes: list[str],
-) -> None:
+def _add_rates(log: _Log) -> None:
     for field in ("gyroUnfilt", "gyroADC"):
         for unit, factor in _RATE_UNITS.items():
-            fields = [f"{field}[{i}]{unit}" for i in range(3)]
-            if not all(name in raw for name in fields):
+            names = [f"{field}[{i}]{unit}" for i in range(3)]
+            if not all(name in log.raw for name in names):
                 continue
-            fine = 10.0 if unit == "" and _number(settings, "blackbox_high_resolution", 1, 1) else 1.0
-            if unit == "" and not settings:
-                notes.append(
-                    f"{field} is taken for deg/s: with blackbox_high_resolution it would be ten times that, and only "
-                    "Blackbox Explorer's export says so"
+            fine = 10.0 if unit == "" and log.setting("blackbox_high_resolution", 1, 1) else 1.0
+            if unit == "" and not log.settings:
+                log.notes.append(
+                    f"{field} is taken as deg/s: with blackbox_high_resolution its unit is 0.1 deg/s, and only an "
+                    "export by Blackbox Explorer says so"
                 )
-            for column, name in zip("pqr", fields, strict=True):
-                columns[column], names[column] = raw[name] * factor / fine, name
+            for column, name in zip("pqr", names, strict=True):
+                log.add(column, name, log.raw[name] * factor / fine)
             return
-    refuse(path, "holds no body rates: gyroADC[0..2] or gyroUnfilt[0..2] is missing; log the gyro")
+    refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
 
 
-def _add_rotors(
-    table: Table,
-    raw: dict[str, np.ndarray],
-    settings: Mapping[str, str],
-    columns: dict[str, np.ndarray],
-    names: dict[str, str],
-    notes: list[str],
-) -> None:
+def _add_rotors(log: _Log) -> None:
+    raw = log.raw
     for field in ("eRPM", "motor"):
-        if any(f"{field}[{i}]" in raw and np.ptp(_seen(raw[f"{field}[{i}]"])) > 0 for i in range(4, 8)):
-            refuse(table.path, "has more than four motors; this library knows four: no quadrotor's log")
+        if any(f"{field}[{i}]" in raw and np.ptp(_finite(raw[f"{field}[{i}]"])) > 0 for i in range(4, 8)):
+            refuse(log.path, "has more than four motors; give the log of a quadrotor", row=log.header)
     speeds, commands = ([f"{field}[{i}]" for i in range(4)] for field in ("eRPM", "motor"))
-    if all(name in raw and (_seen(raw[name]) > 0).any() for name in speeds):
-        poles = _number(settings, "motor_poles", 2, 100)
+    if all(name in raw and (_finite(raw[name]) > 0).any() for name in speeds):
+        poles = log.setting("motor_poles", 2, 100)
         if poles is None:
-            notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle's")
+            log.notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle")
         factor = 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60
         for i, name in enumerate(speeds):
-            columns[f"omega{i + 1}"], names[f"omega{i + 1}"] = raw[name] * factor, name
+            log.add(f"omega{i + 1}", name, raw[name] * factor)
         return
     lacking = next((name for name in commands if name not in raw), None)
     if lacking is not None:
-        refuse(table.path, f"there is no {lacking} in it; log the motors, or eRPM (bidirectional DShot)")
-    values = np.column_stack([raw[name] for name in commands])
-    low, high = _ends(values, settings)
-    notes.append(
-        f"commands are motor[0..3] from {low:g} to {high:g}, taken for fractions of full-scale rotor speed"
-        + ("" if settings else "; the ends are told by their range")
+        what = "is missing; log the motors, or eRPM (bidirectional DShot)"
+        refuse(log.path, what, row=log.header, column=lacking)
+    low, high = _ends(np.column_stack([raw[name] for name in commands]), log)
+    log.notes.append(
+        f"commands are motor[0..3] from {low:g} to {high:g}, taken as fractions of full-scale rotor speed"
+        + ("" if log.settings else "; the protocol is assumed from their range")
     )
     for i, name in enumerate(commands):
-        columns[f"command{i + 1}"] = np.clip((values[:, i] - low) / (high - low), 0.0, 1.0)
-        names[f"command{i + 1}"] = name
+        log.add(f"command{i + 1}", name, np.clip((raw[name] - low) / (high - low), 0.0, 1.0))
 
 
-def _ends(values: np.ndarray, settings: Mapping[str, str]) -> tuple[float, float]:
-    """What stands for a rotor at rest and at full speed: the protocol's ends, not those of idle."""
-    seen = _seen(values)
-    high = settings.get("motorOutput", "").split(",")[-1]
-    full = _number({"high": high}, "high", 1, 65535) or _number(settings, "maxthrottle", 1, 65535)
-    if (seen[seen > 0] < _PWM[0]).any() or seen.max(initial=0) > _PWM[1] or (full or 0) > _PWM[1]:
+def _ends(values: np.ndarray, log: _Log) -> tuple[float, float]:
+    """The commands at rest and at full speed: the ends of the protocol, and not the idle command."""
+    finite = _finite(values)
+    output = log.settings.get("motorOutput", "").split(",")[-1]
+    full = _number(output, 1, 65535) or log.setting("maxthrottle", 1, 65535)
+    if (finite[finite > 0] < _PWM[0]).any() or finite.max(initial=0) > _PWM[1] or (full or 0) > _PWM[1]:
         return _DSHOT
     return _PWM
 
 
-def _add_force(
-    raw: dict[str, np.ndarray],
-    settings: Mapping[str, str],
-    columns: dict[str, np.ndarray],
-    names: dict[str, str],
-    notes: list[str],
-) -> None:
+def _add_force(log: _Log) -> None:
     for unit, factor in _FORCE_UNITS.items():
-        fields = [f"accSmooth[{i}]{unit}" for i in range(3)]
-        if not all(name in raw for name in fields):
+        names = [f"accSmooth[{i}]{unit}" for i in range(3)]
+        if not all(name in log.raw for name in names):
             continue
         if factor is None:
-            one = _number(settings, "acc_1G", 1, 65535)
+            one = log.setting("acc_1G", 1, 65535)
             if one is None:
-                median = float(np.nanmedian(np.sqrt(sum(raw[name] ** 2 for name in fields))))
+                median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
                 one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
-                notes.append(f"accSmooth is taken for {one} units a g, as its median of {median:.4g} suggests")
+                log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
             factor = _GRAVITY / one
-        for column, name in zip(("ax", "ay", "az"), fields, strict=True):
-            columns[column], names[column] = raw[name] * factor, name
+        for column, name in zip(("ax", "ay", "az"), names, strict=True):
+            log.add(column, name, log.raw[name] * factor)
         return
 
 
-def _seen(values: np.ndarray) -> np.ndarray:
-    seen = values[np.isfinite(values)]
-    return seen if seen.size else np.zeros(1)
+def _finite(values: np.ndarray) -> np.ndarray:
+    finite = values[np.isfinite(values)]
+    return finite if finite.size else np.zeros(1)

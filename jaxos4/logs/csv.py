@@ -1,13 +1,20 @@
-"""Flights in CSV files.
+"""The flight CSV: the project's own log format.
 
-A header row, then numbers in SI units, separated by commas:
+The first row holds the names of the columns, in any order. Cells are separated by commas.
 
-- `t` [s], increasing.
-- `omega1..4` [rad/s], measured rotor speeds, or `command1..4`, fractions 0..1 of the airframe's `max_rotor_speed`.
-- any of `x, vx, y, vy, z, vz, phi, p, theta, q, psi, r`: the states of Eq. (14), in m, m/s, rad and rad/s.
-- any of `ax, ay, az` [m/s^2]: specific force.
+| column | unit | content |
+| --- | --- | --- |
+| `t` | s | time; it must increase |
+| `omega1..4` | rad/s | measured rotor speeds |
+| `command1..4` | 0..1 | commands, as fractions of the airframe's `max_rotor_speed` |
+| `x, y, z` | m | position |
+| `vx, vy, vz` | m/s | velocity |
+| `phi, theta, psi` | rad | roll, pitch, yaw |
+| `p, q, r` | rad/s | body rates |
+| `ax, ay, az` | m/s^2 | specific force |
 
-A column that is missing and a cell that is empty were not measured.
+A missing column or an empty cell means that the value was not measured. A flight needs `t`, all four rotors (speeds
+or commands), and at least one of the twelve states of Eq. (14).
 """
 
 import csv
@@ -19,28 +26,28 @@ import numpy as np
 from .._files import write_atomically
 from ..airframe import Airframe
 from ..errors import InputError
-from ..flight import STATE_NAMES, Flight
-from ._assemble import COLUMN_NAMES as COLUMN_NAMES, FORCE_NAMES, SPEED_NAMES, flight_of
-from ._table import printable, read_table
+from ..flight import FORCE_NAMES, STATE_NAMES, Flight
+from .assemble import COLUMN_NAMES as COLUMN_NAMES, SPEED_NAMES, flight_of
+from .csv_text import read_table
+from .table import LogFormat, Table, printable
 
 _ROWS_AT_ONCE = 8192
 
 
 def read_flight(path: str | os.PathLike[str], airframe: Airframe | None = None) -> Flight:
-    """The flight in a CSV file; this module's docstring tells the format.
+    """Read a flight from a CSV file. The columns are listed in `jaxos4.logs.csv`.
 
     **Arguments:**
 
     - `path`: the file.
-    - `airframe`: needed where the file holds `command1..4`: its `max_rotor_speed` turns them into rotor speeds.
+    - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds. A file with `omega1..4` needs none.
 
-    **Returns:** a `Flight`. Rows within 1 % of a uniform time grid stand as they were recorded; others are resampled
-    (`jaxos4.logs.resample`). Jumps of a turn in roll and yaw are taken out.
+    **Returns:** a `Flight`. Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such
+    a grid (see `jaxos4.logs.resample`). Jumps of 2 pi in roll and yaw are removed.
 
     **Raises:** `InputError`, one line: file, row, column, what is wrong and what to do.
 
-    **Warns:** `UserWarning` for what was done to the data: resampling, rotor speeds held over empty cells, unknown
-    columns.
+    **Warns:** `UserWarning` for each change to the data: resampling, empty cells of a rotor, ignored columns.
     """
     flight, notes = read_flight_and_notes(path, airframe)
     for note in notes:
@@ -51,33 +58,41 @@ def read_flight(path: str | os.PathLike[str], airframe: Airframe | None = None) 
 def read_flight_and_notes(
     path: str | os.PathLike[str], airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
-    """`read_flight` with its warnings as values: one line each, without the file's name.
+    """Read a flight as `read_flight` does, and return its warnings as notes: one line each, without the file's name.
 
-    `full_scale`: as `jaxos4.logs.read_log` has it.
+    `full_scale` is the rotor speed of command 1 [rad/s] if the airframe gives none.
     """
     return flight_of(read_table(path, COLUMN_NAMES), airframe, full_scale=full_scale)
 
 
+def _read(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
+    return read_table(path, COLUMN_NAMES), ()
+
+
+CSV = LogFormat("CSV", "flight CSV", lambda begin: True, _read)
+
+
 def write_flight(flight: Flight, path: str | os.PathLike[str]) -> None:
-    """Write a flight as CSV: `t`, `omega1..4`, what was measured of the twelve states and the specific force.
+    """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of the states and the specific force.
 
-    Numbers are written so that reading gives back every bit, and the file is whole or as it was before.
+    Reading the file gives back every bit. If writing fails, an older file at `path` is unchanged.
 
-    **Raises:** `InputError` where the flight holds what a file cannot (an infinity, a rotor speed that is not finite)
-    or is a batch; `OSError` where the file cannot be written.
+    **Raises:** `InputError` for a batch of flights, or for values that a file cannot contain (an infinity, a rotor
+    speed that is not finite); `OSError` if the file cannot be written.
     """
     if flight.time.ndim != 1:
         raise InputError(
-            f"{printable(os.fspath(path))}: one file holds one flight, got a batch of shape {flight.time.shape[:-1]}."
+            f"{printable(os.fspath(path))}: one file holds one flight, got a batch of shape {flight.time.shape[:-1]}; "
+            "write each flight to its own file."
         )
     columns = {"t": np.asarray(flight.time), **dict(zip(SPEED_NAMES, np.asarray(flight.omega).T, strict=True))}
     for name, column in columns.items():
-        _refuse_to_write(path, name, column, ~np.isfinite(column))
+        _check_cells(path, name, column, np.isfinite(column))
     measured: dict[str, np.ndarray] = dict(zip(STATE_NAMES, np.asarray(flight.states).T, strict=True))
     if flight.specific_force is not None:
         measured.update(zip(FORCE_NAMES, np.asarray(flight.specific_force).T, strict=True))
     for name, column in measured.items():
-        _refuse_to_write(path, name, column, np.isinf(column))
+        _check_cells(path, name, column, ~np.isinf(column))
         if not np.isnan(column).all():
             columns[name] = column
     with write_atomically(path) as beside, open(beside, "w", encoding="utf-8", newline="") as file:
@@ -89,10 +104,10 @@ def write_flight(flight: Flight, path: str | os.PathLike[str]) -> None:
             writer.writerows(zip(*cells, strict=True))
 
 
-def _refuse_to_write(path: str | os.PathLike[str], name: str, column: np.ndarray, unusable: np.ndarray) -> None:
-    if unusable.any():
-        index = int(np.argmax(unusable))
+def _check_cells(path: str | os.PathLike[str], name: str, column: np.ndarray, usable: np.ndarray) -> None:
+    if not usable.all():
+        index = int(np.argmin(usable))
         raise InputError(
             f"{printable(os.fspath(path))}: sample {index}, column {name}: is {column[index]}, "
-            "which a flight file cannot hold; cut the flight before it."
+            "which a flight file cannot contain; cut the flight before it."
         )

@@ -1,4 +1,4 @@
-"""Rows recorded at uneven times to a uniform grid, inventing nothing across gaps."""
+"""Resampling of rows at uneven times to a uniform grid. Gaps stay unmeasured."""
 
 import math
 from typing import NamedTuple
@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-UNIFORM = 0.01  # of dt: rows no further from a grid stand as they were recorded
+UNIFORM = 0.01  # of dt: rows this close to a grid keep their values
 REACH = 1.5  # times dt: measured samples further apart have a gap between them
-ROUNDING = 1e-6  # of dt: times no further from a grid are the grid, rounded
+ROUNDING = 1e-6  # of dt: a smaller difference from a grid is a rounding error
 
 
 class Gap(NamedTuple):
-    """What filling the grid across a gap would cost: `samples` in all, most of them after row index `row`."""
+    """The widest gap: its `length` [s], the index `row` before it, and the `samples` of a grid over all rows."""
 
     samples: float
     row: int
@@ -20,9 +20,9 @@ class Gap(NamedTuple):
 
 
 def uniform_grid(t: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"] | None:
-    """The grid on which rows at `t` [s] may stand as recorded: within 1 % of a step from it; None where they may not.
+    """The uniform grid from the first to the last time [s], or None if a row is more than 1 % of a step away from it.
 
-    The grid joins the end points. Where the times are its equals but for rounding, they are returned untouched.
+    If the times differ from the grid by rounding errors only, the times themselves are returned.
     """
     grid = np.linspace(t[0], t[-1], t.size)
     dt = (t[-1] - t[0]) / (t.size - 1)
@@ -33,7 +33,7 @@ def uniform_grid(t: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"] | 
 
 
 def widest_gap(t: Float[np.ndarray, " rows"], dt: float) -> Gap:
-    """The number of samples a grid of `dt` needs, and the widest gap it has to bridge."""
+    """The widest gap between rows at `t` [s], and the number of samples on a grid of step `dt` [s]."""
     step = np.diff(t)
     row = int(np.argmax(step))
     return Gap(math.floor((t[-1] - t[0]) / dt + UNIFORM) + 1.0, row, float(step[row]))
@@ -45,24 +45,24 @@ def resample(
     channels: Float[np.ndarray, "rows channels"],
     dt: float,
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 4"], Float[np.ndarray, "samples channels"], str]:
-    """Rows at uneven times on the grid t_0, t_0 + dt, ...
+    """Resample rows at uneven times to the grid t_0, t_0 + dt, ...
 
     **Arguments:**
 
     - `t`: [s], increasing.
-    - `omega`: rotor speeds [rad/s], each held to the next row.
-    - `channels`: measurements; NaN where not measured. Angles must be unwrapped.
-    - `dt`: [s].
+    - `omega`: rotor speeds [rad/s], each held until the next row.
+    - `channels`: measurements. NaN means not measured. Angles must be unwrapped.
+    - `dt`: step of the grid [s].
 
-    **Returns:** time, rotor speeds, channels, and a line of figures for the user.
+    **Returns:** time, rotor speeds, channels, and a note with the figures of the resampling.
 
-    A rotor speed becomes the root mean square of the held speed over the sample's interval: thrust and torque go with
-    its square, so that each rotor's impulse is conserved, however the rows lie. The last one is the speed held there.
+    Rotor speeds: the root mean square of the held speed over each interval of the grid. Thrust and torque are
+    proportional to the square, so each rotor's impulse is conserved. The last value is the speed held at that time.
 
-    A measurement is interpolated linearly between neighbouring measured samples no further apart than 1.5 dt: second
-    order in dt. A sensor slower than the rows (its own median step is longer) yields one grid sample for each of its
-    own, the nearest, interpolated toward the next one. Where the neighbours are further apart than 1.5 of either step
-    there is a gap, and NaN in it, save that a sample within 1 % of dt from a grid time stands there.
+    Measurements: linear interpolation between measured samples at most 1.5 dt apart, with an error of second order in
+    dt. A slower sensor gives one value for each of its samples, at the nearest time of the grid. Neighbours further
+    apart than 1.5 steps of the sensor have a gap between them. A gap is NaN, except for samples within 1 % of dt of a
+    time of the grid.
     """
     samples = int(widest_gap(t, dt).samples)
     grid = t[0] + dt * np.arange(samples)
@@ -71,7 +71,7 @@ def resample(
 
 
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:
-    """An angle [rad] without its jumps of a turn, and their number; NaN stay, and so does what follows no jump."""
+    """Remove the jumps of 2 pi from an angle [rad], and count them. Values before the first jump do not change."""
     measured = np.flatnonzero(np.isfinite(angle))
     step = np.diff(angle[measured])
     turns = np.where(np.abs(step) > math.pi, np.rint(step / (2 * math.pi)), 0.0)
@@ -89,21 +89,21 @@ def _interpolate(t: np.ndarray, y: np.ndarray, grid: np.ndarray, dt: float) -> n
     if t.size > 1:
         left = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, t.size - 2)
         after, before, step = grid - t[left], t[left + 1] - grid, np.diff(t)
-        own = REACH * max(dt, float(np.median(step)))
+        own_reach = REACH * max(dt, float(np.median(step)))
         step = step[left]
         near = np.minimum(after, before) <= dt / 2
-        joined = (after >= 0) & (before >= 0) & ((step <= REACH * dt) | (near & (step <= own)))
+        joined = (after >= 0) & (before >= 0) & ((step <= REACH * dt) | (near & (step <= own_reach)))
         out[joined] = (y[left] + after / step * (y[left + 1] - y[left]))[joined]
     nearest = np.rint((t - grid[0]) / dt).astype(int)
     inside = nearest < grid.size
     nearest, t, y = nearest[inside], t[inside], y[inside]
-    stands = (np.abs(t - grid[nearest]) <= UNIFORM * dt) & np.isnan(out[nearest])
-    out[nearest[stands]] = y[stands]
+    exact = (np.abs(t - grid[nearest]) <= UNIFORM * dt) & np.isnan(out[nearest])
+    out[nearest[exact]] = y[exact]
     return out
 
 
 def root_mean_square(t: np.ndarray, omega: np.ndarray, grid: np.ndarray, dt: float) -> np.ndarray:
-    """Rotor speeds on a grid, each the root mean square over the sample that follows."""
+    """Root mean square of held rotor speeds over each interval of a uniform grid. The last value is the held speed."""
     held = np.minimum(np.searchsorted(t, grid, side="right") - 1, t.size - 1)
     speeds = omega[held]
     squares = np.vstack([np.zeros(4), np.cumsum(omega[:-1] ** 2 * np.diff(t)[:, None], axis=0)])
@@ -128,6 +128,6 @@ def _figures(t: np.ndarray, grid: np.ndarray, dt: float) -> str:
     inside = np.searchsorted(grid, t[starts + 1] - UNIFORM * dt) - np.searchsorted(grid, t[starts] + UNIFORM * dt)
     gaps = "1 gap" if starts.size == 1 else f"{starts.size} gaps"
     return (
-        f"{text}; {gaps} of up to {1e3 * step.max():.4g} ms: rotor speeds are held over {int(inside.sum())} samples "
-        "there, and nothing counts as measured"
+        f"{text}; {gaps} of up to {1e3 * step.max():.4g} ms: the {int(inside.sum())} samples in gaps hold the rotor "
+        "speeds and count as not measured"
     )

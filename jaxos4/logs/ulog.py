@@ -1,24 +1,29 @@
-"""Flights in ULog files, the logs of PX4.
+"""ULog: the logs of PX4. Reading needs `pip install 'jaxos4[ulog]'`.
 
-Read are, each from the first of the topics that is there:
+| column | topic and field of the log | unit in the log |
+| --- | --- | --- |
+| `p, q, r` | `vehicle_angular_velocity.xyz`, or `sensor_combined.gyro_rad` | rad/s |
+| `ax, ay, az` | `sensor_combined.accelerometer_m_s2`, or `vehicle_acceleration.xyz` | m/s^2 |
+| `phi, theta, psi` | `vehicle_attitude.q`: w, x, y, z, from the body to the earth | |
+| `x, y, z` | `vehicle_local_position.x, y, z`, while `xy_valid` and `z_valid` | m |
+| `vx, vy, vz` | `vehicle_local_position.vx, vy, vz`, while `v_xy_valid` and `v_z_valid` | m/s |
+| `omega1..4` | `esc_status.esc[0..3].esc_rpm`, interpolated linearly in the square | rpm |
+| `command1..4` | `actuator_motors.control[0..3]`, if there is no `omega1..4` | 0..1 |
+| `command1..4` | `actuator_outputs.output[0..3]`, if there is no `actuator_motors` | PWM or DShot |
 
-- body rates: `vehicle_angular_velocity.xyz`, or `sensor_combined.gyro_rad` [rad/s]. Their samples are the rows: what
-  was logged at other rates is brought to them (`jaxos4.logs._series`).
-- specific force: `sensor_combined.accelerometer_m_s2`, or `vehicle_acceleration.xyz` [m/s^2].
-- attitude: `vehicle_attitude.q` (w, x, y, z; from the body to the earth frame).
-- position and velocity: `vehicle_local_position` `x, y, z` [m], `vx, vy, vz` [m/s], where its flags say they are valid.
-- rotors: `esc_status.esc[0..3].esc_rpm` [rpm], measured, joined linearly; or commands, held: `actuator_motors.control
-  [0..3]` [0..1], or `actuator_outputs.output[0..3]`, as PWM [1000..2000 us] or, where they go below 800, DShot
-  [0..1999]. A command is taken for a fraction of the airframe's `max_rotor_speed`.
+Outputs are DShot (0..1999) if one of them lies between 1 and 800, and PWM (1000..2000 us) otherwise. A command is held
+until the next one, and counts as a fraction of the airframe's `max_rotor_speed`.
 
-PX4's body has x forward, y right, z down, its earth x north, y east, z down. Ours has x forward, y left, z up, and
-north, west, up, which is half a turn about x: y, z, q, r, theta and psi change their signs, x, p and phi do not.
+**Time.** A sample's time is its `timestamp_sample`, or its `timestamp`. `t` is 0 at the first sample used. The samples
+of the body rates are the rows; samples at other rates are brought to them (`jaxos4.logs.series`).
 
-Rotors keep PX4's numbers (of its quad X: 1 front right, 2 rear left, 3 front left, 4 rear right): the airframe's
-`rotor_positions` and `rotor_spins` must be in the same order. Where `esc_status` says which motor an ESC turns
-(`actuator_function`), its speeds are put in the motors' order.
+**Frames.** PX4's body has x forward, y right, z down; its earth has x north, y east, z down. Our body has x forward,
+y left, z up; our earth has x north, y west, z up. A half turn about x leads from one to the other: y, z, q, r, theta
+and psi change their signs; x, p and phi do not.
 
-A sample's time is its `timestamp_sample`, where there is one; `t` counts from the first one used.
+**Rotors.** They keep PX4's numbers (quad X: 1 front right, 2 rear left, 3 front left, 4 rear right). The airframe's
+`rotor_positions` and `rotor_spins` must have the same order. If `actuator_function` says which motor an ESC drives,
+the speeds are put in the order of the motors.
 """
 
 import contextlib
@@ -31,10 +36,9 @@ import numpy as np
 
 from .._files import BROKEN
 from ..errors import InputError
-from ._series import Series, covered, driving, in_order, placed
-from ._table import MAX_ROWS, Table, printable, refuse
-from ._ulog_messages import needed_messages
-from .resample import unwrap
+from .series import Series, at_rows, euler_angles, gyro_rows, in_order, unwrapped
+from .table import LogFormat, Table, printable, refuse
+from .ulog_messages import MAGIC, needed_messages
 
 TOPICS = (
     "vehicle_angular_velocity",
@@ -46,15 +50,15 @@ TOPICS = (
     "actuator_motors",
     "actuator_outputs",
 )
-_AXES = ("[0]", "[1]", "[2]")
 _RATES = (("vehicle_angular_velocity", "xyz"), ("sensor_combined", "gyro_rad"))
 _FORCES = (("sensor_combined", "accelerometer_m_s2"), ("vehicle_acceleration", "xyz"))
+_FLAGS = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
 _HALF_TURN = np.array([1.0, -1.0, -1.0])  # about x: from forward, right, down to forward, left, up
 _FIRST_MOTOR = 101  # PX4's number of the output function "Motor 1"
 _RPM = 2 * math.pi / 60
 _PWM, _DSHOT = (1000.0, 2000.0), (0.0, 1999.0)
 _LEAST_PWM = 800.0
-_REMEDY = "the log is broken there, or a sensor was: choose another log"
+_REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 
 Fields = dict[str, np.ndarray]
 
@@ -65,211 +69,165 @@ class _Rotors(NamedTuple):
     names: tuple[str, ...]
 
 
+class _Log(NamedTuple):
+    """The decoded topics, each with its instances; the log's names of our columns; the notes."""
+
+    path: str | os.PathLike[str]
+    topics: dict[str, list[Fields]]
+    names: dict[str, str]
+    notes: list[str]
+
+    def series(self, topic: str, fields: tuple[str, ...], instance: int = 0) -> Series | None:
+        """Samples of the fields of a topic, or None if one of them was not logged."""
+        raw = self.topics.get(topic, [])[instance : instance + 1]
+        if not raw or not all(name in raw[0] for name in fields):
+            return None
+        stamp = raw[0].get("timestamp_sample", raw[0]["timestamp"])
+        stamp = np.asarray(stamp if np.all(stamp > 0) else raw[0]["timestamp"], dtype=float)
+        kept = in_order(stamp)
+        if kept is None:
+            refuse(self.path, f"time runs backward in {topic}: it is corrupt; copy the log again from the vehicle")
+        if not kept.all():
+            self.notes.append(f"{topic}: {np.count_nonzero(~kept)} late samples are ignored")
+        with np.errstate(all="ignore"):  # a damaged float need not be finite
+            values = np.column_stack([np.asarray(raw[0][name], dtype=float)[kept] for name in fields])
+        return Series(stamp[kept] / 1e6, np.where(np.isfinite(values), values, np.nan))
+
+    def vector(self, sources: tuple[tuple[str, str], ...], columns: tuple[str, ...]) -> Series | None:
+        """The first of the sources (topic, field) that was logged, in our frame."""
+        for topic, field in sources:
+            fields = tuple(f"{field}[{i}]" for i in range(3))
+            series = self.series(topic, fields)
+            if series is not None and np.isfinite(series.values).any():
+                self.names.update((c, f"{topic}.{f}") for c, f in zip(columns, fields, strict=True))
+                return Series(series.t, series.values * _HALF_TURN)
+        return None
+
+
 def read_ulog(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
-    """The columns of a PX4 log, and what was done to it; this module's docstring tells what is read.
+    """Read the columns of a PX4 log (listed in `jaxos4.logs.ulog`), and notes on what was assumed.
 
     **Raises:** `InputError`, one line: file, topic and field, what is wrong and what to do.
     """
-    shown = printable(os.fspath(path))
-    notes: list[str] = []
-    topics = _decoded(path, notes)
-    names: dict[str, str] = {}
-    rates = _vector(shown, topics, _RATES, ("p", "q", "r"), names, notes)
+    log = _decoded(path)
+    rates = log.vector(_RATES, ("p", "q", "r"))
     if rates is None:
-        refuse(shown, "holds no body rates; log vehicle_angular_velocity or sensor_combined (SDLOG_PROFILE)")
-    rotors = _rotors(shown, topics, notes)
+        refuse(path, "holds no body rates; log vehicle_angular_velocity or sensor_combined (SDLOG_PROFILE)")
+    rotors = _esc_speeds(log) or _motor_commands(log) or _outputs(log)
     if rotors is None:
-        refuse(shown, "holds no rotor speeds or commands; log esc_status, actuator_motors or actuator_outputs")
-    inside = covered(rates.t, rotors.series.t)
-    if np.count_nonzero(inside) < 2:
-        refuse(shown, "rates and motors were not logged at the same time; record both in one flight")
-    rates = Series(rates.t[inside], rates.values[inside])
-    if rates.t.size > MAX_ROWS:
-        refuse(shown, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
-    rows = rates.t
-    columns: dict[str, np.ndarray] = {"t": rows - rows[0]}
-    columns.update(zip(("p", "q", "r"), (rates.values * _HALF_TURN).T, strict=True))
-    driven = driving(rows, rotors.series, measured=rotors.measured)
+        refuse(path, "holds no rotor speeds or commands; log esc_status, actuator_motors or actuator_outputs")
+    rows, columns = gyro_rows(path, rates, rotors.series, measured=rotors.measured)
     prefix = "omega" if rotors.measured else "command"
-    for i, column in enumerate(driven.T):
-        columns[f"{prefix}{i + 1}"] = column
-        names[f"{prefix}{i + 1}"] = rotors.names[i]
-    force = _vector(shown, topics, _FORCES, ("ax", "ay", "az"), names, notes)
-    if force is not None:
-        columns.update(zip(("ax", "ay", "az"), (placed(rows, force) * _HALF_TURN).T, strict=True))
-    columns.update(_attitude(shown, topics, rows, names, notes))
-    columns.update(_position(shown, topics, rows, names, notes))
-    notes.append(
+    log.names.update((f"{prefix}{i + 1}", name) for i, name in enumerate(rotors.names))
+    others = {
+        ("ax", "ay", "az"): log.vector(_FORCES, ("ax", "ay", "az")),
+        ("phi", "theta", "psi"): _attitude(log),
+        tuple(_FLAGS): _position(log),
+    }
+    for names, series in others.items():
+        if series is not None:
+            columns.update(zip(names, at_rows(rows, series).T, strict=True))
+    log.notes.append(
         f"rotors keep the log's numbers ({rotors.names[0]} is rotor 1): rotor_positions and rotor_spins must be in "
         "the same order"
     )
-    return Table(shown, columns, first_row=None, names=names, remedy=_REMEDY), tuple(notes)
+    return Table(path, columns, first_row=None, names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
-def _decoded(path: str | os.PathLike[str], notes: list[str]) -> dict[str, list[Fields]]:
-    """The topics by name, each with its instances."""
-    shown = printable(os.fspath(path))
+ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(MAGIC[:4]), read_ulog)
+
+
+def _decoded(path: str | os.PathLike[str]) -> _Log:
     needed = needed_messages(path, TOPICS)
-    if needed.left_out:
-        notes.append(f"the log was cut while it was written: its last {needed.left_out} bytes are left out")
+    notes = [f"the log ends abruptly: its last {needed.cut} bytes are ignored"] if needed.cut else []
     try:
         from pyulog.core import ULog
         from pyulog.exceptions import ULogException
     except ImportError:
-        raise InputError(f"{shown}: a ULog needs pyulog to be read; install jaxos4[ulog].") from None
+        raise InputError(
+            f"{printable(os.fspath(path))}: reading a ULog file needs pyulog; install jaxos4[ulog]."
+        ) from None
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            log = ULog(io.BytesIO(needed.content))
+            decoded = ULog(io.BytesIO(needed.content))
     except (*BROKEN, ULogException) as error:
-        refuse(shown, f"cannot be decoded ({type(error).__name__}); copy the log again from the vehicle")
-    if log.file_corruption:
-        refuse(shown, "is corrupt: a message is not of its topic's size; copy the log again from the vehicle")
+        refuse(path, f"cannot be decoded ({type(error).__name__}); copy the log again from the vehicle")
+    if decoded.file_corruption:
+        refuse(path, "is corrupt: a message does not have its topic's size; copy the log again from the vehicle")
     topics: dict[str, list[Fields]] = {}
-    for data in sorted(log.data_list, key=lambda data: data.multi_id):
+    for data in sorted(decoded.data_list, key=lambda data: data.multi_id):
         if "timestamp" in data.data:
             topics.setdefault(data.name, []).append(data.data)
-    return topics
+    return _Log(path, topics, {}, notes)
 
 
-def _times(path: str, topic: str, fields: Fields, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] that increase, and which samples they are of."""
-    stamp = fields.get("timestamp_sample", fields["timestamp"])
-    stamp = np.asarray(stamp if np.all(stamp > 0) else fields["timestamp"], dtype=float)
-    kept = in_order(stamp)
-    if kept is None:
-        refuse(path, f"time runs backward in {topic}: it is corrupt; copy the log again from the vehicle")
-    if not kept.all():
-        notes.append(f"{topic}: {np.count_nonzero(~kept)} samples that came late are left out")
-    return stamp[kept] / 1e6, np.flatnonzero(kept)
-
-
-def _columns(fields: Fields, names: tuple[str, ...], index: np.ndarray) -> np.ndarray | None:
-    if not all(name in fields for name in names):
-        return None
-    with np.errstate(all="ignore"):  # a damaged number need not be one
-        values = np.column_stack([np.asarray(fields[name], dtype=float)[index] for name in names])
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def _vector(
-    path: str,
-    topics: dict[str, list[Fields]],
-    sources: tuple[tuple[str, str], ...],
-    columns: tuple[str, ...],
-    names: dict[str, str],
-    notes: list[str],
-) -> Series | None:
-    """The first of `sources` (topic, field) that was logged."""
-    for topic, field in sources:
-        fields = tuple(field + axis for axis in _AXES)
-        for instance in topics.get(topic, [])[:1]:
-            t, index = _times(path, topic, instance, notes)
-            values = _columns(instance, fields, index)
-            if values is not None and np.isfinite(values).any():
-                names.update((c, f"{topic}.{f}") for c, f in zip(columns, fields, strict=True))
-                return Series(t, values)
-    return None
-
-
-def _rotors(path: str, topics: dict[str, list[Fields]], notes: list[str]) -> _Rotors | None:
-    for read in (_esc_speeds, _motor_commands, _outputs):
-        rotors = read(path, topics, notes)
-        if rotors is not None:
-            return rotors
-    return None
-
-
-def _esc_speeds(path: str, topics: dict[str, list[Fields]], notes: list[str]) -> _Rotors | None:
+def _esc_speeds(log: _Log) -> _Rotors | None:
     names = tuple(f"esc[{i}].esc_rpm" for i in range(4))
-    for fields in topics.get("esc_status", [])[:1]:
-        t, index = _times(path, "esc_status", fields, notes)
-        values = _columns(fields, names, index)
-        if values is None or t.size < 2:
-            return None
-        if not (np.abs(values) > 0).any(axis=0).all():
-            notes.append("esc_status holds no speed of some rotor: commands are used")
-            return None
-        functions = [np.unique(fields.get(f"esc[{i}].actuator_function", np.zeros(1))) for i in range(4)]
-        motors = [int(f[-1]) - _FIRST_MOTOR for f in functions]
-        order = np.argsort(motors) if sorted(motors) == [0, 1, 2, 3] else np.arange(4)
-        measured = np.isfinite(values).all(axis=1)
-        series = Series(t[measured], np.abs(values[measured])[:, order] * _RPM)
-        if series.t.size > 1:
-            return _Rotors(series, True, tuple(f"esc_status.{names[i]}" for i in order))
-    return None
+    series = log.series("esc_status", names)
+    if series is None or series.t.size < 2:
+        return None
+    if not (np.abs(series.values) > 0).any(axis=0).all():
+        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
+        return None
+    fields = log.topics["esc_status"][0]
+    functions = [np.unique(fields.get(f"esc[{i}].actuator_function", np.zeros(1))) for i in range(4)]
+    motors = [int(f[-1]) - _FIRST_MOTOR for f in functions]
+    order = np.argsort(motors) if sorted(motors) == [0, 1, 2, 3] else np.arange(4)
+    measured = np.isfinite(series.values).all(axis=1)
+    if np.count_nonzero(measured) < 2:
+        return None
+    speeds = Series(series.t[measured], np.abs(series.values[measured])[:, order] * _RPM)
+    return _Rotors(speeds, True, tuple(f"esc_status.{names[i]}" for i in order))
 
 
-def _motor_commands(path: str, topics: dict[str, list[Fields]], notes: list[str]) -> _Rotors | None:
+def _motor_commands(log: _Log) -> _Rotors | None:
     names = tuple(f"control[{i}]" for i in range(4))
-    for fields in topics.get("actuator_motors", [])[:1]:
-        t, index = _times(path, "actuator_motors", fields, notes)
-        values = _columns(fields, names, index)
-        if values is None or t.size < 2 or not np.isfinite(values).any():
-            return None
-        others = [i for i in range(4, 12) if np.nan_to_num(fields.get(f"control[{i}]", np.zeros(1))).any()]
-        if others:
-            refuse(
-                path, f"actuator_motors drives {4 + len(others)} motors; this library knows four: no quadrotor's log"
-            )
-        notes.append("commands are actuator_motors.control, taken for fractions of full-scale rotor speed")
-        series = Series(t, np.clip(np.nan_to_num(values), 0.0, 1.0))  # NaN: not armed
-        return _Rotors(series, False, tuple(f"actuator_motors.{name}" for name in names))
-    return None
+    series = log.series("actuator_motors", names)
+    if series is None or series.t.size < 2 or not np.isfinite(series.values).any():
+        return None
+    fields = log.topics["actuator_motors"][0]
+    others = [i for i in range(4, 12) if np.nan_to_num(fields.get(f"control[{i}]", np.zeros(1))).any()]
+    if others:
+        refuse(log.path, f"actuator_motors drives {4 + len(others)} motors; give the log of a quadrotor")
+    log.notes.append("commands are actuator_motors.control, taken as fractions of full-scale rotor speed")
+    commands = Series(series.t, np.clip(np.nan_to_num(series.values), 0.0, 1.0))  # NaN means not armed
+    return _Rotors(commands, False, tuple(f"actuator_motors.{name}" for name in names))
 
 
-def _outputs(path: str, topics: dict[str, list[Fields]], notes: list[str]) -> _Rotors | None:
+def _outputs(log: _Log) -> _Rotors | None:
     names = tuple(f"output[{i}]" for i in range(4))
-    found: list[tuple[float, Series]] = []
-    for fields in topics.get("actuator_outputs", []):
-        t, index = _times(path, "actuator_outputs", fields, notes)
-        values = _columns(fields, names, index)
-        if values is not None and t.size > 1 and np.isfinite(values).all():
-            found.append((float(values.std(axis=0).min()), Series(t, values)))
+    instances = range(len(log.topics.get("actuator_outputs", [])))
+    found = [log.series("actuator_outputs", names, i) for i in instances]
+    found = [s for s in found if s is not None and s.t.size > 1 and np.isfinite(s.values).all()]
     if not found:
         return None
-    series = max(found, key=lambda each: each[0])[1]
+    series = max(found, key=lambda each: float(each.values.std(axis=0).min()))
     turning = series.values[series.values > 1]
     kind, (low, high) = ("DShot", _DSHOT) if (turning < _LEAST_PWM).any() else ("PWM", _PWM)
-    notes.append(
-        f"commands are actuator_outputs.output, {kind} {low:g}..{high:g}, taken for fractions of full-scale rotor speed"
+    log.notes.append(
+        f"commands are actuator_outputs.output, {kind} {low:g}..{high:g}, taken as fractions of full-scale rotor speed"
     )
     series = Series(series.t, np.clip((series.values - low) / (high - low), 0.0, 1.0))
     return _Rotors(series, False, tuple(f"actuator_outputs.{name}" for name in names))
 
 
-def _attitude(
-    path: str, topics: dict[str, list[Fields]], rows: np.ndarray, names: dict[str, str], notes: list[str]
-) -> dict[str, np.ndarray]:
-    for fields in topics.get("vehicle_attitude", [])[:1]:
-        t, index = _times(path, "vehicle_attitude", fields, notes)
-        q = _columns(fields, tuple(f"q[{i}]" for i in range(4)), index)
-        if q is None:
-            break
-        with np.errstate(all="ignore"):
-            w, x, y, z = (q / np.sqrt((q**2).sum(axis=1, keepdims=True))).T
-        phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-        theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-        psi = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        angles = np.column_stack([unwrap(phi)[0], -theta, unwrap(-psi)[0]])
-        names.update(dict.fromkeys(("phi", "theta", "psi"), "vehicle_attitude.q"))
-        return dict(zip(("phi", "theta", "psi"), placed(rows, Series(t, angles)).T, strict=True))
-    return {}
+def _attitude(log: _Log) -> Series | None:
+    series = log.series("vehicle_attitude", tuple(f"q[{i}]" for i in range(4)))
+    if series is None:
+        return None
+    log.names.update(dict.fromkeys(("phi", "theta", "psi"), "vehicle_attitude.q"))
+    return unwrapped(series.t, euler_angles(series.values) * _HALF_TURN)
 
 
-def _position(
-    path: str, topics: dict[str, list[Fields]], rows: np.ndarray, names: dict[str, str], notes: list[str]
-) -> dict[str, np.ndarray]:
-    columns = ("x", "y", "z", "vx", "vy", "vz")
-    for fields in topics.get("vehicle_local_position", [])[:1]:
-        t, index = _times(path, "vehicle_local_position", fields, notes)
-        values = _columns(fields, columns, index)
-        if values is None:
-            break
-        flags = ("xy_valid", "xy_valid", "z_valid", "v_xy_valid", "v_xy_valid", "v_z_valid")
-        for i, flag in enumerate(flags):
-            if flag in fields:
-                values[np.asarray(fields[flag])[index] == 0, i] = np.nan
-        names.update((name, f"vehicle_local_position.{name}") for name in columns)
-        values *= np.tile(_HALF_TURN, 2)
-        return dict(zip(columns, placed(rows, Series(t, values)).T, strict=True))
-    return {}
+def _position(log: _Log) -> Series | None:
+    columns = tuple(_FLAGS)
+    logged = log.topics.get("vehicle_local_position", [{}])[0]
+    flags = {column: flag for column, flag in _FLAGS.items() if flag in logged}
+    series = log.series("vehicle_local_position", (*columns, *flags.values()))
+    if series is None:
+        return None
+    values = series.values[:, :6] * np.tile(_HALF_TURN, 2)
+    for i, column in enumerate(flags):
+        values[series.values[:, 6 + i] == 0, columns.index(column)] = np.nan
+    log.names.update((name, f"vehicle_local_position.{name}") for name in columns)
+    return Series(series.t, values)

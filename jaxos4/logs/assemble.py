@@ -1,4 +1,4 @@
-"""Columns of a log, of whichever format, to a `Flight`: the same checks, resampling and notes for all of them."""
+"""The columns of a log to a `Flight`. The checks, the resampling and the notes are the same for all formats."""
 
 import re
 
@@ -8,15 +8,15 @@ import numpy as np
 from .._custom_types import as_float
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES, Flight
-from ._table import MAX_ROWS, Table, quoted
-from ._units import check_time, check_units, force_note, thrust_note
 from .resample import UNIFORM, resample, uniform_grid, unwrap, widest_gap
+from .table import MAX_ROWS, Table, quoted
+from .units import check_time, check_units, force_note, thrust_note
 
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
 COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES)
 
-_OTHER_NAMES = {  # what other loggers call them, for a hint
+_OTHER_NAMES = {  # names that other loggers use, for the question "should 'time' be t?"
     "time": "t",
     "timestamp": "t",
     "times": "t",
@@ -30,21 +30,23 @@ _OTHER_NAMES = {  # what other loggers call them, for a hint
     "accy": "ay",
     "accz": "az",
 }
-MOST_SAMPLES = 10_000  # and ten for each row: a flight that is mostly gap is two flights
+MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
 
 
 def flight_of(
     table: Table, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
-    """The flight that a log's columns record, and what was done to them: one line each, without the file's name.
+    """Make a flight from the columns of a log.
 
     **Arguments:**
 
-    - `table`: columns by the names in `COLUMN_NAMES`.
+    - `table`: columns with the names in `COLUMN_NAMES`.
     - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds.
-    - `full_scale`: the rotor speed of command 1 [rad/s] where there is no such airframe; 1 leaves commands as they are.
+    - `full_scale`: rotor speed of command 1 [rad/s] if the airframe gives none. With 1, commands stay as they are.
 
-    **Raises:** `InputError`, one line: file, row and column (where the format has them), what is wrong, what to do.
+    **Returns:** the flight, and notes on what was changed: one line each, without the file's name.
+
+    **Raises:** `InputError`, one line: file, row and column (if the format has them), what is wrong, what to do.
     """
     notes = [_unknown_note(table.unknown)] if table.unknown else []
     table = _measured(table)
@@ -53,16 +55,15 @@ def flight_of(
     omega = _rotor_speeds(table, airframe, full_scale, notes)
     commanded = not any(name in table.columns for name in SPEED_NAMES)
     if airframe is not None:
-        carried = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient / (airframe.mass * airframe.gravity)
-        _add(notes, thrust_note(float(carried)))
+        thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient
+        _add(notes, thrust_note(float(thrust / (airframe.mass * airframe.gravity))))
     channels = _channels(table, notes)
     with_force = any(name in table.columns for name in FORCE_NAMES)
     time, omega, channels = _evenly(table._replace(columns={"t": table.columns["t"]}), dt, omega, channels, notes)
-    del table  # a long log's memory
+    del table  # frees the memory of a long log
     dt = float(time[-1] - time[0]) / (time.size - 1)
     if np.finfo(jnp.result_type(float)).eps * abs(time[0]) > UNIFORM * dt:
-        late = f"t starts at {time[0]:.10g} s, too late for this precision to tell samples apart"
-        notes.append(f"{late}: it starts at 0 now")
+        notes.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
         time = dt * np.arange(time.size)
     force = as_float(channels[:, 12:]) if with_force else None
     flight = Flight(as_float(time), as_float(omega), as_float(channels[:, :12]), force, commanded=commanded)
@@ -70,7 +71,7 @@ def flight_of(
 
 
 def _measured(table: Table) -> Table:
-    """The table without columns that hold nothing, after a look at what a flight cannot do without."""
+    """The table without its empty columns, if time and a state remain."""
     columns = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
     table = table._replace(columns=columns)
     if "t" not in columns:
@@ -89,7 +90,7 @@ def _missing(what: str, wanted: tuple[str, ...], table: Table) -> str:
 
 
 def _meant(name: str) -> str | None:
-    """The column that an unknown name may stand for: another case, other separators, or another logger's word."""
+    """The column that an unknown name may mean: in another case, with other separators, or as other loggers say."""
     plain = re.sub(r"[\W_]", "", name).lower()
     return _OTHER_NAMES.get(plain, plain if plain in COLUMN_NAMES else None)
 
@@ -97,7 +98,7 @@ def _meant(name: str) -> str | None:
 def _unknown_note(unknown: tuple[str, ...]) -> str:
     shown = [quoted(name) + (f" (did you mean {_meant(name)}?)" if _meant(name) else "") for name in unknown[:8]]
     more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
-    return f"unknown columns are left out: {', '.join(shown)}{more}"
+    return f"unknown columns are ignored: {', '.join(shown)}{more}"
 
 
 def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | None, notes: list[str]) -> np.ndarray:
@@ -107,10 +108,10 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
     if len(names) < 4:
         wanted = COMMAND_NAMES if commands and not speeds else SPEED_NAMES
         lacking = next(name for name in wanted if name not in names)
-        what = _missing(f"there is no {lacking} in it", wanted, table)
+        what = _missing("is missing", wanted, table)
         table.refuse(f"{what}; a flight needs omega1..4 [rad/s] or command1..4 [0..1], all four", column=lacking)
     if speeds and commands:
-        notes.append(f"measured {speeds[0]}..{speeds[-1]} are used, {', '.join(commands)} are not")
+        notes.append(f"measured {speeds[0]}..{speeds[-1]} are used; {', '.join(commands)} are ignored")
     omega = np.column_stack([_held(table, name, notes) for name in names])
     if speeds:
         return omega
@@ -119,23 +120,20 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
         full_scale = known
     if not np.isfinite(full_scale):
         table.refuse(
-            "commands say nothing without the rotor speed of full scale; "
-            "set max_rotor_speed [rad/s] in the airframe's TOML file",
+            "the rotor speed of full command is not known; set max_rotor_speed [rad/s] in the airframe's TOML file",
             column=names[0],
         )
     return omega * full_scale
 
 
 def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
-    """A rotor's column, with each empty cell at the value before it."""
+    """The column of a rotor. An empty cell gets the value before it."""
     column = table.columns[name]
     empty = np.isnan(column)
     if not empty.any():
         return column
     if empty[0]:
-        table.refuse(
-            "is empty, and no value before it could be held; cut the rows before the first one", index=0, column=name
-        )
+        table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
     last = np.maximum.accumulate(np.where(empty, 0, np.arange(column.size)))
     t = table.columns["t"]
     longest = (t - t[last]).max()
@@ -144,7 +142,7 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
 
 
 def _channels(table: Table, notes: list[str]) -> np.ndarray:
-    """States and specific force, shape (rows, 15); NaN where not measured, angles without jumps of a turn."""
+    """States and specific force, shape (rows, 15). NaN means not measured. Angles are unwrapped."""
     channels = np.full((table.columns["t"].size, len(CHANNEL_NAMES)), np.nan)
     for i, name in enumerate(CHANNEL_NAMES):
         if name not in table.columns:
@@ -153,7 +151,7 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
         if name in ("phi", "psi"):
             channels[:, i], jumps = unwrap(table.columns[name])
             if jumps:
-                notes.append(f"{name}: {jumps} {'jump' if jumps == 1 else 'jumps'} of a turn taken out")
+                notes.append(f"{name}: {jumps} {'jump' if jumps == 1 else 'jumps'} of 2 pi removed")
     _add(notes, force_note(channels[:, 12:]))
     return channels
 
@@ -161,7 +159,7 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
 def _evenly(
     table: Table, dt: float, omega: np.ndarray, channels: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, rotor speeds and channels on a uniform grid: the rows themselves wherever they may stand."""
+    """Time, rotor speeds and channels on a uniform grid. Rows that already lie on one keep their values."""
     t = table.columns["t"]
     time = uniform_grid(t)
     if time is not None:
@@ -169,14 +167,14 @@ def _evenly(
     gap = widest_gap(t, dt)
     if gap.samples > min(MAX_ROWS, MOST_SAMPLES + 10 * t.size):
         what = (
-            f"leaves a gap of {gap.length:.6g} s before it: at the median step of {dt:.3g} s the flight would have "
+            f"comes after a gap of {gap.length:.6g} s: at the median step of {dt:.3g} s the flight would have "
             f"{gap.samples:.3g} samples; cut the file there"
         )
         table.refuse(what, index=gap.row + 1, column="t")
     time, omega, channels, figures = resample(t, omega, channels, dt)
     notes.append(figures)
     if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
-        table.refuse("no measured sample has a neighbour within 1.5 steps or lies on the grid; record time evenly")
+        table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
     return time, omega, channels
 
 

@@ -1,84 +1,119 @@
-"""Whatever a file holds, reading it gives a usable flight or one line that says why not, and nothing else."""
+"""The law of all log formats: a file gives a usable flight or an `InputError` of one line, whatever it contains."""
 
 import math
 
 import equinox as eqx
 import numpy as np
 import pytest
+import test_logs_blackbox as blackbox
+import test_logs_crazyflie as crazyflie
+import test_logs_ulog as ulog
 from hypothesis import example, given, settings, strategies as st
+from recorded_logs import damaged, outcome
+from test_flight_csv import CRAZYFLIE, csv
 
-import jaxos4.logs._table as table_module
-from jaxos4.airframe import OS4
-from jaxos4.errors import InputError
+import jaxos4.logs.csv_text as csv_module
 from jaxos4.flight import Flight
-from jaxos4.logs import read_flight_and_notes
+from jaxos4.logs import FORMATS, log_format, read_flight_and_notes, read_log
 from jaxos4.logs.csv import COLUMN_NAMES
 
-AIRFRAME = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(400.0))
 NAMES = ("t", "omega1", "omega2", "omega3", "omega4", "p", "q", "r", "phi", "theta", "psi", "x", "az")
 JUNK = st.one_of(
     st.sampled_from(
-        ["", " ", "nan", "NaN", "inf", "-inf", "1e999", "-1e999", "1e-999", "1e308", "-0", "1_0", "0x1", "١", "½", "é"]
-        + [
-            "true",
-            "None",
-            ",",
-            ";",
-            '"',
-            '""',
-            '"1',
-            "1 2",
-            "--1",
-            "+",
-            "e",
-            ".",
-            "1e",
-            "\0",
-            "\x1c1",
-            "\r",
-            "\n",
-            "\t1",
-        ]
-        + ["-1", "0.05", "1e11", "1e-9", "6.3", "-7", "59", "61", "1e5", "1e6", "\u2028", "\x85", "\ufeff", "x" * 60]
+        """- , ; " "" "1 -- --1 + e . 1e 1_0 0x1 nan NaN inf -inf true None 1e999 -1e999 1e-999 1e308 -0 -1 0.05 1e11
+        1e-9 6.3 -7 59 61 1e5 1e6""".split()
+        + ["", " ", "1 2", "\0", "\x1c1", "\r", "\n", "\t1", "\u2028", "\x85", "\ufeff", "x" * 60, "١", "½", "é"]
     ),
     st.floats().map(repr),
     st.integers().map(str),
     st.text(max_size=6),
 )
 
-
-def outcome(read, path):
-    """The flight, or the refusal as a string; an `AssertionError` or what was raised otherwise."""
-    try:
-        flight, notes = read(path)
-    except InputError as error:
-        message = str(error)
-        assert len(message.splitlines()) == 1
-        assert message.startswith(f"{path}: ")
-        assert message.isprintable()
-        assert len(message) < len(str(path)) + 400
-        return message
-    time, omega, states = (np.asarray(a) for a in (flight.time, flight.omega, flight.states))
-    assert np.isfinite(time).all()
-    assert np.isfinite(omega).all()
-    assert (omega >= 0).all()
-    assert not np.isinf(states).any()
-    assert np.isfinite(states).any()
-    assert flight.specific_force is None or not np.isinf(np.asarray(flight.specific_force)).any()
-    dt = (time[-1] - time[0]) / (time.size - 1)
-    assert dt > 0
-    assert np.abs(np.diff(time) - dt).max() <= 1e-5 * dt + 4 * np.spacing(np.abs(time).max())
-    assert all(note.isprintable() for note in notes)
-    return flight
+# Each format: a good log, the bytes at its beginning that are its header, and bad logs with words of their messages.
+SUBJECTS = {
+    "ULog": (ulog.SMALL, 16, ulog.BAD),
+    "Crazyflie": (crazyflie.SMALL, 60, crazyflie.BAD),
+    "blackbox": (blackbox.SMALL, 400, blackbox.BAD),
+    "CSV": (csv().encode(), 38, {}),
+}
+BAD = {(name, case): bad[case] for name, (_, _, bad) in SUBJECTS.items() for case in bad}
+ACCIDENTS = st.lists(
+    st.tuples(
+        st.sampled_from(["cut", "flip", "flip", "insert", "drop", "zeros"]), st.floats(0, 1), st.integers(0, 999)
+    ),
+    max_size=4,
+)
 
 
 def read(path):
-    return read_flight_and_notes(path, AIRFRAME)
+    return read_log(path, CRAZYFLIE)
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    return tmp_path_factory.mktemp("fuzz") / "flight.csv"
+    return tmp_path_factory.mktemp("fuzz") / "flight.log"
+
+
+def test_every_format_is_a_subject():
+    assert list(SUBJECTS) == [each.name for each in FORMATS]
+
+
+@pytest.mark.parametrize(("name", "case"), BAD)
+def test_a_bad_log_is_refused_in_one_line(name, case, save):
+    content, words = BAD[name, case]
+    message = outcome(read, save(content))
+    assert isinstance(message, str)
+    assert words in message
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_a_damaged_log(name, path):
+    content = SUBJECTS[name][0]
+    path.write_bytes(content)
+    assert log_format(path).name == name
+    assert isinstance(outcome(read, path), Flight)
+
+    @given(accidents=ACCIDENTS)
+    @settings(max_examples=150)
+    def law(accidents):
+        path.write_bytes(damaged(content, accidents))
+        outcome(read, path)
+
+    law()
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_any_bytes_after_a_part_of_the_header(name, path):
+    content, header, _ = SUBJECTS[name]
+
+    @given(junk=st.binary(max_size=400), keep=st.integers(1, header))
+    @settings(max_examples=80)
+    def law(junk, keep):
+        path.write_bytes(content[:keep] + junk)
+        assert isinstance(outcome(read, path), str)  # no flight is found by chance
+
+    law()
+
+
+@given(
+    lines=st.lists(
+        st.sampled_from(
+            [*blackbox.LINES[:4], '"acc_1G","x"', '"motor_poles","0"', '"a,b', "gyroADC[0],1,2,3", "", "\0", "1,2"]
+        ),
+        max_size=8,
+    )
+)
+@settings(max_examples=80)
+def test_lines_of_a_blackbox_log_in_any_order(lines, path):
+    path.write_text("\n".join([blackbox.LINES[0], *lines] if len(lines) % 2 else lines))
+    outcome(read, path)
+
+
+# The flight CSV
+
+
+def read_csv(path):
+    return read_flight_and_notes(path, CRAZYFLIE)
 
 
 @given(content=st.one_of(st.binary(max_size=300), st.text(max_size=300).map(lambda s: s.encode("utf-8", "replace"))))
@@ -89,7 +124,7 @@ def path(tmp_path_factory):
 @example(content=b"\r\r\n\r")
 def test_arbitrary_bytes(content, path):
     path.write_bytes(content)
-    assert isinstance(outcome(read, path), str)  # no flight is found by chance
+    assert isinstance(outcome(read_csv, path), str)  # no flight is found by chance
 
 
 @given(
@@ -100,13 +135,13 @@ def test_arbitrary_bytes(content, path):
 def test_tables_of_junk(header, rows, path):
     text = "\n".join(",".join(row) for row in [header, *rows])
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    outcome(read, path)
+    outcome(read_csv, path)
 
 
 def good(rows, dt, start, wide):
-    """The cells of a flight that can be read."""
+    """The cells of a good flight."""
     names = NAMES if wide else NAMES[:7]
-    lines = [list(names)]
+    lines: list[list[str]] = [list(names)]
     for k in range(rows):
         swing = [0.3 * math.sin(0.4 * k + i) for i in range(len(names) - 5)]
         lines.append([repr(start + dt * k), "200.0", "201.5", "199", "2e2", *map(repr, swing)])
@@ -146,12 +181,12 @@ def mutated(draw):
 @settings(max_examples=400)
 def test_good_flights_after_accidents(text, block, path):
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    whole = outcome(read, path)
+    whole = outcome(read_csv, path)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(table_module, "_BLOCK", block)
-        parts = outcome(read, path)
+        patch.setattr(csv_module, "_BLOCK", block)
+        parts = outcome(read_csv, path)
     if isinstance(whole, str):
-        assert isinstance(parts, str)  # of two faults, another may be met first where the text is cut for parsing
+        assert isinstance(parts, str)  # of two faults, another may be found first
     else:
         assert eqx.tree_equal(whole, parts) or np.isnan(np.asarray(whole.states)).any()
 
@@ -165,12 +200,12 @@ def test_dropped_rows_never_refuse_a_flight(keep, seed, path):
         line[0] = repr(float(line[0]) + offset)
     kept = [lines[0]] + [line for line, k in zip(lines[1:], keep, strict=True) if k]
     path.write_text("\n".join(",".join(line) for line in kept))
-    flight = outcome(read, path)
+    flight = outcome(read_csv, path)
     assert isinstance(flight, Flight)
 
 
 def naive(path):
-    """What a reader without care does."""
+    """A reader without checks."""
     with open(path, encoding="utf-8") as file:
         file.readline()
         cells = [[float(cell or "nan") for cell in line.split(",")] for line in file]
@@ -191,4 +226,4 @@ def test_the_law_fails_a_naive_reader(row, cell, junk, path):
     path.write_text("\n".join(",".join(line) for line in lines))
     with pytest.raises((AssertionError, ValueError)):
         outcome(naive, path)
-    outcome(read, path)
+    outcome(read_csv, path)

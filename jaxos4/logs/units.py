@@ -1,7 +1,7 @@
-"""Whether numbers can be in the units that the format asks for.
+"""Checks that the numbers of a log can be in the units of the flight CSV.
 
-A limit is no model of a quadrotor: it lies where no quadrotor flies and a wrong unit does. What it lets through may
-still be wrong, so that where an angle and its rate were both measured, the one is compared with the other's integral.
+Each limit lies beyond the reach of any quadrotor, but not beyond that of a wrong unit. A wrong unit can still give
+numbers within the limits, so each angle is also compared with the integral of its rate, if both were measured.
 """
 
 import math
@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._table import Table
+from .table import Table
 
 DEGREES = 180 / math.pi
 
 
 class Limit(NamedTuple):
-    """The largest magnitude that is taken for what it says, its unit, and what a larger one probably is."""
+    """The largest possible magnitude, its unit, and advice on the probable unit of a larger one."""
 
     largest: float
     unit: str
@@ -24,7 +24,7 @@ class Limit(NamedTuple):
 
 _TIME = Limit(1e11, "s", "t is in seconds: if these are milli-, micro- or nanoseconds, divide")
 _SPEED = Limit(1e5, "rad/s", "rotor speeds are in rad/s: if these are rpm, divide by 9.549")
-_POSITION = Limit(1e6, "m", "positions are in metres from a place near the flight")
+_POSITION = Limit(1e6, "m", "positions are in metres from a point near the flight; subtract an offset")
 _VELOCITY = Limit(1e3, "m/s", "velocities are in m/s: if these are mm/s, divide by 1000")
 _RATE = Limit(60.0, "rad/s", "it looks like deg/s: divide by 57.3")
 _ROLL = Limit(2 * math.pi, "rad", "it looks like degrees: divide by 57.3")
@@ -43,18 +43,18 @@ LIMITS = {
     "psi": _YAW,
     **dict.fromkeys(("ax", "ay", "az"), _FORCE),
 }
-SHORTEST_STEP, LONGEST_STEP = 1e-6, 2.0  # [s] of the median time between rows
+SHORTEST_STEP, LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
 _ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
-_WINDOW = 0.2  # [s] over which an angle's increment is compared with its rate's integral
-_FEWEST = 8  # windows, fewer of which tell nothing
-_SIMILARITY = 0.7  # cosine between the two, below which they tell nothing
-_SPREAD = 1.6  # a ratio within this factor of 57.3 is taken for it
+_WINDOW = 0.2  # [s]: increments of an angle over this time are compared with the integral of its rate
+_FEWEST = 8  # windows that a comparison needs
+_SIMILARITY = 0.7  # smallest cosine between increments and integrals at which their ratio is used
+_SPREAD = 1.6  # a ratio within this factor of 57.3 counts as 57.3
 
 
 def check_units(table: Table) -> None:
-    """Refuse magnitudes beyond `LIMITS`, rotor speeds and commands out of range, and angles at odds with rates.
+    """Refuse numbers beyond `LIMITS`, speeds and commands out of range, and angles that contradict their rates.
 
-    Roll may pass 2 pi where the roll rate says that it did: a flip is no degree.
+    Roll may pass 2 pi if its rate agrees: the vehicle made a flip.
 
     **Raises:** `InputError`.
     """
@@ -68,10 +68,10 @@ def check_units(table: Table) -> None:
         ratio = ratios.get(name)
         if ratio is not None and 1 / _SPREAD < ratio / DEGREES < _SPREAD:
             what = table.remedy or "it looks like degrees, divide by 57.3"
-            table.refuse(f"changes {ratio:.3g} times as fast as {rate} says: {what}", column=name)
+            table.refuse(f"changes {ratio:.3g} times as fast as {rate}: {what}", column=name)
         if ratio is not None and 1 / _SPREAD < ratio * DEGREES < _SPREAD:
             what = table.remedy or "it looks like deg/s, divide by 57.3"
-            table.refuse(f"is {1 / ratio:.3g} times what {name} does: {what}", column=rate)
+            table.refuse(f"is {1 / ratio:.3g} times as fast as {name} changes: {what}", column=rate)
     flips = ratios.get("phi") is not None and 1 / 3 < (ratios["phi"] or 0) < 3
     for name, values in columns.items():
         limit = LIMITS.get(name)
@@ -85,16 +85,16 @@ def check_units(table: Table) -> None:
             what = f"is {values[index]:g} {limit.unit}, beyond {largest:.4g} {limit.unit}; {advice}"
             table.refuse(what, index=index, column=name)
         if limit is _SPEED and (index := _first(values < 0)) is not None:
-            what = f"is {values[index]:g} rad/s; rotor speeds are magnitudes: drop the sign, rotor_spins hold the sense"
+            what = f"is {values[index]:g} rad/s; drop the sign, because rotor_spins gives the direction"
             table.refuse(what, index=index, column=name)
     if "psi" in columns:
         _check_yaw_steps(table)
 
 
 def check_time(table: Table) -> float:
-    """The median time between rows [s], of time that is there, increases, and can be seconds.
+    """The median time between rows [s].
 
-    **Raises:** `InputError`.
+    **Raises:** `InputError` if a time is missing, does not increase, or cannot be in seconds.
     """
     t = table.columns["t"]
     index = _first(np.isnan(t))
@@ -110,11 +110,11 @@ def check_time(table: Table) -> float:
             row = index + (table.first_row or 0)
             what = f"repeats {t[index]:.9g} s of row {row}; time must increase: delete one of the two rows"
         else:
-            what = f"runs backward, from {t[index]:.9g} s to {t[index + 1]:.9g} s; sort or cut the rows"
+            what = f"runs backward, from {t[index]:.9g} s to {t[index + 1]:.9g} s; sort the rows, or cut the file there"
         table.refuse(what, index=index + 1, column="t")
     dt = float(np.median(step))
     if dt < SHORTEST_STEP:
-        table.refuse(f"has rows {dt:.3g} s apart; t is in seconds, and no closer than a microsecond", column="t")
+        table.refuse(f"has rows {dt:.3g} s apart, less than a microsecond; t is in seconds: multiply", column="t")
     if dt > LONGEST_STEP:
         table.refuse(
             f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide",
@@ -124,15 +124,15 @@ def check_time(table: Table) -> float:
 
 
 def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | None:
-    """How much faster an angle changes than its rate says, or None where the flight does not tell.
-
-    Increments over 0.2 s against the rate's integral, so that the noise of differences does not matter. Euler-angle
-    kinematics couple the axes in a steep attitude: there the two grow unlike, and the answer is None rather than wrong.
+    """How much faster an angle changes than its rate, or None if the flight does not show it.
 
     **Arguments:**
 
     - `t`: [s], increasing.
-    - `angle`, `rate`: in units that are in question; NaN where not measured.
+    - `angle`, `rate`: in unknown units. NaN means not measured.
+
+    Increments of the angle over 0.2 s are compared with the integral of the rate, so that noise averages out. In a
+    steep attitude the axes are coupled, and the increments no longer resemble the integral: the result is then None.
     """
     with_angle, with_rate = np.isfinite(angle), np.isfinite(rate)
     if np.count_nonzero(with_rate) < 2:
@@ -151,16 +151,16 @@ def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | N
     steps = np.diff(angle[with_angle])
     turn = 360.0 if np.abs(steps).max() > 3 * math.pi else 2 * math.pi
     unwrapped = np.concatenate([[0.0], np.cumsum(steps - turn * np.rint(steps / turn))])
-    turned = np.diff(unwrapped[knots])
-    told = np.diff(np.interp(instants[knots], times, integral))
-    sizes = float(np.linalg.norm(turned)), float(np.linalg.norm(told))
-    if min(sizes) == 0 or turned @ told < _SIMILARITY * sizes[0] * sizes[1]:
+    increments = np.diff(unwrapped[knots])
+    expected = np.diff(np.interp(instants[knots], times, integral))
+    sizes = float(np.linalg.norm(increments)), float(np.linalg.norm(expected))
+    if min(sizes) == 0 or increments @ expected < _SIMILARITY * sizes[0] * sizes[1]:
         return None
     return sizes[0] / sizes[1]
 
 
 def force_note(force: np.ndarray) -> str | None:
-    """A note where specific force [m/s^2], shape (samples, 3), looks like multiples of g."""
+    """A note if specific force [m/s^2], shape (samples, 3), seems to be in multiples of g."""
     size = np.sqrt((force**2).sum(axis=1))
     size = size[np.isfinite(size)]
     if size.size == 0 or not 0.5 < np.median(size) < 2:
@@ -169,15 +169,15 @@ def force_note(force: np.ndarray) -> str | None:
 
 
 def thrust_note(ratio: float) -> str | None:
-    """A note where the rotors carry `ratio` times the weight, and rpm or rev/s would explain it."""
+    """A note if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
     if 1 / 25 < ratio < 25:
         return None
     if ratio == 0:
-        return "the rotors stand still for half of the flight or more: keep the part that was flown"
+        return "the rotors do not turn for at least half of the flight: keep only the part in the air"
     unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
     return (
-        f"the rotor speeds carry {ratio:.2g} times the airframe's weight (median): check the airframe, "
-        f"and if they are in {unit}"
+        f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight: check the airframe, and whether "
+        f"rotor speeds are in {unit}"
     )
 
 
@@ -185,7 +185,7 @@ def _check_command(table: Table, name: str) -> None:
     values = table.columns[name]
     index = _first((values < 0) | (values > 1))
     if index is not None:
-        what = f"is {values[index]:g}; commands are 0..1 of full-scale rotor speed: divide by full scale (100, 65535)"
+        what = f"is {values[index]:g}; commands are fractions 0..1 of full scale: divide by full scale (100, 65535)"
         table.refuse(what, index=index, column=name)
 
 
