@@ -76,7 +76,7 @@ def fit_inertia(
     scale = jnp.append(first, jnp.sqrt(covariance[1, 1]) * first[0] / model.gyroscopic_factor)
 
     def residuals(u: Float[Array, "4"]) -> Float[Array, "8"]:
-        return whiten @ (alpha - jnp.stack(inertial.alphas(tuple(u * scale))))
+        return whiten @ (alpha - jnp.stack(inertial.inner(tuple(u * scale))))
 
     def step(u: Float[Array, "4"], _) -> tuple[Float[Array, "4"], None]:
         jacobian = jax.jacfwd(residuals)(u)

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..flight import STATE_NAMES, Flight, held_values
+from ..flight import STATE_NAMES, Flight, fill_gaps
 from ..trigonometry import sincos
 from .state import Attitude, Forcing, Rates, Samples, State, Vector
 
@@ -42,7 +42,7 @@ def with_body_velocity(flight: Flight) -> Flight:
     columns = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "vx", "vy", "vz")]
     if bool(jnp.isnan(flight.states[:, columns]).all(axis=0).any()):
         return flight
-    *angles, vx, vy, vz = held_values(flight.states[:, columns]).T
+    *angles, vx, vy, vz = fill_gaps(flight.states[:, columns]).T
     velocity = to_body(Attitude(*angles), (vx, vy, vz))
     return eqx.tree_at(lambda f: f.body_velocity, flight, jnp.stack(velocity, axis=1), is_leaf=lambda x: x is None)
 

@@ -1,0 +1,200 @@
+"""The pictures of the documentation, drawn from real results: `python experiments/pictures/run.py docs/pictures`."""
+
+import tomllib
+from html import escape
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import matplotlib as mpl
+import numpy as np
+import typer
+from matplotlib.figure import Figure
+
+import jaxos4
+
+BLUE, ORANGE, INK, GREY = "#0072b2", "#d55e00", "#1b1e23", "#b9bec6"
+PICTURES = ("estimate", "halving", "sweeps", "floors")
+ROOMS = {
+    "cli": "reads the arguments, calls the library, prints",
+    "report": "tables, figures, HTML pages",
+    "study": "many flights: specification, storage, resume",
+    "identification": "one answer: noise, intervals, notes, checks",
+    "recording": "usable stretches, excitation, held-out parts",
+    "logs": "file formats to Flight",
+    "estimators": "one algorithm a file",
+    "networks": "features, training, network file",
+    "analysis": "Fisher information, intervals, diagnostics",
+    "estimate": "what every estimator returns",
+    "shooting": "model + flight: cost, residuals, slope",
+    "bracket": "where to look",
+    "noise": "sensors",
+    "simulation": "Euler, RK4, diffrax",
+    "models": "equations with parameters",
+    "excitation": "inputs",
+    "flight": "time, rotor speeds, states",
+    "airframe": "mass, geometry, inertia",
+}
+
+
+def simulated() -> tuple[jaxos4.AbstractModel, jaxos4.ShootingProblem, jaxos4.Bracket, jaxos4.Estimate]:
+    """The flight of `jaxos4 simulate --noise 1 --seed 0`, identified by IBSS, which records its brackets."""
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    omega = jaxos4.multisine(model.airframe, duration=5.0, dt=0.01)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=0.01)
+    noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
+    problem = jaxos4.ShootingProblem(model, noisy, sigma=jaxos4.SENSOR_SIGMA)
+    bracket = jaxos4.Bracket.default(model)
+    return model, problem, bracket, jaxos4.IBSS(record=60)(problem, bracket)
+
+
+def estimate_picture(model, problem, bracket, estimate) -> Figure:
+    """Left: measured and simulated body rates. Right: each parameter's bracket and its 95 % interval."""
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(1.25, 1.0))
+    names = list(jaxos4.STATE_NAMES)
+    flown = jaxos4.simulate(model, estimate.parameters, problem.flight.omega, dt=0.01)
+    for axes, name in zip(left.subplots(3, sharex=True), ("p", "q", "r"), strict=True):
+        at, few = names.index(name), slice(None, None, 7)
+        measured = problem.flight.time[few], problem.flight.states[few, at]
+        axes.plot(*measured, "o", color=ORANGE, mfc="none", mew=0.8, ms=4, label="measured (one in seven)")
+        axes.plot(flown.time[::2], flown.states[::2, at], color=BLUE, lw=1.2, label="simulated with the estimate")
+        axes.set_ylabel(f"{name} [rad/s]")
+    axes.set_xlabel("time [s]")
+    left.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+
+    truth, width = np.asarray(model.alpha), np.asarray(bracket.half_width)
+    error = 100 * (np.asarray(estimate.parameters) - truth) / width
+    reach = 100 * np.asarray(estimate.half_width(0.95)) / width
+    rows, axes = np.arange(len(truth)), right.subplots()
+    axes.barh(rows, 200, left=-100, height=0.62, color=GREY, alpha=0.5, label="bracket before")
+    axes.barh(rows, 2 * reach, left=error - reach, height=0.62, color=BLUE, label="95 % interval after")
+    axes.axvline(0, color=INK, lw=0.9, ls="--")
+    axes.set_xscale("symlog", linthresh=1.0)
+    ticks = (-100, -10, -1, 0, 1, 10, 100)
+    axes.set_xticks(ticks, [str(tick) for tick in ticks])
+    axes.set_yticks(rows, model.parameter_names)
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("error [% of the bracket's half-width]")
+    right.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    return figure
+
+
+def halving_picture(problem, estimate) -> Figure:
+    """A bracket of alpha3, halved six times on the sign of the slope; the other parameters stay at the estimate."""
+    rates = problem.restrict("rates")
+    cost = eqx.filter_jit(jax.value_and_grad(lambda value: rates.cost(estimate.parameters.at[2].set(value))))
+    low, high = 75.0, 180.0
+    grid = np.linspace(low, high, 81)
+    costs = [float(cost(value)[0]) for value in grid]
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    above, below = figure.subplots(2, sharex=True, height_ratios=(1.0, 1.15))
+    above.plot(grid, costs, color=INK, lw=1.3)
+    above.set_yscale("log")
+    above.set_ylabel("cost of a shot")
+    for number in range(7):
+        middle = (low + high) / 2
+        value, slope = (float(x) for x in cost(middle))
+        below.barh(number, high - low, left=low, height=0.55, color=BLUE, alpha=0.35)
+        below.plot(middle, number, ">" if slope < 0 else "<", color=ORANGE, ms=7)
+        above.plot(middle, value, ">" if slope < 0 else "<", color=ORANGE, ms=7)
+        low, high = (middle, high) if slope < 0 else (low, middle)
+    below.set_xlim(grid[0] - 3, grid[-1] + 3)
+    below.set_yticks(range(7))
+    below.invert_yaxis()
+    below.set_ylabel("halvings")
+    below.set_xlabel("alpha3 [1/(kg m²)]")
+    return figure
+
+
+def sweeps_picture(model, bracket, estimate) -> Figure:
+    """Half-widths of the brackets sweep by sweep, in standard deviations of the final estimate."""
+    std, brackets = np.asarray(estimate.std), np.asarray(estimate.brackets)[: int(estimate.sweeps)]
+    widths = np.concatenate([np.asarray(bracket.half_width)[None], (brackets[:, 1] - brackets[:, 0]) / 2]) / std
+    figure = Figure(figsize=(7.0, 3.8), layout="constrained")
+    axes = figure.subplots()
+    axes.axhline(1.0, color=INK, lw=0.9, ls="--")
+    for place, name in enumerate(model.parameter_names):
+        axes.plot(widths[:, place], f"{'os^Dv*PX'[place]}-", lw=1.1, ms=5, label=name)
+    axes.set_yscale("log")
+    axes.set_xticks(range(len(widths)), ["given", *map(str, range(1, len(widths)))])
+    axes.set_xlabel("sweep")
+    axes.set_ylabel("half-width of the bracket\n[standard deviations of the estimate]")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def floors_picture(pyproject: Path) -> str:
+    """The floors of the package as SVG, from the layers that import-linter checks."""
+    contract = tomllib.loads(pyproject.read_text())["tool"]["importlinter"]["contracts"][0]
+    width, height, gap = 860, 44, 8
+    floors = [[room.strip() for room in layer.split("|")] for layer in contract["layers"]]
+    total = len(floors) * (height + gap) + gap
+    shapes = []
+    for place, rooms in enumerate(floors):
+        own = (width - 60 - gap * (len(rooms) + 1)) / len(rooms)
+        for number, room in enumerate(rooms):
+            x, y = gap + number * (own + gap), gap + place * (height + gap)
+            text = escape(ROOMS.get(room, ""))
+            name = escape(room)
+            shapes.append(
+                f'<rect x="{x:.0f}" y="{y}" width="{own:.0f}" height="{height}" rx="6" class="room"/>'
+                f'<text x="{x + own / 2:.0f}" y="{y + (19 if text else 27)}" class="name">{name}</text>'
+                f'<text x="{x + own / 2:.0f}" y="{y + 35}" class="does">{text}</text>'
+            )
+    arrow = width - 38
+    style = (
+        f".room{{fill:#eef4f9;stroke:{BLUE};stroke-width:1.2}} text{{font-family:sans-serif;text-anchor:middle}}"
+        f".name{{font-size:14px;font-weight:bold;fill:{INK}}} .does{{font-size:11.5px;fill:#444b55}}"
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {total}" role="img">'
+        f"<title>The floors of jaxos4</title><style>{style}</style>"
+        f'<rect width="{width}" height="{total}" fill="#ffffff"/>\n' + "\n".join(shapes) + "\n"
+        f'<path d="M{arrow} {gap} V{total - 14} m-6 -10 l6 10 l6 -10" fill="none" stroke="{ORANGE}" stroke-width="2"/>'
+        f'<text transform="translate({arrow + 22} {total / 2}) rotate(90)" class="does">'
+        "a file imports only from floors below its own</text></svg>\n"
+    )
+
+
+def main(
+    out: Annotated[Path, typer.Argument(help="The folder to write to.")],
+    only: Annotated[list[str] | None, typer.Option(help=f"Some of {', '.join(PICTURES)}; all by default.")] = None,
+    pyproject: Annotated[Path, typer.Option(help="Where the floors are written.")] = Path("pyproject.toml"),
+) -> None:
+    """Draws the pictures of the documentation as SVG."""
+    jax.config.update("jax_enable_x64", True)
+    chosen = only or list(PICTURES)
+    out.mkdir(parents=True, exist_ok=True)
+    if "floors" in chosen:
+        (out / "floors.svg").write_text(floors_picture(pyproject))
+    if set(chosen) == {"floors"}:
+        return
+    model, problem, bracket, estimate = simulated()
+    drawings = {
+        "estimate": lambda: estimate_picture(model, problem, bracket, estimate),
+        "halving": lambda: halving_picture(problem, estimate),
+        "sweeps": lambda: sweeps_picture(model, bracket, estimate),
+    }
+    look = {
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.titlesize": 10,
+        "font.size": 9,
+        "grid.color": "#e3e5e9",
+        "legend.frameon": False,
+        "savefig.facecolor": "white",
+        "svg.hashsalt": "jaxos4",
+    }
+    with mpl.rc_context(look):
+        for name, draw in drawings.items():
+            if name in chosen:
+                draw().savefig(out / f"{name}.svg", metadata={"Date": None})
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,26 @@
+"""The documentation agrees with the code: the API reference and the picture of the floors."""
+
+import importlib.util
+import pathlib
+import re
+
+import jaxos4
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+
+
+def test_every_public_name_is_in_the_api_reference():
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md"))
+    documented = set(re.findall(r"^::: jaxos4\.(\w+)$", pages, flags=re.MULTILINE))
+    public = {name for name, thing in vars(jaxos4).items() if name[0] != "_" and not isinstance(thing, type(jaxos4))}
+    assert public - documented == set()
+
+
+def test_the_picture_of_the_floors_is_up_to_date():
+    script = ROOT / "experiments" / "pictures" / "run.py"
+    spec = importlib.util.spec_from_file_location("experiment_pictures_run", script)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    drawn = (ROOT / "docs" / "pictures" / "floors.svg").read_text(encoding="utf-8")
+    # If this fails: python experiments/pictures/run.py docs/pictures --only floors
+    assert drawn == module.floors_picture(ROOT / "pyproject.toml")
