@@ -124,13 +124,13 @@ def _diagnostics(
 
 
 class _Residuals(NamedTuple):
-    """Weighted residuals `errors` and measured `values`, 0 for missing samples; `most`: `count`, or 1 if it is 0."""
+    """Weighted residuals `errors` and measured `values`, 0 for missing samples; `most`: `total`, or 1 if it is 0."""
 
     sound: Bool[Array, ""]
     errors: Float[Array, "samples size"]
     measured: Bool[Array, "samples size"]
     values: Float[Array, "samples size"]
-    count: Int[Array, " size"]
+    total: Int[Array, " size"]
     most: Int[Array, " size"]
     squares: Float[Array, " size"]
 
@@ -148,7 +148,7 @@ def _residuals(problem: ShootingProblem, parameters: Parameters, initial_state: 
 
 def _level(residuals: _Residuals, unknowns: int) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
     """Mean square of the residuals by degree of freedom, and its p-value."""
-    count, squares = residuals.count, residuals.squares
+    count, squares = residuals.total, residuals.squares
     freedom = jnp.maximum(count * (1 - unknowns / jnp.maximum(count.sum(), 1)), 1.0)
     below, above = (
         tail(freedom / 2, squares / 2) for tail in (jax.scipy.special.gammainc, jax.scipy.special.gammaincc)

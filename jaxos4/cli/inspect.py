@@ -9,12 +9,14 @@ from rich.console import Console
 from rich.table import Table
 
 from ..airframe import load_airframe
+from ..logs import FORMATS
 from ..recording.inspection import RATES, AxisExcitation, IdentifiableParameters, Inspection, inspect_log
 from ._check_output import check_output
 from ._choices import OutOption
 from ._json import write_json
 
-# Of the flight's parts, how many are shown.
+LABELS = {each.name: each.label for each in FORMATS}
+# At most so many parts are printed, the longest ones.
 MOST_PARTS = 14
 CHANNELS = (
     (RATES, "rad/s"),
@@ -39,29 +41,13 @@ def inspect(
     vehicle = None if airframe is None else load_airframe(airframe)
     if out is not None:
         check_output(out, log, None if airframe is None else Path(airframe))
-    kind = log_format(log)
-    flight, notes = read_log(log, vehicle, full_scale=1.0)
-    parts = stretches(flight, vehicle)
-    usable = [part for part in parts if not part.reason]
-    moved = {part: excitation(cut(flight, part), vehicle) for part in usable}
-
-    report: dict[str, Any] = {
-        "log": str(log),
-        "format": kind.name,
-        "samples": int(flight.time.shape[0]),
-        "begin": float(flight.time[0]),
-        "end": float(flight.time[-1]),
-        "sample_time": float(flight.dt),
-        "measured": _measured(flight),
-        "notes": list(notes),
-        "parts": [_part(part, moved.get(part)) for part in parts],
-        "identifiable": None,
-    }
-    _print_contents(console, report, kind.label)
-    _print_parts(console, parts, moved)
-    longest = max(usable, key=lambda part: part.length, default=None)
-    if longest is None:
-        console.print("nothing to identify from: no part of the log is usable.", highlight=False)
+    found = inspect_log(log, vehicle)
+    _print_contents(console, found)
+    _print_parts(console, found)
+    if found.identifiable is not None:
+        _print_identifiable(console, found.identifiable)
+    elif not any(part.usable for part in found.parts):
+        console.print("no parameter is identifiable: no part of the log can be used.")
     elif vehicle is None:
         console.print("give --airframe to see which parameters are identifiable.")
     else:
@@ -70,49 +56,10 @@ def inspect(
         write_json(found.to_dict(), out)
 
 
-def _measured(flight: Flight) -> dict[str, dict[str, float]]:
-    """Of each channel that was measured: samples a second, the longest time without one [s], and the range."""
-    duration = float(flight.time[-1] - flight.time[0])
-    columns: dict[str, np.ndarray] = {}
-    columns.update(zip(STATE_NAMES, np.asarray(flight.states).T, strict=True))
-    if flight.specific_force is not None:
-        columns.update(zip(("ax", "ay", "az"), np.asarray(flight.specific_force).T, strict=True))
-    columns.update((f"rotor{i + 1}", speed) for i, speed in enumerate(np.asarray(flight.omega).T))
-    time, out = np.asarray(flight.time), {}
-    for name, values in columns.items():
-        at = np.flatnonzero(np.isfinite(values))
-        if at.size == 0:
-            continue
-        edges = np.concatenate([time[:1], time[at], time[-1:]])
-        out[name] = {
-            "rate": at.size / duration,
-            "longest_gap": float(np.diff(edges).max()),
-            "least": float(values[at].min()),
-            "most": float(values[at].max()),
-        }
-    return out
-
-
-def _part(part: Stretch, moved: tuple[Excitation, ...] | None) -> dict[str, Any]:
-    axes = {
-        each.axis: {
-            "torque": finite(each.torque),
-            "rate": finite(each.rate),
-            "noise": finite(each.noise),
-            "verdict": each.verdict,
-        }
-        for each in moved or ()
-    }
-    return {"begin": part.begin, "end": part.end, "usable": not part.reason, "reason": part.reason, "excitation": axes}
-
-
-def _print_contents(console: Console, report: dict[str, Any], label: str) -> None:
-    dt, measured = report["sample_time"], report["measured"]
+def _print_contents(console: Console, found: Inspection) -> None:
     console.print(
-        f"{report['log']}: {label}, {report['begin']:.2f} to {report['end']:.2f} s, {report['samples']} "
-        f"samples, one every {1e3 * dt:.4g} ms",
-        markup=False,
-        highlight=False,
+        f"{found.log}: {LABELS[found.format]}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
+        f"one every {1e3 * found.sample_time:.4g} ms",
         soft_wrap=True,
     )
     for names, unit in CHANNELS:

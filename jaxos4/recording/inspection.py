@@ -108,7 +108,6 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
 
     **Raises:** `InputError` for a file that cannot be read as a log.
     """
-    kind = log_format(path)
     flight, notes = read_log(path, airframe, full_scale=1.0)
     found = stretches(flight, airframe)
     usable = [stretch for stretch in found if not stretch.reason]
@@ -119,7 +118,7 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
         identifiable = _identifiable(flight, longest, airframe)
     return Inspection(
         log=str(path),
-        format=kind,
+        format=log_format(path).name,
         samples=int(flight.time.shape[0]),
         begin=float(flight.time[0]),
         end=float(flight.time[-1]),
