@@ -1,10 +1,8 @@
-"""What `study` and `compare` share: devices, a bar over the cells, and the Dataset at the end."""
+"""What `study` and `compare` share: a bar over the cells, and the Dataset at the end."""
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
 import typer
 import xarray as xr
@@ -12,23 +10,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from ..study import OUTCOMES, Step, Store, Study, assemble, open_store, save_dataset
-
-
-def use_all_cores() -> None:
-    """Makes a device of each core that this process may use: cells run side by side. Before anything is computed.
-
-    Where `JAX_NUM_CPU_DEVICES` is set, that many.
-    """
-    if os.environ.get("JAX_NUM_CPU_DEVICES"):
-        return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", cores)
-
-
-def device_name() -> str:
-    """The devices of this process, in words."""
-    devices = jax.local_devices()
-    return f"{len(devices)} x {devices[0].device_kind}"
 
 
 def carry_out(study: Study, out: Path, device: str, run: Callable[[Store], Iterator[Step]]) -> xr.Dataset:

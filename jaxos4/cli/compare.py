@@ -8,8 +8,8 @@ import typer
 from rich.console import Console
 
 from ..estimators import ESTIMATORS
-from ..study import Study, Training, run_here
-from ._studies import carry_out, device_name, summary, use_all_cores
+from ..study import Study, Training, device_name, run_here, use_all_cores
+from ._studies import carry_out, summary
 
 # Shorter training than a network takes at its best: it costs the network, and not the hybrid, which needs no more than
 # the rates' network to know where to look.

@@ -21,8 +21,16 @@ from ..models.abstract import AbstractModel
 from ..noise import AbstractNoise
 from ..report.style import Style, drawing, pdf, svg
 from ..shooting import ShootingProblem
-from ..study import RESULTS_FILE, Study, provenance, run_here, save_dataset
-from ._studies import carry_out, device_name, use_all_cores as use_all_cores
+from ..study import (
+    RESULTS_FILE,
+    Study,
+    device_name,
+    provenance,
+    run_here,
+    save_dataset,
+    use_all_cores as use_all_cores,
+)
+from ._studies import carry_out
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Headings of the eight alphas."""

@@ -1,7 +1,7 @@
 """Estimators: a `ShootingProblem` and a `Bracket` in, an `Estimate` out; one algorithm a file."""
 
 from ..estimate import AbstractEstimator
-from ..networks.network import TrainedNetwork
+from ..networks import TrainedNetwork
 from .equation_error import EquationError as EquationError
 from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS

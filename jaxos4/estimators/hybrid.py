@@ -6,7 +6,7 @@ import equinox as eqx
 
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate
-from ..networks.network import TrainedNetwork
+from ..networks import TrainedNetwork
 from ..shooting import ShootingProblem
 from .ibss import IBSS
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from ..results import NINETY_FIVE
 from ..study import metrics
 from .figures_noise import dodged, error_unit, positive_scales
 from .figures_spread import error_quantiles, nearest_scale, price, rollout_ticks
@@ -129,7 +130,7 @@ def _distribution(data: xr.Dataset) -> dict[str, Any] | None:
                     | ends
                 )
             y = {"type": "category", "autorange": "reversed"}
-            x = {"lines_at": [-metrics.NOISE_FLOOR, 0, metrics.NOISE_FLOOR], "title": "error / bound"}
+            x = {"lines_at": [-NINETY_FIVE, 0, NINETY_FIVE], "title": "error / bound"}
             panels.append({"title": name, "x": x, "y": y, "traces": traces})
         choices.append({"label": f"noise x {data['scale'].values[scale]:g}", "panels": panels})
     return {"choices": choices, "chosen": nearest_scale(data), "height": _HEIGHT}
