@@ -45,10 +45,13 @@ from .models.corrected import CorrectedOS4 as CorrectedOS4
 from .models.held import HeldParameters as HeldParameters, hold as hold
 from .models.inertial import InertialOS4 as InertialOS4
 from .models.published import PublishedOS4 as PublishedOS4
-from .models.terms import TERMS as TERMS
-from .models.vehicle import FlightModel as FlightModel
-from .networks.file import load_network as load_network, save_network as save_network
-from .networks.network import NetworkEstimator as NetworkEstimator, TrainedNetwork as TrainedNetwork
+from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
+from .networks import (
+    NetworkEstimator as NetworkEstimator,
+    TrainedNetwork as TrainedNetwork,
+    load_network as load_network,
+    save_network as save_network,
+)
 from .noise import (
     SENSOR_SIGMA as SENSOR_SIGMA,
     AbstractNoise as AbstractNoise,

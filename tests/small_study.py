@@ -1,4 +1,4 @@
-"""A study that takes seconds, run in this process or by the command line in another, and compared."""
+"""A study of a few seconds, run in this process or by the command line in another process."""
 
 import os
 import pathlib
@@ -8,7 +8,7 @@ import sys
 import jax
 import xarray as xr
 
-from jaxos4.study import carry_out, load_study
+from jaxos4.study import load_study
 
 SPECIFICATION = """
 title = "A small study"
@@ -21,7 +21,7 @@ flights = 95
 batch = 4
 seed = 3
 """
-# Training of two steps: bad, and the same as a long one in all that is asked here.
+# Training of two steps: the network is bad, which does not matter here.
 NETWORKED = """
 title = "A small study with a network"
 durations = [0.5]
@@ -39,21 +39,24 @@ COMMAND = "from jaxos4.cli import main; main()"
 
 
 def specification(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
-    """A specification as a file."""
+    """Writes a specification to a file."""
     path = folder / "spec.toml"
     path.write_text(text)
     return path
 
 
 def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
-    """A whole study, in this process."""
-    out = folder / "whole"
-    carry_out(load_study(specification(folder, text)), out, "these tests")
+    """Runs a study in this process."""
+    study, out = load_study(specification(folder, text)), folder / "whole"
+    with open_store(out, study, "these tests") as store:
+        for _ in run_here(store):
+            pass
+        save_dataset(assemble(store), out)
     return out
 
 
 def environment(devices: int = 1) -> dict[str, str]:
-    """Of another process: its devices, and the compiled programs that it shares with this one."""
+    """The environment of another process: its number of devices, and this process's cache of compiled programs."""
     return os.environ | {
         "JAX_NUM_CPU_DEVICES": str(devices),
         "JAX_PLATFORMS": "cpu",
@@ -64,7 +67,7 @@ def environment(devices: int = 1) -> dict[str, str]:
 
 
 def start(*arguments: str | pathlib.Path, code: str = COMMAND, devices: int = 1) -> subprocess.Popen[str]:
-    """Another process of this Python: the command line, or other code."""
+    """Starts another Python process with the command line, or with other code."""
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
         env=environment(devices),
@@ -75,14 +78,14 @@ def start(*arguments: str | pathlib.Path, code: str = COMMAND, devices: int = 1)
 
 
 def finish(process: subprocess.Popen[str]) -> str:
-    """What it printed; it must end well, and without a word on its error output."""
+    """Returns the output of a process; it must succeed without any error output."""
     out, err = process.communicate(timeout=300)
     assert (process.returncode, err) == (0, ""), err
     return out
 
 
 def results(out: pathlib.Path) -> xr.Dataset:
-    """The Dataset of a study, but for what computed it."""
+    """The Dataset of a study without the name of the device."""
     with xr.open_dataset(out / "results.nc") as dataset:
         dataset = dataset.load()
     del dataset.attrs["device"]
@@ -90,5 +93,5 @@ def results(out: pathlib.Path) -> xr.Dataset:
 
 
 def cells(out: pathlib.Path) -> dict[str, bytes]:
-    """The bytes of every cell."""
+    """The bytes of every cell's file."""
     return {path.name: path.read_bytes() for path in (out / "cells").glob("[0-9]*.npz")}

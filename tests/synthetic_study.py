@@ -1,9 +1,11 @@
-"""A study that nobody ran: a Dataset of the layout that studies write, from a random generator with a fixed seed."""
+"""A synthetic study: random numbers with a fixed seed, in the layout of a study's Dataset."""
 
 import json
 
 import numpy as np
 import xarray as xr
+
+from jaxos4.study import OUTCOMES as RESULTS
 
 PARAMETERS = tuple(f"alpha{i}" for i in range(1, 9))
 UNITS = ("1", "1/s", "1/(kg m^2)", "1", "1/s", "1/(kg m^2)", "1", "1/(kg m^2)")
@@ -15,7 +17,7 @@ BOUND = {
     "attitude": np.array([2.6e-3, 4e-4, 0.131, 2.8e-3, 9.2e-4, 0.132, 1.3e-3, 0.069]),
     "all": np.array([1.0e-3, 1.4e-4, 0.0387, 1.1e-3, 3.3e-4, 0.036, 1.2e-3, 0.068]),
 }
-# How each estimator errs, in its bounds: spread, bias and rollouts; and whether it looks at the rates alone.
+# For each estimator: spread and bias of its errors in bounds, rollouts, and whether it looks at the rates alone.
 ESTIMATORS = {
     "ibss": (1.0, 0.0, 600, False),
     "network": (1.15, 0.0, 0, True),
@@ -26,18 +28,6 @@ ESTIMATORS = {
     "svsf": (4.0, 3.0, 0, True),
     "kalman": (1.3, 0.2, 24, False),
 }
-RESULTS = (
-    "successful",
-    "at_bound",
-    "unidentifiable",
-    "nonfinite_trajectory",
-    "attitude_singularity",
-    "bracket_invalid",
-    "network_mismatch",
-    "max_sweeps",
-    "failed",
-    "not_run",
-)
 LEVELS = np.array([0.5, 0.9, 0.95, 0.99])
 GAUSSIAN = np.array([0.67449, 1.64485, 1.95996, 2.57583])
 SCENARIO = ("model", "airframe", "excitation", "duration", "method", "noise", "scale", "width", "channels", "estimator")
@@ -57,9 +47,10 @@ def synthetic_study(
     drawn=False,
     example=True,
 ):
-    """The Dataset. `spoiled`: with a failed cell, one that was not run, and flights of other results.
+    """A synthetic Dataset.
 
-    `drawn`: each flight has a truth of its own, drawn over 60 % of the bracket.
+    `spoiled`: some flights have other results, one cell failed, and one was not run. `drawn`: each flight has its own
+    truth, drawn over 60 % of the bracket.
     """
     rng = np.random.default_rng(seed)
     coordinates = {

@@ -1,4 +1,4 @@
-"""`jaxos4 compare`: from simulation to report in one command, here of a comparison cut to seconds."""
+"""`jaxos4 compare`: from simulation to report in one command, here with a comparison of a few seconds."""
 
 import msgspec
 import pytest
@@ -27,7 +27,7 @@ def cut(monkeypatch):
 def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path):
     code, out, err = run("compare", "--quick", "--out", "here")
     assert (code, err) == (0, "")
-    for told in (
+    for words in (
         "noise x 0.1",
         "noise x 10",
         "bound, rates",
@@ -37,7 +37,7 @@ def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path):
         "bracket centre",
         "144 estimates",
     ):
-        assert told in out
+        assert words in out
     assert (tmp_path / "here/report.html").stat().st_size > 1e6
     assert {path.stem for path in (tmp_path / "here/figures").iterdir()} >= {"error", "efficiency", "search", "path"}
     with xr.open_dataset(tmp_path / "here/results.nc") as results:
@@ -45,7 +45,7 @@ def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path):
         assert dict(results.sizes)["scale"] == 3
 
     log = (tmp_path / "here/log.jsonl").read_bytes()
-    code, again, _ = run("compare", "--quick", "--out", "here")  # goes on from where it was: the end
+    code, again, _ = run("compare", "--quick", "--out", "here")  # nothing remains to be computed
     assert code == 0
     assert (tmp_path / "here/log.jsonl").read_bytes() == log
     assert again.splitlines()[:-2] == out.splitlines()[:-2]

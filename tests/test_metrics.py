@@ -10,7 +10,7 @@ from synthetic_study import BOUND, LEVELS, RESULTS, SCENARIO, synthetic_study
 
 from jaxos4.study import metrics
 
-TOLD = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
+CONVERGED = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["one truth", "a truth each"])
@@ -24,8 +24,8 @@ def cells(study):
     for index in np.ndindex(tuple(study.sizes[name] for name in SCENARIO)):
         at = dict(zip(SCENARIO, index, strict=True))
         one = study.isel(at)
-        told = [f for f in range(study.sizes["flight"]) if int(one["result"].values[f]) in TOLD]
-        yield at, one, told
+        converged = [f for f in range(study.sizes["flight"]) if int(one["result"].values[f]) in CONVERGED]
+        yield at, one, converged
 
 
 def same(actual, expected):
@@ -33,61 +33,40 @@ def same(actual, expected):
 
 
 def rms(values):
-    return math.sqrt(sum(v * v for v in values) / len(values)) if values else math.nan
+    return math.sqrt(sum(v * v for v in values) / len(values)) if len(values) else math.nan
 
 
 def test_errors_efficiency_and_bounds_against_plain_loops(study):
     errors, best = metrics.estimator_error(study), metrics.bound_error(study)
     middle, efficiency = metrics.center_error(study), metrics.efficiency(study)
-    flights = range(study.sizes["flight"])
-    for at, one, told in cells(study):
+    for at, one, converged in cells(study):
         without = {name: place for name, place in at.items() if name != "estimator"}
         truth, bound, estimate = (one[name].values for name in ("truth", "bound", "estimate"))
         least = np.nanmin(study.isel(without)["bound"].values, axis=0)
         for p in range(8):
-            zero = any(truth[f, p] == 0 for f in flights)
-            below = any(abs(truth[f, p]) < 1.96 * bound[f, p] for f in flights)
+            place, size = at | {"parameter": p}, abs(truth[:, p])
+            zero, below = (size == 0).any(), (size < 1.959964 * bound[:, p]).any()
             reason = 1 if zero else 2 if below else 0
-            found = errors.isel(at | {"parameter": p})
+            found = errors.isel(place)
             assert int(found["reason"]) == reason
-            deviations = [estimate[f, p] - truth[f, p] for f in told]
+            deviations = (estimate - truth)[converged, p]
             same(found["absolute"], rms(deviations))
-            percent = [100 * e / abs(truth[f, p]) for e, f in zip(deviations, told, strict=True)] if not reason else []
-            same(found["percent"], rms(percent))
-            ratios = [e / bound[f, p] for e, f in zip(deviations, told, strict=True)]
-            same(efficiency["efficiency"].isel(at | {"parameter": p}), rms(ratios))
-            assert int(efficiency["count"].isel(at | {"parameter": p})) == len(told)
-            there = [f for f in flights if not math.isnan(bound[f, p])]
-            same(best["absolute"].isel(at | {"parameter": p}), rms([bound[f, p] for f in there]))
-            shares = [100 * bound[f, p] / abs(truth[f, p]) for f in there] if not reason else []
-            same(best["percent"].isel(at | {"parameter": p}), rms(shares))
-            distances = [float(one["center"][p]) - truth[f, p] for f in flights]
-            center = middle.isel(without | {"parameter": p})
+            same(found["percent"], rms([] if reason else 100 * deviations / size[converged]))
+            same(efficiency["efficiency"].isel(place), rms(deviations / bound[converged, p]))
+            assert int(efficiency["count"].isel(place)) == len(converged)
+            known = ~np.isnan(bound[:, p])
+            same(best["absolute"].isel(place), rms(bound[known, p]))
+            same(best["percent"].isel(place), rms([] if reason else 100 * bound[known, p] / size[known]))
+            distances, center = float(one["center"][p]) - truth[:, p], middle.isel(without | {"parameter": p})
             same(center["absolute"], rms(distances))
-            told_by_any = not zero and not any(abs(truth[f, p]) < 1.96 * least[f, p] for f in flights)
-            shares = (
-                [100 * d / abs(truth[f, p]) for d, f in zip(distances, flights, strict=True)] if told_by_any else []
-            )
-            same(center["percent"], rms(shares))
-
-
-def test_signed_percentages(study):
-    signed, reason = metrics.percentage_error(study), metrics.no_percentage(study)
-    for at, one, told in cells(study):
-        for p in range(8):
-            for f in range(study.sizes["flight"]):
-                value = float(signed.isel(at | {"parameter": p, "flight": f}))
-                if f not in told or int(reason.isel(at | {"parameter": p})):
-                    assert math.isnan(value)
-                else:
-                    truth = one["truth"].values[f, p]
-                    same(value, 100 * (one["estimate"].values[f, p] - truth) / abs(truth))
+            below_least = zero or (size < 1.959964 * least[:, p]).any()
+            same(center["percent"], rms([] if below_least else 100 * distances / size))
 
 
 def test_coverage_results_hits_and_rollouts_against_plain_loops(study):
     coverage, counts = metrics.coverage(study), metrics.result_counts(study)
     hits, spent = metrics.hit_rate(study), metrics.mean_rollouts(study)
-    for at, one, told in cells(study):
+    for at, one, converged in cells(study):
         results = [int(code) for code in one["result"].values]
         for code, name in enumerate(RESULTS):
             assert int(counts.sel(code=name).isel(at)) == results.count(code)
@@ -98,29 +77,29 @@ def test_coverage_results_hits_and_rollouts_against_plain_loops(study):
         distance = abs(one["estimate"].values - one["truth"].values)
         for p in range(8):
             for k in range(len(LEVELS)):
-                held = sum(bool(distance[f, p] <= one["half_width"].values[f, p, k]) for f in told)
+                held = sum(bool(distance[f, p] <= one["half_width"].values[f, p, k]) for f in converged)
                 part = coverage.isel(at | {"parameter": p, "level": k})
-                same(part["coverage"], held / len(told) if told else math.nan)
-                if told:
-                    test = scipy.stats.binomtest(held, len(told)).proportion_ci(0.95, method="wilson")
+                same(part["coverage"], held / len(converged) if converged else math.nan)
+                if converged:
+                    test = scipy.stats.binomtest(held, len(converged)).proportion_ci(0.95, method="wilson")
                     assert np.allclose([part["low"], part["high"]], [test.low, test.high], atol=1e-9)
 
 
 def test_accuracy_is_against_the_least_bound(study):
     accuracy = metrics.accuracy(study)
-    for at, one, told in cells(study):
+    for at, one, converged in cells(study):
         others = study.isel({name: place for name, place in at.items() if name != "estimator"})
         least = np.nanmin(others["bound"].values, axis=0)
         errors = one["estimate"].values - one["truth"].values
-        ratios = [rms([errors[f, p] / least[f, p] for f in told]) for p in range(8)]
-        same(accuracy.isel(at), math.exp(sum(math.log(r) for r in ratios) / 8) if told else math.nan)
+        ratios = [rms([errors[f, p] / least[f, p] for f in converged]) for p in range(8)]
+        same(accuracy.isel(at), math.exp(sum(math.log(r) for r in ratios) / 8) if converged else math.nan)
 
 
-def test_the_frontier_is_where_the_truth_is_1_96_bounds():
+def test_the_frontier_is_the_scale_at_which_the_truth_is_the_noise_floor():
     study = synthetic_study(flights=3, spoiled=False, example=False)
     frontier = metrics.frontier(study).squeeze().sel(estimator="ibss")
     truth = abs(study["truth"].isel(scale=0, flight=0).squeeze().values)
-    assert np.allclose(frontier, truth / (1.96 * BOUND["all"]))
+    assert np.allclose(frontier, truth / (1.959964 * BOUND["all"]))
     assert float(frontier.sel(parameter="alpha7")) == 0  # its truth is 0
 
 
@@ -156,7 +135,7 @@ def test_monte_carlo_intervals_hold_the_truth_as_often_as_they_say():
     assert abs(share - 0.95) < 4 * math.sqrt(0.95 * 0.05 / 400)
 
 
-def test_a_study_of_which_nothing_was_run_gives_nothing_and_no_warning():
+def test_metrics_of_a_study_without_results_are_nan_without_a_warning():
     study = synthetic_study(flights=4, spoiled=False, example=False)
     study["result"][:] = RESULTS.index("not_run")
     for name in ("truth", "estimate", "std", "half_width", "bound"):
@@ -172,7 +151,7 @@ def test_a_study_of_which_nothing_was_run_gives_nothing_and_no_warning():
     assert int(metrics.result_counts(study).sel(code="not_run").sum()) == 4 * 15
 
 
-def test_without_noise_there_is_no_bound_to_be_measured_by():
+def test_without_noise_there_is_no_efficiency():
     study = synthetic_study(flights=4, scales=(0.0, 1.0), spoiled=False, example=False)
     assert metrics.efficiency(study)["efficiency"].isel(scale=0).isnull().all()
     assert metrics.estimator_error(study)["percent"].sel(parameter="alpha2").isel(scale=0).notnull().all()

@@ -1,4 +1,4 @@
-"""Networks: what they see, how they are trained, whether their intervals hold, and what happens when they cannot."""
+"""Networks: their features, their training, the coverage of their intervals, and the problems that they refuse."""
 
 import functools
 import json
@@ -16,27 +16,24 @@ import jaxos4
 from jaxos4.estimators.hybrid import search_from_seed
 from jaxos4.networks.architecture import Regressor
 from jaxos4.networks.features import FEATURES, Coordinates
-from jaxos4.networks.network import _regressor
+from jaxos4.networks.first_weights import first_regressor
 from jaxos4.networks.training import draw_many
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 DURATION = 3.0
 SMALL = {"width": 32, "depth": 2, "steps": 500, "batch": 64, "held_out": 4000}
+SHORT = SMALL | {"steps": 5, "held_out": 1000}
 BRACKET = jaxos4.Bracket.default(PUBLISHED())
+OMEGA = standard_flight(duration=DURATION).omega
+MANY, LANES = 2000, 64  # flights of a statistical test, and of a hybrid: tests with equal numbers share programs
 
 
-def problem_of(states=None, *, noise=1.0, channels="rates", free=False, model=None, omega=None, dt=DT, **kwargs):
-    exact = standard_flight(duration=DURATION)
-    flight = jaxos4.Flight(
-        dt * jnp.arange(len(exact.time)),
-        exact.omega if omega is None else omega,
-        exact.states if states is None else states,
-    )
+def problem_of(states=None, *, noise=1.0, channels="rates", free=False, model=None, omega=OMEGA, dt=DT, **kwargs):
+    states = standard_flight(duration=DURATION).states if states is None else states
+    flight = jaxos4.Flight(dt * jnp.arange(len(omega)), omega, states)
+    model = PUBLISHED() if model is None else model
     kwargs = {"initial_state": None if free else jnp.zeros(12)} | kwargs
-    sigma = noise * jaxos4.SENSOR_SIGMA
-    return jaxos4.ShootingProblem(
-        PUBLISHED() if model is None else model, flight, sigma=sigma, channels=channels, **kwargs
-    )
+    return jaxos4.ShootingProblem(model, flight, sigma=noise * jaxos4.SENSOR_SIGMA, channels=channels, **kwargs)
 
 
 @functools.cache
@@ -45,33 +42,32 @@ def trained(free=False, seed=0, **changes):
     return jaxos4.NetworkEstimator(**(SMALL | changes)).fit(problem, BRACKET, key=jax.random.key(seed))
 
 
-def flights(count, *, seed=0, noise=1.0, bracket=BRACKET, start_width=(0.0, 0.0, 0.0)):
+def flights(count, *, seed=0, noise=1.0, start_width=(0.0, 0.0, 0.0)):
     """Parameters drawn over the bracket, initial rates over +-`start_width`, and the noisy states of their flights."""
     width = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(jnp.asarray(start_width))
-
-    return fly(jnp.arange(count), jax.random.key(seed), jnp.asarray(noise), bracket, width)
+    return fly(jnp.arange(count), jax.random.key(seed), jnp.asarray(noise), width)
 
 
 @eqx.filter_jit
-def fly(numbers, key, noise, bracket, width):
+def fly(numbers, key, noise, width):
     def one(i):
         alpha_key, noise_key = jax.random.split(jax.random.fold_in(key, i))
         start = width * jax.random.uniform(jax.random.fold_in(alpha_key, 1), (12,), minval=-1, maxval=1)
-        u = jax.random.uniform(alpha_key, (8,), minval=-1, maxval=1)
-        alpha = bracket.center + u * bracket.half_width
-        omega = standard_flight(duration=DURATION).omega
-        return alpha, jaxos4.simulate(PUBLISHED(), alpha, omega, dt=DT, initial_state=start), noise_key
+        alpha = BRACKET.center + BRACKET.half_width * jax.random.uniform(alpha_key, (8,), minval=-1, maxval=1)
+        return alpha, jaxos4.simulate(PUBLISHED(), alpha, OMEGA, dt=DT, initial_state=start), noise_key
 
     sensors = jaxos4.WhiteNoise(noise * jaxos4.SENSOR_SIGMA)
     alpha, exact, keys = jax.vmap(one)(numbers)
-    return alpha, jax.lax.map(
-        lambda flight_and_key: sensors(flight_and_key[0], key=flight_and_key[1]).states, (exact, keys)
-    )
+    return alpha, jax.lax.map(lambda pair: sensors(pair[0], key=pair[1]).states, (exact, keys))
+
+
+def identify(estimator, states, noise=1.0, channels="rates", free=False):
+    return identified(estimator, states, jnp.asarray(noise), channels, free)  # one program for all noises
 
 
 @eqx.filter_jit
-def identify(estimator, states, noise=1.0, channels="rates", free=False, bracket=BRACKET):
-    return jax.vmap(lambda s: estimator(problem_of(s, noise=noise, channels=channels, free=free), bracket))(states)
+def identified(estimator, states, noise, channels, free):
+    return jax.vmap(lambda s: estimator(problem_of(s, noise=noise, channels=channels, free=free), BRACKET))(states)
 
 
 def names(estimates):
@@ -94,12 +90,11 @@ def test_simulated_features_are_those_of_the_simulated_flight(kind, free):
     u = jax.random.uniform(jax.random.key(1), features.coordinates.center.shape, minval=-1, maxval=1)
     parameters, start = features.coordinates.split(u, 8)
     initial_state = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(start)
-    omega = standard_flight(duration=DURATION).omega
-    flight = jaxos4.simulate(PUBLISHED(), parameters, omega, dt=DT, initial_state=initial_state)
-    seen = features(problem_of(flight.states, free=free))
+    flight = jaxos4.simulate(PUBLISHED(), parameters, OMEGA, dt=DT, initial_state=initial_state)
+    measured = features(problem_of(flight.states, free=free))
     simulated = features.simulated(u, jnp.zeros(()), key=jax.random.key(2))
-    np.testing.assert_allclose(simulated, seen.values, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(seen.inflation, 1.0, rtol=1e-12)
+    np.testing.assert_allclose(simulated, measured.values, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(measured.inflation, 1.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", FEATURES)
@@ -109,10 +104,10 @@ def test_simulated_noise_is_that_of_noisy_flights(kind):
     noise = jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
     keys = jax.random.split(jax.random.key(3), count)
     exact = standard_flight(duration=DURATION)
-    see = eqx.filter_jit(lambda features, k: features(problem_of(noise(exact, key=k).states)).values)
+    measure = eqx.filter_jit(lambda features, k: features(problem_of(noise(exact, key=k).states)).values)
     draw = eqx.filter_jit(lambda features, k: features.simulated(u, jnp.asarray(scale), key=k))
     u = jnp.zeros(features.coordinates.center.shape)
-    measured, drawn = (jax.lax.map(lambda k, one=one: one(features, k), keys) for one in (see, draw))
+    measured, drawn = (jax.lax.map(lambda k, one=one: one(features, k), keys) for one in (measure, draw))
     picked = slice(None) if kind == "score" else slice(300, 308)
     measured, drawn = np.asarray(measured)[:, picked], np.asarray(drawn)[:, picked]
     unit = np.sqrt(np.diagonal(np.cov(drawn.T)))
@@ -128,7 +123,7 @@ def test_the_score_is_one_gauss_newton_step():
     np.testing.assert_allclose(step.values * BRACKET.half_width, alpha - BRACKET.center, rtol=0.05, atol=1e-3)
 
 
-def test_flights_that_cannot_be_flown_are_not_a_number_and_are_left_out():
+def test_features_of_flights_that_diverge_are_not_a_number():
     problem = problem_of(model=CORRECTED())
     wild = jaxos4.Bracket.around(CORRECTED().alpha, 100 * CORRECTED().half_width)
     features = FEATURES["score"].of(problem, Coordinates.of(problem, wild, jnp.asarray(1.0)))
@@ -140,16 +135,15 @@ def test_flights_that_cannot_be_flown_are_not_a_number_and_are_left_out():
 
 
 def test_first_weights_are_uniform_as_those_of_equinox():
-    settings, skip = jaxos4.NetworkEstimator(), jnp.ones((8, 9))
-    first, second = (eqx.filter_jit(_regressor)(settings, skip, jax.random.key(seed)) for seed in (0, 1))
-    theirs = eqx.filter_eval_shape(
-        lambda key: Regressor(skip, "mlp", width=settings.width, depth=settings.depth, key=key), jax.random.key(0)
-    )
-    assert jax.tree.structure(first) == jax.tree.structure(theirs)
-    shapes = [[getattr(leaf, "shape", None) for leaf in jax.tree.leaves(regressor)] for regressor in (first, theirs)]
+    linear_map, size = jnp.ones((8, 9)), {"width": 128, "depth": 3}
+    draw = eqx.filter_jit(lambda key: first_regressor(linear_map, "mlp", **size, key=key))
+    first, second = draw(jax.random.key(0)), draw(jax.random.key(1))
+    expected = eqx.filter_eval_shape(lambda key: Regressor(linear_map, "mlp", **size, key=key), jax.random.key(0))
+    assert jax.tree.structure(first) == jax.tree.structure(expected)
+    shapes = [[getattr(leaf, "shape", None) for leaf in jax.tree.leaves(regressor)] for regressor in (first, expected)]
     assert shapes[0] == shapes[1]
-    np.testing.assert_array_equal(first.skip, skip)
-    seen = set()
+    np.testing.assert_array_equal(first.skip, linear_map)
+    used = set()
     for perceptron, other in ((first.approximator, second.approximator), (first.spread, second.spread)):
         for layer, elsewhere in zip(perceptron.layers, other.layers, strict=True):
             for x, y in ((layer.weight, elsewhere.weight), (layer.bias, elsewhere.bias)):
@@ -158,14 +152,14 @@ def test_first_weights_are_uniform_as_those_of_equinox():
                 assert abs(u.mean()) < 4.5 * np.sqrt(1 / 3 / u.size)
                 assert abs(np.mean(u**2) - 1 / 3) < 4.5 * np.sqrt(4 / 45 / u.size)
                 assert not np.isclose(x, y).any()
-                assert seen.isdisjoint(u.tolist())  # no number is used twice
-                seen.update(u.tolist())
+                assert used.isdisjoint(u.tolist())  # no number is used twice
+                used.update(u.tolist())
 
 
 def test_training_learns_and_comes_near_the_bound():
     network = trained()
     assert network.history.shape == (2, 2)
-    alpha, states = flights(1000, seed=11)
+    alpha, states = flights(MANY, seed=11)
     estimates = identify(network, states)
     bound = jax.vmap(lambda a: jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(problem_of(), a))))(alpha)
     assert set(names(estimates)) <= {"successful", "at_bound", "unidentifiable"}
@@ -186,22 +180,22 @@ def test_training_learns_and_comes_near_the_bound():
     ids=str,
 )
 def test_intervals_hold_whatever_the_networks_quality(changes):
-    network, count = trained(**changes), 2000
+    network = trained(**changes)
     for noise in (1.0,) if "noise" in changes else (0.1, 1.0, 7.0):
-        alpha, states = flights(count, seed=12, noise=noise)
+        alpha, states = flights(MANY, seed=12, noise=noise)
         estimates = identify(network, states, noise, channels=network.channels)
         error = np.abs(estimates.parameters - alpha)
         for level in (0.5, 0.9, 0.99):
-            # Within 4.5 Monte-Carlo errors of 2,000 flights and of the 4,000 that calibrated, and what lies between
-            # two of the calibrated noise levels.
-            allowed = 4.5 * np.sqrt(level * (1 - level) * (1 / count + 1 / 4000)) + 0.002
+            # 4.5 Monte-Carlo errors of these flights and of the 4,000 for calibration, and 0.002 for the interpolation
+            # between two calibrated noise scales.
+            allowed = 4.5 * np.sqrt(level * (1 - level) * (1 / MANY + 1 / 4000)) + 0.002
             assert np.abs(np.mean(error < estimates.half_width(level), axis=0) - level).max() < allowed
         together = np.mean((error < estimates.half_width(0.9, simultaneous=True)).all(axis=1))
-        assert abs(together - 0.9) < 4.5 * np.sqrt(0.09 * (1 / count + 1 / 4000)) + 0.002
+        assert abs(together - 0.9) < 4.5 * np.sqrt(0.09 * (1 / MANY + 1 / 4000)) + 0.002
 
 
-def test_an_answer_has_the_error_that_its_covariance_says():
-    alpha, states = flights(2000, seed=13)
+def test_errors_have_the_size_of_the_covariance():
+    alpha, states = flights(MANY, seed=13)
     estimates = identify(trained(), states)
     error = np.asarray(estimates.parameters - alpha)
     squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimates.covariance), error) / 8
@@ -209,10 +203,14 @@ def test_an_answer_has_the_error_that_its_covariance_says():
 
 
 def test_the_same_key_gives_the_same_network_and_another_another():
-    small = jaxos4.NetworkEstimator(**(SMALL | {"steps": 5, "held_out": 1000}))
-    a, b, c = (small.fit(problem_of(), BRACKET, key=jax.random.key(k)) for k in (0, 0, 1))
+    small, reports = jaxos4.NetworkEstimator(**SHORT), []
+    a, b, c = (
+        small.fit(problem_of(), BRACKET, key=jax.random.key(k), progress=lambda *report: reports.append(report))
+        for k in (0, 0, 1)
+    )
     assert eqx.tree_equal(a, b)
     assert not eqx.tree_equal(a.regressor, c.regressor)
+    assert reports == [(5, 5, float(network.history[0, 1])) for network in (a, b, c)]
 
 
 def test_training_stops_early_without_progress():
@@ -263,9 +261,8 @@ def test_brackets_and_channels_that_cannot_be_trained_for_are_named():
         jaxos4.NetworkEstimator(**SMALL, channels="attitude").fit(problem_of(), BRACKET, key=key)
 
 
-# Use on flights that are not what it was trained for.
+# Flights that it was not trained for.
 
-OMEGA = standard_flight(duration=DURATION).omega
 OTHER = {
     "rotor speeds": ({"omega": OMEGA.at[50, 2].add(0.1)}, "another series of rotor speeds"),
     "sample time": ({"dt": 0.011}, "another sample time"),
@@ -286,18 +283,15 @@ def test_another_problem_is_an_error_that_says_what_differs(what):
 
 def test_fewer_samples_and_channels_are_errors():
     short = standard_flight(duration=1.0)
-    problem = jaxos4.ShootingProblem(
-        PUBLISHED(), short, sigma=jaxos4.SENSOR_SIGMA, initial_state=jnp.zeros(12), channels="rates"
-    )
     with pytest.raises(ValueError, match="trained for 301 samples, not 101"):
-        trained()(problem, BRACKET)
+        trained()(problem_of(short.states, omega=short.omega), BRACKET)
     with pytest.raises(ValueError, match="looks at 'attitude' channels"):
         trained(channels="attitude", steps=1)(problem_of(), BRACKET)
 
 
 def test_in_a_batch_each_lane_has_its_own_result_and_leaves_the_others_alone():
     network, lanes = trained(), 8
-    _, states = flights(lanes, seed=14)
+    states = flights(LANES, seed=14)[1][:lanes]
     omega = jnp.tile(OMEGA, (lanes, 1, 1))
     noise = jnp.ones(lanes)
     sound = eqx.filter_jit(jax.vmap(lambda s, w, n: network(problem_of(s, omega=w, noise=n), BRACKET)))
@@ -320,30 +314,31 @@ def test_in_a_batch_each_lane_has_its_own_result_and_leaves_the_others_alone():
 
 
 def test_missing_samples_widen_the_intervals_and_no_more():
-    network, count = trained(), 1000
-    alpha, states = flights(count, seed=15)
-    lost = jax.random.bernoulli(jax.random.key(16), 0.4, states.shape)
-    whole, holed = identify(network, states), identify(network, jnp.where(lost, jnp.nan, states))
-    assert (np.asarray(holed.std / whole.std) > 1.1).mean() > 0.9
-    told = np.array(names(holed)) == "successful"
-    assert told.mean() > 0.9
-    covered = np.mean(np.abs(holed.parameters - alpha)[told] < holed.half_width(0.9)[told], axis=0)
+    network, (alpha, states) = trained(), flights(MANY, seed=15)
+    missing = jax.random.bernoulli(jax.random.key(16), 0.4, states.shape)
+    complete, fewer = identify(network, states), identify(network, jnp.where(missing, jnp.nan, states))
+    assert (np.asarray(fewer.std / complete.std) > 1.1).mean() > 0.9
+    successful = np.array(names(fewer)) == "successful"
+    assert successful.mean() > 0.9
+    covered = np.mean((np.abs(fewer.parameters - alpha) < fewer.half_width(0.9))[successful], axis=0)
     assert np.abs(covered - 0.9).max() < 0.06
 
 
-def test_a_flight_that_tells_no_more_than_the_bracket_is_unidentifiable():
+def test_a_flight_without_excitation_is_unidentifiable():
     """Hover: no yaw, no roll, no pitch."""
     hover = jnp.full_like(OMEGA, jaxos4.OS4.hover_speed)
     flight = jaxos4.simulate(PUBLISHED(), PUBLISHED().alpha, hover, dt=DT)
     still = problem_of(flight.states, omega=hover)
-    network = jaxos4.NetworkEstimator(**(SMALL | {"steps": 20})).fit(still, BRACKET, key=jax.random.key(0))
+    network = jaxos4.NetworkEstimator(**(SMALL | {"steps": 5, "held_out": 1000})).fit(
+        still, BRACKET, key=jax.random.key(0)
+    )
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(1))
     assert names(network(problem_of(noisy.states, omega=hover), BRACKET)) == "unidentifiable"
 
 
 def test_a_column_that_is_missing_is_named_and_one_that_begins_late_is_not_another_start():
     network = trained(free=True)
-    _, states = flights(1, seed=23)
+    _, states = flights(LANES, seed=23)
     with pytest.raises(ValueError, match="it looks at q, which this flight did not measure"):
         network(problem_of(states[0].at[:, 9].set(jnp.nan), free=True), BRACKET)
     late = network(problem_of(states[0].at[:20, 9].set(jnp.nan), free=True), BRACKET)
@@ -352,19 +347,19 @@ def test_a_column_that_is_missing_is_named_and_one_that_begins_late_is_not_anoth
 
 
 def test_an_invalid_bracket_is_a_result():
-    nothing = jaxos4.Bracket(BRACKET.upper, BRACKET.lower)
-    assert names(trained()(problem_of(), nothing)) == "bracket_invalid"
+    invalid = jaxos4.Bracket(BRACKET.upper, BRACKET.lower)
+    assert names(trained()(problem_of(), invalid)) == "bracket_invalid"
 
 
 def test_a_free_initial_state_is_estimated_too():
     network = trained(free=True)
     # Its intervals are calibrated over all the starts that it was trained for, and hold more often at their middle.
-    alpha, states = flights(500, seed=17, start_width=network.features.coordinates.width[8:])
+    alpha, states = flights(MANY, seed=17, start_width=network.features.coordinates.width[8:])
     estimates = identify(network, states, free=True)
-    assert estimates.initial_state.shape == (500, 3)
+    assert estimates.initial_state.shape == (MANY, 3)
     assert np.abs(estimates.initial_state).max() < 0.5  # +-0.3 rad/s, 30 standard deviations
     covered = np.mean(np.abs(estimates.parameters - alpha) < estimates.half_width(0.9), axis=0)
-    assert np.abs(covered - 0.9).max() < 4.5 * np.sqrt(0.09 * (1 / 500 + 1 / 4000)) + 0.01
+    assert np.abs(covered - 0.9).max() < 4.5 * np.sqrt(0.09 * (1 / MANY + 1 / 4000)) + 0.01
 
 
 # The file.
@@ -388,32 +383,23 @@ def test_a_model_of_ones_own_cannot_be_saved(tmp_path):
     class Own(PUBLISHED):
         pass
 
-    small = jaxos4.NetworkEstimator(**(SMALL | {"steps": 1, "held_out": 1000}))
-    network = small.fit(problem_of(model=Own()), BRACKET, key=jax.random.key(0))
+    network = eqx.tree_at(lambda n: n.features.problem.model, trained(), Own())
     with pytest.raises(ValueError, match="model Own; only networks for published, corrected can be saved"):
         jaxos4.save_network(network, tmp_path / "own.net")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")
-def whole_file(tmp_path_factory):
+def network_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("network") / "whole.net"
     jaxos4.save_network(trained(), path)
     return path.read_bytes()
 
 
-def refusal(path):
-    try:
-        jaxos4.load_network(path)
-    except jaxos4.InputError as error:
-        return str(error)
-    return ""
-
-
 @settings(max_examples=30)
 @given(st.data())
-def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(tmp_path_factory, whole_file, data):
-    content = bytearray(whole_file)
+def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(tmp_path_factory, network_file, data):
+    content = bytearray(network_file)
     if data.draw(st.booleans()):
         content = content[: data.draw(st.integers(0, len(content) - 1))]
     else:
@@ -421,7 +407,12 @@ def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(tmp_path_factory,
             content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path = tmp_path_factory.mktemp("fuzz") / "altered.net"
     path.write_bytes(content)
-    assert "\n" not in refusal(path)
+    message = ""
+    try:
+        jaxos4.load_network(path)
+    except jaxos4.InputError as error:
+        message = str(error)
+    assert "\n" not in message
 
 
 def test_objects_in_a_file_are_not_run(tmp_path):
@@ -443,14 +434,10 @@ def test_objects_in_a_file_are_not_run(tmp_path):
 # The hybrid.
 
 
-LANES = 64  # as many in all tests of the hybrid: they share its program
-
-
 def test_the_hybrid_finds_what_ibss_finds_in_fewer_rollouts():
-    lanes = LANES
-    alpha, states = flights(lanes, seed=18)
+    alpha, states = flights(LANES, seed=18)
     hybrid, alone = (identify(e, states, channels="all") for e in (jaxos4.Hybrid(trained()), jaxos4.IBSS()))
-    assert names(hybrid) == names(alone) == ["successful"] * lanes
+    assert names(hybrid) == names(alone) == ["successful"] * LANES
     assert np.abs((hybrid.parameters - alone.parameters) / alone.std).max() < 0.1
     assert hybrid.rollouts.mean() < 0.5 * alone.rollouts.mean()
     hit = (alpha >= hybrid.seed.lower) & (alpha <= hybrid.seed.upper)
@@ -458,14 +445,14 @@ def test_the_hybrid_finds_what_ibss_finds_in_fewer_rollouts():
 
 
 def test_the_hybrid_recovers_where_the_seed_misses():
-    """The network was trained in a bracket that lies elsewhere: it says so, or is wrong; the hybrid is neither."""
+    """The network was trained in another bracket, and misses the truth."""
     aside = jaxos4.Bracket.around(BRACKET.center + 0.5 * BRACKET.half_width, 0.3 * BRACKET.half_width)
-    network, lanes = jaxos4.NetworkEstimator(**SMALL).fit(problem_of(), aside, key=jax.random.key(0)), LANES
-    alpha, states = flights(lanes, seed=19)
+    network = jaxos4.NetworkEstimator(**SMALL).fit(problem_of(), aside, key=jax.random.key(0))
+    _, states = flights(LANES, seed=19)
     hybrid, alone = (identify(e, states, channels="all") for e in (jaxos4.Hybrid(network), jaxos4.IBSS()))
     missed = ~((hybrid.parameters >= hybrid.seed.lower) & (hybrid.parameters <= hybrid.seed.upper)).all(axis=1)
     assert missed.mean() > 0.5
-    assert names(hybrid) == ["successful"] * lanes
+    assert names(hybrid) == ["successful"] * LANES
     assert np.abs((hybrid.parameters - alone.parameters) / alone.std).max() < 0.1
 
 
@@ -488,17 +475,14 @@ def seeded(states, seeds):
 
 @pytest.mark.parametrize("name", ["network_mismatch", "nonfinite_trajectory", "at_bound", "unidentifiable"])
 def test_a_seed_without_an_answer_is_never_passed_on(name):
-    """Neither alone nor as one lane of a batch; a seed that is sure and wrong is not believed either."""
-    alpha, states = flights(4, seed=21)
+    """A seed with a small error that is wrong is not believed either."""
+    alpha, states = (x[:4] for x in flights(LANES, seed=21))
     std = 1e-3 * BRACKET.half_width if name == "at_bound" else jnp.full(8, np.inf)
     seed = seed_of(getattr(jaxos4.RESULTS, name), std=std)
-    alone = search_from_seed(jaxos4.IBSS(), problem_of(states[0]), BRACKET, seed)
     sound = seed_of(jaxos4.RESULTS.successful, alpha[1], 1e-2 * BRACKET.half_width)
     stack = jax.tree.map(lambda *x: jnp.stack(x), seed, sound, seed, sound)
     many, best = seeded(states, stack), identify(jaxos4.IBSS(), states)
-    assert names(alone) == "successful"
     assert names(many) == ["successful"] * 4
-    assert np.abs((alone.parameters - best.parameters[0]) / best.std[0]).max() < 0.1
     assert np.abs((many.parameters - best.parameters) / best.std)[np.array([0, 2])].max() < 0.1
     assert (many.rollouts[np.array([0, 2])] > many.rollouts[1]).all()
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +19,20 @@ from hypothesis import given, settings, strategies as st
 from small_study import COMMAND, environment, run_study, specification
 
 import jaxos4
+from jaxos4.estimators import ESTIMATORS
 from jaxos4.flight import STATE_NAMES
-from jaxos4.study import OUTCOMES, Study, cell as cells_module, load_study, open_store, run as run_module
+from jaxos4.study import (
+    OUTCOMES,
+    Study,
+    cell as cell_module,
+    flights as flights_module,
+    load_study,
+    open_store,
+    plan,
+    run as run_module,
+)
 from jaxos4.study.cell import run_cell
+from jaxos4.study.specification import AXES
 
 SPECIFICATION = """
 durations = [1.0]
@@ -58,75 +70,56 @@ def dataset(whole):
 # The specification.
 
 
-@pytest.mark.parametrize(
-    ("text", "key"),
-    [
-        ("flites = 3", "knows no key `flites`; there are title, models,"),
-        ('flights = "many"', "`flights`: expected a whole number, got a string; correct it there."),
-        ("network = 3", "`network`: expected a table, got a whole number"),
-        ("network = { layers = 3 }", "[network]: knows no key `layers`; there are features,"),
-        ('network = { features = "all" }', "`network.features` knows no 'all'; choose from score, raw"),
-        ("flights = 1.5", "flights"),
-        ("flights = 0", "flights"),
-        ('models = "published"', "models"),
-        ('models = ["newton"]', "`models` knows no 'newton'"),
-        ('airframes = ["boeing"]', "`airframes` knows no 'boeing'"),
-        ('excitations = ["wobble"]', "excitations"),
-        ('methods = ["rk5"]', "methods"),
-        ('fit_method = "diffrax"', "fit_method"),
-        ('noises = ["pink"]', "noises"),
-        ('channels = ["smell"]', "channels"),
-        ('estimators = ["oracle"]', "estimators"),
-        ('truth = "guess"', "`truth` knows no 'guess'; choose from airframe, drawn"),
-        ('initial_state = "hidden"', "initial_state"),
-        ('precision = "float16"', "precision"),
-        ("scales = []", "`scales` is empty"),
-        ("scales = [1, 1.0]", "`scales` names something twice"),
-        ('estimators = ["ibss", "ibss"]', "`estimators` names something twice"),
-        ("scales = [-1.0]", "scales"),
-        ("scales = [nan]", "scales"),
-        ("scales = [inf]", "scales"),
-        ("widths = [0.0]", "widths"),
-        ("durations = [-1.0]", "durations"),
-        ("durations = [inf]", "durations"),
-        ("durations = [0.01]", "durations"),
-        ("durations = [1e300]", "durations"),
-        ("dt = nan", "dt"),
-        ("dt = inf", "dt"),
-        ("dt = 0", "dt"),
-        ("seed = -1", "seed"),
-        ("seed = 9223372036854775808", "seed"),
-        ("batch = 0", "batch"),
-        ("flights = 1_000_000_000", "cells"),
-        ("flights = 1_000_000_000\nbatch = 1_000_000", "estimates"),
-        ('durations = [0.5]\nexcitations = ["chirp"]', "`excitations`: chirp of 0.5 s by os4: `duration`"),
-        ('durations = [0.5]\nexcitations = ["multisine", "3211"]', "`excitations`: 3211 of 0.5 s"),
-        ("dt = 0.5", "`excitations`: multisine of 5 s by os4: `tones`"),
-        (MINE + "max_rotor_speed = 230", "`excitations`: multisine of 5 s by mine: `amplitude`"),
-        ("[network]\nsteps = 0", "network.steps"),
-        ("[network]\nsteps = 100_000_000", "`network`: `steps`"),
-        ("[network]\nheld_out = 10", "network.held_out"),
-        ("[network]\nlayers = 3", "layers"),
-        ('[network]\nfeatures = "raw"\napproximator = "cmac"', "`network`: `approximator`"),
-        (MINE + "wheels = 4", "[airframe.mine]: `wheels` is not a known key"),
-        (MINE.replace("mass = 0.6", ""), "[airframe.mine]: `mass` is missing"),
-        (MINE.replace("mass = 0.6", "mass = -0.6"), "[airframe.mine]: `mass`"),
-        (MINE.replace("mass = 0.6", "mass = 1979-05-27"), "[airframe.mine]: `mass`"),
-        (MINE + "max_rotor_speed = inf", "[airframe.mine]: not finite"),
-        (MINE.replace("7e-3, 7e-3", "7e-3"), "[airframe.mine]: `inertia`"),
-        (AIRFRAME, "[airframe.mine] is flown by nobody"),
-        ("airframe = 3", "airframe"),
-        ('title = "two\\nlines"', "title"),
-        ('title = "\\u0000"', "title"),
-        ("flights = ", "not a TOML file"),
-        ("flights = 1\nflights = 2", "not a TOML file"),
-        ("a = " + "[" * 5000, "spec.toml"),
-    ],
-)
-def test_a_specification_that_cannot_be_is_one_line(run, tmp_path, text, key):
+# Refused with a message that names the key.
+WRONG_VALUES = (
+    "flights = 1.5", "flights = 0", 'models = "published"', 'excitations = ["wobble"]', 'methods = ["rk5"]',
+    'fit_method = "diffrax"', 'noises = ["pink"]', 'channels = ["smell"]', 'estimators = ["oracle"]',
+    'initial_state = "hidden"', 'precision = "float16"', "scales = [-1.0]", "scales = [nan]", "scales = [inf]",
+    "widths = [0.0]", "durations = [-1.0]", "durations = [inf]", "durations = [0.01]", "durations = [1e300]",
+    "dt = nan", "dt = inf", "dt = 0", "seed = -1", "seed = 9223372036854775808", "batch = 0", "airframe = 3",
+    'title = "two\\nlines"', 'title = "\\u0000"',
+)  # fmt: skip
+WRONG_SPECIFICATIONS = [
+    ("flites = 3", "unknown key `flites`; choose from title, models,"),
+    ('flights = "many"', "`flights`: expected a whole number, got a string; correct it."),
+    ("network = 3", "`network`: expected a table, got a whole number"),
+    ("network = { layers = 3 }", "[network]: unknown key `layers`; choose from features,"),
+    ('network = { features = "all" }', "`network.features`: unknown 'all'; choose from score, raw"),
+    ('models = ["newton"]', "`models`: unknown 'newton'; choose from published, corrected"),
+    ('airframes = ["boeing"]', "`airframes`: unknown 'boeing'; choose from os4,"),
+    ('truth = "guess"', "`truth`: unknown 'guess'; choose from airframe, drawn"),
+    ("scales = []", "`scales` is empty"),
+    ("scales = [1, 1.0]", "`scales` names a value twice"),
+    ('estimators = ["ibss", "ibss"]', "`estimators` names a value twice"),
+    ("flights = 1_000_000_000", "cells"),
+    ("flights = 1_000_000_000\nbatch = 1_000_000", "estimates"),
+    ('durations = [0.5]\nexcitations = ["chirp"]', "`excitations`: chirp of 0.5 s by os4: `duration`"),
+    ('durations = [0.5]\nexcitations = ["multisine", "3211"]', "`excitations`: 3211 of 0.5 s"),
+    ("dt = 0.5", "`excitations`: multisine of 5 s by os4: `tones`"),
+    (MINE + "max_rotor_speed = 230", "`excitations`: multisine of 5 s by mine: `amplitude`"),
+    ("[network]\nsteps = 0", "network.steps"),
+    ("[network]\nsteps = 100_000_000", "`network`: `steps`"),
+    ("[network]\nheld_out = 10", "network.held_out"),
+    ('[network]\nfeatures = "raw"\napproximator = "cmac"', "`network`: `approximator`"),
+    (MINE + "wheels = 4", "[airframe.mine]: knows no key `wheels`"),
+    (MINE.replace("mass = 0.6", ""), "[airframe.mine]: lacks `mass`"),
+    (MINE.replace("mass = 0.6", "mass = -0.6"), "[airframe.mine]: `mass`"),
+    (MINE.replace("mass = 0.6", "mass = 1979-05-27"), "[airframe.mine]: `mass`"),
+    (MINE + "max_rotor_speed = inf", "[airframe.mine]: not finite"),
+    (MINE.replace("7e-3, 7e-3", "7e-3"), "[airframe.mine]: `inertia`"),
+    (AIRFRAME, "[airframe.mine] is not flown"),
+    ("flights = ", "not a TOML file"),
+    ("flights = 1\nflights = 2", "not a TOML file"),
+    ("a = " + "[" * 5000, "spec.toml"),
+    *((text, f"`{text.split()[0]}") for text in WRONG_VALUES),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), WRONG_SPECIFICATIONS)
+def test_a_wrong_specification_is_one_line(run, tmp_path, text, words):
     specification(tmp_path, text)
     for option in ((), ("--dry-run",)):
-        refused(run("study", "spec.toml", "--out", "out", *option), "spec.toml: ", key)
+        refused(run("study", "spec.toml", "--out", "out", *option), "spec.toml: ", words)
     assert not (tmp_path / "out").exists()
 
 
@@ -168,11 +161,41 @@ def test_any_specification_is_a_study_or_an_input_error_of_one_line(table):
         try:
             study = load_study(path)
         except jaxos4.InputError as error:
-            told = str(error)
+            line = str(error)
         else:
-            told = f"{path}: {study.cell(study.count - 1)}"
-        assert told.startswith(f"{path}: ")
-        assert "\n" not in told
+            line = f"{path}: {study.cell(study.count - 1)}"
+        assert line.startswith(f"{path}: ")
+        assert "\n" not in line
+
+
+class Center(jaxos4.AbstractEstimator):
+    """Returns the center of the bracket."""
+
+    looks_at: ClassVar[str] = "rates"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = 1.0
+    needs_network: ClassVar[bool] = False
+
+    def __call__(self, problem, bracket):
+        return jaxos4.Estimate(
+            parameters=bracket.center,
+            covariance=jnp.diag(bracket.half_width**2),
+            initial_state=jnp.zeros(3),
+            cost=problem.cost(bracket.center),
+            rollouts=jnp.ones((), dtype=int),
+            sweeps=jnp.zeros((), dtype=int),
+            result=jaxos4.RESULTS.successful,
+        )
+
+
+def test_an_estimator_needs_only_its_line_in_the_registry(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(ESTIMATORS, "center", Center)
+    specification(tmp_path, SPECIFICATION.replace('["ibss", "equation-error"]', '["center"]'))
+    code, out, err = run("study", "spec.toml", "--out", "out")
+    assert (code, err) == (0, "")
+    assert "20 estimates: 20 successful" in out
+    out = run("study", "spec.toml", "--out", "out", "--dry-run")[1]
+    assert ["center", "0", "0", "0", "0", "0.0"] in [line.split() for line in out.splitlines()]
 
 
 def test_another_specification_or_version_is_refused_with_what_changed(run, tmp_path):
@@ -184,8 +207,8 @@ def test_another_specification_or_version_is_refused_with_what_changed(run, tmp_
         result = run("study", "other.toml", "--out", "out", *option)
         refused(result, "out: holds another study", "`seed` was 5, now 6", "`dt` was 0.01, now 0.02")
         assert "`flights`" not in result[2]
-    code, told, _ = run("study", "spec.toml", "--out", "out", "--dry-run")
-    assert (code, "12 of 12 cells" in told) == (0, True)
+    code, out, _ = run("study", "spec.toml", "--out", "out", "--dry-run")
+    assert (code, "12 of 12 cells" in out) == (0, True)
     header = json.loads((tmp_path / "out" / "study.json").read_text())
     (tmp_path / "out" / "study.json").write_text(json.dumps(header | {"version": "9.9"}))
     for option in ((), ("--dry-run",)):
@@ -196,19 +219,28 @@ def test_a_dry_run_writes_nothing_and_counts(tmp_path):
     text = MINE.replace("\n", "\ntruth = 'drawn'\nflights = 1000\nbatch = 100\nestimators = ['ibss', 'kalman']\n", 1)
     specification(tmp_path, text)
     command = [sys.executable, "-c", COMMAND, "study", "spec.toml", "--out", "out", "--dry-run"]
-    # In a process of its own: an airframe's table is computed with before the devices are chosen, or it would fail.
+    # In its own process: the devices must be chosen before the airframe's table is computed.
     env = {name: value for name, value in environment().items() if name != "JAX_NUM_CPU_DEVICES"} | {"COLUMNS": "100"}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert [path.name for path in tmp_path.iterdir()] == ["spec.toml"]
     rows = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines() if line.split()}
     for name in ("ibss", "kalman"):
-        cells, flights, memory, minutes = rows[name]
-        assert (cells, flights) == ("30", "3000")
-        assert 700 < float(memory) < 10_000
-        assert 0 < float(minutes) < 60
+        assert rows[name] == ["30", "3000", "1", "0", "-"]
     devices = len(os.sched_getaffinity(0))
-    assert f"60 of 60 cells to be run, 6000 flights identified, on {devices} devices" in done.stdout
+    assert f"60 of 60 cells to be run, 6000 flights to be identified, on {devices} x cpu" in done.stdout
+
+
+def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
+    study = Study(channels=("rates", "attitude"), estimators=("network", "hybrid", "ibss"), flights=250, batch=100)
+    with open_store(tmp_path, study, "these tests") as store:
+        for cell in (cell for cell in study.cells() if cell.scenario.estimator == "ibss" and cell.first == 0):
+            store.write(store.cell_file(cell.number), b"", cell=cell.number, seconds=2.0 + cell.scenario.scale)
+    network, hybrid, ibss = plan(study, tmp_path)
+    assert network == ("network", 18, 1500, 2, 1, None)
+    assert hybrid == ("hybrid", 18, 1500, 2, 1, None)  # a network for the attitude, and the network's for the rates
+    assert ibss[:5] == ("ibss", 12, 900, 2, 0)
+    assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / len(jax.local_devices()))
 
 
 # The grid.
@@ -234,17 +266,12 @@ def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
     )
     cells = list(study.cells())
     assert [cell.number for cell in cells] == list(range(study.count))
-    axes = [getattr(study, axis) for axis in cells_module_axes()]
+    axes = [getattr(study, axis) for axis in AXES]
     wanted = set(itertools.product(itertools.product(*axes), range(0, flights, batch)))
     assert {(tuple(cell.scenario), cell.first) for cell in cells} == wanted
     assert len(cells) == len(wanted) == study.count
     for cell in cells:
         assert tuple(axis[i] for axis, i in zip(axes, cell.place, strict=True)) == tuple(cell.scenario)
-
-
-def cells_module_axes() -> list[str]:
-    plural = {"channels": "channels"}
-    return [plural.get(field, f"{field}s") for field in Study().cell(0).scenario._fields]
 
 
 def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
@@ -260,8 +287,8 @@ def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
     )
     truths, noises, draws = {}, {}, {}
     for cell in study.cells():
-        fleet = cells_module._fleet(study, cell.scenario)
-        truth, true, measured = (np.asarray(x) for x in cells_module._flights(study, fleet, cell))
+        fleet = flights_module.fleet_of(study, cell.scenario)
+        truth, true, measured = (np.asarray(x) for x in flights_module.fly(study, fleet, cell))
         scenario, first = cell.scenario, cell.first
         for known, key, value in (
             (truths, (scenario.width, first), truth),
@@ -344,13 +371,13 @@ def test_all_brackets_are_off_the_airframe_by_one_draw():
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     u = jax.random.uniform(jax.random.fold_in(jax.random.key(7), 0), (8,), minval=-0.8, maxval=0.8)
     for width in study.widths:
-        bracket = cells_module.bracket_of(study, "published", "os4", width)
+        bracket = flights_module.bracket_of(study, "published", "os4", width)
         same(bracket.center, model.alpha + u * width * model.half_width, model.half_width)
         same(bracket.half_width, width * model.half_width)
         assert np.all((bracket.lower < model.alpha) & (model.alpha < bracket.upper))
 
 
-def test_every_variable_tells_what_it_is(dataset):
+def test_every_variable_has_a_name_and_a_unit(dataset):
     for name, variable in dataset.variables.items():
         assert variable.attrs["long_name"], name
         assert variable.attrs["units"], name
@@ -363,7 +390,7 @@ def test_every_variable_tells_what_it_is(dataset):
     assert dataset["unit"].sel(parameter="alpha3").item() == "1/(kg m^2)"
 
 
-def test_the_attributes_are_the_studys_and_not_the_runs(whole, dataset, tmp_path):
+def test_the_attributes_are_those_of_the_study_and_not_of_the_run(whole, dataset, tmp_path):
     study = load_study(specification(tmp_path, SPECIFICATION))
     attributes = dict(dataset.attrs)
     assert attributes.pop("device") == "these tests"
@@ -383,20 +410,20 @@ def test_the_attributes_are_the_studys_and_not_the_runs(whole, dataset, tmp_path
 def test_a_poisoned_flight_leaves_its_neighbours_alone(tmp_path, monkeypatch, estimator, poison):
     study = load_study(specification(tmp_path, SPECIFICATION))
     cell = next(cell for cell in study.cells() if cell.scenario.estimator == estimator)
-    clean, flights = run_cell(study, cell, None), cells_module._flights
+    clean = run_cell(study, cell, None)
 
     def poisoned(*arguments):
-        truth, true, measured = flights(*arguments)
-        return truth, true, measured.at[2, 50:].set(poison).at[2, 0].set(poison)
+        flights = flights_module.fly(*arguments)
+        return flights._replace(measured=flights.measured.at[2, 50:].set(poison).at[2, 0].set(poison))
 
-    monkeypatch.setattr(cells_module, "_flights", poisoned)
+    monkeypatch.setattr(cell_module, "fly", poisoned)
     found = run_cell(study, cell, None)
     assert clean.keys() == found.keys()
     others = [0, 1, 3]
     for name, value in clean.items():
         if len(value) == 4:
             np.testing.assert_array_equal(found[name][others], value[others])
-    if np.isinf(poison):  # missing samples are borne
+    if np.isinf(poison):  # NaN are missing samples, which are allowed
         assert OUTCOMES[found["result"][2]] == "nonfinite_trajectory"
         assert np.isnan(found["estimate"][2]).all()
         assert np.isnan(found["std"][2]).all()
@@ -405,20 +432,20 @@ def test_a_poisoned_flight_leaves_its_neighbours_alone(tmp_path, monkeypatch, es
 
 def test_a_diverging_cell_is_counted_and_the_study_ends(run, tmp_path, dataset):
     specification(tmp_path, SPECIFICATION.replace("[1.0, 0.1]", "[1.0, 1e300]"))
-    code, told, err = run("study", "spec.toml", "--out", "out")
+    code, out, err = run("study", "spec.toml", "--out", "out")
     assert (code, err) == (0, "")
     with xr.open_dataset("out/results.nc") as found:
         diverged = found["result"].sel(scale=1e300)
         assert (diverged != OUTCOMES.index("successful")).all()
         assert (diverged < OUTCOMES.index("failed")).all()
-        # The other scale is as it was.
+        # The other scale is unchanged.
         for name in ("estimate", "std", "result", "cost"):
             ours, theirs = (d[name].sel(scale=1.0) for d in (found, dataset))
             np.testing.assert_array_equal(ours, theirs)
         codes, counts = np.unique(found["result"], return_counts=True)
-    assert "40 estimates" in told
+    assert "40 estimates" in out
     for result, count in zip(codes, counts, strict=True):
-        assert f"{count} {OUTCOMES[result]}" in told
+        assert f"{count} {OUTCOMES[result]}" in out
 
 
 def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path, monkeypatch, dataset):
@@ -431,16 +458,16 @@ def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path,
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "run_cell", raises)
-        code, told, err = run("study", "spec.toml", "--out", "out")
+        code, out, err = run("study", "spec.toml", "--out", "out")
     assert (code, err) == (0, "")
-    assert "12 failed" in told
-    assert "12 failed" in run("study", "spec.toml", "--out", "out")[1]  # and stays so
+    assert "12 failed" in out
+    assert "12 failed" in run("study", "spec.toml", "--out", "out")[1]  # it is not tried again
     with xr.open_dataset("out/results.nc") as found:
         failures = json.loads(found.attrs["failures"])
         lost = found["result"].to_numpy() == OUTCOMES.index("failed")
         assert np.isnan(found["estimate"].to_numpy()[lost]).all()
         np.testing.assert_array_equal(found["result"].to_numpy()[~lost], dataset["result"].to_numpy()[~lost])
-        # No estimator ran on flights 4 to 7 at scale 1: what is true of them is known all the same.
+        # No estimator ran on flights 4 to 7 at scale 1, but their truth is known.
         np.testing.assert_array_equal(found["truth"], dataset["truth"])
     assert [(f["cell"], f["first"], f["estimator"], f["scale"]) for f in failures] == [
         (1, 4, "ibss", 1.0),
@@ -450,7 +477,7 @@ def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path,
     assert {f["message"] for f in failures} == {"the moon was in the way"}
     for index in (1, 7, 10):
         (tmp_path / "out" / "cells" / f"{index:08d}.npz").unlink()
-    code, told, _ = run("study", "spec.toml", "--out", "out")
-    assert (code, "failed" in told) == (0, False)
+    code, out, _ = run("study", "spec.toml", "--out", "out")
+    assert (code, "failed" in out) == (0, False)
     with xr.open_dataset("out/results.nc") as found:
         assert found.drop_attrs(deep=False).identical(dataset.drop_attrs(deep=False))

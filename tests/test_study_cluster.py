@@ -12,19 +12,19 @@ from small_study import NETWORKED, cells, environment, results, run_study, speci
 
 from jaxos4.study import assemble, load_study, open_store, run_on_cluster, save_dataset
 
-# A worker that is killed leaves sockets to the garbage collector.
+# The sockets of a killed worker are closed by the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The study, in this process."""
+    """The study, run in this process."""
     return run_study(tmp_path_factory.mktemp("study"), NETWORKED)
 
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Two workers, each a process of one thread, that share this process's compiled programs."""
+    """Two workers, each a process with one thread; they share this process's cache of compiled programs."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment().items():
             patch.setenv(name, value)
@@ -47,7 +47,7 @@ def kill_a_worker(client: Client) -> None:
 @pytest.mark.parametrize("trained", [False, True])
 def test_a_study_is_the_same_on_a_cluster_that_loses_workers(whole, client, tmp_path, trained):
     study, out = load_study(specification(tmp_path, NETWORKED)), tmp_path / "out"
-    if trained:  # a run that ended after the training, and some cells
+    if trained:  # a run that ended after the training and some cells
         (out / "cells").mkdir(parents=True)
         shutil.copy(whole / "study.json", out)
         shutil.copytree(whole / "networks", out / "networks")
@@ -55,10 +55,10 @@ def test_a_study_is_the_same_on_a_cluster_that_loses_workers(whole, client, tmp_
             shutil.copy(whole / "cells" / f"{index:08d}.npz", out / "cells")
     done = []
     with open_store(out, study, "a cluster") as store:
-        there = study.count - len(store.missing())
+        before = study.count - len(store.missing())
         for step in run_on_cluster(store, client):
             done.append(step.done)
-            if step.done in (there + 2, there + 9):
+            if step.done in (before + 2, before + 9):
                 kill_a_worker(client)
         save_dataset(assemble(store), out)
         entries = store.read_log()
@@ -81,9 +81,9 @@ def test_a_damaged_network_is_named(whole, client, tmp_path, run):
     for options in ((), ("--executor", "dask", "--scheduler", address)):
         refused(run("study", "spec.toml", "--out", "out", *options), "0000.net", "delete it")
     network.unlink()
-    code, told, err = run("study", "spec.toml", "--out", "out", "--executor", "dask", "--scheduler", address)
+    code, out, err = run("study", "spec.toml", "--out", "out", "--executor", "dask", "--scheduler", address)
     assert (code, err) == (0, "")
-    assert "95 estimates" in told
+    assert "95 estimates" in out
     assert network.read_bytes() == whole_network
     assert cells(tmp_path / "out") == cells(whole)
 

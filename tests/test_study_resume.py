@@ -1,4 +1,4 @@
-"""A study that is killed, meets a full disk or damaged files, or is run twice at once: nothing is lost or altered."""
+"""Kills, full disks, damaged files and simultaneous runs: no result of a study is lost or altered."""
 
 import collections
 import errno
@@ -31,13 +31,13 @@ for index in random.Random(0).sample(range(study.count), study.count):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The study, uninterrupted."""
+    """The study in one run, without interruption."""
     return run_study(tmp_path_factory.mktemp("study"))
 
 
 @pytest.fixture
 def copy(whole, tmp_path):
-    """The finished study, to be damaged; `spec.toml` beside it."""
+    """A copy of the finished study to damage; `spec.toml` is beside it."""
     specification(tmp_path)
     return pathlib.Path(shutil.copytree(whole, tmp_path / "out"))
 
@@ -53,7 +53,7 @@ def test_a_study_is_the_same_after_any_number_of_kills(whole, tmp_path):
     count, before = load_study(tmp_path / "spec.toml").count, 0
     while kills < 4:
         process = start(*command)
-        # One while it starts; the others when it has done some more cells.
+        # The first kill comes during the start, the others after some more cells.
         deadline = time.monotonic() + (moments.uniform(0, 2) if kills == 0 else 120)
         wanted = before + moments.randint(1, 12)
         while process.poll() is None and time.monotonic() < deadline and len(list(out.glob("cells/*.npz"))) < wanted:
@@ -64,19 +64,19 @@ def test_a_study_is_the_same_after_any_number_of_kills(whole, tmp_path):
         kills, before = kills + 1, len(list(out.glob("cells/*.npz")))
         assert before < count
     assert before > 0
-    there = cells(out)
+    finished = cells(out)
     assert "190 estimates" in finish(start(*command))
     xr.testing.assert_identical(results(out), results(whole))
     assert cells(out) == cells(whole)
-    assert there.items() <= cells(out).items()
-    # What was kept was never computed again; a kill may come between a cell and its line.
+    assert finished.items() <= cells(out).items()
+    # No finished cell is computed again; a kill may come between a cell and its entry in the log.
     times = collections.Counter(logged(out))
     assert set(times.values()) == {1}
     assert count - kills <= len(times) <= count
 
 
-def test_an_interrupt_ends_it_at_once_with_one_line_and_the_same_command_goes_on(whole, tmp_path):
-    # Training of hours is at work, in a thread that cannot be interrupted.
+def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_resumes(whole, tmp_path):
+    # A long training runs in a thread that cannot be interrupted.
     text = (
         SPECIFICATION.replace('["equation-error"]', '["equation-error", "network"]') + "[network]\nsteps = 1_000_000\n"
     )
@@ -86,10 +86,10 @@ def test_an_interrupt_ends_it_at_once_with_one_line_and_the_same_command_goes_on
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, f"jaxos4: {out}: interrupted; run the same command again to continue.\n")
-    there = cells(out)
-    assert there.items() <= cells(whole).items()
-    assert len(read_store(out).missing()) == 96 - len(there)
+    assert (process.returncode, err) == (130, f"jaxos4: {out}: interrupted; the same command goes on where it was.\n")
+    finished = cells(out)
+    assert finished.items() <= cells(whole).items()
+    assert len(read_store(out).missing()) == 96 - len(finished)
 
 
 def test_cells_are_the_same_in_any_order_in_another_process(whole, tmp_path):
@@ -107,7 +107,7 @@ def test_a_study_is_the_same_on_any_number_of_devices(whole, tmp_path):
 
 
 @pytest.mark.parametrize(("after", "name"), [(0, "study.json"), (20, "00000019.npz"), (49, "results.nc")])
-def test_a_full_disk_is_one_line_and_the_study_goes_on_later(whole, run, tmp_path, monkeypatch, after, name):
+def test_a_full_disk_is_one_line_and_the_study_resumes_later(whole, run, tmp_path, monkeypatch, after, name):
     specification(tmp_path)
     write, written = pathlib.Path.write_bytes, []
 
@@ -128,7 +128,7 @@ def test_a_full_disk_is_one_line_and_the_study_goes_on_later(whole, run, tmp_pat
     xr.testing.assert_identical(results(tmp_path / "out"), results(whole))
 
 
-def test_a_disk_that_is_full_for_the_dataset_keeps_the_older_one(copy, run):
+def test_a_full_disk_keeps_the_older_dataset(copy, run):
     older, (soft, hard) = (copy / "results.nc").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(older) // 2, hard))
     try:
@@ -143,16 +143,16 @@ def test_a_disk_that_is_full_for_the_dataset_keeps_the_older_one(copy, run):
 def test_a_folder_that_cannot_be_written_to_is_refused(run, tmp_path, monkeypatch):
     specification(tmp_path)
     (tmp_path / "out").mkdir()
-    # Root may write anywhere: what others are told is told here.
+    # Root may write anywhere, so that the refusal must be simulated.
     monkeypatch.setattr("os.access", lambda path, mode, **options: mode != os.W_OK)
     refused(run("study", "spec.toml", "--out", "out"), "study.json", "not writable")
 
 
-def test_a_second_run_is_kept_out_while_the_first_lasts(copy, run):
+def test_a_second_run_is_refused_during_the_first(copy, run):
     with open_store(copy, load_study(copy.parent / "spec.toml"), "the first"):
         refused(run("study", "spec.toml", "--out", "out"), "out", "another run is at work")
-        code, told, _ = run("study", "spec.toml", "--out", "out", "--dry-run")
-        assert (code, "0 of 48 cells" in told) == (0, True)
+        code, out, _ = run("study", "spec.toml", "--out", "out", "--dry-run")
+        assert (code, "0 of 48 cells" in out) == (0, True)
     assert run("study", "spec.toml", "--out", "out")[0] == 0
 
 
@@ -190,7 +190,7 @@ def test_a_folder_whose_specification_is_damaged_is_refused(copy, run, content, 
     assert (copy / "study.json").read_text() == content
 
 
-def test_a_folder_of_something_else_is_refused_and_left_alone(run, tmp_path):
+def test_a_folder_with_other_files_is_refused_and_unchanged(run, tmp_path):
     specification(tmp_path)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("mine")
@@ -202,13 +202,13 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(run, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
 
 
-def test_what_a_kill_left_half_written_is_no_obstacle(copy, whole, run):
+def test_half_written_files_of_a_killed_run_are_no_obstacle(copy, whole, run):
     for place in (".study.0123abcd.part.json", ".results.0123abcd.part.nc", "cells/.00000003.0123abcd.part.npz"):
         (copy / place).write_bytes(b"half")
     with open(copy / "log.jsonl", "a") as log:
         log.write('{"cell": 3, "sec')
     (copy / "cells" / "00000003.npz").unlink()
-    # So early a kill that the specification was not there yet, and so late that all but the Dataset was.
+    # A kill before the specification was written, and a kill before the Dataset was written.
     (copy / "results.nc").unlink()
     assert run("study", "spec.toml", "--out", "out")[0] == 0
     assert not list(copy.rglob(".*"))
@@ -218,8 +218,8 @@ def test_what_a_kill_left_half_written_is_no_obstacle(copy, whole, run):
     early.mkdir()
     (early / ".study.0123abcd.part.json").write_bytes(b"half")
     (early / "lock").touch()
-    code, told, _ = run("study", "spec.toml", "--out", "early", "--dry-run")
-    assert (code, "48 of 48 cells" in told) == (0, True)
+    code, out, _ = run("study", "spec.toml", "--out", "early", "--dry-run")
+    assert (code, "48 of 48 cells" in out) == (0, True)
     with open_store(early, load_study(copy.parent / "spec.toml"), "d") as store:
         assert len(store.missing()) == 48
     assert not list(early.glob(".*"))

@@ -1,4 +1,4 @@
-"""The comparison as a table in colours: estimators against parameters, a panel a noise scale."""
+"""The comparison as a coloured table: rows are estimators, columns are parameters, panels are noise scales."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ WORST = 30.0
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """Numbers: RMS errors, in percent where that means something. Colour: over the least bound of any estimator."""
+    """Numbers: RMS errors, in percent if that has a meaning. Colour: RMS error / smallest bound of any estimator."""
     data = data.squeeze([d for d in metrics.SCENARIO if d not in ("scale", "estimator")])
     found, least = metrics.estimator_error(data), metrics.bound_error(data)["absolute"].min("estimator")
     ratio = (found["absolute"] / least).transpose("scale", "estimator", "parameter").values
@@ -50,7 +50,7 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what `jaxos4 study` wrote."""
+    """Draws the results of `jaxos4 study`."""
     write_figure(lambda: draw(read_results(results)), figures, "comparison")
 
 

@@ -1,6 +1,6 @@
-"""Networks, the hybrid and IBSS on unseen flights drawn over the whole bracket: RMSE / bound, coverage, rollouts, time.
+"""Networks, the hybrid and IBSS on new flights with random parameters: RMSE / bound, coverage, rollouts, time.
 
-Parameters, noise and flights are new; each error is taken in units of the Cramer-Rao bound at that flight's own truth.
+Each error is in units of the Cramer-Rao bound at that flight's own truth.
 """
 
 import functools
@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
+from jaxos4.cli.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
 from rich.console import Console
 
 import jaxos4
-from jaxos4.report.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
+from jaxos4.study import metrics
 
 jax.config.update("jax_enable_x64", True)
 
@@ -29,12 +30,12 @@ LEVELS = (0.5, 0.9, 0.99)
 NOISES = (0.1, 1.0, 10.0)
 
 
-# All axes at once, as the standard flight, at other frequencies [Hz].
+# Frequencies [Hz] that the standard flight does not have; all axes move at once, as there.
 OTHER_TONES = ((0.4, 0.9, 2.9), (0.5, 1.5, 2.1), (0.3, 1.1, 2.7))
 
 
 class Case(NamedTuple):
-    """What is identified: a model on an excitation, in brackets so many times as wide as the default."""
+    """A model, an excitation, and the width of the bracket in multiples of the default."""
 
     model: type[jaxos4.AbstractModel] = jaxos4.PublishedOS4
     excite: Callable[[jaxos4.Airframe], jax.Array] = jaxos4.multisine
@@ -42,7 +43,7 @@ class Case(NamedTuple):
 
     @property
     def bracket(self) -> jaxos4.Bracket:
-        """Around the OS4."""
+        """The bracket around the OS4."""
         model = self.model(jaxos4.OS4)
         return jaxos4.Bracket.around(model.alpha, self.wide * model.half_width)
 
@@ -53,7 +54,7 @@ class Case(NamedTuple):
         return jaxos4.simulate(model, model.alpha, self.excite(model.airframe), dt=0.01)
 
     def problem(self, flight: jaxos4.Flight, noise: float | jax.Array, channels: str = "all") -> jaxos4.ShootingProblem:
-        """All flights start at rest, and it is known."""
+        """The problem of a flight; all flights start at rest, and the start is known."""
         sigma = noise * jaxos4.SENSOR_SIGMA
         model = self.model(jaxos4.OS4)
         return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=jnp.zeros(12), channels=channels)
@@ -87,7 +88,7 @@ def unseen(
     flights: int,
     seed: int,
 ) -> Iterator[tuple[float, dict]]:
-    """For each noise, identifies `flights` flights that can be flown, of parameters drawn over the bracket."""
+    """For each noise, identifies `flights` flights that do not diverge, with parameters drawn over the bracket."""
     bracket, exact, at_once = case.bracket, case.flight, min(CHUNK, flights)
 
     @eqx.filter_jit
@@ -127,27 +128,24 @@ def unseen(
 
 
 def summary(data: dict[str, np.ndarray]) -> dict:
-    """What a row of the table shows: errors of the flights whose search ended at an answer, and how all of them ended.
-
-    `max_sweeps` and `at_bound` say themselves that they are no answer: they are counted, and left out of the errors.
-    """
-    told = np.isin(data["result"], ["successful", "unidentifiable"])
-    error, bound = data["error"][told], data["bound"][told]
+    """A row of the table: errors of the converged flights, and the number of flights with each result."""
+    converged = np.isin(data["result"], metrics.CONVERGED)
+    error, bound = data["error"][converged], data["bound"][converged]
     return {
-        "flights": len(told),
-        "answers": int(told.sum()),
+        "flights": len(converged),
+        "answers": int(converged.sum()),
         "results": count_results(data["result"]),
         "efficiency": np.sqrt(np.mean((error / bound) ** 2, axis=0)).tolist(),
         "rms_ratio": np.sqrt(np.mean(error**2, axis=0) / np.mean(bound**2, axis=0)).tolist(),
-        "monte_carlo_error": float(1 / np.sqrt(2 * max(told.sum(), 1))),
-        "covered": data["covered"][told].mean(axis=(0, 2)).tolist(),
+        "monte_carlo_error": float(1 / np.sqrt(2 * max(converged.sum(), 1))),
+        "covered": data["covered"][converged].mean(axis=(0, 2)).tolist(),
         "rollouts": float(data["rollouts"].mean()),
         "hit_rate": float(data["hit"].mean()) if "hit" in data else None,
     }
 
 
 def amortised(case: Case, network: jaxos4.TrainedNetwork, channels: str, flights: int) -> dict:
-    """Identifies many noisy flights in one call: time, and what it adds to the memory of the process."""
+    """Identifies many noisy flights in one call: time, and the growth of the process's memory."""
     keys = jax.random.split(jax.random.key(3), flights)
     noisy = measure(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), case.flight, keys)
     arguments = network, case.problem(case.flight, 1.0, channels), many_times(case.bracket, flights), noisy
@@ -171,15 +169,19 @@ def amortised(case: Case, network: jaxos4.TrainedNetwork, channels: str, flights
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Unseen flights for a row.")] = 2000,
-    seed: Annotated[int, typer.Option(help="Of the unseen flights; networks are trained with seed 0.")] = 7,
-    cases: Annotated[list[str], typer.Option(help="Which cases.")] = tuple(CASES),
-    networks: Annotated[list[str], typer.Option(help="Which networks, in the standard case.")] = tuple(NETWORKS),
+    flights: Annotated[int, typer.Option(help="New flights for each row.")] = 2000,
+    seed: Annotated[int, typer.Option(help="Random seed for the new flights; networks are trained with seed 0.")] = 7,
+    cases: Annotated[list[str], typer.Option(help="Cases to run.")] = tuple(CASES),
+    networks: Annotated[list[str], typer.Option(help="Networks of the standard case.")] = tuple(NETWORKS),
     noises: Annotated[list[float], typer.Option(help="Noise scales.")] = NOISES,
-    channels: Annotated[str, typer.Option(help="What was measured, and hybrid and IBSS look at.")] = "all",
-    steps: Annotated[int | None, typer.Option(help="Of training, in place of each network's own.")] = None,
-    many: Annotated[int, typer.Option(help="Flights identified by one call.")] = 10_000,
-    separate: Annotated[bool, typer.Option(help="Also one network for each noise scale.")] = True,
+    channels: Annotated[
+        str, typer.Option(help="Channels that are measured, and that the hybrid and IBSS look at.")
+    ] = "all",
+    steps: Annotated[
+        int | None, typer.Option(help="Training steps of all networks; each has its own number without it.")
+    ] = None,
+    many: Annotated[int, typer.Option(help="Flights identified in one call.")] = 10_000,
+    separate: Annotated[bool, typer.Option(help="Train one network for each noise scale too.")] = True,
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
     """Networks, hybrid and IBSS on flights drawn over the whole bracket."""

@@ -1,4 +1,4 @@
-"""RMSE / bound of white noise, and coverage of 95 % intervals, by kind of noise."""
+"""RMSE / bound of white noise, and coverage of 95 % intervals, for each kind of noise."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ LEVEL = 0.95
 
 
 def draw(data: xr.Dataset) -> Figure:
-    """At each kind: the mean over the parameters, and from the least to the largest of them."""
+    """For each kind of noise: the mean over the parameters, with a bar from the smallest to the largest."""
     data = data.squeeze([d for d in metrics.SCENARIO if d not in ("noise", "estimator")])
     figure, (left, right) = grid(2, columns=2, height=2.9)
     style = styles(list(data["estimator"].values))
@@ -41,7 +41,7 @@ def draw(data: xr.Dataset) -> Figure:
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what `jaxos4 study` wrote."""
+    """Draws the results of `jaxos4 study`."""
     write_figure(lambda: draw(read_results(results)), figures, "noise_kinds")
 
 

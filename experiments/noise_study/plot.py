@@ -1,4 +1,4 @@
-"""RMS error with the bound, and RMSE / bound, of each parameter against the noise scale."""
+"""RMS error and bound of each parameter, and RMSE / bound, against the noise scale."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from jaxos4.study import metrics
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what `jaxos4 study` wrote."""
+    """Draws the results of `jaxos4 study`."""
     data = read_results(results).squeeze([d for d in metrics.SCENARIO if d not in ("scale", "estimator")])
     write_figure(lambda: errors(data), figures, "noise_study-error")
     write_figure(lambda: efficiency(data), figures, "noise_study-efficiency")

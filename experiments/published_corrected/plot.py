@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxos4.report.experiment import load_results, write_figure
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
-from jaxos4.study.metrics import NOISE_FLOOR
+from jaxos4.results import NINETY_FIVE
 
 LEVEL = 0.01
 TESTS = {"white_p": "white", "input_p": "free of\ninputs", "level_p": "of the\nnoise's size"}
@@ -23,7 +23,7 @@ def draw(data: xr.Dataset) -> Figure:
     rejected = 100 * (data[list(TESTS)].to_dataarray("test") < LEVEL).mean("flight")
     for row, channels in enumerate(data["channels"].values):
         left, middle, right = axes[3 * row : 3 * row + 3]
-        left.axhline(NOISE_FLOOR, color=FAINT, linestyle="dashed", linewidth=1.0)
+        left.axhline(NINETY_FIVE, color=FAINT, linestyle="dashed", linewidth=1.0)
         middle.axhline(1, color=INK, linewidth=1.0)
         right.axhline(100 * LEVEL, color=INK, linewidth=1.0)
         for place, (fitted, look) in enumerate(looks.items()):

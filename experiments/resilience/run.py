@@ -1,8 +1,8 @@
-"""A study that is killed again and again, and resumed: is it the study that ran through, and was any work done twice?
+"""Kills a study again and again and resumes it: are the results those of an uninterrupted run?
 
     python experiments/resilience/run.py SPEC.toml --out FOLDER
 
-Writes FOLDER/whole, the study uninterrupted; FOLDER/killed, killed ten times; and FOLDER/report.json.
+Writes FOLDER/whole, an uninterrupted run; FOLDER/killed, killed ten times; and FOLDER/report.json.
 """
 
 import collections
@@ -27,14 +27,14 @@ COMMAND = "from jaxos4.cli import main; main()"
 
 
 def main(
-    specification: Annotated[Path, typer.Argument(help="As for `jaxos4 study`; some hundred cells make good targets.")],
-    out: Annotated[Path, typer.Option(help="Folder for both studies and the report.")],
-    kills: Annotated[int, typer.Option(help="How often to kill.", min=1)] = 10,
-    seed: Annotated[int, typer.Option(help="Of the moments.")] = 0,
+    specification: Annotated[Path, typer.Argument(help="Specification of a study with some hundred cells.")],
+    out: Annotated[Path, typer.Option(help="Folder for both runs and the report.")],
+    kills: Annotated[int, typer.Option(help="Number of kills.", min=1)] = 10,
+    seed: Annotated[int, typer.Option(help="Random seed for the moments of the kills.")] = 0,
 ) -> None:
     """Kill a study at random moments until it was killed often enough; finish it; compare."""
     out.mkdir(parents=True)
-    # Compiled programs are kept: a resumed run comes to its cells soon.
+    # Compiled programs are kept, so that a resumed run soon reaches its cells.
     environment = {
         "JAX_COMPILATION_CACHE_DIR": str(out / "programs"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -45,20 +45,20 @@ def main(
     seconds = time.perf_counter() - begin
     moments, rows = random.Random(seed), []
     while len(rows) < kills:
-        before, begin = _there(out / "killed"), time.perf_counter()
+        before, begin = _finished(out / "killed"), time.perf_counter()
         process = _start(specification, out / "killed", environment)
-        # Half at any moment of a run, half when it has just come to its cells.
+        # Every second kill comes at any moment of a run, the others after some more cells.
         end = time.perf_counter() + moments.uniform(0, seconds if len(rows) % 2 else 3600)
         more = moments.uniform(0, 2 * (count - before) / (kills + 1 - len(rows)))
-        while process.poll() is None and time.perf_counter() < end and _there(out / "killed") < before + more:
+        while process.poll() is None and time.perf_counter() < end and _finished(out / "killed") < before + more:
             time.sleep(0.002)
         process.kill()
         process.wait()
         if process.returncode != -signal.SIGKILL:
-            raise SystemExit(f"{specification}: ended by itself after {len(rows)} kills; give a longer one.")
-        there, lasted = _there(out / "killed"), round(time.perf_counter() - begin, 3)
-        rows.append({"seconds": lasted, "before": before, "after": there})
-        typer.echo(f"kill {len(rows)}: {there} of {count} cells")
+            raise SystemExit(f"{specification}: the study ended after {len(rows)} kills; give a longer one.")
+        after, lasted = _finished(out / "killed"), round(time.perf_counter() - begin, 3)
+        rows.append({"seconds": lasted, "before": before, "after": after})
+        typer.echo(f"kill {len(rows)}: {after} of {count} cells")
     _run(specification, out / "killed", environment)
     times = collections.Counter(e["cell"] for e in read_store(out / "killed").read_log() if "cell" in e)
     report = {
@@ -93,7 +93,7 @@ def _run(specification: Path, folder: Path, environment: dict[str, str]) -> None
         raise SystemExit(f"{folder}: the study ended with exit code {code}.")
 
 
-def _there(folder: Path) -> int:
+def _finished(folder: Path) -> int:
     return len(list(folder.glob("cells/[0-9]*.npz")))
 
 

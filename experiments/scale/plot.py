@@ -1,4 +1,4 @@
-"""RMSE / bound against the noise scale, and coverage: with this many flights, to a hundredth."""
+"""RMSE / bound and coverage against the noise scale; with 10,000 flights their error is below 0.01."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from jaxos4.study import metrics
 
 
 def main(results: Path, figures: Path) -> None:
-    """Draws what `jaxos4 study` wrote."""
+    """Draws the results of `jaxos4 study`."""
     data = read_results(results).squeeze([d for d in metrics.SCENARIO if d not in ("scale", "estimator")])
     write_figure(lambda: efficiency(data), figures, "scale-efficiency")
     write_figure(lambda: coverage(data), figures, "scale-coverage")

@@ -10,8 +10,7 @@ from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
 from ..models import MODELS
 from ..models.state import CHANNELS
-from ..networks.features import FEATURES
-from ..networks.network import APPROXIMATORS
+from ..networks import APPROXIMATORS, FEATURES
 from ..simulation import METHODS
 
 Model = StrEnum("Model", list(MODELS))

@@ -23,7 +23,7 @@ from ..logs import read_flight_and_notes
 from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
-from ..networks.network import NetworkEstimator, TrainedNetwork
+from ..networks import NetworkEstimator, TrainedNetwork
 from ..noise import SENSOR_SIGMA
 from ..results import RESULTS, result_names
 from ..shooting import ShootingProblem

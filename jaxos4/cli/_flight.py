@@ -24,8 +24,7 @@ from ..identification.vehicle import NO_ANSWER
 from ..logs import read_flight_and_notes
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
-from ..networks.file import load_network
-from ..networks.network import NetworkEstimator, TrainedNetwork
+from ..networks import NetworkEstimator, TrainedNetwork, load_network
 from ..results import result_names
 from ..shooting import ShootingProblem
 from ._choices import Channels, Estimator, InitialState, Model

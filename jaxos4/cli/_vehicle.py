@@ -24,7 +24,7 @@ from ..models.abstract import PARAMETER_NAMES
 from ..models.corrected import CorrectedOS4
 from ..models.held import hold
 from ..models.vehicle import TERMS, FlightModel, has_full_scale
-from ..networks.network import NetworkEstimator
+from ..networks import NetworkEstimator
 from ..results import result_names
 from ..shooting import ShootingProblem
 from ._bracket_file import load_bracket

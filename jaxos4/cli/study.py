@@ -5,14 +5,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import typer
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from ..errors import InputError
-from ..study import Study, check_store, load_study, plan, run_on_cluster, use_all_cores
+from ..study import Study, device_name, load_study, plan, run_on_cluster, use_all_cores
 
 Executor = StrEnum("Executor", ["local", "dask"])
 
@@ -43,18 +42,17 @@ def study(
 
 
 def _print_plan(wanted: Study, out: Path) -> None:
-    missing, devices = check_store(out, wanted), len(jax.local_devices())
-    rows = plan(wanted, missing, devices)
+    rows = plan(wanted, out)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("estimator", "cells", "flights", "memory [MiB]", "time [min]"):
+    for heading in ("estimator", "cells", "flights", "programs", "networks", "time [min]"):
         table.add_column(heading, justify="left" if heading == "estimator" else "right")
-    for row in rows:
-        table.add_row(row.estimator, str(row.cells), str(row.flights), f"{row.memory:.0f}", f"{row.seconds / 60:.1f}")
+    for *counts, seconds in rows:
+        table.add_row(*map(str, counts), "-" if seconds is None else f"{seconds / 60:.1f}")
     Console(highlight=False).print(table)
-    flights, minutes = sum(row.flights for row in rows), sum(row.seconds for row in rows) / 60
+    cells, flights = sum(row.cells for row in rows), sum(row.flights for row in rows)
     typer.echo(
-        f"{len(missing)} of {wanted.count} cells to be run, {flights} flights identified, on {devices} devices of this "
-        f"machine: about {minutes:.0f} minutes, roughly."
+        f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}. The time "
+        "is known for estimators with finished cells. It does not include the training of networks."
     )
 
 

@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
-from ..networks.file import save_network
-from ..networks.network import NetworkEstimator
+from ..networks import NetworkEstimator, save_network
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,

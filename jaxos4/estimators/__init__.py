@@ -1,7 +1,7 @@
 """Estimators: from a `ShootingProblem` and a `Bracket` to an `Estimate`. Each algorithm has its own file."""
 
 from ..estimate import AbstractEstimator
-from ..networks.network import TrainedNetwork
+from ..networks import TrainedNetwork
 from .equation_error import EquationError as EquationError
 from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS

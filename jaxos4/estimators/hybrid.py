@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate
-from ..networks.network import TrainedNetwork
+from ..networks import TrainedNetwork
 from ..results import RESULTS
 from ..shooting import ShootingProblem
 from .ibss import IBSS

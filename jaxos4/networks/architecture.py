@@ -1,4 +1,4 @@
-"""From features to unknowns: a linear skip, what an approximator adds to it, and how far off both are."""
+"""From features to unknowns: a linear map, a learnt correction, and the learnt size of the error that remains."""
 
 import itertools
 from typing import NamedTuple
@@ -11,20 +11,20 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Key, Scalar
 
-# Inputs are taken as they are up to here, and logarithmically beyond: flights that nearly diverge have huge features.
+# Features grow linearly up to this size and logarithmically beyond: flights that nearly diverge have huge features.
 _LINEAR = 4.0
-# The network that says how far off the answer is: as large as that needs.
+# Width and depth of the perceptron that predicts the size of the error.
 _SPREAD_WIDTH, _SPREAD_DEPTH = 32, 2
-# Its logarithm stays within this.
-_LOGARITHM = 7.0
+# Limit of the logarithm of that size.
+_LARGEST_LOGARITHM = 7.0
 
 
 class Scaling(eqx.Module):
-    """Units of the inputs and outputs, measured once and frozen.
+    """Units of the inputs and outputs, measured once before training and then frozen.
 
-    - `width`: how large each feature is.
+    - `width`: the typical size of each feature.
     - `unit`: the Cramer-Rao bound of each unknown at the bracket's center, in bracket coordinates.
-    - `gain`: how large a correction the approximator makes where it says 1, in bracket coordinates.
+    - `gain`: the correction of each unknown when the approximator returns 1, in bracket coordinates.
     - `span`: the largest logarithm of a noise scale.
     """
 
@@ -34,12 +34,15 @@ class Scaling(eqx.Module):
     span: Scalar
 
     def bound(self, scale: Scalar) -> Float[Array, " unknowns"]:
-        """What can be known of each unknown at a noise scale, the bracket counted as data (variance 1/3)."""
+        """The smallest possible standard deviation of each unknown at a noise scale.
+
+        The bracket counts as data: a uniform distribution over it has the variance 1/3.
+        """
         return jax.lax.rsqrt(1 / jnp.square(self.unit * scale) + 3)
 
 
-class Answer(NamedTuple):
-    """Unknowns in bracket coordinates, and their standard deviations in units of `Scaling.bound`, as a logarithm."""
+class NetworkOutput(NamedTuple):
+    """Unknowns in bracket coordinates, and the logarithm of their standard deviations in units of `Scaling.bound`."""
 
     u: Float[Array, " unknowns"]
     log_spread: Float[Array, " unknowns"]
@@ -48,8 +51,8 @@ class Answer(NamedTuple):
 class CMAC(eqx.Module):
     """Tile coding (cerebellar model articulation controller): shifted grids of cells cover every pair of inputs.
 
-    The answer is the mean over the grids of the entries of the cells that the inputs fall into. All inputs at once
-    would need a number of cells that grows exponentially with them; pairs catch what two inputs do together.
+    The output is a sum over the pairs. Each pair contributes the mean, over its grids, of the entry of the cell that
+    holds the two inputs. A grid over all inputs at once would need a number of cells that grows exponentially.
     """
 
     tables: Float[Array, "pairs tilings cells cells out"]
@@ -59,7 +62,7 @@ class CMAC(eqx.Module):
         self.tables = jnp.zeros((pairs, tilings, cells, cells, out_size))
 
     def __call__(self, x: Float[Array, " in"]) -> Float[Array, " out"]:
-        """The approximation at `x`; cells cover -3 to 3, and the outermost ones all beyond."""
+        """The output for inputs `x`. The cells cover -3 to 3; the outermost cells also cover everything beyond."""
         pairs, tilings, cells = self.tables.shape[:3]
         shift = jnp.arange(tilings) / tilings
         place = jnp.clip(x / 6 + 0.5, 0, 1) * (cells - 1)
@@ -70,7 +73,7 @@ class CMAC(eqx.Module):
 
 
 class Regressor(eqx.Module):
-    """What is trained."""
+    """The trained part of a network: a linear map `skip`, an approximator that corrects it, and the error's spread."""
 
     skip: Float[Array, "unknowns features"]
     approximator: eqx.nn.MLP | CMAC
@@ -89,16 +92,16 @@ class Regressor(eqx.Module):
         )
         self.spread = perceptron(_SPREAD_WIDTH, _SPREAD_DEPTH, spread_key)
 
-    def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> Answer:
-        """The answer for one flight."""
-        seen = compress(features / scaling.width)
-        inputs = jnp.concatenate([seen, (jnp.log(scale) / scaling.span)[None]])
-        u = self.skip @ seen + scaling.gain * self.approximator(inputs)
-        return Answer(u, jnp.clip(self.spread(inputs), -_LOGARITHM, _LOGARITHM))
+    def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> NetworkOutput:
+        """Unknowns of one flight, from its features and its noise scale."""
+        compressed = compress(features / scaling.width)
+        inputs = jnp.concatenate([compressed, (jnp.log(scale) / scaling.span)[None]])
+        u = self.skip @ compressed + scaling.gain * self.approximator(inputs)
+        return NetworkOutput(u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM))
 
 
 def compress(x: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
-    """Features as the network takes them: as they are up to a size, logarithmically beyond."""
+    """Features as the network takes them: linear up to a size, logarithmic beyond."""
     size = jnp.abs(x)
     return jnp.where(size < _LINEAR, x, jnp.sign(x) * (_LINEAR + jnp.log1p(jnp.maximum(size - _LINEAR, 0))))
 
@@ -110,13 +113,13 @@ def squared_error(
     scale: Scalar,
     u: Float[Array, " unknowns"],
 ) -> Scalar:
-    """Mean square error in units of what can be known, plus the likelihood of that error under the spread.
+    """The loss of one flight: mean square error in units of `Scaling.bound`, plus the likelihood of the spread.
 
-    The spread follows the error and does not lead it: weighting by a spread that is learnt with it lets the answer
-    settle where it is bad.
+    The likelihood trains the spread alone: its gradient does not reach `u`. If errors were weighted by a spread that
+    is learnt at the same time, training could settle at a bad answer with a large spread.
     """
-    answer = regressor(features, scale, scaling)
-    error = (answer.u - u) / scaling.bound(scale)
-    settled = jax.lax.stop_gradient(error)
-    likelihood = jnp.square(settled * jnp.exp(-answer.log_spread)) / 2 + answer.log_spread
+    output = regressor(features, scale, scaling)
+    error = (output.u - u) / scaling.bound(scale)
+    fixed_error = jax.lax.stop_gradient(error)
+    likelihood = jnp.square(fixed_error * jnp.exp(-output.log_spread)) / 2 + output.log_spread
     return jnp.square(error).mean() + likelihood.mean()

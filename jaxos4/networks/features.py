@@ -1,7 +1,7 @@
-"""What a network sees of a flight, and of simulated ones with their noise: a few numbers in place of a trajectory.
+"""The features of a flight: a few numbers in place of a trajectory, from a measured flight or from a simulated one.
 
-Unknowns are the parameters and, where it is free, the initial state, in *bracket coordinates*: 0 at the center of the
-bracket, +-1 at its ends.
+Unknowns are the parameters and, if it is free, the initial state. They are in *bracket coordinates*: 0 at the center
+of the bracket, +-1 at its ends.
 """
 
 import abc
@@ -19,11 +19,11 @@ from ..models.state import CASCADE_ORDER
 from ..shooting import FASTEST, ShootingProblem
 
 
-class Seen(NamedTuple):
-    """What features say of a measured flight.
+class FlightFeatures(NamedTuple):
+    """The features of a measured flight.
 
-    - `values`: the network's input, in units in which it was trained.
-    - `inflation`: by how much less each parameter is known than in training, because samples are missing.
+    - `values`: the network's input.
+    - `inflation`: for each parameter, the factor by which missing samples enlarge its standard deviation.
     """
 
     values: Float[Array, " features"]
@@ -35,8 +35,8 @@ class Coordinates(eqx.Module):
 
     **Arguments:**
 
-    - `center`, `width`: in the unknowns' units; the parameters first, then the initial state where it is free.
-    - `first_state`: the initial state at the center, whether free or not, in cascade order.
+    - `center`, `width`: in the unknowns' units; parameters first, then the initial state if it is free.
+    - `first_state`: the initial state at the center, free or known, in cascade order.
     """
 
     center: Float[Array, " unknowns"]
@@ -45,7 +45,12 @@ class Coordinates(eqx.Module):
 
     @classmethod
     def of(cls, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> "Coordinates":
-        """Of a problem's unknowns: an initial state lies as far from the first measurement as `noise` puts it."""
+        """Coordinates of a problem's unknowns in a bracket.
+
+        **Arguments:**
+
+        - `noise`: the largest noise scale. It widens the bracket of a free initial state, whose center is measured.
+        """
         first_state, off = problem.first_state()
         free = problem.windows * problem.free_size
         sigma = jnp.tile(problem.sigma[CASCADE_ORDER[: problem.size]], problem.windows)
@@ -64,10 +69,10 @@ class Coordinates(eqx.Module):
 
 
 class AbstractFeatures(eqx.Module):
-    """What a network sees, prepared for one input, start, sampling and bracket.
+    """Features prepared for one input, start, sampling and bracket.
 
-    - `problem`: what it was prepared for; of the flight's states it uses which are measured, and the first.
-    - `coordinates`: of the unknowns.
+    - `problem`: the problem of training. Of its states only the first counts, and which samples were measured.
+    - `coordinates`: bracket coordinates of the unknowns.
     - `reference`: the trajectory at the bracket's center.
     """
 
@@ -78,18 +83,18 @@ class AbstractFeatures(eqx.Module):
     @property
     @abc.abstractmethod
     def size(self) -> int:
-        """How many numbers."""
+        """The number of features."""
 
     @abc.abstractmethod
-    def __call__(self, problem: ShootingProblem) -> Seen:
-        """Of a measured flight. NaN where its numbers are not finite."""
+    def __call__(self, problem: ShootingProblem) -> FlightFeatures:
+        """Features of a measured flight; NaN if its numbers are not finite."""
 
     @abc.abstractmethod
     def simulated(self, u: Float[Array, " unknowns"], scale: Scalar, *, key: Key) -> Float[Array, " features"]:
-        """Of the flight at `u`, with white noise of `scale` times the problem's sigma; NaN where it cannot be flown."""
+        """Features of the flight at `u` with white noise of `scale` times sigma; NaN if the flight diverges."""
 
     def _deviation(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
-        """W (x(u) - x(0)), 0 where nothing is measured; NaN throughout where the flight at `u` diverges."""
+        """W (x(u) - x(0)); 0 in samples that are not measured, NaN everywhere if the flight at `u` diverges."""
         trajectory = self.problem.predict(*self.coordinates.split(u, len(self.problem.model.parameter_names)))
         sound = (jnp.abs(trajectory[:, :3]) < FASTEST).all()
         if self.problem.size > 3:
@@ -97,7 +102,7 @@ class AbstractFeatures(eqx.Module):
         return jnp.where(sound, self._weighted(self.problem, trajectory), jnp.nan)
 
     def _mismatch(self, problem: ShootingProblem) -> Float[Array, "samples size"]:
-        """W (y - x(0)) of a measured flight, with the weights of training; 0 where nothing is measured in both."""
+        """W (y - x(0)) of a measured flight, with the weights of training; 0 unless measured here and in training."""
         mismatch = self._weighted(problem, problem.measured())
         return jnp.where(_measured(self.problem), mismatch, 0.0)
 
@@ -111,9 +116,9 @@ class AbstractFeatures(eqx.Module):
 class Score(AbstractFeatures):
     """F^-1 J^T W (y - x) at the bracket's center: one Gauss-Newton step, a number for each unknown.
 
-    Nearly everything that the flight tells about the parameters is in these numbers, as long as the trajectories of the
-    bracket are nearly a linear manifold (score compression; Alsing and Wandelt 2018). White noise passes through a
-    linear map as Gaussian noise of covariance F^-1: simulated flights need no noise drawn sample by sample.
+    If trajectories are nearly linear in the unknowns over the bracket, these numbers hold nearly all information that
+    the flight has about them (score compression; Alsing and Wandelt 2018). White noise passes through a linear map as
+    Gaussian noise of covariance F^-1, so that a simulated flight needs no noise for each sample.
     """
 
     problem: ShootingProblem
@@ -137,13 +142,13 @@ class Score(AbstractFeatures):
         """One for each unknown."""
         return self.noise_factor.shape[0]
 
-    def __call__(self, problem: ShootingProblem) -> Seen:
-        """See `AbstractFeatures`. Samples that were measured in training and are missing here only cost precision."""
+    def __call__(self, problem: ShootingProblem) -> FlightFeatures:
+        """See `AbstractFeatures`. Samples that were measured in training may be missing: they only cost precision."""
         jacobian = jnp.where(_measured(problem)[:, :, None], self.jacobian, 0.0)
         noise_factor = invert_factor(cholesky(_squares(jacobian))).T
         step = noise_factor @ (noise_factor.T @ jnp.einsum("tcu,tc->u", jacobian, self._mismatch(problem)))
-        lost = jnp.linalg.norm(noise_factor, axis=1) / jnp.linalg.norm(self.noise_factor, axis=1)
-        return Seen(step, lost[: len(self.problem.model.parameter_names)])
+        inflation = jnp.linalg.norm(noise_factor, axis=1) / jnp.linalg.norm(self.noise_factor, axis=1)
+        return FlightFeatures(step, inflation[: len(self.problem.model.parameter_names)])
 
     def simulated(self, u: Float[Array, " unknowns"], scale: Scalar, *, key: Key) -> Float[Array, " features"]:
         """See `AbstractFeatures`."""
@@ -152,7 +157,7 @@ class Score(AbstractFeatures):
 
 
 class Raw(AbstractFeatures):
-    """The flattened trajectory, as its difference from that at the bracket's center: the paper-style input."""
+    """The paper-style input: the whole trajectory as one vector, minus the trajectory at the bracket's center."""
 
     problem: ShootingProblem
     coordinates: Coordinates
@@ -168,11 +173,11 @@ class Raw(AbstractFeatures):
         """One for each sample and channel."""
         return self.reference.size
 
-    def __call__(self, problem: ShootingProblem) -> Seen:
+    def __call__(self, problem: ShootingProblem) -> FlightFeatures:
         """See `AbstractFeatures`. Samples that were measured in training must be measured here."""
-        lost = (_measured(self.problem) & ~_measured(problem)).any()
-        inflation = jnp.where(lost, jnp.inf, jnp.ones(len(self.problem.model.parameter_names)))
-        return Seen(self._mismatch(problem).ravel(), inflation)
+        missing = (_measured(self.problem) & ~_measured(problem)).any()
+        inflation = jnp.where(missing, jnp.inf, jnp.ones(len(self.problem.model.parameter_names)))
+        return FlightFeatures(self._mismatch(problem).ravel(), inflation)
 
     def simulated(self, u: Float[Array, " unknowns"], scale: Scalar, *, key: Key) -> Float[Array, " features"]:
         """See `AbstractFeatures`."""

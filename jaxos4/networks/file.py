@@ -1,4 +1,4 @@
-"""A trained network as one file: a zip of plain NumPy arrays and a header in JSON, from which nothing is executed."""
+"""A trained network as one file: a zip of NumPy arrays and a header in JSON. Reading it runs no code from it."""
 
 import dataclasses
 import importlib.metadata
@@ -20,16 +20,17 @@ from ..errors import InputError
 from ..flight import Flight
 from ..models import MODELS
 from ..shooting import ShootingProblem
-from .network import NetworkEstimator, TrainedNetwork, untrained
+from .estimator import NetworkEstimator
+from .trained import TrainedNetwork
 
 _FORMAT = 2
 _LARGEST = 2**30
 
 
 def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
-    """Writes a network with all that it was trained for: model, airframe, inputs, sampling, bracket, noise, version.
+    """Writes a network with its problem of training: model, airframe, inputs, sampling, bracket, noise, version.
 
-    **Raises:** `ValueError` for a model that is not one of ours; `OSError` where the file cannot be written.
+    **Raises:** `ValueError` for a model that is not in `MODELS`; `OSError` if the file cannot be written.
     """
     problem = network.problem
     kinds = {kind: name for name, kind in MODELS.items()}
@@ -55,21 +56,21 @@ def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
     }
     if problem.initial_state is not None:
         arrays["initial_state"] = problem.initial_state
-    without = eqx.tree_at(lambda n: n.features.problem, network, None)
-    places = jax.tree_util.tree_leaves_with_path(eqx.filter(without, eqx.is_array))
-    arrays |= {_name(place): leaf for place, leaf in places}
+    without_problem = eqx.tree_at(lambda n: n.features.problem, network, None)
+    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(without_problem, eqx.is_array))
+    arrays |= {_name(leaf_path): leaf for leaf_path, leaf in leaves}
     with write_atomically(path) as beside, open(beside, "wb") as file:
         np.savez(file, header=np.asarray(json.dumps(header)), **jax.tree.map(np.asarray, arrays))  # pyright: ignore[reportArgumentType]
 
 
 def load_network(path: str | os.PathLike[str]) -> TrainedNetwork:
-    """The network that `save_network` wrote, in the precision that is set now.
+    """Reads a network that `save_network` wrote, in the current precision.
 
-    **Raises:** `InputError` for what is not such a file, whole and of this version; `OSError` where it cannot be read.
+    **Raises:** `InputError` if it is no complete network file of this format; `OSError` if it cannot be read.
     """
     try:
-        with zipfile.ZipFile(path) as whole:
-            if sum(entry.file_size for entry in whole.infolist()) > _LARGEST:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
                 raise InputError(f"{path}: larger than any network; give a file that `jaxos4 train` wrote.")
         with np.load(path, allow_pickle=False) as file:
             return _restore({name: file[name] for name in file.files})
@@ -87,9 +88,9 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     if header["format"] != _FORMAT:
         raise ValueError(f"format {header['format']}, expected {_FORMAT}")
     for name, value in arrays.items():
-        whole = value.dtype.kind in "fui" and (name == "states" or not np.isnan(value).any())
-        if name != "header" and not whole:
-            raise ValueError(f"{name} is not what it should be")
+        valid = value.dtype.kind in "fui" and (name == "states" or not np.isnan(value).any())
+        if name != "header" and not valid:
+            raise ValueError(f"{name} holds no numbers, or NaN")
     settings = NetworkEstimator(**header["settings"] | {"noise": tuple(header["settings"]["noise"])})
     airframe = Airframe(**{f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
     problem = ShootingProblem(
@@ -101,7 +102,7 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
         method=header["method"],
         windows=header["windows"],
     )
-    blank = eqx.filter_eval_shape(untrained, settings, problem, Bracket.default(problem.model), jax.random.key(0))
+    blank = eqx.filter_eval_shape(settings.untrained, problem, Bracket.default(problem.model), jax.random.key(0))
     blank = eqx.tree_at(lambda n: n.features.problem, blank, problem)
     history = jax.ShapeDtypeStruct((header["checks"], 2), float)
     blank = eqx.tree_at(lambda n: n.history, blank, history)

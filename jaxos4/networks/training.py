@@ -1,7 +1,6 @@
-"""Simulated pairs of features and parameters, and the loop that trains any network on them.
+"""Simulated flights for training, and the loop that trains a network on them.
 
-Nothing is stored: every batch is simulated inside the jitted step from fresh draws of parameters, initial state, noise
-level and noise.
+No flight is stored. Each step simulates its own batch: parameters, initial state, noise scale and noise are new draws.
 """
 
 import functools
@@ -14,27 +13,29 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, PyTree
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .._custom_types import Key, Scalar
 from ..errors import TrainingError
 from .features import AbstractFeatures
 
-# Steps between two looks at the validation flights.
 CHECK = 250
-# A better loss is one that is lower by this share.
-_GAIN = 1e-4
-# The loss is in units of the noise: the worst answer in a bracket is far below this.
+"""Steps between two evaluations of the validation loss."""
+
+Progress = Callable[[int, int, float], None]
+"""Called at every check with the steps done, the number of steps, and the validation loss."""
+
+# A loss is an improvement if it is lower by this share.
+_IMPROVEMENT = 1e-4
+# The loss is in units of the noise: the worst answer inside a bracket is far below this.
 _DIVERGED = 1e15
-# The share of simulated flights that must be flyable.
+# The smallest share of simulated flights that must not diverge.
 _FLYABLE = 0.01
 
 Network = TypeVar("Network", bound=eqx.Module)
 
 
 class Pair(NamedTuple):
-    """A simulated flight: what the network sees, with the noise level in multiples of sigma, and what it should say."""
+    """A simulated flight: features, noise scale (multiples of sigma), and the true unknowns in bracket coordinates."""
 
     features: Float[Array, "*batch features"]
     scale: Float[Array, "*batch"]
@@ -42,7 +43,7 @@ class Pair(NamedTuple):
 
 
 def draw(features: AbstractFeatures, scales: Float[Array, "2"], *, key: Key) -> Pair:
-    """One flight: unknowns uniform in the bracket, noise level log-uniform between `scales`."""
+    """Simulates one flight: unknowns uniform in the bracket, noise scale log-uniform between `scales`."""
     u_key, scale_key, noise_key = jax.random.split(key, 3)
     u = jax.random.uniform(u_key, features.coordinates.center.shape, minval=-1, maxval=1, dtype=float)
     low, high = jnp.log(scales)
@@ -51,14 +52,14 @@ def draw(features: AbstractFeatures, scales: Float[Array, "2"], *, key: Key) -> 
 
 
 def draw_many(features: AbstractFeatures, scales: Float[Array, "2"], count: int, *, key: Key) -> Pair:
-    """`count` flights; flight i draws from `fold_in(key, i)`."""
+    """Simulates `count` flights; flight i draws from `fold_in(key, i)`."""
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(count))
     return jax.vmap(lambda k: draw(features, scales, key=k))(keys)
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def split_key(key: Key, count: int) -> tuple[Key, ...]:
-    """As many keys, by one program: taking an array of keys apart would need some more."""
+    """Splits a key into a tuple of keys in one program; unpacking an array of keys would compile more."""
     return tuple(jax.random.split(key, count))
 
 
@@ -74,38 +75,32 @@ def train(
     validation: int,
     patience: int,
     key: Key,
-    progress: bool,
+    progress: Progress | None = None,
 ) -> tuple[Network, Float[np.ndarray, "checks 2"]]:
-    """The network that did best on the validation flights, and the losses of training and validation at every check.
+    """Trains a network, and returns it as it was at the check with the best validation loss.
 
     **Arguments:**
 
-    - `loss`: of one flight. Flights that cannot be flown count nothing.
-    - `validation`: how many flights to hold out.
-    - `patience`: stop after so many checks without a better loss.
+    - `loss`: the loss of one flight. Flights that diverge do not count.
+    - `scales`: the lowest and highest noise scale.
+    - `batch`, `steps`: simulated flights in a step, and the number of steps.
+    - `validation`: number of flights for validation.
+    - `patience`: training stops after this number of checks without an improvement.
 
-    **Raises:** `TrainingError` where the loss diverges, or hardly any flight of the bracket can be flown.
+    **Returns:** the network, and the losses of training and validation at every check.
+
+    **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
     train_key, validation_key = split_key(key, 2)
     held_out = eqx.filter_jit(draw_many)(features, scales, validation, key=validation_key)
-    flyable = np.isfinite(np.asarray(held_out.features)).all(axis=1).mean()
-    if not flyable > _FLYABLE:
-        raise TrainingError(
-            f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end: narrow the "
-            "bracket, or shorten the flight."
-        )
-
     weights, structure = eqx.partition(network, eqx.is_inexact_array)
-    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(weights)):
-        raise TrainingError(
-            "the network has no finite start: the flight at the bracket's center diverges, or measures too little."
-        )
+    _check_trainable(held_out, weights)
 
     def mean_loss(weights: PyTree, pairs: Pair) -> Scalar:
         flown = jnp.isfinite(pairs.features).all(axis=1)
-        # What NaN touches has a NaN gradient, whatever its weight.
-        seen = jnp.where(flown[:, None], pairs.features, 0.0)
-        losses = jax.vmap(lambda pair: loss(eqx.combine(weights, structure), pair))(pairs._replace(features=seen))
+        # NaN would make the gradient NaN even at a weight of 0.
+        finite = jnp.where(flown[:, None], pairs.features, 0.0)
+        losses = jax.vmap(lambda pair: loss(eqx.combine(weights, structure), pair))(pairs._replace(features=finite))
         return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
 
     @eqx.filter_jit
@@ -121,28 +116,33 @@ def train(
         return weights, state, values.mean(), mean_loss(weights, held_out)
 
     state = jax.jit(optimiser.init)(weights)
-    best, least, since, history = weights, np.inf, 0, []
-    columns = (
-        TextColumn("training the network"),
-        BarColumn(),
-        TextColumn("loss {task.fields[loss]}"),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not (progress and console.is_terminal)) as bar:
-        task = bar.add_task("", total=steps, loss="-")
-        for first in range(0, steps, CHECK):
-            indices = np.arange(first, min(first + CHECK, steps))
-            weights, state, *losses = advance(features, held_out, weights, state, train_key, indices)
-            history.append([float(value) for value in losses])
-            if not np.less(history[-1], _DIVERGED).all():
-                raise TrainingError(
-                    f"training diverged after {first} steps (loss {history[-1][0]:g}): lower `learning_rate`."
-                )
-            bar.update(task, completed=int(indices[-1]) + 1, loss=f"{history[-1][1]:.4g}")
-            since += 1
-            if history[-1][1] < least - _GAIN * abs(history[-1][1]):
-                best, least, since = weights, history[-1][1], 0
-            if since >= patience:
-                break
+    best, lowest, without_improvement, history = weights, np.inf, 0, []
+    for first in range(0, steps, CHECK):
+        indices = np.arange(first, min(first + CHECK, steps))
+        weights, state, *losses = advance(features, held_out, weights, state, train_key, indices)
+        history.append([float(value) for value in losses])
+        value, current = history[-1]
+        if not np.less(history[-1], _DIVERGED).all():
+            raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
+        if progress is not None:
+            progress(int(indices[-1]) + 1, steps, current)
+        without_improvement += 1
+        if current < lowest - _IMPROVEMENT * abs(current):
+            best, lowest, without_improvement = weights, current, 0
+        if without_improvement >= patience:
+            break
     return eqx.combine(best, structure), np.asarray(history)
+
+
+def _check_trainable(held_out: Pair, weights: PyTree) -> None:
+    flyable = np.isfinite(np.asarray(held_out.features)).all(axis=1).mean()
+    if not flyable > _FLYABLE:
+        raise TrainingError(
+            f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end: narrow the "
+            "bracket, or shorten the flight."
+        )
+    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(weights)):
+        raise TrainingError(
+            "the network's first weights are not finite, because the flight at the bracket's center diverges or too "
+            "few samples were measured: move the bracket, or use a longer flight."
+        )

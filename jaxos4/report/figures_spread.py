@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from ..results import NINETY_FIVE
 from ..study import metrics
 from .figures_noise import positive_scales
 from .legend import legend
@@ -28,7 +29,7 @@ def nearest_scale(data: xr.Dataset) -> int:
 
 
 def error_quantiles(data: xr.Dataset) -> xr.DataArray:
-    """`QUANTILES` of the errors in bounds, over the flights told."""
+    """`QUANTILES` of the errors in bounds, over the converged flights."""
     found = metrics.normalised_error(data)
     some = found.notnull().any("flight")
     return found.where(some, 0.0).quantile(list(QUANTILES), dim="flight").where(some)
@@ -43,7 +44,7 @@ def distribution(data: xr.Dataset) -> Figure | None:
     figure, axes = grid(data.sizes["parameter"], columns=4, height=0.28 * len(style) + 0.75)
     reach = _reach(found)
     for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
-        for x in (-metrics.NOISE_FLOOR, metrics.NOISE_FLOOR):
+        for x in (-NINETY_FIVE, NINETY_FIVE):
             panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
         panel.axvline(0, color=INK, linewidth=0.8)
         for row, look in enumerate(style.values()):

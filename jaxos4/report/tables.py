@@ -171,8 +171,8 @@ class Trouble(NamedTuple):
 
 
 def troubled_flights(data: xr.Dataset) -> Trouble:
-    """The flights that were run and are not among those told."""
-    bad = (metrics.was_run(data) & ~metrics.told(data)).transpose("scale", "estimator", "flight").values
+    """The flights that were run and did not converge."""
+    bad = (metrics.was_run(data) & ~metrics.converged(data)).transpose("scale", "estimator", "flight").values
     known = {value: name.replace("_", " ") for name, value in metrics.codes(data).items()}
     results = data["result"].transpose("scale", "estimator", "flight").values
     estimators, flights = names(data, "estimator"), names(data, "flight")

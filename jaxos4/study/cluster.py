@@ -1,7 +1,7 @@
-"""Runs the cells of a study on a Dask cluster: a task a cell, its results the same bit for bit as on this machine.
+"""Runs the cells of a study on a Dask cluster, one task for each; results are the same bit for bit as on one machine.
 
-Workers need this package and nothing else. They get the specification, the number of a cell and the bytes of its
-network's file, and send back the bytes of the cell's file. What a lost worker had is done by another.
+Workers need only this package. They get the specification, the number of a cell and the bytes of its network's file,
+and return the bytes of the cell's file. If a worker is lost, another worker repeats its tasks.
 """
 
 import collections
@@ -15,31 +15,30 @@ import jax
 import msgspec
 
 from ..errors import InputError
-from ..networks.file import load_network, save_network
-from ..networks.network import TrainedNetwork
-from .cell import jobs, train
-from .run import FAILURES, Step, compute, label_of, network_number
+from ..networks import TrainedNetwork, load_network, save_network
+from .network_jobs import job_number, jobs, train_network
+from .run import FAILURES, Step, compute, label_of
 from .specification import Study
 from .store import Store
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# Cells that wait on the cluster, for each of its threads: enough to keep it busy.
+# Cells that wait on the cluster for each of its threads: enough to keep it busy.
 _AHEAD = 3
-# How often a task may raise what a cell should not before the study ends. Lost workers are the cluster's to count.
+# How often a task that raises an unexpected exception is repeated. The cluster itself counts lost workers.
 _RETRIES = 2
 
 
 def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
-    """Computes the cells that are missing on a cluster, in whatever order they finish.
+    """Computes the remaining cells on a cluster, in the order in which they finish.
 
     **Arguments:**
 
-    - `client`: of `distributed`, connected to the scheduler; not the default one (`set_as_default=False`), or the
-      Dataset would be written under a lock of the cluster.
+    - `client`: a client of `distributed`, made with `set_as_default=False`: under a default client, the Dataset would
+      be written under a lock of the cluster.
 
-    **Raises:** `InputError` where the cluster has no workers, or loses a cell more often than it allows.
+    **Raises:** `InputError` if the cluster has no workers, or loses a cell more often than it allows.
     """
     from distributed import as_completed
 
@@ -55,8 +54,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
 
     def network_of(number: int) -> Any:
         if number not in networks:
-            if store.read_network(number) is not None:  # whole: workers need not find out
-                # A task, not scattered: a worker that is lost takes what was scattered to it along.
+            if store.read_network(number) is not None:  # raises here, and not on a worker, if the file is damaged
+                # As a task, because data that are scattered to a worker are lost with it.
                 data = store.network_file(number).read_bytes()
                 networks[number] = client.submit(bytes, data, pure=False)
             else:
@@ -67,7 +66,7 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         room = _AHEAD * max(_threads(client), 1) - len(running)
         for _ in range(min(room, len(waiting))):
             index = waiting.popleft()
-            number = network_number(study, study.cell(index), needed)
+            number = job_number(study, study.cell(index), needed)
             network = None if number is None else network_of(number)
             future = client.submit(remote_cell, specification, index, network, retries=_RETRIES, pure=False)
             running[future] = index, number
@@ -80,9 +79,9 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         try:
             data, seconds = future.result()
             trained = None if number is None or store.network_file(number).exists() else networks[number].result()
-        except Exception as error:  # noqa: BLE001  # whatever a cluster raises, the cells that are there are kept
+        except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
             what = " ".join(str(error).split())[:300] or type(error).__name__
-            raise InputError(f"cell {index}: the cluster lost it ({what}); run the study again to resume.") from None
+            raise InputError(f"cell {index}: lost by the cluster ({what}); run the study again to resume.") from None
         if number is not None and isinstance(trained, bytes):
             store.write(store.network_file(number), trained, network=number)
         store.write(store.cell_file(index), data, cell=index, seconds=seconds)
@@ -97,22 +96,22 @@ def _threads(client: Any) -> int:
 
 
 def remote_training(specification: str, number: int) -> bytes | str:
-    """The bytes of a network's file, or why there is none."""
+    """The bytes of a network's file, or a message that says why there is none."""
     study = msgspec.json.decode(specification, type=Study)
     try:
-        network = train(study, jobs(study)[number])
+        network = train_network(study, jobs(study)[number])
     except FAILURES as error:
         return str(error)
-    with tempfile.TemporaryDirectory() as folder, jax.enable_x64(study.precision == "float64"):
+    with tempfile.TemporaryDirectory() as folder, jax.enable_x64(study.double):
         path = Path(folder) / "network.net"
         save_network(network, path)
         return path.read_bytes()
 
 
 def remote_cell(specification: str, index: int, network: bytes | str | None) -> tuple[bytes, float]:
-    """The bytes of a cell's file, and the seconds that it took."""
+    """The bytes of a cell's file, and the seconds of its computation."""
     study = msgspec.json.decode(specification, type=Study)
-    trained = _loaded(network, study.precision == "float64") if isinstance(network, bytes) else network
+    trained = _loaded(network, study.double) if isinstance(network, bytes) else network
     return compute(study, study.cell(index), trained)
 
 

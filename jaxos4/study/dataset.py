@@ -1,4 +1,4 @@
-"""The results of a study as an xarray Dataset: every finished cell in its place, with units, names and provenance."""
+"""The results of a study as an xarray Dataset with units, names and provenance."""
 
 import importlib.metadata
 import itertools
@@ -16,15 +16,16 @@ from .._files import write_atomically
 from ..errors import InputError
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
-from ..networks.network import TrainedNetwork
-from ..networks.training import CHECK
-from .cell import LEVELS, OUTCOMES, bracket_of, fly_again, jobs, truth_of
+from ..networks import CHECK
+from .cell_file import LEVELS, OUTCOMES
+from .flights import bracket_of, fly_again, truth_of
 from .metrics import SCENARIO
+from .network_jobs import jobs
 from .specification import AXES, Cell, Study
 from .store import RESULTS_FILE, Store
 
 _LANES = (*SCENARIO, "flight")
-# Of what is kept for each flight: dimensions beyond the flight, type, unit, and what it is.
+# For each variable of a flight: its further dimensions, type, unit and description.
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "truth": (("parameter",), "f8", "unit", "true parameter"),
     "estimate": (("parameter",), "f8", "unit", "estimated parameter; missing where `result` says that there is none"),
@@ -54,12 +55,12 @@ _AXES_ATTRIBUTES = {
 
 
 def assemble(store: Store) -> xr.Dataset:
-    """The Dataset of a study's finished cells; the others are `not_run`.
+    """The Dataset of a study's finished cells; the result of all others is `not_run`.
 
-    The dimensions are the axes of the grid, each there even where it has length 1; `flight`, `parameter`, `level`; and
-    those of the example flight and of the networks' training.
+    The dimensions are all axes of the grid, also those of length 1; `flight`, `parameter`, `level`; and those of the
+    example flight and of the networks' training.
 
-    **Raises:** `InputError` where a cell's file was damaged.
+    **Raises:** `InputError` if a cell's file is damaged.
     """
     study = store.study
     names = MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_names
@@ -83,7 +84,9 @@ def assemble(store: Store) -> xr.Dataset:
         lanes, shared = (*cell.place, flights), (*cell.place[:-1], flights)
         if "failed" in results:
             arrays["result"][lanes] = OUTCOMES.index("failed")
-            if np.isnan(arrays["truth"][shared]).all():  # where another estimator has run, it is there bit for bit
+            if np.isnan(
+                arrays["truth"][shared]
+            ).all():  # unless another estimator has run: its truths are the same bit for bit
                 arrays["truth"][shared] = truth_of(study, cell)
             where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
@@ -109,20 +112,20 @@ def assemble(store: Store) -> xr.Dataset:
 
 
 def _dims(name: str) -> tuple[str, ...]:
-    """Of a variable; the truth is the same for all estimators."""
+    """The dimensions of a variable; the truth is the same for all estimators."""
     lanes = [dim for dim in _LANES if (name, dim) != ("truth", "estimator")]
     return (*lanes, *_VARIABLES[name][0])
 
 
 def save_dataset(dataset: xr.Dataset, directory: Path) -> Path:
-    """Writes a study's Dataset into its folder, whole or not at all."""
+    """Writes a study's Dataset into its folder, completely or not at all."""
     path = directory / RESULTS_FILE
     encoding = {
         name: {"zlib": True, "complevel": 4}
         for name, variable in dataset.data_vars.items()
         if variable.dtype.kind in "fi" and variable.ndim
     }
-    # In memory first: HDF5 does not end well on a disk that is full.
+    # In memory first: HDF5 can crash on a full disk.
     data = dataset.to_netcdf(engine="h5netcdf", encoding=encoding)
     with write_atomically(path) as beside:
         beside.write_bytes(data)
@@ -141,7 +144,7 @@ def _coordinates(study: Study, names: tuple[str, ...]) -> dict:
 
 
 def provenance(study: Study, device: str) -> dict[str, str | int]:
-    """Where results come from, for the attributes of their Dataset; `device`: what computed them, in words."""
+    """The attributes of a Dataset that say where it comes from; `device`: the devices that computed it, in words."""
     return {
         "title": study.title,
         "specification": tomlkit.dumps(msgspec.to_builtins(study)),
@@ -154,7 +157,7 @@ def provenance(study: Study, device: str) -> dict[str, str | int]:
 
 
 def _brackets(study: Study) -> dict:
-    """The bracket that all searches and networks of a model, an airframe and a width get."""
+    """The brackets of all searches and networks, by model, airframe and width."""
     shape = [len(study.models), len(study.airframes), len(study.widths)]
     brackets = [bracket_of(study, *which) for which in itertools.product(study.models, study.airframes, study.widths)]
     lower, upper = (np.stack([getattr(b, end) for b in brackets]).reshape(*shape, -1) for end in ("lower", "upper"))
@@ -172,7 +175,7 @@ def _seen(study: Study) -> dict:
 
 
 def _example(store: Store) -> dict:
-    """The first flight of the first scenario whose noise is nearest the standard one, and how IBSS searched it."""
+    """The first flight of the first scenario whose noise is nearest the standard one, and a recorded search on it."""
     study = store.study
     scale = min(study.scales, key=lambda s: abs(math.log(s)) if s > 0 else math.inf)
     first = study.cell(0).scenario._replace(scale=scale)
@@ -203,9 +206,9 @@ def _example(store: Store) -> dict:
             _named("its states as simulated with the estimate", "state_unit"),
         ),
     }
-    brackets = found.get("ibss", {}).get("brackets")
-    if brackets is not None:
-        brackets = brackets[np.isfinite(brackets).all(axis=(1, 2))]
+    recorded = [results["brackets"] for results in found.values() if "brackets" in results]
+    if recorded:
+        brackets = recorded[0][np.isfinite(recorded[0]).all(axis=(1, 2))]
         lower, upper = brackets[:, 0], brackets[:, 1]
         along = ("sweep", "parameter")
         variables |= {
@@ -217,9 +220,9 @@ def _example(store: Store) -> dict:
 
 
 def _training(store: Store) -> dict:
-    """The losses of the networks that were trained."""
+    """The losses of the networks during training."""
     needed = jobs(store.study)
-    networks: list[TrainedNetwork | None] = [store.read_network(number) for number in range(len(needed))]
+    networks = [store.read_network(number) for number in range(len(needed))]
     histories = [np.zeros((0, 2)) if network is None else np.asarray(network.history) for network in networks]
     if not any(len(history) for history in histories):
         return {}

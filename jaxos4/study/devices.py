@@ -1,6 +1,9 @@
-"""The devices of this process."""
+"""The devices of this process, and what they leave in memory."""
 
+import contextlib
+import ctypes
 import os
+from collections.abc import Iterator
 
 import jax
 
@@ -20,3 +23,17 @@ def device_name() -> str:
     """The devices of this process, in words."""
     devices = jax.local_devices()
     return f"{len(devices)} x {devices[0].device_kind}"
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[None]:
+    """Computes on the first core of a CPU: a program that all estimators share is compiled once, not for each core."""
+    first = jax.local_devices()[0]
+    with jax.default_device(first) if first.platform == "cpu" else contextlib.nullcontext():
+        yield
+
+
+def give_memory_back() -> None:
+    """Returns the compiler's freed memory to the system; the C library keeps half a gigabyte of a large program."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # not every C library can
+        ctypes.CDLL(None).malloc_trim(0)

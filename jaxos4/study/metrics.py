@@ -1,44 +1,29 @@
-"""What a study's Dataset says of its estimators: errors, efficiency, coverage, results, and what can be known at all.
+"""Metrics of the estimators in a study's Dataset: errors, efficiency, coverage, results, and limits of the noise.
 
-Pure functions from a Dataset (or a selection of it) to labelled arrays. What is missing is NaN and is left out of
-means; a mean over nothing is NaN. Only the flights that an estimator *told* count in errors: those of result
-`successful`, and `unidentifiable`, whose numbers are real although the bracket knew as much.
+Pure functions from a Dataset, or from a selection of it, to labelled arrays. Missing numbers are NaN and do not count
+in means; a mean over nothing is NaN. Errors are those of *converged* flights, with the result `successful` or
+`unidentifiable`: an unidentifiable flight has an estimate too, although the bracket already held as much information.
 """
 
 import math
-from statistics import NormalDist
 
 import numpy as np
 import xarray as xr
 
-SCENARIO = (
-    "model",
-    "airframe",
-    "excitation",
-    "duration",
-    "method",
-    "noise",
-    "scale",
-    "width",
-    "channels",
-    "estimator",
-)
-"""The dimensions that tell one cell of a study from another."""
+from ..results import NINETY_FIVE
+from .specification import Scenario
 
-TOLD = ("successful", "unidentifiable")
-"""The results whose numbers count in errors."""
+SCENARIO = Scenario._fields
+"""The dimensions of a study's cells."""
+
+CONVERGED = ("successful", "unidentifiable")
+"""The results of flights whose estimates count in errors."""
 
 WITHOUT_RUN = ("failed", "not_run")
-"""The results of flights that were not identified at all."""
-
-NOISE_FLOOR = 1.96
-"""A parameter smaller than this many standard deviations of the best possible estimate cannot be told from 0."""
+"""The results of flights that no estimator was run on."""
 
 NO_PERCENTAGE = ("", "the truth is 0", "below the noise floor")
-"""Why a percentage means nothing, by the codes of `no_percentage`."""
-
-# Of intervals for Monte-Carlo errors.
-_CONFIDENCE = 0.95
+"""Why a percentage has no meaning, by the codes of `no_percentage`."""
 
 
 def codes(dataset: xr.Dataset) -> dict[str, int]:
@@ -48,13 +33,13 @@ def codes(dataset: xr.Dataset) -> dict[str, int]:
     return {name: int(value) for name, value in zip(attributes["flag_meanings"].split(), values, strict=True)}
 
 
-def told(dataset: xr.Dataset) -> xr.DataArray:
+def converged(dataset: xr.Dataset) -> xr.DataArray:
     """Which flights count in errors."""
-    return _one_of(dataset, TOLD)
+    return _one_of(dataset, CONVERGED)
 
 
 def was_run(dataset: xr.Dataset) -> xr.DataArray:
-    """Which flights were identified, with whatever result."""
+    """Which flights an estimator was run on, with any result."""
     return ~_one_of(dataset, WITHOUT_RUN)
 
 
@@ -66,38 +51,33 @@ def result_counts(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def error(dataset: xr.Dataset) -> xr.DataArray:
-    """Estimate - truth of each flight that was told, in the parameter's unit."""
-    return (dataset["estimate"] - dataset["truth"]).where(told(dataset))
+    """Estimate - truth of each converged flight, in the parameter's unit."""
+    return (dataset["estimate"] - dataset["truth"]).where(converged(dataset))
 
 
 def no_percentage(dataset: xr.Dataset) -> xr.DataArray:
-    """Where percentages mean nothing and why: an index into `NO_PERCENTAGE`, one for all flights of a cell.
+    """Why the percentages of a cell and parameter have no meaning: an index into `NO_PERCENTAGE`; 0: they have.
 
-    1 where the truth of any flight is 0, else 2 where that of any is below `NOISE_FLOOR` times its bound: relative to a
-    number that no estimator can tell from 0, an error is as large as one likes.
+    1 if the truth of any flight is 0; else 2 if the truth of any flight is below its noise floor, `NINETY_FIVE` bounds.
+    A parameter below the noise floor cannot be distinguished from 0, so that its relative error is arbitrary.
     """
     return _no_percentage(dataset["truth"], dataset["bound"])
 
 
-def percentage_error(dataset: xr.Dataset) -> xr.DataArray:
-    """100 (estimate - truth) / |truth| of each flight, with its sign; NaN where `no_percentage` says so."""
-    return _percent(error(dataset), dataset["truth"], no_percentage(dataset))
-
-
 def estimator_error(dataset: xr.Dataset) -> xr.Dataset:
-    """Root mean square over the flights told: `percent` of each flight's own truth, and `absolute`."""
+    """Root mean square error of converged flights: in `percent` of each flight's truth, and `absolute`."""
     return _both(error(dataset), dataset["truth"], no_percentage(dataset))
 
 
 def bound_error(dataset: xr.Dataset) -> xr.Dataset:
-    """The Cramer-Rao bound as `estimator_error` has errors: root mean square over all flights."""
+    """The Cramer-Rao bound in the form of `estimator_error`: root mean square over all flights."""
     return _both(dataset["bound"], dataset["truth"], no_percentage(dataset))
 
 
 def center_error(dataset: xr.Dataset) -> xr.Dataset:
-    """What the bracket's centre alone would give: the error that an estimator has before it sees a flight.
+    """The error of the bracket's center, in the form of `estimator_error`: the error before any flight is seen.
 
-    `reason` is that of the estimator that sees most.
+    `reason` is that of the estimator with the smallest bound.
     """
     truth = dataset["truth"]
     reason = _no_percentage(truth, dataset["bound"].min("estimator"))
@@ -105,35 +85,35 @@ def center_error(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def normalised_error(dataset: xr.Dataset) -> xr.DataArray:
-    """Error of each flight in standard deviations of the best possible estimate; NaN where the bound is 0."""
+    """Error / Cramer-Rao bound of each flight; NaN if the bound is 0."""
     return error(dataset) / dataset["bound"].where(dataset["bound"] > 0)
 
 
 def efficiency(dataset: xr.Dataset) -> xr.Dataset:
-    """RMSE / bound over the flights told, each against its own bound, with a 95 % Monte-Carlo interval.
+    """RMSE / bound of converged flights, each relative to its own bound, with a 95 % Monte-Carlo interval.
 
-    1 is the best that an unbiased estimator can do. `low` and `high` are those of a Gaussian's standard deviation from
-    `count` draws (chi-squared, quantiles by Wilson and Hilferty 1931); NaN below two flights.
+    1 is the best value for an unbiased estimator. `low` and `high` are the interval of a Gaussian's standard deviation
+    from `count` draws (chi-squared, quantiles by Wilson and Hilferty 1931); NaN for fewer than two flights.
     """
     ratio = normalised_error(dataset)
     count = ratio.notnull().sum("flight")
     value = _rms(ratio)
     some = count.where(count > 1)
-    high, low = (value * np.sqrt(some / _chi_squared(some, tail)) for tail in _tails())
+    high, low = (value * np.sqrt(some / _chi_squared(some, tail)) for tail in (-NINETY_FIVE, NINETY_FIVE))
     return xr.Dataset({"efficiency": value, "low": low, "high": high, "count": count})
 
 
 def coverage(dataset: xr.Dataset) -> xr.Dataset:
-    """The share of flights told whose interval holds the truth, at each level, with a 95 % Wilson interval."""
+    """The share of converged flights whose interval holds the truth, at each level, with a 95 % Wilson interval."""
     distance, half_width = abs(error(dataset)), dataset["half_width"]
-    there = distance.notnull() & half_width.notnull()
-    return _share((distance <= half_width) & there, there).rename({"share": "coverage"})
+    measured = distance.notnull() & half_width.notnull()
+    return _share((distance <= half_width) & measured, measured).rename({"share": "coverage"})
 
 
 def mean_coverage(dataset: xr.Dataset) -> xr.Dataset:
-    """`coverage` averaged over the parameters; its interval is that of as many draws as there are flights.
+    """`coverage` averaged over the parameters, with the interval of one draw for each flight.
 
-    The parameters of one flight err together, so that this interval is on the safe side.
+    Errors of one flight's parameters are correlated, so that this interval is conservative.
     """
     each = coverage(dataset)
     share, count = each["coverage"].mean("parameter"), each["count"].min("parameter")
@@ -142,20 +122,20 @@ def mean_coverage(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def hit_rate(dataset: xr.Dataset) -> xr.Dataset:
-    """The share of flights whose seed bracket held the truth, with a 95 % Wilson interval; NaN where there is none."""
+    """The share of flights whose seed bracket held the truth, with a 95 % Wilson interval; NaN without seeds."""
     hit = dataset["hit"]
     return _share(hit == 1, (hit >= 0) & was_run(dataset)).rename({"share": "hit_rate"})
 
 
 def mean_rollouts(dataset: xr.Dataset) -> xr.DataArray:
-    """Simulated flights spent on one identification, on average over those that were run."""
+    """The mean number of simulated flights that one identification took."""
     return dataset["rollouts"].where(was_run(dataset)).mean("flight")
 
 
 def accuracy(dataset: xr.Dataset) -> xr.DataArray:
-    """One number for all parameters: the geometric mean of RMSE / the least bound of any estimator.
+    """One number for all parameters: the geometric mean of RMSE / the smallest bound of any estimator.
 
-    Other than `efficiency` this does not forgive an estimator that looks at few channels.
+    Unlike `efficiency`, this counts against an estimator that looks at few channels.
     """
     least = dataset["bound"].min("estimator")
     ratio = _rms(error(dataset) / least.where(least > 0))
@@ -164,12 +144,12 @@ def accuracy(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def frontier(dataset: xr.Dataset) -> xr.DataArray:
-    """The noise scale below which a parameter can be told from 0: where |truth| is `NOISE_FLOOR` bounds.
+    """The noise scale below which a parameter can be distinguished from 0: |truth| is `NINETY_FIVE` bounds there.
 
-    The bound grows in proportion to the scale, so that each flight tells of it; this is their median. 0: never.
+    The bound is proportional to the scale, so that every flight gives this scale; the result is the median. 0: never.
     """
     bound = dataset["bound"].where(dataset["bound"] > 0)
-    return (dataset["scale"] * abs(dataset["truth"]) / (NOISE_FLOOR * bound)).median(("scale", "flight"))
+    return (dataset["scale"] * abs(dataset["truth"]) / (NINETY_FIVE * bound)).median(("scale", "flight"))
 
 
 def _one_of(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
@@ -179,7 +159,7 @@ def _one_of(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
 
 def _no_percentage(truth: xr.DataArray, bound: xr.DataArray) -> xr.DataArray:
     zero = (truth == 0).any("flight")
-    below = (abs(truth) < NOISE_FLOOR * bound).any("flight")
+    below = (abs(truth) < NINETY_FIVE * bound).any("flight")
     return xr.where(zero, 1, xr.where(below, 2, 0))
 
 
@@ -196,29 +176,23 @@ def _rms(values: xr.DataArray) -> xr.DataArray:
     return (values**2).mean("flight") ** 0.5
 
 
-def _share(yes: xr.DataArray, there: xr.DataArray) -> xr.Dataset:
-    count = there.sum("flight")
+def _share(yes: xr.DataArray, counted: xr.DataArray) -> xr.Dataset:
+    count = counted.sum("flight")
     some = count.where(count > 0)
-    share = (yes & there).sum("flight") / some
+    share = (yes & counted).sum("flight") / some
     low, high = _wilson(share, some)
     return xr.Dataset({"share": share, "low": low, "high": high, "count": count})
 
 
-def _tails() -> tuple[float, float]:
-    """Standard deviations at the two ends of a Gaussian's 95 % interval."""
-    end = NormalDist().inv_cdf((1 + _CONFIDENCE) / 2)
-    return -end, end
-
-
 def _wilson(share: xr.DataArray, count: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
-    """Wilson's interval of a probability from a share of `count` draws."""
-    z2 = _tails()[1] ** 2
+    """Wilson's 95 % interval of a probability, from a share of `count` draws."""
+    z2 = NINETY_FIVE**2
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     half = math.sqrt(z2) * np.sqrt(share * (1 - share) / count + z2 / (4 * count**2)) / (1 + z2 / count)
     return (middle - half).clip(0, 1), (middle + half).clip(0, 1)
 
 
 def _chi_squared(freedom: xr.DataArray, deviations: float) -> xr.DataArray:
-    """The quantile of chi-squared that lies where a Gaussian's lies `deviations` from its mean."""
+    """The quantile of chi-squared at the level of a Gaussian `deviations` from its mean."""
     part = 2 / (9 * freedom)
     return freedom * (1 - part + deviations * np.sqrt(part)) ** 3

@@ -1,8 +1,7 @@
-"""Runs the cells of a study that are not there yet, on the devices of this process."""
+"""Runs the remaining cells of a study on the devices of this process."""
 
 import concurrent.futures
 import contextlib
-import ctypes
 import itertools
 import time
 from collections import deque
@@ -10,31 +9,32 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from ..errors import InputError, TrainingError
-from ..networks.file import save_network
-from ..networks.network import TrainedNetwork
-from .cell import Job, blank_network, encode, job_of, jobs, program_of, run_cell, train
-from .specification import Cell, Study
+from ..estimators import ESTIMATORS
+from ..networks import TrainedNetwork, save_network
+from .cell import program_of, run_cell
+from .cell_file import encode, failed
+from .devices import give_memory_back
+from .network_jobs import blank_network, job_number, job_of, jobs, train_network
+from .specification import Cell, Job, Study
 from .store import Store
 
-# What a cell that cannot be computed raises: it is kept as failed, with the message, and the study goes on.
+# Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
-# A device helps with what another one has compiled where at least so many cells are left: fewer are done sooner than
-# compiled.
+# A device joins the program of another device if at least this number of cells waits: it must compile the program too.
 _WORTH_COMPILING = 8
 
 
 class Step(NamedTuple):
-    """`done` cells are there, and what is at work now, in words."""
+    """`done` cells are finished; `label` names the running tasks."""
 
     done: int
     label: str
 
 
 class _Task(NamedTuple):
-    """What a device is given to do: in words, the call that does it, and what becomes of its result."""
+    """A task for a device: its name, the call, and what to do with the result."""
 
     label: str
     call: Callable[[Any], Any]
@@ -42,15 +42,15 @@ class _Task(NamedTuple):
 
 
 class _Program:
-    """Cells that one compiled program can identify, and the network that they need."""
+    """The waiting cells of one compiled program, the network that they need, and the devices that run it."""
 
     def __init__(self, cells: list[Cell], study: Study, needed: list[Job]):
-        self.waiting, self.network = deque(cells), network_number(study, cells[0], needed)
+        self.waiting, self.network = deque(cells), job_number(study, cells[0], needed)
         self.devices: set[Any] = set()
 
 
 class _Work:
-    """What is missing of a study, and what a free device should do of it."""
+    """The remaining work of a study, and the choice of the next task for a free device."""
 
     def __init__(self, store: Store):
         self.store, self.study, missing = store, store.study, store.missing()
@@ -63,7 +63,7 @@ class _Work:
         self.untrained = deque(dict.fromkeys(p.network for p in self.programs if p.network is not None))
 
     def task(self, device: Any) -> _Task | None:
-        """The next for a device that is free, or `None` where all that is left waits for others."""
+        """The next task for a free device, or `None` if all remaining work waits for other tasks."""
         if self.untrained:
             return self._training(self.untrained.popleft())
         if (program := self._ready(device)) is not None:
@@ -75,7 +75,7 @@ class _Work:
         return None
 
     def _ready(self, device: Any) -> _Program | None:
-        """What the device was at, what nobody is at, or what is the longest."""
+        """The program that the device runs already, else one that no device runs, else the one with most cells."""
         ready = [p for p in self.programs if p.waiting and (p.network is None or p.network in self.networks)]
         own = [p for p in ready if device in p.devices]
         new = [p for p in ready if not p.devices]
@@ -83,9 +83,10 @@ class _Work:
         return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
 
     def _untried(self) -> _Program | None:
-        """What waits for its network, and can be compiled meanwhile: a hybrid first, which takes longer."""
+        """A program to compile while it waits for its network; estimators that shoot first, which take longest."""
         untried = [p for p in self.programs if p.waiting and not p.devices]
-        return min(untried, key=lambda p: (p.network, p.waiting[0].scenario.estimator != "hybrid"), default=None)
+        shoots = {name: kind.shoots for name, kind in ESTIMATORS.items()}
+        return min(untried, key=lambda p: (p.network, not shoots[p.waiting[0].scenario.estimator]), default=None)
 
     def _training(self, number: int) -> _Task:
         job = self.needed[number]
@@ -114,12 +115,11 @@ class _Work:
 
 
 def run_here(store: Store) -> Iterator[Step]:
-    """Computes the cells that are missing, each device at its own.
+    """Computes the remaining cells; each device computes its own.
 
-    A device compiles and runs programs by itself: a program that was divided among devices would be another program,
-    and differ in the last digits. First each device takes a program that no other has; then it helps with the longest;
-    while a network is trained, what waits for it is compiled.
-    A cell that cannot be computed is kept as failed, and stays so: delete its file to try it again.
+    No program is divided among devices: its results would differ in the last digits. A device first takes a program
+    that no other device runs, then helps with the longest one. While a network is trained, the programs that wait for
+    it are compiled. A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
     work, free = _Work(store), deque(jax.local_devices())
     running: dict[concurrent.futures.Future, tuple[Any, _Task]] = {}
@@ -137,35 +137,29 @@ def run_here(store: Store) -> Iterator[Step]:
             for future in finished:
                 device, task = running.pop(future)
                 free.append(device)
-                _give_memory_back()
+                give_memory_back()
                 task.keep(future.result())
     finally:
-        # Who ends it early does not wait for what is at work, a training of minutes maybe: nothing of that is kept.
+        # An interrupt does not wait for running tasks, which may last minutes; their results are lost.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _compile(study: Study, cell: Cell, device: Any) -> None:
-    with jax.default_device(device), contextlib.suppress(*FAILURES):  # the cell itself will say what is wrong
+    with jax.default_device(device), contextlib.suppress(*FAILURES):  # the cell itself will report the failure
         run_cell(study, cell, blank_network(study, job_of(study, cell.scenario)))
 
 
-def _give_memory_back() -> None:
-    """To the system what the compiler has freed: half a gigabyte for a large program, which the C library keeps."""
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library does without
-        ctypes.CDLL(None).malloc_trim(0)
-
-
 def _train(store: Store, number: int, job: Job, device: Any) -> TrainedNetwork | str | None:
-    """The network, kept and read back as any later run reads it; or why there is none."""
+    """The network as read from its file, as a resumed run reads it; or a message that says why there is none."""
     begin = time.perf_counter()
     with jax.default_device(device):
         if (network := store.read_network(number)) is not None:
             return network
         try:
-            network = train(store.study, job)
+            network = train_network(store.study, job)
         except FAILURES as error:
             return str(error)
-        with jax.enable_x64(store.study.precision == "float64"):
+        with jax.enable_x64(store.study.double):
             save_network(network, store.network_file(number))
         store.log(network=number, seconds=round(time.perf_counter() - begin, 3))
         return store.read_network(number)
@@ -177,30 +171,20 @@ def _compute(study: Study, cell: Cell, network: TrainedNetwork | str | None, dev
 
 
 def compute(study: Study, cell: Cell, network: TrainedNetwork | str | None) -> tuple[bytes, float]:
-    """The bytes of a cell's file, and the seconds that it took. A network that is a string says why there is none."""
+    """The bytes of a cell's file, and the seconds of its computation. A string as network: why there is none."""
     begin = time.perf_counter()
     try:
         results = failed(network) if isinstance(network, str) else run_cell(study, cell, network)
     except FAILURES as error:
         if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
             raise InputError(
-                "out of memory: free some and run the study again, or give it a smaller `batch`."
+                "out of memory: free some and run the study again, or start another study with a smaller `batch`."
             ) from None
         results = failed(str(error))
     return encode(results), round(time.perf_counter() - begin, 3)
 
 
-def failed(message: str) -> dict[str, np.ndarray]:
-    """What is kept of a cell that could not be computed."""
-    return {"failed": np.asarray(" ".join(message.split())[:500])}
-
-
-def network_number(study: Study, cell: Cell, needed: list[Job]) -> int | None:
-    """The place among the study's networks of the one that a cell needs."""
-    return needed.index(job_of(study, cell.scenario)) if cell.scenario.needs_network else None
-
-
 def label_of(study: Study, cell: Cell) -> str:
-    """What a cell does, in a word or two: what it shares with the whole study is left out."""
+    """The name of a cell: its estimator, and its values on the axes that have more than one."""
     *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in cell.scenario)
     return " ".join([estimator, *itertools.compress(shared, (length > 1 for length in study.shape))])

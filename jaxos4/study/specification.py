@@ -1,13 +1,12 @@
-"""What a study is: the axes of a grid of simulated flights, and the cells that the grid is cut into.
+"""The specification of a study: the axes of a grid of simulated flights, and the cells of that grid.
 
 A cell is `batch` flights of one scenario, identified by one estimator. Flight i has the same parameters and the same
-random numbers in every scenario: differences between estimators, and between scales of noise, are differences of
-pairs.
+random numbers in every scenario. Differences between estimators, or between scales of noise, are thus paired.
 """
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
@@ -21,7 +20,7 @@ from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
 from ..models import MODELS
 from ..models.state import CHANNELS
-from ..networks.network import NetworkEstimator
+from ..networks import NetworkEstimator
 from ..noise import NOISES
 from ..simulation import METHODS
 
@@ -30,36 +29,24 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
-AXES = (
-    "models",
-    "airframes",
-    "excitations",
-    "durations",
-    "methods",
-    "noises",
-    "scales",
-    "widths",
-    "channels",
-    "estimators",
-)
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "models": tuple(MODELS),
-    "excitations": tuple(EXCITATIONS),
-    "methods": tuple(METHODS),
-    "noises": tuple(NOISES),
-    "channels": tuple(CHANNELS),
-    "estimators": tuple(ESTIMATORS),
+_CHOICES: dict[str, Collection[str]] = {
+    "models": MODELS,
+    "excitations": EXCITATIONS,
+    "methods": METHODS,
+    "noises": NOISES,
+    "channels": CHANNELS,
+    "estimators": ESTIMATORS,
 }
-# A study of more is a mistake in its specification: each cell is a file, and all estimates together must fit in memory.
+# A larger study is a mistake in its specification: each cell is a file, and all estimates must fit in memory.
 _MOST_CELLS = 1_000_000
 _MOST_ESTIMATES = 100_000_000
 _MOST_SAMPLES = 1_000_000
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the networks of a study are trained: see `NetworkEstimator`. Table `network` of the specification.
+    """How the networks of a study are trained: the table `network` of the specification. See `NetworkEstimator`.
 
-    - `hybrid_channels`: what the network of the hybrid looks at, at most the channels of the scenario; the network
+    - `hybrid_channels`: the channels that the hybrid's network looks at, at most those of the scenario. A network
       alone looks at the rates.
     """
 
@@ -72,7 +59,7 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Scenario(NamedTuple):
-    """One point of the grid: what is flown, how it is measured, and who identifies it."""
+    """One point of the grid: what is flown, how it is measured, and which estimator identifies it."""
 
     model: str
     airframe: str
@@ -87,7 +74,7 @@ class Scenario(NamedTuple):
 
     @property
     def needs_network(self) -> bool:
-        """Whether its estimator is made from a trained network."""
+        """Whether the estimator is made from a trained network."""
         return ESTIMATORS[self.estimator].needs_network
 
     @property
@@ -96,8 +83,22 @@ class Scenario(NamedTuple):
         return min(self.channels, ESTIMATORS[self.estimator].looks_at, key=CHANNELS.__getitem__)
 
 
+AXES = tuple(field if field.endswith("s") else f"{field}s" for field in Scenario._fields)
+
+
+class Job(NamedTuple):
+    """What a network is trained for."""
+
+    model: str
+    airframe: str
+    excitation: str
+    duration: float
+    width: float
+    channels: str
+
+
 class Cell(NamedTuple):
-    """`batch` flights of a scenario: `first`, and those after it."""
+    """`batch` flights of a scenario, from the number `first` on; `place` is its index along each axis."""
 
     number: int
     scenario: Scenario
@@ -113,19 +114,20 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     - `models`, `excitations`, `channels`, `estimators`: names as on the command line.
     - `airframes`: names of presets, or of tables `[airframe.NAME]` with the keys of an airframe file.
     - `durations` [s], at a sample time of `dt` [s].
-    - `methods`: how true flights are simulated; estimators shoot by `fit_method`. The same for both is the inverse
-      crime: the model then has no error of discretisation.
+    - `methods`: the integration method of true flights; estimators simulate by `fit_method`. If both are the same, the
+      model has no discretisation error (the inverse crime).
     - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At scale 0 flights are exact, and
-      estimators are told the noise of scale 1.
-    - `widths`: brackets, in multiples of the model's default half-width.
-    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket is off them by a draw within
-      80 % of its half-width; `"drawn"`: each flight has its own, uniform in a bracket around the airframe's.
+      estimators assume the noise of scale 1.
+    - `widths`: widths of the brackets, in multiples of the model's default half-width.
+    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's center is off them by a
+      random offset within 80 % of its half-width; `"drawn"`: each flight has its own parameters, uniform in a bracket
+      around the airframe's.
     - `initial_state`: `"known"`, or `"free"`: estimated too.
-    - `flights`, `seed`: how many, and of what random numbers.
-    - `batch`: flights of a cell, identified at once by one device: what fits in memory, thousands for a GPU. The last
-      digits of results depend on it.
+    - `flights`, `seed`: number of flights of a scenario, and the random seed.
+    - `batch`: flights of a cell, identified at once by one device: as many as fit in memory, thousands for a GPU. The
+      last digits of results depend on it.
     - `precision`: `"float64"` or `"float32"`.
-    - `network`: how networks are trained, a table.
+    - `network`: how networks are trained; a table.
     """
 
     title: str = "Noise study"
@@ -154,42 +156,41 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         for axis in AXES:
             values = getattr(self, axis)
             if not values:
-                raise InputError(f"`{axis}` is empty; give at least one.")
+                raise InputError(f"`{axis}` is empty; give at least one value.")
             if len(set(values)) < len(values):
-                raise InputError(f"`{axis}` names something twice: {', '.join(map(str, values))}.")
+                raise InputError(f"`{axis}` names a value twice: {', '.join(map(str, values))}; remove one.")
             for value in values if axis in _CHOICES else ():
                 if value not in _CHOICES[axis]:
-                    raise InputError(f"`{axis}` knows no {value!r}; choose from {', '.join(_CHOICES[axis])}.")
+                    raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(_CHOICES[axis])}.")
             if any(isinstance(value, float) and not math.isfinite(value) for value in values):
-                raise InputError(f"`{axis}` must be finite, got {', '.join(map(str, values))}.")
+                raise InputError(f"`{axis}` must be finite numbers, got {', '.join(map(str, values))}; correct them.")
         if not math.isfinite(self.dt):
-            raise InputError(f"`dt` must be finite, got {self.dt}.")
+            raise InputError(f"`dt` must be finite, got {self.dt}; give the sample time in seconds.")
         if not self.title.isprintable():
-            raise InputError("`title` must be one line of printable characters.")
+            raise InputError("`title` has a line break or another control character; remove it.")
         for name, table in self.airframe.items():
             if not (name.isprintable() and name.strip()):
-                raise InputError(f"[airframe.{_short(name)}]: its name must be printable characters.")
+                raise InputError(f"[airframe.{_short(name)}]: its name is empty or not printable; rename it.")
             if name not in self.airframes:
-                raise InputError(f"[airframe.{name}] is flown by nobody: name it in `airframes`.")
+                raise InputError(f"[airframe.{name}] is not flown; name it in `airframes`, or remove it.")
             if not all(math.isfinite(value) for value in table.values() if isinstance(value, float)):
-                raise InputError(f"[airframe.{name}]: not finite; leave `max_rotor_speed` out where it is not known.")
+                raise InputError(f"[airframe.{name}]: not finite; leave out `max_rotor_speed` if it is unknown.")
         for name in self.airframes:
             self.vehicle(name)
         for duration in self.durations:
             if not 2 <= duration / self.dt <= _MOST_SAMPLES:
-                raise InputError(
-                    f"`durations`: {duration:g} s at `dt` {self.dt:g} s is not 2 to {_MOST_SAMPLES} samples."
-                )
+                limits = f"2 to {_MOST_SAMPLES} samples"
+                raise InputError(f"`durations`: {duration:g} s at `dt` {self.dt:g} s is not {limits}; change one.")
         if self.count > _MOST_CELLS:
-            raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or enlarge `batch`.")
+            raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
         estimates = math.prod(self.shape) * self.flights
         if estimates > _MOST_ESTIMATES:
             raise InputError(
-                f"{estimates} estimates, more than {_MOST_ESTIMATES}; take fewer `flights`, or cut an axis."
+                f"{estimates} estimates, more than {_MOST_ESTIMATES}; reduce `flights`, or shorten an axis."
             )
 
     def check_computable(self) -> None:
-        """Raises `InputError` for inputs that an airframe cannot fly, or networks that cannot be trained."""
+        """Raises `InputError` for an excitation that an airframe cannot fly, or a network that cannot be trained."""
         for name, excitation, duration in itertools.product(self.airframes, self.excitations, self.durations):
             try:
                 EXCITATIONS[excitation](self.vehicle(name), duration=duration, dt=self.dt)
@@ -207,7 +208,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise InputError(f"`network`: {error}") from None
 
     def vehicle(self, name: str) -> Airframe:
-        """The airframe of that name. Raises `InputError` where there is none, or its table is not usable."""
+        """The airframe of that name. Raises `InputError` if there is none, or if its table is not usable."""
         if name in self.airframe:
             try:
                 return airframe_from_table(self.airframe[name])
@@ -215,9 +216,14 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise InputError(f"[airframe.{name}]: {error}") from None
         if name not in PRESETS:
             raise InputError(
-                f"`airframes` knows no {name!r}; choose from {', '.join(PRESETS)}, or add [airframe.{name}]."
+                f"`airframes`: unknown {name!r}; choose from {', '.join(PRESETS)}, or add [airframe.{name}]."
             )
         return PRESETS[name]
+
+    @property
+    def double(self) -> bool:
+        """Whether the study is computed in double precision."""
+        return self.precision == "float64"
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -226,44 +232,44 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @property
     def blocks(self) -> int:
-        """Cells of a scenario."""
+        """The number of cells of a scenario."""
         return -(-self.flights // self.batch)
 
     @property
     def count(self) -> int:
-        """Cells of the study."""
+        """The number of cells of the study."""
         return math.prod(self.shape) * self.blocks
 
     def cell(self, index: int) -> Cell:
-        """The cell of that index, from 0 to `count` - 1. Cells of a scenario, and of an estimator, are neighbours."""
-        # Along the estimators first: what was compiled, or trained, for one serves all its cells.
+        """The cell of an index from 0 to `count` - 1. Cells of an estimator, and of a scenario, follow one another."""
+        # The estimator is the outermost axis: its compiled programs and its networks serve all its cells.
         estimator, *others, block = np.unravel_index(index, (self.shape[-1], *self.shape[:-1], self.blocks))
         place = tuple(int(i) for i in (*others, estimator))
         values = [getattr(self, axis)[i] for axis, i in zip(AXES, place, strict=True)]
         return Cell(index, Scenario(*values), place, int(block) * self.batch)
 
     def cells(self) -> Iterator[Cell]:
-        """All of them."""
+        """All cells in their order."""
         return (self.cell(index) for index in range(self.count))
 
 
 def load_study(path: Path) -> Study:
-    """The study that a TOML file specifies.
+    """Reads the specification of a study from a TOML file.
 
-    **Raises:** `InputError` with one line: which key, what is wrong, what to do; `OSError` where it cannot be read.
+    **Raises:** `InputError` with one line: which key, what is wrong, what to do; `OSError` if it cannot be read.
     """
     table = read_toml(path)
     try:
         study = msgspec.convert(table, Study)
         study.check_computable()
     except (InputError, msgspec.ValidationError, RecursionError) as error:
-        ours = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
+        in_our_words = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
         what = " ".join(str(error).split())[:300]
-        raise InputError(f"{path}: {what}" if ours else f"{path}: {_in_words(what)}; correct it there.") from None
+        raise InputError(f"{path}: {what}" if in_our_words else f"{path}: {_in_words(what)}; correct it.") from None
     return study
 
 
-# What msgspec calls a kind of value, and what TOML does.
+# The types of values, in the words of msgspec and of TOML.
 _WORDS = {
     "object": "a table",
     "array": "a list",
@@ -275,7 +281,7 @@ _WORDS = {
 
 
 def _in_words(message: str) -> str:
-    """A complaint of msgspec's with the words of TOML, the key first, and the keys or values that there are."""
+    """Rewrites a message of msgspec: first the key, then what is wrong in the words of TOML, then the choices."""
     complaint, _, place = message.partition(" - at `$")
     key = place.strip(".`")
     for kind, word in _WORDS.items():
@@ -283,18 +289,18 @@ def _in_words(message: str) -> str:
     known = Training if key.startswith("network") else Study
     if complaint.startswith("Object contains unknown field "):
         where = f"[{key}]: " if key else ""
-        return f"{where}knows no key {complaint.rsplit(' ', 1)[1]}; there are {', '.join(known.__struct_fields__)}"
+        return f"{where}unknown key {complaint.rsplit(' ', 1)[1]}; choose from {', '.join(known.__struct_fields__)}"
     if complaint.startswith("Invalid enum value "):
         choices = get_args(get_type_hints(known)[key.removeprefix("network.")])
-        return f"`{key}` knows no {complaint.removeprefix('Invalid enum value ')}; choose from {', '.join(choices)}"
+        return f"`{key}`: unknown {complaint.removeprefix('Invalid enum value ')}; choose from {', '.join(choices)}"
     if not key:
         return complaint
     return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}"
 
 
-def differences(ours: Study, theirs: Study) -> list[str]:
-    """What two specifications differ in, a phrase each."""
-    a, b = msgspec.to_builtins(ours), msgspec.to_builtins(theirs)
+def differences(now: Study, before: Study) -> list[str]:
+    """How a specification differs from an earlier one, a phrase for each key."""
+    a, b = msgspec.to_builtins(now), msgspec.to_builtins(before)
     return [f"`{key}` was {_short(b.get(key))}, now {_short(a.get(key))}" for key in a if a.get(key) != b.get(key)]
 
 

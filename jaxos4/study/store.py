@@ -1,7 +1,7 @@
-"""The folder of a study: its specification, networks, finished cells, and a log of what was computed when.
+"""The folder of a study: its specification, networks, finished cells, and a log of the computation.
 
-Every file is whole or absent: written beside and renamed. A lock, which ends with its process however that ends, keeps
-a second run out.
+Every file is complete or absent: it is written under another name and then renamed. A lock keeps a second run out; it
+ends with its process, even if the process is killed.
 """
 
 import contextlib
@@ -19,38 +19,37 @@ import numpy as np
 
 from .._files import BROKEN, write_atomically
 from ..errors import InputError
-from ..networks.file import load_network
-from ..networks.network import TrainedNetwork
-from .cell import decode
+from ..networks import TrainedNetwork, load_network
+from .cell_file import decode
 from .specification import Study, differences
 
 RESULTS_FILE = "results.nc"
 _SPECIFICATION, _LOCK, _LOG = "study.json", "lock", "log.jsonl"
-# What a kill leaves of a file that was being written.
-_LEFT = ".*.part*"
+# Names of files that were being written when a run was killed.
+_UNFINISHED = ".*.part*"
 
 
 class Store:
-    """A study's folder; made by `open_store`, or read-only by `read_store`."""
+    """A study's folder, made by `open_store`, or by `read_store` to read only."""
 
     def __init__(self, directory: Path, study: Study, device: str, version: str):
         self.directory, self.study, self.device, self.version = directory, study, device, version
 
     def cell_file(self, index: int) -> Path:
-        """Where the cell of that index is kept."""
+        """The file of a cell."""
         return self.directory / "cells" / f"{index:08d}.npz"
 
     def network_file(self, number: int) -> Path:
-        """Where the network of that place among `jobs` is kept."""
+        """The file of a network, by its place in `jobs`."""
         return self.directory / "networks" / f"{number:04d}.net"
 
     def missing(self) -> list[int]:
-        """Cells that are not there yet."""
-        there = {path.name for path in (self.directory / "cells").glob("*.npz")}
-        return [index for index in range(self.study.count) if self.cell_file(index).name not in there]
+        """The cells that are not finished."""
+        finished = {path.name for path in (self.directory / "cells").glob("*.npz")}
+        return [index for index in range(self.study.count) if self.cell_file(index).name not in finished]
 
     def read(self, index: int) -> dict[str, np.ndarray] | None:
-        """The results of a cell, or `None` where it is not there. Raises `InputError` where its file was damaged."""
+        """The results of a cell, or `None` if it is not finished. Raises `InputError` if its file is damaged."""
         path = self.cell_file(index)
         try:
             return decode(path.read_bytes())
@@ -61,24 +60,24 @@ class Store:
             raise InputError(f"{path}: not a whole cell ({what}); delete it, and run the study again.") from None
 
     def write(self, path: Path, data: bytes, **entry: Any) -> None:
-        """Keeps a file, and logs what it was."""
+        """Writes a file of the study, and an entry of the log."""
         with write_atomically(path) as beside:
             beside.write_bytes(data)
         self.log(**entry)
 
     def log(self, **entry: Any) -> None:
-        """Adds a line to the log."""
+        """Adds an entry to the log."""
         with open(self.directory / _LOG, "a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
 
     def end_line(self) -> None:
-        """Ends the line that a kill, or a full disk, cut: the next is whole again."""
+        """Ends a line of the log that a kill or a full disk cut, so that the next entry has its own line."""
         with contextlib.suppress(FileNotFoundError), open(self.directory / _LOG, "rb+") as file:
             if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
                 file.write(b"\n")
 
     def read_log(self) -> list[dict[str, Any]]:
-        """What was computed when, in its order; lines that a kill cut are left out."""
+        """The entries of the log in their order, without lines that a kill cut."""
         entries = []
         with contextlib.suppress(FileNotFoundError):
             for line in (self.directory / _LOG).read_text(encoding="utf-8", errors="replace").splitlines():
@@ -87,12 +86,12 @@ class Store:
         return entries
 
     def read_network(self, number: int) -> TrainedNetwork | None:
-        """A network, or `None` where it was not trained yet."""
+        """A network, or `None` if it is not trained. Raises `InputError` if its file is damaged."""
         path = self.network_file(number)
         if not path.exists():
             return None
         try:
-            with jax.enable_x64(self.study.precision == "float64"):
+            with jax.enable_x64(self.study.double):
                 return load_network(path)
         except InputError:
             raise InputError(f"{path}: not a whole network; delete it, and run the study again.") from None
@@ -100,14 +99,14 @@ class Store:
 
 @contextlib.contextmanager
 def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
-    """The folder of a study, new or to be resumed, kept from other runs until the block is done.
+    """Opens the folder of a study, new or to be resumed, and locks it until the block ends.
 
     **Arguments:**
 
-    - `device`: what computes, in words; a study that is resumed keeps its first.
+    - `device`: the devices that compute, in words; a resumed study keeps those of its first run.
 
-    **Raises:** `InputError` where the folder holds another study (with what differs), something else, or a run that is
-    going on; `OSError` where it cannot be written to.
+    **Raises:** `InputError` if the folder holds another study (with what differs), other files, or a study that another
+    run is computing; `OSError` if it cannot be written to.
     """
     _check_folder(directory)
     specification = directory / _SPECIFICATION
@@ -117,7 +116,7 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
         lock.acquire()
     except filelock.Timeout:
         raise InputError(
-            f"{directory}: another run is at work on it; wait for its end, or give another folder."
+            f"{directory}: another run is at work on this study; wait for its end, or give another folder."
         ) from None
     try:
         if specification.exists():
@@ -130,8 +129,8 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
                 beside.write_bytes(msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
         for folder in (directory, directory / "cells", directory / "networks"):
             folder.mkdir(exist_ok=True)
-            for beside in folder.glob(_LEFT):
-                beside.unlink(missing_ok=True)
+            for unfinished in folder.glob(_UNFINISHED):
+                unfinished.unlink(missing_ok=True)
         store.end_line()
         yield store
     finally:
@@ -139,7 +138,7 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
 
 
 def read_store(directory: Path) -> Store:
-    """The folder of a study, to be read. Raises `InputError` where it holds none, or one of another version."""
+    """Opens the folder of a study to read. Raises `InputError` if it holds no study, or one of another version."""
     path = directory / _SPECIFICATION
     ours = importlib.metadata.version("jaxos4")
     try:
@@ -165,27 +164,27 @@ class _Header(_Version):
     study: Study
 
 
-def check_store(directory: Path, study: Study) -> list[int]:
-    """The cells that a run would compute, with nothing written. Raises `InputError` as `open_store` does."""
+def check_store(directory: Path, study: Study) -> Store:
+    """The folder of a study as a run would find it; nothing is written. Raises `InputError` as `open_store` does."""
     _check_folder(directory)
     if not (directory / _SPECIFICATION).exists():
-        return list(range(study.count))
+        return Store(directory, study, "", "")
     store = read_store(directory)
     _check_same(directory, study, store.study)
-    return store.missing()
+    return store
 
 
 def _check_folder(directory: Path) -> None:
     if not directory.exists():
         return
     if not directory.is_dir():
-        raise InputError(f"{directory}: a file; give a folder for the study.")
-    names = {path.name for path in directory.iterdir()} - {path.name for path in directory.glob(_LEFT)}
+        raise InputError(f"{directory}: is a file; give a folder for the study.")
+    names = {path.name for path in directory.iterdir()} - {path.name for path in directory.glob(_UNFINISHED)}
     if _SPECIFICATION not in names and names - {_LOCK}:
         raise InputError(f"{directory}: holds {min(names)} and no study; give an empty or a new folder.")
 
 
-def _check_same(directory: Path, ours: Study, theirs: Study) -> None:
-    changed = differences(ours, theirs)
+def _check_same(directory: Path, wanted: Study, stored: Study) -> None:
+    changed = differences(wanted, stored)
     if changed:
         raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")

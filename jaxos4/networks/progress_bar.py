@@ -1,0 +1,28 @@
+"""A bar in the terminal that shows how far a training is."""
+
+import contextlib
+from collections.abc import Iterator
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeRemainingColumn
+
+from .training import Progress
+
+
+@contextlib.contextmanager
+def training_bar(steps: int) -> Iterator[Progress]:
+    """Shows a bar on the error output while the block runs; shows nothing unless that is a terminal."""
+    columns = (
+        TextColumn("training the network"),
+        BarColumn(),
+        TextColumn("loss {task.fields[loss]}"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=steps, loss="-")
+
+        def update(done: int, steps: int, loss: float) -> None:
+            bar.update(task, completed=done, total=steps, loss=f"{loss:.4g}")
+
+        yield update

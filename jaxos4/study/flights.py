@@ -1,0 +1,204 @@
+"""The flights of a study: pure functions of its specification and of a flight's number."""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
+from ..analysis.fisher import cramer_rao_bound
+from ..bracket import Bracket
+from ..excitation import EXCITATIONS
+from ..flight import Flight
+from ..models import MODELS
+from ..models.abstract import AbstractModel
+from ..models.state import CASCADE_ORDER
+from ..noise import NOISES, SENSOR_SIGMA
+from ..shooting import ShootingProblem
+from ..simulation import simulate
+from .specification import Cell, Job, Scenario, Study
+
+# The largest offset of a bracket from the parameters that all flights have, as a share of its half-width.
+_LARGEST_OFFSET = 0.8
+
+
+class Fleet(NamedTuple):
+    """What the flights of a scenario share, whatever their noise."""
+
+    model: AbstractModel
+    bracket: Bracket
+    omega: Array
+    dt: Scalar
+
+
+class Flights(NamedTuple):
+    """Flights of a cell: true parameters, true states and measured states."""
+
+    truth: Float[Array, "lanes parameters"]
+    exact: Float[Array, "lanes samples 12"]
+    measured: Float[Array, "lanes samples 12"]
+
+
+def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
+    """Model, bracket and rotor speeds of a scenario or of a network's job."""
+    airframe = study.vehicle(scenario.airframe)
+    model = MODELS[scenario.model](airframe)
+    omega = EXCITATIONS[scenario.excitation](airframe, duration=scenario.duration, dt=study.dt)
+    return Fleet(model, _bracket(study, model, scenario.width), omega, as_float(study.dt))
+
+
+def bracket_of(study: Study, model: str, airframe: str, width: float) -> Bracket:
+    """The bracket of all searches and networks of a model, an airframe and a width."""
+    with jax.enable_x64(study.double):
+        return _bracket(study, MODELS[model](study.vehicle(airframe)), width)
+
+
+def _bracket(study: Study, model: AbstractModel, width: float) -> Bracket:
+    return _offset_bracket(model, np.asarray(width), study.seed, offset=study.truth == "airframe")
+
+
+@eqx.filter_jit
+def _offset_bracket(model: AbstractModel, width: Float[Numeric, ""], seed: int, *, offset: bool) -> Bracket:
+    center, half_width = model.alpha, width * model.half_width
+    if offset:
+        u = jax.random.uniform(
+            key_of(seed, 0), center.shape, minval=-_LARGEST_OFFSET, maxval=_LARGEST_OFFSET, dtype=float
+        )
+        center = center + half_width * u
+    return Bracket.around(center, half_width)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def key_of(seed: int, number: int) -> Key:
+    """The random key of a seed and a number."""
+    return jax.random.fold_in(jax.random.key(seed), number)
+
+
+def blank_problem(study: Study, fleet: Fleet, scale: float, channels: str) -> ShootingProblem:
+    """The problem that all flights of a scenario share: everything measured, at rest at the start.
+
+    **Arguments:**
+
+    - `scale`: the noise in multiples of the standard sensors'.
+    """
+    samples, dtype = fleet.omega.shape[0], jnp.result_type(float)
+    # By NumPy: outside jit, JAX would compile a program for each operation, on each device.
+    time = np.asarray(study.dt, dtype) * np.arange(samples, dtype=dtype)
+    return ShootingProblem(
+        fleet.model,
+        Flight(as_float(time), fleet.omega, as_float(np.zeros((samples, 12)))),
+        sigma=scale * SENSOR_SIGMA,
+        initial_state=as_float(np.zeros(12)) if study.initial_state == "known" else None,
+        channels=channels,
+        method=study.fit_method,
+    )
+
+
+def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
+    """Simulates the flights of a cell. Flights of one number have the same random numbers in all scenarios."""
+    return _fly(
+        fleet,
+        *_draws(study, cell),
+        as_float(cell.scenario.scale),
+        method=cell.scenario.method,
+        kind=cell.scenario.noise,
+        drawn=study.truth == "drawn",
+    )
+
+
+def truth_of(study: Study, cell: Cell) -> np.ndarray:
+    """The true parameters of a cell's flights; they are known even if no estimator can be run."""
+    with jax.enable_x64(study.double):
+        fleet = fleet_of(study, cell.scenario)
+        truths = _truths(fleet, *_draws(study, cell), drawn=study.truth == "drawn")
+        return np.asarray(truths)[: study.flights - cell.first]
+
+
+def _draws(study: Study, cell: Cell) -> tuple[Int[np.ndarray, " lanes"], Key]:
+    """The numbers of a cell's flights, and the key that each number is folded into."""
+    return cell.first + np.arange(study.batch), key_of(study.seed, 1)
+
+
+def _truth(fleet: Fleet, key: Key, drawn: bool) -> Parameters:
+    truth = fleet.model.alpha
+    if not drawn:
+        return truth
+    u = jax.random.uniform(key, truth.shape, minval=-1, maxval=1, dtype=float)
+    return fleet.bracket.center + u * fleet.bracket.half_width
+
+
+@eqx.filter_jit
+def _truths(
+    fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, *, drawn: bool
+) -> Float[Array, "lanes parameters"]:
+    """True parameters alone, from the draws of `_fly`."""
+    return jax.vmap(lambda number: _truth(fleet, jax.random.split(jax.random.fold_in(key, number))[0], drawn))(numbers)
+
+
+@eqx.filter_jit
+def _fly(
+    fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, scale: Scalar, *, method: str, kind: str, drawn: bool
+) -> Flights:
+    def simulated(number: Int[Array, ""]) -> tuple[Parameters, Flight, Key]:
+        truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
+        truth = _truth(fleet, truth_key, drawn)
+        return truth, simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method), noise_key
+
+    def measured(exact_and_key: tuple[Flight, Key]) -> States:
+        exact, noise_key = exact_and_key
+        return NOISES[kind](scale * SENSOR_SIGMA)(exact, key=noise_key).states
+
+    truth, exact, noise_keys = jax.vmap(simulated)(jnp.asarray(numbers))
+    # XLA takes seconds to compile a batch of random numbers for a CPU; one flight after the other runs as fast there.
+    each = jax.lax.map if jax.default_backend() == "cpu" else lambda one, flights: jax.vmap(one)(flights)
+    return Flights(truth, exact.states, each(measured, (exact, noise_keys)))
+
+
+@eqx.filter_jit
+def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "lanes parameters"]:
+    """The Cramer-Rao standard deviations of each flight, at the noise of a problem."""
+
+    def one(states: States, parameters: Parameters) -> Parameters:
+        problem = eqx.tree_at(lambda p: p.flight.states, blank, states)
+        start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
+        return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem, parameters, start)))
+
+    return jax.vmap(one)(flights.exact, flights.truth)
+
+
+def fly_again(study: Study, cell: Cell, answers: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """Simulates a cell's first flight with the answer of each estimator.
+
+    **Arguments:**
+
+    - `answers`: for each estimator, the results of its cell of the same flights; NaN without an answer.
+
+    **Returns:** states, (estimators, samples, 12).
+    """
+    with jax.enable_x64(study.double):
+        fleet = fleet_of(study, cell.scenario)
+        parameters = np.stack([results["estimate"][0] for results in answers])
+        starts = np.zeros((len(answers), 12))
+        for start, results in zip(starts, answers, strict=True):
+            known = results["initial_state"][0]
+            start[CASCADE_ORDER[: known.size]] = known
+        return np.asarray(_simulated(fleet, as_float(parameters), as_float(starts), method=study.fit_method))
+
+
+@eqx.filter_jit
+def _simulated(
+    fleet: Fleet,
+    parameters: Float[Array, "estimators parameters"],
+    starts: Float[Array, "estimators 12"],
+    *,
+    method: str,
+) -> Float[Array, "estimators samples 12"]:
+    def one(parameters: Parameters, start: Float[Array, "12"]) -> States:
+        flight = simulate(fleet.model, parameters, fleet.omega, dt=fleet.dt, initial_state=start, method=method)
+        return jnp.where(jnp.isfinite(parameters).all(), flight.states, jnp.nan)
+
+    return jax.vmap(one)(parameters, starts)
