@@ -19,7 +19,7 @@ from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..recording import stretches
 from ..recording.excited import Excitation, excitation
-from ..recording.stretches import Stretch, cut
+from ..recording.usable import Stretch, cut
 from ..shooting import ShootingProblem
 from ._check_output import check_output
 from ._choices import OutOption
