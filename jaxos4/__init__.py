@@ -37,21 +37,26 @@ from .estimators import (
     profile_likelihood as profile_likelihood,
 )
 from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
-from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight, join as join
-from .identification.vehicle import VehicleFit as VehicleFit, fit_vehicle as fit_vehicle
-from .logs import read_flight as read_flight, write_flight as write_flight
+from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
+from .identification import (
+    FlightIdentification as FlightIdentification,
+    FlightInformation as FlightInformation,
+    Identification as Identification,
+    VehicleFit as VehicleFit,
+    VehicleIdentification as VehicleIdentification,
+    assess as assess,
+    fit_vehicle as fit_vehicle,
+    identify as identify,
+)
+from .logs import read_flight as read_flight, read_log as read_log, write_flight as write_flight
 from .models.abstract import DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH, AbstractModel as AbstractModel
 from .models.corrected import CorrectedOS4 as CorrectedOS4
 from .models.held import HeldParameters as HeldParameters, hold as hold
 from .models.inertial import InertialOS4 as InertialOS4
 from .models.published import PublishedOS4 as PublishedOS4
 from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
-from .networks import (
-    NetworkEstimator as NetworkEstimator,
-    TrainedNetwork as TrainedNetwork,
-    load_network as load_network,
-    save_network as save_network,
-)
+from .networks import NetworkEstimator as NetworkEstimator, TrainedNetwork as TrainedNetwork
+from .networks.file import load_network as load_network, save_network as save_network
 from .noise import (
     SENSOR_SIGMA as SENSOR_SIGMA,
     AbstractNoise as AbstractNoise,
@@ -62,6 +67,7 @@ from .noise import (
     Quantisation as Quantisation,
     WhiteNoise as WhiteNoise,
 )
+from .recording import Recording as Recording, join as join
 from .results import RESULTS as RESULTS, result_names as result_names
 from .shooting import ShootingProblem as ShootingProblem
 from .simulation import simulate as simulate

@@ -1,12 +1,10 @@
 """A flight: the recorded rotor speeds, and the measured rates, attitude, velocity and position."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._custom_types import RotorSpeeds, Scalar, States, as_float
@@ -17,9 +15,6 @@ STATE_UNITS = ("m", "m/s", "m", "m/s", "m", "m/s", "rad", "rad/s", "rad", "rad/s
 FORCE_NAMES = ("ax", "ay", "az")
 CHANNEL_NAMES = (*STATE_NAMES, *FORCE_NAMES)
 """Every channel that a flight can measure: the states, then the specific force."""
-
-# Relative difference up to which two sample times count as equal.
-_SAME_STEP = 1e-6
 
 
 def _optional_float(x: ArrayLike | None) -> Array | None:
@@ -141,41 +136,3 @@ def fill_gaps(
     exists = (previous >= first) | (following <= last)
     source = jnp.where(previous >= first, previous, jnp.minimum(following, count - 1))
     return jnp.where(exists, jnp.nan_to_num(jnp.take_along_axis(values, source, axis=0)), 0.0)
-
-
-def join(flights: Sequence[Flight], *, length: int) -> Flight:
-    """Stretches of flights one after the other, as one flight of so many windows of `length` samples.
-
-    What is left over at the end of each is dropped, so that no window reaches from one into the next. Time becomes a
-    count of samples from 0. The twelve states and what else was measured are kept as they are.
-
-    Those that are shorter than one window are left out.
-
-    **Raises:** `ValueError` for flights of different sample times, or none that is long enough.
-    """
-    steps = np.array([float(flight.dt) for flight in flights])
-    if steps.size and np.ptp(steps) > _SAME_STEP * steps[0]:
-        raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
-    counts = [flight.time.shape[0] // length * length for flight in flights]
-    if not any(counts):
-        raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
-    kept = [jax.tree.map(lambda leaf, n=n: leaf[:n], _rows_of(f)) for f, n in zip(flights, counts, strict=True) if n]
-    with_velocity = all(rows[3] is not None for rows in kept)
-    omega, states, force = (np.concatenate([rows[i] for rows in kept]) for i in range(3))
-    velocity = np.concatenate([rows[3] for rows in kept if rows[3] is not None]) if with_velocity else None
-    lengths = [n for n in counts if n]
-    return Flight(
-        time=steps[0] * np.arange(sum(counts)),
-        omega=omega,
-        states=states,
-        specific_force=None if np.isnan(force).all() else force,
-        body_velocity=velocity,
-        stretch=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths)),
-        commanded=any(flight.commanded for flight in flights),
-    )
-
-
-def _rows_of(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    force = np.asarray(flight.channels[:, len(STATE_NAMES) :])
-    velocity = None if flight.body_velocity is None else np.asarray(flight.body_velocity)
-    return np.asarray(flight.omega), np.asarray(flight.states), force, velocity

@@ -1,4 +1,4 @@
-"""`jaxos4 estimate --model flight`: two logs of a simulated vehicle to its parameters, and every way to ask wrongly."""
+"""`jaxos4 estimate --model flight`: the parameters of a simulated vehicle from two logs, and wrong requests."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,8 @@ import pytest
 
 import jaxos4
 from jaxos4.cli._choices import VehicleModel
-from jaxos4.cli._recordings import Part, load_logs
+from jaxos4.recording.preparation import prepare
+from jaxos4.recording.reading import read_recording
 
 AIRFRAME = """
 mass = 0.65
@@ -45,7 +46,7 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rates[:, [7, 9, 11]] = np.asarray(noisy.states)[:, [7, 9, 11]]
         path = folder / f"flight{number}.csv"
         jaxos4.write_flight(eqx.tree_at(lambda f: f.states, flight, jnp.asarray(rates)), path)
-        # What was recorded are commands.
+        # The log holds commands.
         text = path.read_text(encoding="utf-8").splitlines()
         rows = [line.split(",") for line in text[1:]]
         header = text[0].replace("omega", "command").split(",")
@@ -57,7 +58,7 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
     out = tmp_path / "found.json"
-    code, told, err = run(
+    code, page_text, err = run(
         *("estimate", str(vehicle / "flight1.csv"), str(vehicle / "flight2.csv"), "--model", "flight"),
         *("--airframe", str(vehicle / "airframe.toml"), "--terms", ",".join(TERMS), "--out", str(out)),
         *("--report", str(tmp_path / "found.html")),
@@ -69,16 +70,16 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
         row = report["parameters"][name]
         assert abs(row["estimate"] - truth) < 4 * row["std"], (name, row)
     assert abs(report["parameters"]["rotor_lag"]["estimate"] - 0.06) < 0.005
-    # The equations are the truth's: what was held out is predicted to the noise.
+    # The model has the true equations: it predicts the held-out part up to the noise.
     assert min(report["skill"][rate]["skill"][1] for rate in "pq") > 0.9
-    assert "inertias" in told
+    assert "inertias" in page_text
     page = (tmp_path / "found.html").read_text(encoding="utf-8")
     assert all(name in page for name in TRUTH)
     assert report["provenance"]["terms"] == list(TERMS)
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "said"),
     [
         (("--model", "flight", "--terms", "wings"), "--terms: knows no `wings`"),
         (("--model", "flight", "--terms", "velocity"), "did not measure"),
@@ -97,10 +98,10 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
         (("--from", "1"), "--from"),
     ],
 )
-def test_wrong_requests_are_one_line(run, vehicle, options, told):
+def test_wrong_requests_are_one_line(run, vehicle, options, said):
     code, _, err = run("estimate", str(vehicle / "flight1.csv"), "--airframe", str(vehicle / "airframe.toml"), *options)
     assert code == 2
-    assert told in err
+    assert said in err
     assert len(err.strip().splitlines()) == 1
 
 
@@ -111,16 +112,15 @@ def test_only_the_flight_model_takes_several_flights(run, vehicle):
     assert "--model flight for several" in err
 
 
-def test_what_is_held_out_is_not_fitted_and_all_else_is(vehicle):
+def test_each_measurement_is_either_fitted_or_held_out(vehicle):
     airframe = jaxos4.load_airframe(str(vehicle / "airframe.toml"))
-    paths = [vehicle / "flight1.csv", vehicle / "flight2.csv"]
-    recorded = load_logs(paths, airframe, Part(None, None, 0.25, None, 0.25))
-    assert recorded.tested is not None
-    there, aside = (~np.isnan(np.asarray(f.states)[:, 7]) for f in (recorded.fitted, recorded.tested))
-    assert (there ^ aside).all()
-    assert 0.15 < aside.mean() < 0.35
-    assert recorded.recordings == (0, 1)
-    assert recorded.fitted.commanded
+    prepared = prepare([read_recording(vehicle / f"flight{i}.csv", airframe) for i in (1, 2)], airframe)
+    assert prepared.tested is not None
+    fitted, held_out = (~np.isnan(np.asarray(f.states)[:, 7]) for f in (prepared.fitted, prepared.tested))
+    assert (fitted ^ held_out).all()
+    assert 0.15 < held_out.mean() < 0.35
+    assert prepared.recordings == (0, 1)
+    assert prepared.available == {"commands", "full scale"}
 
 
 def test_the_models_of_the_command_line():
@@ -144,20 +144,15 @@ def sampled(path: Path, to: Path, dt: float) -> Path:
 def test_no_window_reaches_from_one_stretch_into_the_next(vehicle, tmp_path, steps):
     airframe = jaxos4.load_airframe(str(vehicle / "airframe.toml"))
     paths = [sampled(vehicle / "flight1.csv", tmp_path / f"{i}.csv", dt) for i, dt in enumerate(steps)]
-    recorded = load_logs(paths, airframe, Part(None, None, 0.25, None, 0.0))
-    flight = recorded.fitted
-    assert flight.time.shape[0] == recorded.windows * recorded.length
+    prepared = prepare([read_recording(path, airframe) for path in paths], airframe, holdout=0.0)
+    flight, windows = prepared.fitted, prepared.windows
+    assert flight.time.shape[0] == windows * prepared.length
     assert flight.stretch is not None
-    for stretch in np.asarray(flight.stretch).reshape(recorded.windows, recorded.length):
+    for stretch in np.asarray(flight.stretch).reshape(windows, prepared.length):
         assert np.ptp(stretch) == 0
-    problem = jaxos4.ShootingProblem(
-        jaxos4.FlightModel(airframe, recordings=recorded.recordings),
-        flight,
-        sigma=np.ones(12),
-        channels="rates",
-        windows=recorded.windows,
-    )
-    assert (np.diff(problem.window_of_samples().reshape(recorded.windows, -1)) == 0).all()
+    model = jaxos4.FlightModel(airframe, recordings=prepared.recordings)
+    problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates", windows=windows)
+    assert (np.diff(problem.window_of_samples().reshape(windows, -1)) == 0).all()
 
 
 def test_a_log_counts_once(run, vehicle):
@@ -184,7 +179,7 @@ def test_commands_and_speeds_do_not_mix(run, vehicle, tmp_path):
     assert "some of these logs hold commands" in err
 
 
-def test_what_cannot_be_predicted_is_told_before_the_fit(run, vehicle, tmp_path):
+def test_an_unpredictable_flight_is_refused_before_the_fit(run, vehicle, tmp_path):
     def rarely(header, rows):
         at = header.index("q")
         return header, [row if k % 10 == 0 else [*row[:at], "", *row[at + 1 :]] for k, row in enumerate(rows)]

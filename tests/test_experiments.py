@@ -108,7 +108,7 @@ def test_dirty_flights(tmp_path):
     assert max(flight["fastest"] for flight in found["flights"]) < 5
     # The lag of 60 ms and the delay of 8 ms are found within a few standard errors.
     for name in ("rotor_lag", "rotor_delay", "alpha3", "alpha6", "roll_damping", "thrust_gain"):
-        assert found["summary"][name]["told"] == 2
+        assert found["summary"][name]["identified"] == 2
         assert abs(found["summary"][name]["bias"]) < 4
     assert abs(found["summary"]["rotor_lag"]["mean_error"]) < 3e-3
     assert abs(found["summary"]["rotor_delay"]["mean_error"]) < 2e-3

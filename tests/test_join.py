@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
-from jaxos4.flight import Stretches, fill_gaps
+from jaxos4.flight import Stretches, held_values
 from jaxos4.recording.averaging import average
 
 
@@ -60,7 +60,7 @@ def test_no_window_reaches_from_one_stretch_into_the_next(lengths, length, force
 
 
 @pytest.mark.parametrize("velocities", [(True, True), (True, False), (False, False)])
-def test_a_velocity_is_kept_where_every_stretch_has_one(velocities):
+def test_velocity_is_kept_if_every_stretch_has_it(velocities):
     flights = [stretch(30, i, velocity=v) for i, v in enumerate(velocities)]
     joined = jaxos4.join(flights, length=10)
     if all(velocities):
@@ -165,10 +165,10 @@ def test_no_impulse_is_lost(ratio):
     np.testing.assert_allclose(average(t, constant, channels, dt)[1], 250.0, rtol=1e-12)
 
 
-def test_nothing_is_measured_where_less_than_half_was():
+def test_a_sample_with_less_than_half_measured_is_missing():
     t, omega, _, dt = rows(81, 4, 0)
     y = np.ones((81, 1))
-    y[39:42] = np.nan  # a sample is the rows 38 (half), 39, 40, 41, 42 (half): one of four is left
+    y[39:42] = np.nan  # a sample covers the rows 38 (half), 39, 40, 41, 42 (half): one of four was measured
     y[59:61] = np.nan  # two of four
     found = average(t, omega, y, dt)[2][:, 0]
     assert np.flatnonzero(np.isnan(found)).tolist() == [10]
@@ -184,10 +184,10 @@ def test_vibration_above_the_new_rate_does_not_fold_down():
     assert np.abs(taken).max() > 0.25
 
 
-def test_what_is_held_stays_in_its_stretch():
+def test_gaps_are_filled_from_their_own_stretch():
     nan = np.nan
     values = jnp.array([[nan, 1.0, nan, 2.0, nan, nan, nan, nan, 5.0, nan]]).T
     number = jnp.array([0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
-    found = fill_gaps(values, Stretches.of(number))[:, 0]
+    found = held_values(values, Stretches.of(number))[:, 0]
     np.testing.assert_array_equal(found, [1, 1, 1, 2, 0, 0, 5, 5, 5, 5])
-    np.testing.assert_array_equal(fill_gaps(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])
+    np.testing.assert_array_equal(held_values(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])

@@ -1,4 +1,4 @@
-"""What of a flight is usable: each reason to leave a part out, the law that parts are a flight, and real flights."""
+"""Usable stretches: each reason to leave a part out, the law that the parts make the flight, and real flights."""
 
 import equinox as eqx
 import numpy as np
@@ -11,7 +11,7 @@ from jaxos4.flight import Flight
 from jaxos4.logs import read_log
 from jaxos4.recording import stretches
 from jaxos4.recording.excited import excitation, gyro_noise
-from jaxos4.recording.stretches import Stretch, cut, usable_stretches
+from jaxos4.recording.usable import Stretch, cut, usable_stretches
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)
@@ -93,7 +93,7 @@ def test_a_clipped_gyro_is_left_out():
     assert len(reasons(flight_of(parts))) == 1
 
 
-def test_what_was_not_measured_is_left_out():
+def test_gaps_are_left_out():
     parts = hovering()
     parts[2][1000:1100] = np.nan
     parts[2][2000:2004, P] = np.nan  # a moment
@@ -125,7 +125,7 @@ def test_a_bump_in_flight_is_no_crash():
     assert reasons(Flight(time, omega, states, force))[-1][2] == "an impact"
 
 
-def test_short_remains_are_left_out():
+def test_short_parts_between_others_are_left_out():
     parts = hovering(rest=((5, 5.3), (6, 6.3)))
     found = reasons(flight_of(parts))
     assert [reason for *_, reason in found].count("less than 1 s between others") == 1
@@ -135,7 +135,7 @@ def test_short_remains_are_left_out():
 @given(seed=st.integers(0, 999))
 @settings(max_examples=40)
 def test_parts_are_the_flight(seed):
-    """Whatever a flight holds, parts follow one another without a gap, and neighbours differ."""
+    """Parts of any flight follow one another without a gap, and neighbours differ."""
     rng = np.random.default_rng(seed)
     n = int(rng.choice([2, 50, 100, 400]))
     omega = (
@@ -180,7 +180,7 @@ def test_a_part_beyond_the_flight_is_refused():
 # Excitation
 
 
-def test_excitation_is_what_moves_the_vehicle():
+def test_excitation_is_the_spread_of_torque_and_rate():
     flight = flight_of(hovering())
     roll, pitch, yaw = excitation(flight, CRAZYFLIE)
     assert (roll.verdict, pitch.verdict, yaw.verdict) == ("good", "weak", "none")
@@ -201,7 +201,7 @@ def test_angles_stand_in_for_rates():
     assert pitch.verdict == "not measured"
 
 
-def test_noise_is_told_from_motion():
+def test_noise_is_separated_from_motion():
     t = 0.002 * np.arange(5000)
     rate = 3 * np.sin(2 * np.pi * 3 * t) + np.random.default_rng(0).normal(0, 0.05, t.size)
     assert gyro_noise(rate) == pytest.approx(0.05, rel=0.05)

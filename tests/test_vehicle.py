@@ -1,4 +1,4 @@
-"""`fit_vehicle`: what flights cannot tell is held and named, and what is left is found with errors that hold."""
+"""`fit_vehicle`: unidentifiable parameters are held and named, the others are found with honest errors."""
 
 import functools
 
@@ -45,7 +45,7 @@ def fitted(kind):
 
 
 @pytest.mark.parametrize("kind", ["rich", "hover"])
-def test_what_is_told_is_found_within_its_errors(kind):
+def test_identifiable_parameters_are_found_within_their_errors(kind):
     fit, truth, stages = fitted(kind)
     assert fit.answered
     assert str(jaxos4.result_names(fit.estimate.result)) == "successful"
@@ -63,26 +63,26 @@ def test_what_is_told_is_found_within_its_errors(kind):
     assert 0.1 < fit.cut < 0.25
     assert fit.rollouts > 0
     assert stages == [
-        "fitting what every flight tells",
-        "asking what else can be told",
-        "fitting all that can be told",
+        "fitting the parameters that every flight excites",
+        "choosing the identifiable parameters",
+        "fitting the identifiable parameters",
         "computing errors",
     ]
 
 
-def test_a_rich_flight_tells_the_primary_ones():
+def test_a_rich_flight_identifies_the_primary_parameters():
     fit, _, _ = fitted("rich")
     assert set(fit.held) <= set(SECONDARY)
 
 
-def test_what_a_hover_does_not_tell_is_held_and_named():
+def test_parameters_that_a_hover_cannot_identify_are_held_and_named():
     fit, truth, _ = fitted("hover")
     assert {"alpha1", "alpha4"} <= set(fit.held)
     for name, (value, why) in fit.held.items():
         assert value == pytest.approx(float(BRACKET.center[NAMES.index(name)]), abs=1e-12)
         assert why == "not identifiable from these flights"
     assert {"alpha3", "alpha6"}.isdisjoint(fit.held)
-    # And rightly: the bound of the whole model is wider than the bracket there, and narrower for what is left.
+    # The bound of the whole model is wider than the bracket for held parameters, and narrower for the others.
     whole = eqx.tree_at(lambda p: p.model, fit.problem, MODEL)
     std = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(whole, truth, fit.estimate.initial_state)))
     for i, name in enumerate(NAMES):
@@ -92,7 +92,7 @@ def test_what_a_hover_does_not_tell_is_held_and_named():
             assert name not in fit.held
 
 
-def test_a_damping_that_no_air_makes_is_held_at_none():
+def test_a_negative_damping_is_held_at_zero():
     fit, _, _ = fitted("negative")
     assert fit.answered
     assert fit.held["roll_damping"][0] == 0.0
@@ -102,19 +102,17 @@ def test_a_damping_that_no_air_makes_is_held_at_none():
 
 def test_a_value_for_every_parameter():
     fit, _, _ = fitted("negative")
-    whole = fit.problem.model.complete(fit.estimate.parameters)
-    values = dict(zip(NAMES, whole.tolist(), strict=True))
-    assert values["roll_damping"] == 0.0
-    for i, name in enumerate(fit.problem.model.parameter_names):
-        assert values[name] == float(fit.estimate.parameters[i])
-    # The fit's prediction is the whole model's.
-    there = eqx.tree_at(lambda p: p.model, fit.problem, MODEL).cost(whole, fit.estimate.initial_state)
-    assert float(there) == pytest.approx(
+    every = fit.problem.model.complete(fit.estimate.parameters)
+    assert fit.values == dict(zip(NAMES, every.tolist(), strict=True))
+    assert fit.values["roll_damping"] == 0.0
+    # The model with held parameters predicts as the model with all of them.
+    cost = eqx.tree_at(lambda p: p.model, fit.problem, MODEL).cost(every, fit.estimate.initial_state)
+    assert float(cost) == pytest.approx(
         float(fit.problem.cost(fit.estimate.parameters, fit.estimate.initial_state)), rel=1e-9
     )
 
 
-def test_outliers_are_cut_unless_they_are_wanted():
+def test_outliers_are_cut_by_default():
     problem, truth = problem_of(GENTLE, outliers=0.05)
     errors = {}
     for huber in (True, False):
@@ -134,7 +132,7 @@ def test_outliers_are_cut_unless_they_are_wanted():
     assert errors[True] < 0.5 * errors[False]
 
 
-def test_a_flight_that_nothing_can_be_flown_with_has_no_answer():
+def test_a_flight_that_the_model_cannot_follow_has_no_answer():
     problem, _ = problem_of(GENTLE)
     wild = eqx.tree_at(lambda p: p.flight.omega, problem, 1e6 * problem.flight.omega)
     fit = jaxos4.fit_vehicle(wild, BRACKET)

@@ -1,10 +1,10 @@
-"""How often 95 % intervals hold the truth where flights are dirty: rotors that lag, commands late, vibration, colour.
+"""Coverage of 95 % intervals on dirty flights: rotor lag, late commands, vibration, coloured noise, lost samples.
 
-Each flight is flown at 1 kHz by Runge-Kutta with a truth of its own: rotors that follow their commands with a lag of
-60 ms, 8 ms late, a thrust between linear and quadratic in them, offsets and damping. Its gyro and accelerometer show
-coloured noise, the rotors' vibration and rounding, and lose samples, alone and in bursts. What was recorded is averaged
-to 4 ms, cut into windows of a quarter of a second, and fitted by `fit_vehicle`, whose intervals are asked for the
-truth. Parameters that a fit holds are not counted.
+Each flight is simulated at 1 kHz by Runge-Kutta with its own true parameters: rotors follow their commands with a lag
+of 60 ms and a delay of 8 ms, thrust is between linear and quadratic in the rotor speed, and there are offsets and
+damping. Gyro and accelerometer show coloured noise, vibration and rounding, and lose samples, alone and in bursts. The
+recording is averaged to 4 ms, cut into windows of a quarter of a second, and fitted by `fit_vehicle`. Parameters that a
+fit holds are not counted.
 """
 
 import json
@@ -24,6 +24,7 @@ import jaxos4
 from jaxos4.identification.vehicle import SECONDARY
 from jaxos4.models.vehicle import DEFAULT_TERMS
 from jaxos4.recording.averaging import average
+from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)
 
@@ -38,25 +39,25 @@ CRAZYFLIE = jaxos4.Airframe(
     rotor_inertia=1.0e-8,
     max_rotor_speed=2600.0,
 )
-# The paper does not say how fast its rotors turn at most: twice as fast as in hover.
+# The paper gives no largest rotor speed: twice that of hover.
 FAST_OS4 = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, 450.0)
 AIRFRAMES = {"os4": FAST_OS4, "crazyflie": CRAZYFLIE}
 TERMS = (*DEFAULT_TERMS, "curve", "accelerometer")
 LAG, DELAY, CURVE = 0.06, 0.008, (0.4, 1.0)
-# Of the truth and of what is fitted [s]; commands come every other millisecond.
+# Sample times of the simulation and of the fit [s]; a new command comes every other millisecond.
 FINE, COARSE, COMMANDED = 1e-3, 4e-3, 2
 WINDOW = 0.25
-# Designed rates [rad/s] and tones [Hz] of roll, pitch and yaw; thrust goes up and down by a share of the weight.
+# Designed rates [rad/s] and tones [Hz] of roll, pitch and yaw; amplitude of the thrust as a share of the weight.
 AMPLITUDE, TONES, HEAVE = (1.6, 1.6, 0.5), ((0.5, 5.0), (0.5, 5.0), (0.3, 2.0)), 0.15
 # Coloured noise, vibration, rounding: of the gyro [rad/s] and of the accelerometer [m/s^2].
 COLOUR, VIBRATION, STEP = (0.02, 0.2), (0.05, 0.5), (2e-3, 0.02)
 MEMORY, VIBRATING, WANDER = (0.005, 0.02), (80.0, 150.0), 5.0
-# The share of samples that is lost, bursts a second, and how long these last [s].
+# The share of samples lost alone; bursts of lost samples per second, and their lengths [s].
 LOST, BURSTS, BURST = 0.02, 0.5, (0.005, 0.03)
 
 
 def truth_of(model: jaxos4.FlightModel, rng: np.random.Generator) -> np.ndarray:
-    """What a flight's vehicle is: the secondary parameters as the airframe says, the others somewhere around it."""
+    """A flight's true parameters: the secondary ones as the airframe implies, the others random around it."""
     center, half_width = np.asarray(model.alpha), np.asarray(model.half_width)
     values = center + half_width * rng.uniform(-0.4, 0.4, center.size)
     for i, name in enumerate(model.parameter_names):
@@ -72,7 +73,7 @@ def truth_of(model: jaxos4.FlightModel, rng: np.random.Generator) -> np.ndarray:
 
 
 def commands(model: jaxos4.FlightModel, truth: np.ndarray, duration: float, rng: np.random.Generator) -> np.ndarray:
-    """Rotor speeds [rad/s] every millisecond: all axes at once, three tones each, thrust besides, offsets trimmed."""
+    """Commanded rotor speeds [rad/s] every millisecond: three tones for each axis, one for thrust, offsets trimmed."""
     airframe, values = model.airframe, dict(zip(model.parameter_names, truth, strict=True))
     tones = [np.sort(rng.uniform(*span, 3)).tolist() for span in TONES]
     omega = np.array(jaxos4.multisine(airframe, duration=duration, dt=FINE, amplitude=AMPLITUDE, tones=tones))
@@ -81,7 +82,7 @@ def commands(model: jaxos4.FlightModel, truth: np.ndarray, duration: float, rng:
     axes = zip(("roll", "pitch", "yaw"), ("alpha3", "alpha6", "alpha8"), strict=True)
     trim = np.array([-values[f"{axis}_offset"] / values[alpha] for axis, alpha in axes] + [0.0])
     squares = np.maximum(squares + np.linalg.solve(np.asarray(airframe.mixer), trim), 0.0)
-    # Commands of which the thrust curve makes what these squares of speeds would.
+    # Commands that give this thrust through the thrust curve.
     curve = values["thrust_curve"]
     linear = (1 - curve) * float(airframe.max_rotor_speed)
     omega = (np.sqrt(linear**2 + 4 * curve * squares) - linear) / (2 * curve)
@@ -101,7 +102,7 @@ def fly(model: jaxos4.FlightModel, parameters: jax.Array, omega: jax.Array) -> j
 
 
 def dirty(exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What sensors show of it."""
+    """The sensors' readings of `exact`, with every fault."""
     samples, channels = exact.shape
     t, seen = FINE * np.arange(samples), np.array(exact)
     scale = np.array([0, 0, 0, 1])
@@ -111,7 +112,7 @@ def dirty(exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     for k in range(samples):
         seen[k] += colour * error
         error = decay * error + np.sqrt(1 - decay**2) * rng.standard_normal(channels)
-    # Rotors do not turn evenly: the phase of what they shake wanders.
+    # Rotors do not turn evenly: the phase of the vibration wanders.
     wander = np.cumsum(np.sqrt(WANDER * FINE) * rng.standard_normal(samples))
     phase = 2 * np.pi * rng.uniform(*VIBRATING) * t + wander
     seen += vibration * np.sin(phase[:, None] + rng.uniform(0, 2 * np.pi, channels))
@@ -123,7 +124,7 @@ def dirty(exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def recorded(omega: np.ndarray, seen: np.ndarray) -> jaxos4.Flight:
-    """The flight as it is fitted."""
+    """The averaged recording in whole windows."""
     t = FINE * np.arange(omega.shape[0])
     grid, speeds, channels = average(t, omega, seen, COARSE)
     states, force = np.full((grid.size, 12), np.nan), np.full((grid.size, 3), np.nan)
@@ -132,14 +133,14 @@ def recorded(omega: np.ndarray, seen: np.ndarray) -> jaxos4.Flight:
 
 
 def problem_of(model: jaxos4.FlightModel, flight: jaxos4.Flight) -> jaxos4.ShootingProblem:
-    """The flight in windows."""
+    """The problem of fitting it."""
     windows = flight.time.shape[0] // int(WINDOW / COARSE)
     sigma = np.append(3 * jaxos4.SENSOR_SIGMA, np.full(3, 0.3))
     return jaxos4.ShootingProblem(model, flight, sigma=sigma, channels="rates", method="rk4", windows=windows)
 
 
 def identify(airframe: jaxos4.Airframe, duration: float, seed: int, i: int, *, clean: bool = False) -> dict:
-    """One flight: the truth, what was found of it, and why not where not. `clean`: without noise."""
+    """One flight: its true parameters, their estimates, and why others are held. `clean`: without noise."""
     rng = np.random.default_rng([seed, i])
     model = jaxos4.FlightModel(airframe, terms=TERMS)
     truth = truth_of(model, rng)
@@ -165,34 +166,36 @@ def identify(airframe: jaxos4.Airframe, duration: float, seed: int, i: int, *, c
 
 
 def summary(flights: list[dict]) -> dict[str, dict]:
-    """For each parameter: how many flights told it, in which share of them the interval holds it, and by how far off.
+    """For each parameter: in how many flights it was identified, and how often the interval held the truth.
 
-    - `bias`, `spread`: mean and standard deviation of the errors in standard deviations that the fits claim.
+    `bias`, `spread`: mean and standard deviation of the errors, in standard deviations of the fits.
     """
     rows = {}
     for name in flights[0]["truth"]:
-        told = [f for f in flights if name in f["estimate"] and np.isfinite(f["half_width"][name])]
-        errors = np.array([f["estimate"][name] - f["truth"][name] for f in told])
-        half_width = np.array([f["half_width"][name] for f in told])
-        if told:
-            scaled = 1.96 * errors / half_width
+        some = [f for f in flights if name in f["estimate"] and np.isfinite(f["half_width"][name])]
+        errors = np.array([f["estimate"][name] - f["truth"][name] for f in some])
+        half_width = np.array([f["half_width"][name] for f in some])
+        if some:
+            scaled = NINETY_FIVE * errors / half_width
             rows[name] = {
-                "told": len(told),
+                "identified": len(some),
                 "covered": float((np.abs(errors) <= half_width).mean()),
-                "monte_carlo_error": float(np.sqrt(0.95 * 0.05 / len(told))),
+                "monte_carlo_error": float(np.sqrt(0.95 * 0.05 / len(some))),
                 "bias": float(scaled.mean()),
-                "spread": float(scaled.std(ddof=1)) if len(told) > 1 else None,
+                "spread": float(scaled.std(ddof=1)) if len(some) > 1 else None,
                 "mean_error": float(errors.mean()),
-                "claimed_over_bound": float(np.median([f["half_width"][name] / 1.96 / f["bound"][name] for f in told])),
+                "claimed_over_bound": float(
+                    np.median([f["half_width"][name] / NINETY_FIVE / f["bound"][name] for f in some])
+                ),
             }
     return rows
 
 
 def main(
-    flights: Annotated[int, typer.Option(help="Of each airframe.")] = 120,
-    duration: Annotated[float, typer.Option(help="Of each flight [s].")] = 15.0,
-    seed: Annotated[int, typer.Option(help="Of truths, commands and noise.")] = 17,
-    airframes: Annotated[list[str], typer.Option(help="Of which.")] = tuple(AIRFRAMES),
+    flights: Annotated[int, typer.Option(help="Flights of each airframe.")] = 120,
+    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 15.0,
+    seed: Annotated[int, typer.Option(help="Random seed of parameters, commands and noise.")] = 17,
+    airframes: Annotated[list[str], typer.Option(help="Names of airframes.")] = tuple(AIRFRAMES),
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
     """Coverage of 95 % intervals on dirty flights."""
@@ -215,7 +218,7 @@ def main(
         table = Table(title=f"95 % intervals of {flights} flights of {duration:g} s, {name}, {seconds:.1f} s a fit")
         for heading in (
             "parameter",
-            "told by",
+            "identified",
             "covered [%]",
             "+-",
             "bias [std]",
@@ -227,7 +230,7 @@ def main(
         for parameter, row in rows[name]["summary"].items():
             table.add_row(
                 parameter,
-                str(row["told"]),
+                str(row["identified"]),
                 f"{100 * row['covered']:.1f}",
                 f"{100 * row['monte_carlo_error']:.1f}",
                 f"{row['bias']:.2f}",

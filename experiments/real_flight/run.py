@@ -1,16 +1,15 @@
-"""A real Crazyflie: fitted on one part of a flight, tested on another, beside regression and its authors' figures.
+"""A real Crazyflie: one part of a flight is fitted and another predicted, by shooting and by regression.
 
-Blocks of 5 s of the roll and pitch flight, from 1 s on: the 1st, 3rd, ... are fitted, the 2nd, 4th, ... tested, the
-same for all estimators. Predictions use the recorded commands, and with `flapping` the recorded specific force along x
-and y as well, as inputs: they say what the vehicle does next, given these, not what a simulator would do without them.
-Commands are not rotor speeds: how thrust grows with them is fitted to the accelerometer (`thrust_curve`,
-`thrust_gain`), and torques, so inertias, go with that thrust.
+The roll and pitch flight is cut into blocks of 5 s from 1 s on. The 1st, 3rd, ... block is fitted, the 2nd, 4th, ... is
+tested, for all estimators. The inputs of the predictions are the recorded commands and, with `flapping`, the recorded
+specific force along x and y. Commands are not rotor speeds: thrust as a function of the command is fitted to the
+accelerometer (`thrust_curve`, `thrust_gain`). Torques, and therefore inertias, are proportional to this thrust.
 """
 
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,9 +21,12 @@ import typer
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs import read_log
-from jaxos4.recording.averaging import average
-from jaxos4.recording.stretches import Stretch, cut, usable_stretches
+from jaxos4.identification import refit
+from jaxos4.identification.constants import vehicle_constants
+from jaxos4.identification.results import RigidBody
+from jaxos4.models.state import Rates
+from jaxos4.recording import Stretch, averaged, cut, usable_stretches
+from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)
 
@@ -38,26 +40,23 @@ LAGS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09)
 DELAYS = (0.0, 0.004, 0.008, 0.012, 0.016, 0.02)
 # Sample time, window, the first block's begin, and the blocks' length [s].
 DT, WINDOW, BEGIN, BLOCK = 0.004, 0.25, 1.0, 5.0
-# Of the flight, one of which at a time is left out for errors of differences and of regressions: as in `jaxos4.skill`.
+# The parts of a flight for the jackknife, as in `jaxos4.skill`.
 PARTS = 10
 NAMES = ("output-error", "hybrid", "ibss, nothing held", "ibss without flapping")
 SECTIONS = ("regression", "lag", "joint")
-NINETY_FIVE = 1.96
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6"}
 
 Values = dict[str, float]
 
 
 def read(folder: Path, name: str) -> jaxos4.Flight:
-    """A flight, averaged to samples of 4 ms: vibration is above what these can hold."""
-    flight, _ = read_log(folder / f"arpl_crazyflie_{name}.csv", AIRFRAME)
-    rows = (np.asarray(values) for values in (flight.time, flight.omega, flight.channels))
-    t, omega, channels = average(*rows, DT)
-    return jaxos4.Flight(t, omega, channels[:, : len(STATE_NAMES)], channels[:, len(STATE_NAMES) :])
+    """A flight, averaged to samples of 4 ms, which removes the vibration."""
+    flight, _ = jaxos4.read_log(folder / f"arpl_crazyflie_{name}.csv", AIRFRAME)
+    return averaged(flight, DT)
 
 
 def blocks(flight: jaxos4.Flight, seconds: float) -> tuple[list[jaxos4.Flight], list[jaxos4.Flight]]:
-    """What is fitted, and what is tested."""
+    """The fitted and the tested blocks."""
     count = int((min(float(flight.time[-1]), seconds) - BEGIN) / BLOCK)
     begins = BEGIN + BLOCK * np.arange(count)
     parts = [cut(flight, Stretch(float(begin), float(begin) + BLOCK - DT)) for begin in begins]
@@ -67,7 +66,7 @@ def blocks(flight: jaxos4.Flight, seconds: float) -> tuple[list[jaxos4.Flight], 
 def problem_of(
     parts: list[jaxos4.Flight], terms: tuple[str, ...], recordings: tuple[int, ...] | None = None
 ) -> jaxos4.ShootingProblem:
-    """Parts of flights, cut into windows."""
+    """The problem of several parts of flights in windows."""
     length = round(WINDOW / DT)
     flight = jaxos4.join(parts, length=length)
     model = jaxos4.FlightModel(AIRFRAME, terms=terms, recordings=recordings or (0,) * len(parts))
@@ -81,26 +80,26 @@ def without(terms: tuple[str, ...], *left_out: str) -> tuple[str, ...]:
 
 
 def predict(values: Values, parts: list[jaxos4.Flight], terms: tuple[str, ...] = TERMS) -> jaxos4.Predictions:
-    """Of a vehicle with these parameters, over parts of flights."""
+    """Predictions for a vehicle with these parameters, over parts of flights."""
     problem = problem_of(parts, without(terms, "accelerometer"))
     parameters = jnp.asarray([values[name] for name in problem.model.parameter_names])
     return jaxos4.predictions(problem, parameters, horizons=HORIZONS)
 
 
 def difference(one: jaxos4.Predictions, other: jaxos4.Predictions) -> dict[str, Any]:
-    """By how much the skill of `one` exceeds that of `other`, start by start, with a jackknife's error."""
+    """The skill of `one` minus that of `other`, with the jackknife's standard error."""
     squares = [np.nan_to_num(np.square(x.predicted - x.measured)) for x in (one, other)]
     change = np.nan_to_num(np.square(one.initial[:, None] - one.measured))
     parts = np.array_split(np.arange(change.shape[0]), PARTS)
 
-    def worth(kept: np.ndarray) -> np.ndarray:
+    def gain(kept: np.ndarray) -> np.ndarray:
         return (squares[1][kept] - squares[0][kept]).sum(axis=0) / change[kept].sum(axis=0)
 
     everything = np.arange(change.shape[0])
-    left = np.stack([worth(np.setdiff1d(everything, part)) for part in parts])
-    spread = np.sqrt((PARTS - 1) * np.square(left - left.mean(axis=0)).mean(axis=0))
+    without_part = np.stack([gain(np.setdiff1d(everything, part)) for part in parts])
+    spread = np.sqrt((PARTS - 1) * np.square(without_part - without_part.mean(axis=0)).mean(axis=0))
     return {
-        rate: {"difference": worth(everything)[:, i].tolist(), "std": spread[:, i].tolist()}
+        rate: {"difference": gain(everything)[:, i].tolist(), "std": spread[:, i].tolist()}
         for i, rate in enumerate("pqr")
     }
 
@@ -113,41 +112,43 @@ def worth(predicted: jaxos4.Predictions) -> dict[str, Any]:
     return {"horizons": predicted.horizons.tolist(), "starts": found.starts, **table}
 
 
-def inertias(values: Values, std: Values) -> dict[str, Any]:
-    """Ix and Iy [kg m^2] with 95 % intervals: thrust_gain / alpha, as torques go with thrust."""
-    table, gain = {}, values["thrust_gain"]
-    for name, alpha in INERTIAS.items():
-        estimate = gain / values[alpha]
-        relative = NINETY_FIVE * np.hypot(std[alpha] / values[alpha], std.get("thrust_gain", 0.0) / gain)
-        table[name] = {"estimate": estimate, "ci95": [estimate * (1 - relative), estimate * (1 + relative)]}
+def intervals(body: RigidBody, gain: float = 1.0) -> dict[str, Any]:
+    """Moments of inertia [kg m^2] with 95 % intervals; `gain` multiplies them, as torques go with thrust."""
+    table = {}
+    for name, row in body.constants.items():
+        estimate, half_width = gain * row.estimate, gain * NINETY_FIVE * row.std
+        table[name] = {"estimate": estimate, "ci95": [estimate - half_width, estimate + half_width]}
     return table
 
 
-def described(fit: jaxos4.VehicleFit, seconds: float) -> tuple[Values, dict[str, Any]]:
-    """A value for each parameter, estimated or held; and what is written of the fit."""
+def inertias(problem: jaxos4.ShootingProblem, estimate: jaxos4.Estimate, gain: float = 1.0) -> dict[str, Any]:
+    """The `intervals` of an estimate's moments of inertia."""
+    names, bracket = problem.model.parameter_names, jaxos4.Bracket.default(jaxos4.FlightModel(AIRFRAME, terms=()))
+    return intervals(vehicle_constants(names, estimate, bracket, AIRFRAME), gain)
+
+
+def described(fit: jaxos4.VehicleFit, seconds: float, rollouts: int = 0) -> dict[str, Any]:
+    """A fit, for JSON; `rollouts`: those of earlier searches, which do not count."""
     model, found = fit.problem.model, fit.estimate
-    values = dict(zip(model.parameter_names, found.parameters.tolist(), strict=True))
     std = dict(zip(model.parameter_names, found.std.tolist(), strict=True))
     units = dict(zip(model.parameter_names, model.parameter_units, strict=True))
-    report = {
+    return {
         "result": str(jaxos4.result_names(found.result)),
         "cost": float(found.cost),
-        "rollouts": fit.rollouts,
+        "rollouts": fit.rollouts - rollouts,
         "cut": fit.cut,
         "seconds": seconds,
-        "parameters": {name: {"estimate": values[name], "std": std[name], "unit": units[name]} for name in values},
+        "parameters": {name: {"estimate": fit.values[name], "std": std[name], "unit": units[name]} for name in std},
         "held": {name: {"value": value, "note": note} for name, (value, note) in fit.held.items()},
+        "inertias": inertias(fit.problem, found),
+        "cross_checks": cross_checks(fit.values, std),
     }
-    if all(alpha in values for alpha in INERTIAS.values()):
-        report["inertias"] = inertias(values, std)
-        report["cross_checks"] = cross_checks(values, std)
-    return values | {name: value for name, (value, _) in fit.held.items()}, report
 
 
 def cross_checks(values: Values, std: Values) -> dict[str, Any]:
-    """Parameters that hardly show, beside what those that are told imply of them: far apart, neither is to be believed.
+    """Weakly identifiable parameters, compared with what the others imply: if they disagree, trust neither.
 
-    J_R should be alpha2 Ix and alpha5 Iy alike; alpha7 should be (Ix - Iy) / Iz.
+    J_R should be alpha2 Ix and also alpha5 Iy; alpha7 should be (Ix - Iy) / Iz.
     """
     checks: dict[str, Any] = {}
     for gyroscopic, alpha in (("alpha2", "alpha3"), ("alpha5", "alpha6")):
@@ -163,24 +164,14 @@ def cross_checks(values: Values, std: Values) -> dict[str, Any]:
 
 
 def fitted(problem: jaxos4.ShootingProblem) -> tuple[jaxos4.VehicleFit, float]:
-    """The fit in stages, and how long it took [s]."""
+    """The staged fit, and its time [s]."""
     begin = time.perf_counter()
     fit = jaxos4.fit_vehicle(problem, jaxos4.Bracket.default(problem.model))
     return fit, time.perf_counter() - begin
 
 
-def again(fit: jaxos4.VehicleFit, method: Callable[..., jaxos4.Estimate]) -> tuple[jaxos4.VehicleFit, float]:
-    """Another estimator on the problem of the last stage: same noise levels, same cut outliers."""
-    bracket, begin = jaxos4.Bracket.default(fit.problem.model), time.perf_counter()
-    found = jax.block_until_ready(method(fit.problem, bracket))
-    spent = time.perf_counter() - begin
-    covariance = jaxos4.robust_covariance(fit.problem, found.parameters, found.initial_state) / (1 - fit.cut) ** 2
-    found = eqx.tree_at(lambda e: e.covariance, found, covariance)
-    return fit._replace(estimate=found, rollouts=int(found.rollouts)), spent
-
-
 def hybrid_for(fit: jaxos4.VehicleFit, steps: int) -> jaxos4.Hybrid:
-    """A hybrid whose network was trained for this flight, at the noise found."""
+    """A hybrid with a network trained for this flight, at the noise levels that were found."""
     training = jaxos4.NetworkEstimator(steps=steps, batch=32, noise=(1.0, 1.0), held_out=1000, width=32, depth=1)
     bracket = jaxos4.Bracket.default(fit.problem.model)
     return jaxos4.Hybrid(training.fit(fit.problem, bracket, key=jax.random.key(0)))
@@ -189,37 +180,39 @@ def hybrid_for(fit: jaxos4.VehicleFit, steps: int) -> jaxos4.Hybrid:
 def estimators(parts: tuple[list, list], steps: int, names: list[str]) -> Iterator[tuple[str, dict, tuple]]:
     """IBSS in stages; the others, and IBSS with nothing held, on its last problem; IBSS without `flapping`."""
     fit, seconds = fitted(problem_of(parts[0], TERMS))
+    bracket = jaxos4.Bracket.default(problem_of(parts[0], TERMS).model)
     for name in ("ibss", *names):
-        terms, extra, used = TERMS, {}, fit
+        terms, extra, used, rollouts = TERMS, {}, fit, 0
+        begin = time.perf_counter()
         if name == "output-error":
-            used, seconds = again(fit, jaxos4.OutputError())
+            used, rollouts = refit(fit, jaxos4.OutputError(), bracket), fit.rollouts
         elif name == "hybrid":
-            begin = time.perf_counter()
             hybrid = hybrid_for(fit, steps)
             extra["training_seconds"] = time.perf_counter() - begin
-            used, seconds = again(fit, hybrid)
+            begin = time.perf_counter()
+            used, rollouts = refit(fit, hybrid, bracket), fit.rollouts
             at, seed = used.estimate.parameters, used.estimate.seed
             extra["seed_held_the_answer"] = bool(((at > seed.lower) & (at < seed.upper)).all())
         elif name == "ibss, nothing held":
-            free = eqx.tree_at(lambda p: p.model, fit.problem, problem_of(parts[0], TERMS).model)
-            used, seconds = again(fit._replace(problem=free, held={}), jaxos4.IBSS())
+            used, rollouts = refit(fit, jaxos4.IBSS(), bracket, held={}), fit.rollouts
         elif name == "ibss without flapping":
             terms = without(TERMS, "flapping")
-            used, seconds = fitted(problem_of(parts[0], terms))
-        values, table = described(used, seconds)
-        predicted = predict(values, parts[1], terms)
+            used, _ = fitted(problem_of(parts[0], terms))
+        if name != "ibss":
+            seconds = time.perf_counter() - begin
+        predicted = predict(used.values, parts[1], terms)
         print(f"{name}: {seconds:.0f} s", flush=True)
-        yield name, {**table, **extra, "skill": worth(predicted)}, (used, values, predicted)
+        yield name, {**described(used, seconds, rollouts), **extra, "skill": worth(predicted)}, (used, predicted)
 
 
 def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
-    """The root mean square of what the rate equations leave of each sample's change of the rates, over sigma."""
+    """The root mean square error of the rates predicted one sample ahead, over sigma."""
     model, flight = problem.model, problem.flight
     columns = np.array([STATE_NAMES.index(rate) for rate in "pqr"])
     rates, forcing, scalars = flight.states[:, columns], problem.forcing(parameters), tuple(parameters)
 
     def change(rates: jax.Array, forcing) -> jax.Array:
-        return flight.dt * jnp.stack(model.angular_acceleration(jaxos4.models.state.Rates(*rates), forcing, scalars))
+        return flight.dt * jnp.stack(model.angular_acceleration(Rates(*rates), forcing, scalars))
 
     rows = jax.tree.map(lambda leaf: leaf[:-1], forcing)
     predicted = (jax.vmap(change)(rates[:-1], rows) + jax.vmap(change)(rates[1:], rows)) / 2
@@ -229,12 +222,12 @@ def one_step(problem: jaxos4.ShootingProblem, parameters: jax.Array) -> float:
 
 
 def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
-    """Equation error with the same terms: alone, and with what shooting found out about the rotors and what to hold.
+    """Equation error with the same terms: alone, and with the rotors and the held parameters of shooting.
 
-    Alone it takes the lag and the delay that leave least of each sample's change of the rates, thrust and its curve as
-    documented, and holds nothing else.
+    Alone it takes the lag and the delay with the smallest `one_step` error, the documented thrust and its curve, and
+    holds nothing else.
     """
-    fit, shot, _ = found["ibss"]
+    fit, shot = found["ibss"][0], found["ibss"][0].values
     whole = problem_of(parts[0], without(TERMS, "accelerometer"))
     bare = eqx.tree_at(lambda p: p.sigma, whole, fit.problem.sigma[:12])
     of_shooting = {name: value for name, (value, _) in fit.held.items() if name in whole.model.parameter_names}
@@ -245,13 +238,15 @@ def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
         estimate = jaxos4.EquationError(memory=memory)(problem, jaxos4.Bracket.default(model))
         return problem, estimate, dict(zip(model.parameter_names, estimate.parameters.tolist(), strict=True)) | held
 
-    def left_out(memory: float, held: Values) -> Values:
-        """Standard deviations by leaving out a tenth of the flight at a time: what the model lacks is in them."""
+    def jackknifed(memory: float, held: Values, gain: float) -> dict[str, Any]:
+        """Inertias, with the jackknife's standard errors: these contain the errors of the model."""
+        problem, estimate, _ = regress(memory, held)
         some = []
         for part in np.array_split(np.arange(bare.flight.time.shape[0]), PARTS):
             states = bare.flight.states.at[part].set(jnp.nan)
-            some.append(regress(memory, held, bare=eqx.tree_at(lambda p: p.flight.states, bare, states))[2])
-        return {alpha: float(np.sqrt((PARTS - 1) * np.var([x[alpha] for x in some]))) for alpha in INERTIAS.values()}
+            some.append(regress(memory, held, bare=eqx.tree_at(lambda p: p.flight.states, bare, states))[1].parameters)
+        covariance = jnp.diag((PARTS - 1) * jnp.var(jnp.stack(some), axis=0))
+        return inertias(problem, eqx.tree_at(lambda e: e.covariance, estimate, covariance), gain)
 
     documented, grid = {"thrust_curve": 1.0}, []
     for lag in (0.01, *LAGS):
@@ -276,10 +271,10 @@ def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
             rows[f"memory {memory:g}, {choice}"] = {
                 "values": values,
                 "held": sorted(held),
-                "inertias": inertias(values | {"thrust_gain": gain}, left_out(memory, held)),
+                "inertias": jackknifed(memory, held, gain),
                 "skill": worth(predicted),
                 "minus_this": {
-                    name: difference(found[name][2], predicted)
+                    name: difference(found[name][1], predicted)
                     for name in ("ibss", "ibss, nothing held")
                     if name in found
                 },
@@ -289,24 +284,17 @@ def regressions(found: dict[str, tuple], parts: tuple[list, list]) -> dict:
 
 def lag_sensitivity(fit: jaxos4.VehicleFit, parts: tuple[list, list], lags: list[float]) -> list[dict[str, Any]]:
     """The last stage again with the lag held: same noise levels, same cut outliers; the delay stays free."""
-    whole, rows = problem_of(parts[0], TERMS).model, []
-    held = {name: value for name, (value, _) in fit.held.items()}
+    bracket, rows = jaxos4.Bracket.default(problem_of(parts[0], TERMS).model), []
     for lag in lags:
-        model = jaxos4.hold(whole, held | {"rotor_lag": lag})
-        problem = eqx.tree_at(lambda p: p.model, fit.problem, model)
-        found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(model))
-        covariance = jaxos4.robust_covariance(problem, found.parameters, found.initial_state) / (1 - fit.cut) ** 2
-        values = dict(zip(model.parameter_names, found.parameters.tolist(), strict=True))
-        std = dict(zip(model.parameter_names, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
-        at_quarter = worth(predict(values | held | {"rotor_lag": lag}, parts[1]))
+        one = refit(fit, jaxos4.IBSS(), bracket, held=fit.held | {"rotor_lag": (lag, "given")})
         rows.append(
             {
                 "lag": lag,
-                "delay": values.get("rotor_delay"),
-                "result": str(jaxos4.result_names(found.result)),
-                "cost": float(found.cost),
-                "inertias": inertias(values, std),
-                "skill": at_quarter,
+                "delay": one.values["rotor_delay"],
+                "result": str(jaxos4.result_names(one.estimate.result)),
+                "cost": float(one.estimate.cost),
+                "inertias": inertias(one.problem, one.estimate),
+                "skill": worth(predict(one.values, parts[1])),
             }
         )
         print(f"lag {lag:g} s: {rows[-1]['inertias']}", flush=True)
@@ -314,7 +302,7 @@ def lag_sensitivity(fit: jaxos4.VehicleFit, parts: tuple[list, list], lags: list
 
 
 def joint(folder: Path, seconds: float) -> dict[str, Any]:
-    """All flights at once, each with offsets of its own: what yaw needs."""
+    """All flights at once, each with its own offsets: only these excite yaw."""
     parts, recordings = [], []
     for number, name in enumerate(FLIGHTS):
         flight = read(folder, name)
@@ -329,19 +317,19 @@ def joint(folder: Path, seconds: float) -> dict[str, Any]:
         [FLIGHTS[number], float(part.time[0]), float(part.time[-1])]
         for number, part in zip(recordings, parts, strict=True)
     ]
-    return {**described(fit, spent)[1], "stretches": stretches}
+    return {**described(fit, spent), "stretches": stretches}
 
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the results.")],
     flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
     seconds: Annotated[float, typer.Option(help="How much of each flight.")] = np.inf,
-    steps: Annotated[int, typer.Option(help="Training of the hybrid's network.")] = 500,
-    names: Annotated[list[str], typer.Option(help="Beside IBSS.")] = NAMES,
-    lags: Annotated[list[float], typer.Option(help="At which the lag is held [s].")] = LAGS,
-    sections: Annotated[list[str], typer.Option(help="Of regression, lag, joint.")] = SECTIONS,
+    steps: Annotated[int, typer.Option(help="Training steps of the hybrid's network.")] = 500,
+    names: Annotated[list[str], typer.Option(help="Estimators besides IBSS.")] = NAMES,
+    lags: Annotated[list[float], typer.Option(help="Values at which the lag is held [s].")] = LAGS,
+    sections: Annotated[list[str], typer.Option(help="Some of regression, lag, joint.")] = SECTIONS,
 ) -> None:
-    """Fits, tests and compares."""
+    """Fit, test and compare."""
     folder = flights or (Path(os.environ["JAXOS4_FLIGHTS"]) if os.environ.get("JAXOS4_FLIGHTS") else None)
     if folder is None or not (folder / f"arpl_crazyflie_{FLIGHTS[0]}.csv").is_file():
         raise SystemExit(f"--flights: no arpl_crazyflie_{FLIGHTS[0]}.csv in {folder}: give the folder of the flights.")
@@ -367,7 +355,7 @@ def main(
     for name, table, found[name] in estimators(parts, steps, list(names)):
         report["estimators"][name] = table
         save()
-    fit, _, predicted = found["ibss"]
+    fit, predicted = found["ibss"]
     np.savez(out / "predictions.npz", block=_block_of(predicted), **predicted._asdict())
     if "regression" in sections:
         report["regression"] = regressions(found, parts)
@@ -381,7 +369,7 @@ def main(
 
 
 def _block_of(predicted: jaxos4.Predictions) -> np.ndarray:
-    """The tested block in which each start lies."""
+    """The tested block of each start."""
     length = round(WINDOW / DT)
     return predicted.start // (int(BLOCK / DT) // length * length)
 

@@ -1,16 +1,20 @@
-"""`jaxos4 estimate`: the parameters that a flight tells, with their intervals."""
+"""`jaxos4 estimate`: the parameters of a quadrotor from recorded flights, with 95 % intervals."""
 
 import shlex
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
+import msgspec
 import typer
 from rich.console import Console
 
+from .._files import read_toml
+from ..airframe import load_airframe
 from ..errors import InputError
-from ..identification.results import VehicleIdentification
+from ..identification import Identification, VehicleIdentification, identify
+from ..models import MODELS
+from ..recording import read_recording
 from ..report.flight_page import write_flight_page
 from ..report.identification_page import print_identification
 from ..results import RESULTS
@@ -23,23 +27,20 @@ from ._choices import (
     InitialState,
     InitialStateOption,
     Loss,
-    Model,
     OutOption,
     VehicleModel,
     WindowOption,
 )
-from ._flight import identify_flight
 from ._json import write_json
-from ._page import typed
-from ._recordings import HOLDOUT, WINDOW, Part
-from ._vehicle import identify_vehicle
+from ._messages import in_options, option_names
+from ._progress import stages
 
 
 def estimate(
-    flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A recorded flight; logs of one vehicle.")],
+    flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
     estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
     model: Annotated[
-        VehicleModel, typer.Option(help="The equations: as printed, corrected, or of a real vehicle in flight.")
+        VehicleModel, typer.Option(help="The equations: as printed, corrected, or those of a real vehicle.")
     ] = VehicleModel["published"],
     airframe: AirframeOption = "os4",
     bracket: BracketOption = None,
@@ -48,32 +49,33 @@ def estimate(
     window: WindowOption = None,
     network: Annotated[
         Path | None,
-        typer.Option(help="A file from `jaxos4 train`, for the network and the hybrid; trained now without it."),
+        typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now."),
     ] = None,
     validate: Annotated[
-        Path | None, typer.Option(metavar="OTHER.csv", help="A flight that is not fitted, to be predicted.")
+        Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
     ] = None,
     terms: Annotated[
         str | None,
-        typer.Option(help="With --model flight: offset,damping,... ; those that the logs allow without it."),
+        typer.Option(help="With --model flight: offset,damping,...; default: what the logs allow."),
     ] = None,
     begin: Annotated[
-        float | None, typer.Option("--from", metavar="SECONDS", help="With --model flight: use from there on.")
+        float | None,
+        typer.Option("--from", metavar="SECONDS", help="With --model flight: use the logs from this time on."),
     ] = None,
     end: Annotated[
-        float | None, typer.Option("--to", metavar="SECONDS", help="With --model flight: use up to there.")
+        float | None, typer.Option("--to", metavar="SECONDS", help="With --model flight: use the logs up to this time.")
     ] = None,
     sample_time: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="With --model flight: average to it; 0.004 where faster.")
+        float | None,
+        typer.Option(metavar="SECONDS", help="With --model flight: the sample time to average to."),
     ] = None,
     holdout: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="With --model flight: kept back to be predicted; 0.25.")
+        float | None,
+        typer.Option(metavar="SHARE", help="With --model flight: the share to predict; default: 0.25."),
     ] = None,
-    loss: Annotated[
-        Loss | None, typer.Option(help="With --model flight: whether outliers are cut; huber without it.")
-    ] = None,
+    loss: Annotated[Loss | None, typer.Option(help="With --model flight: huber (default) cuts outliers.")] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="With --model flight: a page to write.")
+        Path | None, typer.Option(metavar="FILE.html", help="With --model flight: an HTML report to write.")
     ] = None,
     out: OutOption = None,
 ) -> None:
@@ -84,69 +86,48 @@ def estimate(
             check_output(target, *flights, Path(airframe), bracket, network, validate)
     if out is not None and report is not None and out.resolve() == report.resolve():
         raise InputError(f"{out}: --out and --report name one file; give them two.")
-    if model == "flight":
-        refused = {"--channels": channels, "--network": network}
-        _refuse(refused, "a flight model compares the rates and the specific force, and trains its own network")
-        if initial_state == "known":
-            raise InputError("--initial-state known: each window begins in a state of its own; leave it out.")
-        kept_back = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
-        found, predicted = identify_vehicle(
-            console,
-            flights,
-            estimator=estimator.value,
-            airframe=airframe,
-            bracket=bracket,
-            terms=terms,
-            part=Part(begin, end, WINDOW if window is None else window, sample_time, kept_back),
-            validate=validate,
-            huber=loss != "squares",
-        )
-    else:
-        only = {"--terms": terms, "--from": begin, "--to": end, "--sample-time": sample_time}
-        only |= {"--holdout": holdout, "--loss": loss, "--report": report}
-        _refuse(only, f"is for --model flight, not {model}")
-        if len(flights) > 1:
-            raise InputError(f"{flights[1]}: --model {model} explains one flight; use --model flight for several.")
-        predicted = None
-        found = identify_flight(
-            console,
-            flights[0],
-            estimator,
-            Model(model.value),
-            airframe,
-            bracket=bracket,
-            channels=channels,
-            initial_state=initial_state,
-            window=window,
-            network=network,
-            validate=validate,
-        )
-    found["provenance"] |= _provenance()
+    is_vehicle = model == "flight"
+    if report is not None and not is_vehicle:
+        raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
+    vehicle = load_airframe(airframe)
+    options: dict[str, Any] = {
+        "estimator": estimator.value,
+        "bracket": None if bracket is None else read_toml(bracket),
+        "channels": None if channels is None else channels.value,
+        "initial_state": initial_state.value,
+        "window": window,
+        "network": network,
+        "terms": None if terms is None else [name.strip() for name in terms.split(",") if name.strip()],
+        "begin": begin,
+        "end": end,
+        "sample_time": sample_time,
+        "holdout": holdout,
+        "loss": None if loss is None else loss.value,
+    }
+    with stages("reading") as progress, option_names(bracket=bracket, network=network):
+        recordings = [read_recording(path, vehicle) for path in flights]
+        other = None if validate is None else read_recording(validate, vehicle)
+        subject = vehicle if is_vehicle else MODELS[model](vehicle)
+        found = identify(recordings, subject, validate=other, progress=progress, **options)
+    found = _with_command(found, airframe)
     if out is not None:
-        write_json(found, out)
-    identified = typed(found, predicted)
-    print_identification(console, identified)
-    if report is not None and isinstance(identified, VehicleIdentification):
-        write_flight_page(report, identified, title=", ".join(path.name for path in flights))
+        write_json(found.to_dict(), out)
+    for note in found.provenance["notes"]:
+        console.print(f"note: {note}", markup=False, highlight=False)
+    print_identification(console, found)
+    if report is not None and isinstance(found, VehicleIdentification):
+        write_flight_page(report, found, title=", ".join(path.name for path in flights))
         console.print(f"report: {report}", markup=False, highlight=False)
-    if found["result"] != "successful":
-        typer.echo(f"jaxos4: {found['result']}: {RESULTS[getattr(RESULTS, found['result'])]}", err=True)
+    if not found.successful:
+        typer.echo(f"jaxos4: {found.result}: {RESULTS[getattr(RESULTS, found.result)]}", err=True)
         raise typer.Exit(1)
 
 
-def _refuse(options: dict[str, Any], why: str) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise InputError(f"{name}: {why}; leave it out.")
-
-
-def _provenance() -> dict[str, str]:
-    from .. import __version__
-
-    return {
-        "version": __version__,
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
-        "precision": "float64",
+def _with_command(found: Identification, airframe: str) -> Identification:
+    """The identification with the command in its provenance, and its notes in the words of the command line."""
+    asked = {
+        "airframe": airframe,
+        "notes": [in_options(note) for note in found.provenance["notes"]],
         "command": shlex.join(["jaxos4", *sys.argv[1:]]),
     }
+    return msgspec.structs.replace(found, provenance=found.provenance | asked)

@@ -1,17 +1,16 @@
-"""`jaxos4 identifiability`: what a flight can tell of each parameter, and why not of the others."""
+"""`jaxos4 identifiability`: which parameters a flight can identify, and why not the others."""
 
 from pathlib import Path
 
-import numpy as np
 import rich.box
 from rich.console import Console
 from rich.table import Table
 
-from ..analysis.identifiability import Identifiability, identifiability as information_of
-from ..estimators import IBSS
-from ..flight import STATE_NAMES
-from ..identification.vehicle import NO_ANSWER
-from ..results import result_names
+from .._files import read_toml
+from ..airframe import load_airframe
+from ..identification import FlightInformation, assess
+from ..models import MODELS
+from ..recording import read_recording
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,
@@ -25,11 +24,13 @@ from ._choices import (
     OutOption,
     WindowOption,
 )
-from ._fitting import fit, load_job
-from ._json import finite, write_json
+from ._json import write_json
+from ._messages import option_names
+from ._progress import stages
 
-# Of a direction, what is not shown: shares of a half-width below this one of the largest.
+# Parameters with less than this share of the largest one are not shown in a direction.
 SMALL = 0.1
+_MOST_HALF_WIDTHS = 1e3
 
 
 def identifiability(
@@ -42,72 +43,60 @@ def identifiability(
     window: WindowOption = None,
     out: OutOption = None,
 ) -> None:
-    """Which of alpha_1..8 a flight can identify, and for the others the reason why not."""
+    """Find which of alpha_1..8 a flight can identify, and why not the others."""
     console = Console()
     if out is not None:
         check_output(out, flight, Path(airframe), bracket)
-    problem, where, said = load_job(flight, model, airframe, bracket, channels, initial_state, window)
-    for note in said:
+    subject = MODELS[model](load_airframe(airframe))
+    with stages("reading") as progress, option_names(bracket=bracket):
+        recording = read_recording(flight, subject.airframe)
+        found = assess(
+            recording,
+            subject,
+            bracket=None if bracket is None else read_toml(bracket),
+            channels=None if channels is None else channels.value,
+            initial_state=str(initial_state.value),
+            window=window,
+            progress=progress,
+        )
+    for note in recording.notes:
         console.print(f"note: {note}", markup=False, highlight=False)
-    problem, found, _, _ = fit(IBSS(), problem, where, shoots=True)
-    fitted = str(result_names(found.result)) not in NO_ANSWER
-    if not fitted:
-        console.print("note: no fit; what follows is at the bracket's center", highlight=False)
-    known = information_of(problem, where, found.parameters, found.initial_state if fitted else None)
+    _print_information(console, found)
+    if out is not None:
+        write_json(found.to_dict(), out)
 
+
+def _print_information(console: Console, found: FlightInformation) -> None:
+    if not found.fitted:
+        console.print("note: no fit; all numbers below hold at the bracket's centre", highlight=False)
     table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     for heading in ("parameter", "unit", "bound", "others known", "of bracket", "shows below"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
-    std, alone, share, limit = (
-        np.asarray(x) for x in (known.std, known.std_alone, known.std / known.half_width, known.noise_limit)
-    )
-    names, units = problem.model.parameter_names, problem.model.parameter_units
-    notes = known.notes(names)
-    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
-        shows = f"{limit[i]:.2g} x" if known.identifiable[i] and limit[i] > 0 else "-"
-        table.add_row(name, unit, f"{std[i]:.2g}", f"{alone[i]:.2g}", f"{share[i]:.2g}", shows)
+    for name, row in found.parameters.items():
+        bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
+        shows = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
+        table.add_row(name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", shows)
     console.print(table, markup=False)
     console.print(
-        "bound: least standard deviation at the noise found, and if all others were known; of bracket: above 1, the "
-        "flight tells less than the bracket; shows below: multiples of the noise at which the airframe's own value "
-        "would be told from 0.",
+        "bound: the least standard deviation at the noise levels found; others known: the same if all other parameters "
+        "were known; of bracket: bound over half-width, above 1 the parameter is not identifiable; shows below: the "
+        "largest noise, in multiples of the noise found, at which the airframe's value differs from 0 visibly.",
         highlight=False,
     )
-    for name, note in notes.items():
-        console.print(f"{name}: {note}", highlight=False)
-    if np.isfinite(std).all():
-        _print_weakest(console, known, names)
-    if out is not None:
-        report = {
-            "flight": str(flight),
-            "fitted": fitted,
-            "sigma": dict(zip(STATE_NAMES, problem.sigma.tolist(), strict=True)),
-            "parameters": {
-                name: {
-                    "bound": finite(std[i]),
-                    "others_known": finite(alone[i]),
-                    "half_width": float(known.half_width[i]),
-                    "noise_limit": finite(limit[i]) if np.isfinite(std[i]) else None,
-                    "unit": units[i],
-                    "note": notes.get(name, ""),
-                }
-                for i, name in enumerate(names)
-            },
-            "eigenvalues": known.eigenvalues.tolist() if np.isfinite(std).all() else None,
-            "directions": known.directions.T.tolist() if np.isfinite(std).all() else None,
-        }
-        write_json(report, out)
+    for name, row in found.parameters.items():
+        if row.note:
+            console.print(f"{name}: {row.note}", highlight=False)
+    if found.eigenvalues is not None and found.directions is not None:
+        _print_weakest(console, found.eigenvalues[0], dict(zip(found.parameters, found.directions[0], strict=True)))
 
 
-def _print_weakest(console: Console, known: Identifiability, names: tuple[str, ...]) -> None:
-    weakest = np.asarray(known.directions)[:, 0]
-    parts = [
-        f"{weakest[i]:+.2f} {names[i]}"
-        for i in np.argsort(-np.abs(weakest))
-        if abs(weakest[i]) > SMALL * abs(weakest).max()
-    ]
-    spread = 1 / np.sqrt(max(float(known.eigenvalues[0]), 1e-300))
-    size = f"{spread:.2g}" if spread < 1e3 else "over 1000"
+def _print_weakest(console: Console, eigenvalue: float, direction: dict[str, float]) -> None:
+    largest = max(abs(part) for part in direction.values())
+    ordered = sorted(direction.items(), key=lambda item: -abs(item[1]))
+    parts = " ".join(f"{part:+.2f} {name}" for name, part in ordered if abs(part) > SMALL * largest)
+    spread = max(eigenvalue, 1e-300) ** -0.5
+    size = f"{spread:.2g}" if spread < _MOST_HALF_WIDTHS else f"over {_MOST_HALF_WIDTHS:g}"
     console.print(
-        f"told least, in half-widths: {' '.join(parts)}, to {size} (1: as well as the bracket).", highlight=False
+        f"weakest direction, in half-widths of the bracket: {parts}, known to {size} (1: no better than the bracket).",
+        highlight=False,
     )

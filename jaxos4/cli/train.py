@@ -1,14 +1,19 @@
-"""`jaxos4 train`: a network for a flight's inputs, kept in a file."""
+"""`jaxos4 train`: train a network for a flight's inputs, and keep it in a file."""
 
-import dataclasses
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from .._files import read_toml
+from ..airframe import load_airframe
 from ..errors import InputError
-from ..networks import NetworkEstimator, save_network
+from ..identification.network import train_network
+from ..models import MODELS
+from ..networks import NetworkEstimator
+from ..networks.file import save_network
+from ..recording import read_recording
 from ._check_output import check_output
 from ._choices import (
     AirframeOption,
@@ -21,7 +26,7 @@ from ._choices import (
     Model,
     ModelOption,
 )
-from ._fitting import fit_network, load_job, seen_channels
+from ._messages import option_names
 
 
 def train(
@@ -32,17 +37,21 @@ def train(
     bracket: BracketOption = None,
     initial_state: InitialStateOption = InitialState["free"],
     features: Annotated[Features, typer.Option(help="What the network sees.")] = Features["score"],
-    approximator: Annotated[Approximator, typer.Option(help="What it is made of.")] = Approximator["mlp"],
+    approximator: Annotated[Approximator, typer.Option(help="The kind of network.")] = Approximator["mlp"],
     noise: Annotated[
-        tuple[float, float], typer.Option(help="Least and largest noise, in multiples of the standard one.")
+        tuple[float, float],
+        typer.Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
     ] = NetworkEstimator.noise,
     channels: Annotated[
-        Channels | None, typer.Option(help="What it looks at; the rates without it, or the attitude without rates.")
+        Channels | None,
+        typer.Option(
+            help="The channels that the network sees. Default: the rates, and the attitude if a rate was not measured."
+        ),
     ] = None,
-    steps: Annotated[int, typer.Option(help="Length of the training.")] = NetworkEstimator.steps,
-    seed: Annotated[int, typer.Option(help="Of the training.")] = 0,
+    steps: Annotated[int, typer.Option(help="Number of training steps.")] = NetworkEstimator.steps,
+    seed: Annotated[int, typer.Option(help="Random seed for training.")] = 0,
 ) -> None:
-    """Train a network for a flight's inputs, to identify any flight of the same inputs at once."""
+    """Train a network that identifies any flight with the inputs of this one."""
     if not 0 <= seed < 2**63:
         raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
     try:
@@ -50,17 +59,26 @@ def train(
     except ValueError as error:
         raise InputError(f"options: {error}") from None
     check_output(out, flight, Path(airframe), bracket)
-    problem, where, notes = load_job(flight, model, airframe, bracket, channels, initial_state)
-    for note in notes:
+    subject = MODELS[model](load_airframe(airframe))
+    recording = read_recording(flight, subject.airframe)
+    for note in recording.notes:
         typer.echo(f"note: {note}")
-    seen = seen_channels(problem) if channels is None else channels.value
-    training = dataclasses.replace(settings, channels=seen)
     begin = time.perf_counter()
-    network = fit_network(training, flight, problem, where, seed=seed)
+    with option_names(bracket=bracket):
+        network = train_network(
+            recording,
+            subject,
+            settings,
+            bracket=None if bracket is None else read_toml(bracket),
+            channels=None if channels is None else channels.value,
+            initial_state=str(initial_state.value),
+            seed=seed,
+            progress=True,
+        )
     save_network(network, out)
-    low, high = training.noise
+    low, high = noise
     typer.echo(
-        f"{out}: {features.value} features of the {seen}, noise {low:g} to {high:g} times the standard one, "
-        f"{model.value} model, {problem.flight.time.shape[0]} samples, loss {network.history[:, 1].min():.4g}, "
-        f"{time.perf_counter() - begin:.0f} s"
+        f"{out}: {features.value} features of the {network.channels}, noise {low:g} to {high:g} times the standard "
+        f"one, {model.value} model, {recording.flight.time.shape[0]} samples, loss "
+        f"{network.history[:, 1].min():.4g}, {time.perf_counter() - begin:.0f} s"
     )

@@ -1,4 +1,54 @@
-"""Whether a fit explains a flight."""
+"""How well a model explains flights that were fitted, and flights that were not."""
 
+import equinox as eqx
+from jaxtyping import Array
+
+from ..analysis.diagnostics import Diagnostics, residual_diagnostics
+from ..estimate import Estimate, fit_start
+from ..flight import STATE_NAMES, STATE_UNITS
+from ..models.state import CASCADE_ORDER
+from ..shooting import ShootingProblem
+from .results import ChannelFit, Validation, finite_or_none
+
+# Residuals are coloured if neighbours correlate by more than this: intervals then allow for it.
 COLOURED = 0.3
-"""Residuals whose neighbours correlate by more than this are not white noise: intervals must allow for it."""
+# Correlations of residuals are computed up to this many samples apart.
+_LAGS = 25
+_FEWEST_SAMPLES = 2
+
+
+def diagnose(problem: ShootingProblem, parameters: Array, initial_state: Array, *, fitted: bool) -> Diagnostics:
+    """Diagnostics of the residuals; `fitted`: whether the parameters were fitted to this flight."""
+    lags = min(_LAGS, problem.flight.states.shape[0] // 2)
+    return residual_diagnostics(problem, parameters, initial_state, fitted=fitted, lags=lags)
+
+
+def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str, ChannelFit]:
+    """The diagnostics of each measured channel, by its name."""
+    return {
+        STATE_NAMES[column]: ChannelFit(
+            rms=float(diagnostics.rms[i]),
+            unit=STATE_UNITS[column],
+            percent=finite_or_none(diagnostics.percent[i]),
+            level=float(diagnostics.level[i]),
+            level_p=float(diagnostics.level_p[i]),
+            correlation=float(diagnostics.colour[i]),
+            white_p=float(diagnostics.white_p[i]),
+            input_correlation=dict(
+                zip(("roll", "pitch", "yaw"), diagnostics.input_correlation[i].tolist(), strict=True)
+            ),
+            input_p=float(diagnostics.input_p[i]),
+        )
+        for i, column in enumerate(CASCADE_ORDER[: problem.size])
+        if diagnostics.count[i] > _FEWEST_SAMPLES
+    }
+
+
+def validate_on(problem: ShootingProblem, estimate: Estimate, other: ShootingProblem, name: str) -> Validation:
+    """How well the parameters explain another flight, named `name`; only its initial state is fitted."""
+    other = eqx.tree_at(lambda p: p.sigma, other, problem.sigma)
+    start, cost, sound, _ = eqx.filter_jit(fit_start)(other, estimate.parameters)
+    if not bool(sound):
+        return Validation(name, None, None)
+    diagnostics = diagnose(other, estimate.parameters, start, fitted=False)
+    return Validation(name, finite_or_none(cost), channel_fits(other, diagnostics))

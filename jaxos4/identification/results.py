@@ -1,25 +1,41 @@
 """What an identification returns: typed results, and the same as JSON."""
 
-from typing import Any
+import math
+from typing import Any, SupportsFloat
 
 import msgspec
 
+from ..analysis.identifiability import Identifiability
 from ..analysis.prediction import Predictions
 from ..estimate import Estimate
+from ..results import result_names
 from ..shooting import ShootingProblem
+
+# Results without an estimate.
+NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
+
+
+def has_answer(estimate: Estimate) -> bool:
+    """Whether there is an estimate at all, trustworthy or not."""
+    return str(result_names(estimate.result)) not in NO_ANSWER
+
+
+def finite_or_none(value: SupportsFloat) -> float | None:
+    """A number, or `None` if it is not finite."""
+    return float(value) if math.isfinite(float(value)) else None
 
 
 class ParameterEstimate(msgspec.Struct, frozen=True):
     """One estimated parameter.
 
     - `estimate`: in `unit`; `None` if the parameter is not identifiable.
-    - `std`: its standard deviation; `None` if it is not finite.
-    - `bound`: the Cramer-Rao bound at the noise that was found, as a standard deviation.
+    - `std`: standard deviation of the estimate; `None` if it is not finite.
+    - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation.
     - `ci95`: the 95 % interval; `None` if the parameter is not identifiable.
     - `unit`: of all these.
-    - `note`: what the user must know, or an empty string.
-    - `noise_limit`: below this multiple of the noise, the airframe's value could be distinguished from 0. One flight
-      of an OS4 only.
+    - `note`: a warning, or an empty string.
+    - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise. Only for one
+      flight of an OS4.
     """
 
     estimate: float | None
@@ -39,7 +55,7 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
 class Constant(msgspec.Struct, frozen=True):
     """A physical constant that follows from the parameters, with its standard deviation.
 
-    `note`: what it rests on. A vehicle's only.
+    `note`: the constants of the airframe that must be right. Only for a vehicle.
     """
 
     estimate: float
@@ -49,9 +65,9 @@ class Constant(msgspec.Struct, frozen=True):
 
 
 class RigidBody(msgspec.Struct, frozen=True):
-    """The rigid body that explains the alphas best.
+    """The moments of inertia that explain alpha_1..8 best.
 
-    - `constants`: Ix, Iy, Iz and J_R, those that are identifiable.
+    - `constants`: of Ix, Iy, Iz and J_R those that are identifiable.
     - `consistency_p`: how often the alphas of a rigid body would disagree this much or more; `None`: not tested.
     - `is_rigid_body`: whether no moment of inertia exceeds the sum of the other two; `None`: not tested.
     """
@@ -61,13 +77,16 @@ class RigidBody(msgspec.Struct, frozen=True):
     is_rigid_body: bool | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """As in the JSON: constants by name, then the tests that were made."""
+        """Constants by name, then the tests that were made."""
         tests = {"consistency_p": self.consistency_p, "rigid_body": self.is_rigid_body}
         return msgspec.to_builtins(self.constants) | {k: v for k, v in tests.items() if v is not None}
 
 
 class ChannelFit(msgspec.Struct, frozen=True):
-    """How well one channel is explained: see `jaxos4.Diagnostics` for what the numbers are."""
+    """How well the model explains one channel; `jaxos4.Diagnostics` defines the numbers.
+
+    `correlation`: of neighbouring residuals.
+    """
 
     rms: float
     unit: str
@@ -81,7 +100,7 @@ class ChannelFit(msgspec.Struct, frozen=True):
 
 
 class Validation(msgspec.Struct, frozen=True):
-    """How well a flight that was not fitted is explained; `None` where the model's trajectory diverges."""
+    """How well the model explains a flight that was not fitted; `None` if its trajectory diverges."""
 
     flight: str
     cost: float | None
@@ -89,7 +108,7 @@ class Validation(msgspec.Struct, frozen=True):
 
 
 class HeldParameter(msgspec.Struct, frozen=True):
-    """A parameter that was not estimated: its value, and why."""
+    """A parameter that was not estimated: the value used for it, and why."""
 
     value: float
     unit: str
@@ -97,9 +116,9 @@ class HeldParameter(msgspec.Struct, frozen=True):
 
 
 class RateSkill(msgspec.Struct, frozen=True):
-    """Skill of the predictions of one body rate, by horizon; see `jaxos4.Skill`.
+    """Skill of the predictions of one body rate, by horizon; `jaxos4.Skill` defines the numbers.
 
-    `equation_error`: the skill of regression with the same terms.
+    `equation_error`: the skill of a regression with the same terms.
     """
 
     skill: list[float | None]
@@ -110,7 +129,10 @@ class RateSkill(msgspec.Struct, frozen=True):
 
 
 class PredictionSkill(msgspec.Struct, frozen=True):
-    """Skill of predictions of what was not fitted, from so many starts, over horizons [s]."""
+    """Skill of predictions of measurements that were not fitted, by horizon [s].
+
+    `starts`: the number of predictions.
+    """
 
     horizons: list[float]
     starts: int
@@ -119,18 +141,18 @@ class PredictionSkill(msgspec.Struct, frozen=True):
     r: RateSkill
 
 
-class Identification(msgspec.Struct, frozen=True, kw_only=True):
-    """What is common to every identification.
+class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """The parameters of a quadrotor, with what a user needs to judge them. Made by `jaxos4.identify`.
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
-    - `rollouts`: simulated flights that all searches took together.
-    - `cost`: 1/2 |W (y - x)|^2 at the answer; `None` without one.
-    - `seconds`: from the first computation to the last.
-    - `parameters`: by name; empty without an answer of a vehicle.
+    - `rollouts`: simulated flights of all searches together.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate; `None` without one.
+    - `seconds`: computing time [s].
+    - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
-    - `provenance`: what was identified with what: inputs, settings, versions.
-    - `estimate`, `problem`: the same as arrays, and the problem that was solved; not in `to_dict`.
+    - `provenance`: inputs, settings, notes about the data, versions.
+    - `estimate`, `problem`: the estimate as arrays, and the problem that was solved; not in `to_dict`.
     """
 
     estimator: str
@@ -147,35 +169,40 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def successful(self) -> bool:
-        """Whether the answer can be used."""
+        """Whether the estimate can be trusted."""
         return self.result == "successful"
 
+    @property
+    def has_answer(self) -> bool:
+        """Whether there is an estimate at all."""
+        return self.result not in NO_ANSWER
+
     def to_dict(self) -> dict[str, Any]:
-        """Dictionaries, lists, numbers and strings, ready for JSON."""
-        arrays = ("estimate", "problem", "predictions")
-        fields = {name: getattr(self, name) for name in self.__struct_fields__ if name not in (*arrays, "rigid_body")}
-        return msgspec.to_builtins(fields) | {"constants": self.rigid_body.to_dict()}
+        """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON."""
+        apart = ("rigid_body", "estimate", "problem", "predictions")
+        fields = {name: getattr(self, name) for name in self.__struct_fields__ if name not in apart}
+        return msgspec.to_builtins(fields | {"constants": self.rigid_body.to_dict()})
 
 
-class FlightIdentification(Identification, frozen=True, kw_only=True):
+class FlightIdentification(Identification, frozen=True, kw_only=True, eq=False):
     """An OS4 model identified from one flight.
 
-    - `fit`: how well each measured channel is explained, by its name.
-    - `validation`: the same of another flight, if there was one.
+    - `fit`: how well the model explains each measured channel, by the channel's name.
+    - `validation`: the same for another flight, if one was given.
     """
 
     fit: dict[str, ChannelFit]
     validation: Validation | None
 
 
-class VehicleIdentification(Identification, frozen=True, kw_only=True):
+class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False):
     """A real vehicle identified from its recordings.
 
     - `held`: parameters that were not estimated.
     - `cut`: the share of the measurements that Huber's loss cut.
     - `noise`: standard deviation of the residuals by channel.
-    - `skill`: of predictions of what was not fitted; `None` if there is nothing to predict.
-    - `predictions`: these predictions; not in `to_dict`.
+    - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
+    - `predictions`: the predictions themselves; not in `to_dict`.
     """
 
     held: dict[str, HeldParameter]
@@ -183,3 +210,47 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True):
     noise: dict[str, float]
     skill: PredictionSkill | None
     predictions: Predictions | None
+
+
+class ParameterInformation(msgspec.Struct, frozen=True):
+    """What a flight can say about one parameter.
+
+    - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation; `None`: infinite.
+    - `others_known`: the same if all other parameters were known.
+    - `half_width`: of the bracket.
+    - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise.
+    - `unit`: of the first three.
+    - `note`: why the parameter is not identifiable, or an empty string.
+    """
+
+    bound: float | None
+    others_known: float | None
+    half_width: float
+    noise_limit: float | None
+    unit: str
+    note: str
+
+
+class FlightInformation(msgspec.Struct, frozen=True, eq=False):
+    """Which parameters one flight can identify. Made by `jaxos4.assess`.
+
+    - `flight`: its name.
+    - `fitted`: whether the model could be fitted; otherwise all numbers hold at the bracket's centre.
+    - `sigma`: the noise levels that were found, by channel.
+    - `parameters`: by name.
+    - `eigenvalues`, `directions`: see `jaxos4.Identifiability`; a direction is a row. `None` without a trajectory.
+    - `identifiability`: the same as arrays; not in `to_dict`.
+    """
+
+    flight: str
+    fitted: bool
+    sigma: dict[str, float]
+    parameters: dict[str, ParameterInformation]
+    eigenvalues: list[float] | None
+    directions: list[list[float]] | None
+    identifiability: Identifiability
+
+    def to_dict(self) -> dict[str, Any]:
+        """Dictionaries, lists, numbers and strings: what `jaxos4 identifiability` writes as JSON."""
+        names = (name for name in self.__struct_fields__ if name != "identifiability")
+        return msgspec.to_builtins({name: getattr(self, name) for name in names})

@@ -1,8 +1,10 @@
-"""What a recorded flight goes through before it is fitted."""
+"""What happens to a recorded flight before it is fitted."""
 
 from .averaging import averaged as averaged
 from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
-from .stretches import (
+from .joining import join as join
+from .reading import Recording as Recording, read_recording as read_recording
+from .usable import (
     Stretch as Stretch,
     cut as cut,
     stretches as stretches,

@@ -6,14 +6,15 @@ from jaxtyping import Float
 from ..flight import Flight
 from ..logs.resample import UNIFORM, root_mean_square
 
-# Sample times that differ by less than this share are one: as in `join`.
-_SAME_STEP = 1e-6
-_HALF = 0.45  # of a coarser sample: less of it measured is not measured; the first and the last have half of theirs
+# Sample times that differ by less than this share are equal.
+_EQUAL_STEPS = 1e-6
+# A longer sample needs this share measured. Below one half, because the first and the last have half of their rows.
+_MEASURED = 0.45
 
 
 def averaged(flight: Flight, dt: float) -> Flight:
-    """A flight on a coarser grid of step `dt` [s]: see `average`. Itself where its own step is no finer."""
-    if dt <= float(flight.dt) * (1 + _SAME_STEP):
+    """A flight averaged to samples of `dt` [s], see `average`; unchanged if its samples are not shorter."""
+    if dt <= float(flight.dt) * (1 + _EQUAL_STEPS):
         return flight
     t, omega, channels = (np.asarray(x) for x in (flight.time, flight.omega, flight.channels))
     time, omega, channels = average(t, omega, channels, dt)
@@ -27,11 +28,15 @@ def average(
     channels: Float[np.ndarray, "rows channels"],
     dt: float,
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 4"], Float[np.ndarray, "samples channels"]]:
-    """Rows on a uniform grid on a coarser one, of step `dt` [s], from their first time on.
+    """Average uniformly sampled rows to longer samples of `dt` [s], from the first time on.
 
-    Each measurement becomes the mean over `dt` around its time, so that vibration above the new rate does not fold down
-    and no phase is lost; NaN where less than half of that was measured. Rotor speeds become root mean squares over the
-    sample that follows, as in `resample`.
+    Each measurement becomes the mean over `dt` around its time, which removes vibration above the new rate without a
+    delay. It is missing (NaN) if less than about half of that time was measured. Each rotor speed becomes the root mean
+    square over the sample that follows, as in `resample`.
+
+    **Arguments:** times [s], rotor speeds [rad/s], channels, and the new sample time [s].
+
+    **Returns:** times, rotor speeds and channels of the longer samples.
     """
     own = (t[-1] - t[0]) / (t.size - 1)
     grid = t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + UNIFORM) + 1)
@@ -42,6 +47,6 @@ def average(
         measured = np.isfinite(channel)
         sums = np.append(0.0, np.cumsum(np.where(measured, channel, 0.0)))
         total, share = (np.diff(np.interp(ends, edges, x)) for x in (sums, np.append(0.0, np.cumsum(measured))))
-        told = share > _HALF * dt / own
-        even[:, i] = np.where(told, total / np.where(told, share, 1.0), np.nan)
+        enough = share > _MEASURED * dt / own
+        even[:, i] = np.where(enough, total / np.where(enough, share, 1.0), np.nan)
     return grid, root_mean_square(t, omega, grid, dt), even

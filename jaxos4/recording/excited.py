@@ -1,4 +1,4 @@
-"""What excites a vehicle about its axes in a flight, and how noisy its gyro is."""
+"""How much a flight excites each axis, and how noisy the gyro is."""
 
 import math
 from typing import NamedTuple
@@ -11,17 +11,17 @@ from ..flight import STATE_NAMES, Flight
 
 RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
 _ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi"))
-_GOOD, _WEAK = 0.3, 0.1  # [rad/s] of a body rate's standard deviation
-_OVER_NOISE = 5.0  # times the gyro's noise, below which a rate tells nothing
+_GOOD, _WEAK = 0.3, 0.1  # [rad/s], standard deviation of a body rate
+_OVER_NOISE = 5.0  # a rate below this many times the gyro's noise is not excited
 
 
 class Excitation(NamedTuple):
-    """What moves a vehicle about one axis.
+    """How much a flight excites one axis.
 
     - `axis`: roll, pitch or yaw.
     - `torque`: standard deviation of the rotors' torque [N m]; NaN without an airframe.
-    - `rate`: of the body rate [rad/s]; NaN where neither it nor its angle was measured.
-    - `noise`: of the gyro [rad/s], from second differences: white noise up to half the sampling frequency.
+    - `rate`: standard deviation of the body rate [rad/s]; NaN if neither it nor its angle was measured.
+    - `noise`: standard deviation of the gyro's white noise [rad/s], see `gyro_noise`.
     - `verdict`: "good", "weak", "none" or "not measured".
     """
 
@@ -33,7 +33,7 @@ class Excitation(NamedTuple):
 
 
 def excitation(flight: Flight, airframe: Airframe | None = None) -> tuple[Excitation, Excitation, Excitation]:
-    """What moves the vehicle about roll, pitch and yaw, over all of `flight`."""
+    """The excitation of roll, pitch and yaw over the whole flight; the torque needs an airframe."""
     omega, states = np.asarray(flight.omega, dtype=float), np.asarray(flight.states, dtype=float)
     torque = np.full(3, math.nan)
     if airframe is not None:
@@ -50,9 +50,9 @@ def excitation(flight: Flight, airframe: Airframe | None = None) -> tuple[Excita
 
 
 def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
-    """The standard deviation of white noise on a body rate [rad/s]; NaN where too little was measured.
+    """The standard deviation of the white noise on a body rate [rad/s]; NaN if too little was measured.
 
-    From the median size of second differences, which motion hardly touches: it is smooth from sample to sample.
+    It follows from the median size of second differences: motion is smooth from sample to sample, noise is not.
     """
     second = np.diff(rate, 2)
     second = np.abs(second[np.isfinite(second)])

@@ -16,7 +16,7 @@ from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem
 from .excited import RATE_COLUMNS, excitation
-from .stretches import Stretch, cut, stretches
+from .usable import Stretch, cut, stretches
 
 RATES = ("p", "q", "r")
 # The identifiability is computed from this much of a stretch [s], in windows of this length [s].

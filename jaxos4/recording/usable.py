@@ -1,7 +1,7 @@
 """Which parts of a flight can be used for identification, and why not the others.
 
-Usable is what was flown: the rotors carry the vehicle, none of them rests or is at its limit for longer than a moment,
-the gyro is not clipped, nothing was lost, and it is no crash. A part is cut out of a flight with its time kept.
+A part is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, the gyro
+is not clipped, no samples are lost, and the vehicle does not crash.
 """
 
 import math
@@ -15,25 +15,25 @@ from ..errors import InputError
 from ..flight import Flight
 from .excited import RATE_COLUMNS
 
-SHORTEST = 1.0  # [s] of a stretch
-MOMENT = 0.1  # [s] that a rotor may rest or be at its limit: about the lag of a rotor
-_CARRIES = 0.3  # of the weight: with less thrust for `_SUSTAINED`, the vehicle stands on the ground
-_SUSTAINED = 0.5  # [s] below which thrust may be missing in flight, and there on the ground
-_MARGIN = 0.3  # [s] from the ground to free flight
-_GAP = 0.05  # [s] without a measurement
-_LIMIT = 1e-3  # of a rotor's largest speed: what counts as the same value
-_FULL = 0.995  # of the airframe's `max_rotor_speed`
-_CLIPPED = 5  # samples in a row at a gyro's largest value
+SHORTEST = 1.0  # [s], of a usable stretch
+MOMENT = 0.1  # [s]; a rotor may rest or be at its limit for this long: about its lag
+_CARRIES = 0.3  # share of the weight; with less thrust for `_SUSTAINED`, the vehicle is on the ground
+_SUSTAINED = 0.5  # [s]; shorter pauses of thrust happen in flight, shorter bursts on the ground
+_MARGIN = 0.3  # [s], between the ground and free flight
+_GAP = 0.05  # [s], the longest without a measurement
+_LIMIT = 1e-3  # share of a rotor's largest speed; smaller differences count as none
+_FULL = 0.995  # share of the airframe's `max_rotor_speed`
+_CLIPPED = 5  # samples in a row at the gyro's largest value
 _SLOWEST_CLIP = 3.0  # [rad/s]: no gyro's range ends below 4.3 (250 deg/s)
 _IMPACT_FORCE, _IMPACT_RATE = 50.0, 15.0  # [m/s^2], and [rad/s] within `_IMPACT_TIME`
 _IMPACT_TIME = 0.02  # [s]
-_AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s] to rotors that stand, and from flight that can be trusted
+_AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s], until the rotors stop; not trusted before the impact
 
-_USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last that applies is the reason
+_USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last one that applies counts
 
 
 class Stretch(NamedTuple):
-    """A part of a flight, from `begin` to `end` [s], both samples of it; `reason`: why it is not usable, or empty."""
+    """A part of a flight, from the sample at `begin` to that at `end` [s]; `reason`: why it is not usable, or empty."""
 
     begin: float
     end: float
@@ -53,13 +53,13 @@ class _Saturation(NamedTuple):
 
 
 def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
-    """All of a flight, in order: what is usable and what is not, with the reason.
+    """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
     **Arguments:**
 
     - `flight`: one flight, not a batch.
-    - `airframe`: what weighs how much, and how fast rotors turn. Without it, or where it is another vehicle's (its
-      rotors would carry less than a third or more than three times the weight), a rotor's usual speed is what carries.
+    - `airframe`: the weight, and the largest rotor speed. If there is none, or if it is evidently another vehicle's
+      (thrust below a third or above three times the weight), the median thrust is taken as the weight.
     """
     time, omega = np.asarray(flight.time, dtype=float), np.asarray(flight.omega, dtype=float)
     states, dt = np.asarray(flight.states, dtype=float), float(flight.dt)
@@ -85,14 +85,14 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
 
 
 def usable_stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
-    """The usable ones of `stretches`, in order; none is shorter than a second."""
+    """The usable stretches, in order; each lasts at least one second."""
     return tuple(stretch for stretch in stretches(flight, airframe) if not stretch.reason)
 
 
 def cut(flight: Flight, stretch: Stretch) -> Flight:
-    """The part of a flight from `stretch.begin` to `stretch.end`, with its time kept.
+    """The part of a flight from `stretch.begin` to `stretch.end`; its time stays as recorded.
 
-    **Raises:** `InputError` where fewer than two samples lie there.
+    **Raises:** `InputError` if the part has fewer than two samples.
     """
     time, half = np.asarray(flight.time), float(flight.dt) / 2
     inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
@@ -119,7 +119,7 @@ def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
 
 
 def _ground(share: np.ndarray, dt: float) -> np.ndarray:
-    """Where the rotors do not carry the vehicle, with a margin toward flight."""
+    """The samples on the ground, with a margin toward flight."""
     carried = share >= _CARRIES
     for value in (True, False):  # short pauses in flight first, then short bursts on the ground
         for begin, end in _runs(carried != value):
@@ -142,7 +142,7 @@ def _clipped(rates: np.ndarray) -> np.ndarray:
 
 
 def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> list[_Saturation]:
-    """Where a rotor rests, or is at its limit, for longer than a moment."""
+    """The runs in which a rotor rests, or is at its limit, for longer than a moment."""
     found = []
     full_scale = math.inf if airframe is None else float(airframe.max_rotor_speed)
     for i, speed in enumerate(omega.T):
@@ -164,28 +164,28 @@ def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> lis
 
 
 def _steady(speed: np.ndarray, same: float) -> np.ndarray:
-    """Samples that are as the one before or after them."""
+    """Whether each sample equals the one before or after it."""
     equal = np.abs(np.diff(speed)) <= same
     return np.append(equal, False) | np.insert(equal, 0, False)
 
 
 def _lost(states: np.ndarray, dt: float) -> np.ndarray:
-    """Where nothing was measured for longer than a moment, of the rates or of whatever else was measured."""
+    """The samples in gaps of the rates; without any rate, in gaps of all channels together."""
     out = np.zeros(states.shape[0], dtype=bool)
     seen = np.isfinite(states)
     columns = [c for c in RATE_COLUMNS if seen[:, c].any()]
     groups = [seen[:, c] for c in columns] or [seen.any(axis=1)]
-    for there in groups:
-        at = np.flatnonzero(there)
+    for measured in groups:
+        at = np.flatnonzero(measured)
         usual = float(np.median(np.diff(at))) * dt if at.size > 1 else 0.0
-        for begin, end in _runs(np.asarray(~there)):
+        for begin, end in _runs(np.asarray(~measured)):
             if (end - begin + 1) * dt > max(_GAP, 5 * usual):
                 out[begin:end] = True
     return out
 
 
 def _crashed(flight: Flight, share: np.ndarray, ground: np.ndarray, dt: float) -> np.ndarray:
-    """From shortly before an impact to rotors that stand soon after, or to a record that ends."""
+    """The samples of a crash: from before an impact until the rotors stop, or the recording ends, soon after."""
     out = np.zeros(share.size, dtype=bool)
     impact = np.zeros(share.size, dtype=bool)
     if flight.specific_force is not None:
@@ -226,7 +226,7 @@ def _samples(seconds: float, dt: float) -> int:
 
 
 def _runs(where: Bool[np.ndarray, " samples"]) -> list[tuple[int, int]]:
-    """Begin and end (exclusive) of each run of true."""
+    """Begin and end (exclusive) of each run of `True`."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
 

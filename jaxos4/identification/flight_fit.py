@@ -1,0 +1,96 @@
+"""The fit of one flight: the parameters of an OS4, with the noise levels of the sensors."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._custom_types import Parameters
+from ..analysis.diagnostics import Diagnostics
+from ..analysis.fisher import cramer_rao_bound
+from ..analysis.sandwich import robust_covariance
+from ..bracket import Bracket
+from ..estimate import AbstractEstimator, Estimate
+from ..results import RESULTS
+from ..shooting import ShootingProblem
+from .noise_levels import refine
+from .quality import COLOURED, diagnose
+from .results import has_answer
+
+# Noise levels are computed at most this often before the last estimate.
+_PASSES = 3
+
+
+class FlightFit(NamedTuple):
+    """One flight's estimate.
+
+    - `problem`: with the noise levels that were found.
+    - `estimate`: with its cost and covariance at these noise levels.
+    - `bound`: standard deviations of the Cramer-Rao bound at these noise levels.
+    - `rollouts`: of all searches together.
+    - `diagnostics`: of the residuals; `None` without an answer.
+    """
+
+    problem: ShootingProblem
+    estimate: Estimate
+    bound: Parameters
+    rollouts: int
+    diagnostics: Diagnostics | None = None
+
+
+def fit_flight(
+    estimator: AbstractEstimator,
+    problem: ShootingProblem,
+    bracket: Bracket,
+    *,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> FlightFit:
+    """Estimate the parameters and the noise levels of one flight.
+
+    The covariance of an estimator that shoots is the Cramer-Rao bound, or `robust_covariance` if residuals are
+    coloured. The other estimators have their own, and estimate once more with the last noise levels.
+    """
+    fit = _with_noise_levels(estimator, problem, bracket, progress)
+    if not has_answer(fit.estimate):
+        return fit
+    problem, estimate = fit.problem, fit.estimate
+    diagnostics = diagnose(problem, estimate.parameters, estimate.initial_state, fitted=True)
+    if estimator.shoots and (diagnostics.colour > COLOURED).any():
+        covariance = robust_covariance(problem, estimate.parameters, estimate.initial_state)
+        estimate = eqx.tree_at(lambda e: e.covariance, estimate, covariance)
+    return fit._replace(estimate=estimate, diagnostics=diagnostics)
+
+
+def _with_noise_levels(
+    estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket, progress: Callable[[str], None]
+) -> FlightFit:
+    passes = 0
+
+    def search(weighted: ShootingProblem, previous: Estimate | None, colour: float) -> Estimate:
+        nonlocal passes
+        del colour
+        progress("compiling and fitting" if previous is None else f"fitting with the noise levels of pass {passes}")
+        passes += 1
+        return jax.block_until_ready(estimator(weighted, bracket))
+
+    def failed(estimate: Estimate) -> bool:
+        return estimator.shoots and bool(estimate.result != RESULTS.successful)
+
+    refined = refine(problem, search, passes=_PASSES, stop=failed)
+    problem, estimate, rollouts = refined.problem, refined.estimate, refined.rollouts
+    if not has_answer(estimate):
+        return FlightFit(problem, estimate, estimate.std, rollouts)
+    if not refined.settled:
+        problem = problem.reweighted(problem.residuals(estimate.parameters, estimate.initial_state))
+    if not estimator.shoots:
+        estimate = search(problem, estimate, refined.colour)
+        rollouts += int(estimate.rollouts)
+        if not has_answer(estimate):
+            return FlightFit(problem, estimate, estimate.std, rollouts)
+    bound = cramer_rao_bound(problem, estimate.parameters, estimate.initial_state)
+    cost = problem.cost(estimate.parameters, estimate.initial_state)
+    covariance = bound if estimator.shoots else estimate.covariance
+    estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, (covariance, cost))
+    return FlightFit(problem, estimate, jnp.sqrt(jnp.diagonal(bound)), rollouts)

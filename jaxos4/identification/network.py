@@ -1,0 +1,88 @@
+"""Networks that are trained for one flight's inputs."""
+
+import dataclasses
+import os
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..bracket import Bracket
+from ..errors import InputError
+from ..models.abstract import AbstractModel
+from ..models.state import CASCADE_ORDER, CHANNELS
+from ..networks import NetworkEstimator, TrainedNetwork
+from ..networks.file import load_network
+from ..recording.reading import Recording
+from ..shooting import ShootingProblem
+from .problem import Intervals, bracket_of, flight_problem
+
+# Steps of training for a network that only gives a search its start.
+_SEED_STEPS = 2000
+# The same for a vehicle's flights in windows.
+_VEHICLE_TRAINING = NetworkEstimator(steps=500, batch=64, noise=(1.0, 1.0), held_out=1000)
+
+
+def train_network(
+    recording: Recording,
+    model: AbstractModel,
+    settings: NetworkEstimator | None = None,
+    *,
+    bracket: Intervals = None,
+    channels: str | None = None,
+    initial_state: str = "free",
+    seed: int = 0,
+    progress: bool = False,
+) -> TrainedNetwork:
+    """Train a network that identifies any flight with the inputs of this one. Arguments as of `jaxos4.identify`.
+
+    - `settings`: of the training, but for the channels.
+    - `channels`: what the network looks at; by default the rates, and the attitude if a rate was not measured.
+    - `progress`: whether to show a bar.
+    """
+    problem = flight_problem(recording, model, channels=channels, initial_state=initial_state)
+    seen = channels or _seen_channels(problem)
+    settings = dataclasses.replace(settings or NetworkEstimator(), channels=seen)
+    return _train(settings, problem, bracket_of(bracket, model), recording.name, seed, progress)
+
+
+def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
+    """Train a network for one flight, named `name`: briefly if shooting follows (`shoots`)."""
+    steps = _SEED_STEPS if shoots else NetworkEstimator.steps
+    return _train(NetworkEstimator(channels=_seen_channels(problem), steps=steps), problem, bracket, name, seed, False)
+
+
+def vehicle_network_for(problem: ShootingProblem, bracket: Bracket, seed: int) -> TrainedNetwork:
+    """Train a network for a vehicle's flights in windows, at the noise levels of the problem."""
+    return _VEHICLE_TRAINING.fit(problem, bracket, key=jax.random.key(seed))
+
+
+def loaded(network: TrainedNetwork | str | os.PathLike[str] | None) -> TrainedNetwork | None:
+    """A network, or the one in a file. Raises as `jaxos4.load_network`."""
+    return network if network is None or isinstance(network, TrainedNetwork) else load_network(network)
+
+
+def network_provenance(
+    given: TrainedNetwork | str | os.PathLike[str] | None, network: TrainedNetwork
+) -> dict[str, Any]:
+    """Where a network is from and how it was trained, for JSON."""
+    bracket = network.bracket
+    return {
+        "file": None if given is None or isinstance(given, TrainedNetwork) else os.fspath(given),
+        "settings": {f.name: getattr(network.settings, f.name) for f in dataclasses.fields(network.settings)},
+        "bracket": {"lower": bracket.lower.tolist(), "upper": bracket.upper.tolist()},
+    }
+
+
+def _seen_channels(problem: ShootingProblem) -> str:
+    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
+    return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"
+
+
+def _train(
+    settings: NetworkEstimator, problem: ShootingProblem, bracket: Bracket, name: str, seed: int, progress: bool
+) -> TrainedNetwork:
+    try:
+        return settings.fit(problem, bracket, key=jax.random.key(seed), progress=progress)
+    except ValueError as error:
+        raise InputError(f"{name}: {error}") from None

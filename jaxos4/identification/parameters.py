@@ -1,0 +1,60 @@
+"""The table of parameters: estimates with intervals, and notes."""
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+
+from .._custom_types import Parameters
+from ..bracket import NO_PRIOR, Bracket
+from ..estimate import Estimate
+from ..models.abstract import AbstractModel
+from .results import ParameterEstimate, finite_or_none
+
+
+def parameter_table(
+    model: AbstractModel,
+    estimate: Estimate,
+    bound: Parameters,
+    bracket: Bracket,
+    *,
+    prior: float = NO_PRIOR,
+    reason: Callable[[int], str] = lambda i: "not identifiable from these flights",
+    noise_limit: Callable[[int], float | None] | None = None,
+) -> dict[str, ParameterEstimate]:
+    """Estimates by parameter name.
+
+    **Arguments:**
+
+    - `bound`: standard deviations of the Cramer-Rao bound.
+    - `bracket`: of the model's parameters; decides with `prior` which are identifiable, see `Bracket.identifies`.
+    - `reason`: why a parameter is not identifiable, by its place.
+    - `noise_limit`: by place; see `ParameterEstimate`.
+    """
+    identifiable, half_width = (
+        np.asarray(bracket.identifies(estimate.std, prior)),
+        np.asarray(estimate.half_width(0.95)),
+    )
+    values, std, bounds = (np.asarray(x) for x in (estimate.parameters, estimate.std, bound))
+    return {
+        name: ParameterEstimate(
+            estimate=float(values[i]) if identifiable[i] else None,
+            std=finite_or_none(std[i]),
+            bound=finite_or_none(bounds[i]),
+            ci95=(float(values[i] - half_width[i]), float(values[i] + half_width[i])) if identifiable[i] else None,
+            unit=unit,
+            note=_note(estimate, bracket, i, float(half_width[i])) if identifiable[i] else reason(i),
+            noise_limit=msgspec.UNSET if noise_limit is None else noise_limit(i),
+        )
+        for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True))
+    }
+
+
+def _note(estimate: Estimate, bracket: Bracket, i: int, half_width: float) -> str:
+    value, seed = float(estimate.parameters[i]), estimate.seed
+    notes = ["below noise"] if abs(value) < half_width else []
+    if not float(bracket.lower[i]) <= value <= float(bracket.upper[i]):
+        notes.append("outside its bracket")
+    if seed is not None and not seed.lower[i] <= value <= seed.upper[i]:
+        notes.append("outside the network's interval")
+    return "; ".join(notes)

@@ -1,0 +1,131 @@
+"""From a recorded flight and a model to the problem that estimators solve."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..bracket import Bracket
+from ..errors import InputError
+from ..flight import STATE_NAMES
+from ..models.abstract import AbstractModel
+from ..models.state import CASCADE_ORDER, CHANNELS
+from ..noise import SENSOR_SIGMA
+from ..recording.reading import Recording
+from ..shooting import ShootingProblem
+
+# A bracket, or `[lower, upper]` by parameter name.
+Intervals = Bracket | Mapping[str, Any] | None
+# The states that each choice of channels adds to the one before, in cascade order.
+_ADDED = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
+
+
+def bracket_of(bracket: Intervals, model: AbstractModel) -> Bracket:
+    """The bracket of a model's parameters.
+
+    **Arguments:**
+
+    - `bracket`: a bracket, or `[lower, upper]` by parameter name; the model's default for all others.
+
+    **Raises:** `InputError` for unknown parameters, or intervals that are not two rising numbers.
+    """
+    names = model.parameter_names
+    if isinstance(bracket, Bracket):
+        if bracket.lower.shape != (len(names),):
+            raise InputError(f"`bracket`: must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
+        return bracket
+    default = Bracket.default(model)
+    if bracket is None:
+        return default
+    ends = np.stack([np.asarray(end) for end in (default.lower, default.upper)], axis=1)
+    for name, value in bracket.items():
+        if name not in names:
+            raise InputError(f"`bracket`: knows no parameter `{name}`; the parameters are {', '.join(names)}.")
+        ends[names.index(name)] = _interval(name, value)
+    return Bracket(jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1]))
+
+
+def _interval(name: str, value: Any) -> list[float]:
+    pair = value if isinstance(value, list | tuple) else []
+    numbers = [float(x) for x in pair if isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < 1e12]
+    if len(pair) != 2 or len(numbers) != 2 or not numbers[0] < numbers[1]:
+        raise InputError(f"`bracket`: `{name}` must be [lower, upper] with lower below upper, got {repr(value)[:80]}.")
+    return numbers
+
+
+def flight_problem(
+    recording: Recording,
+    model: AbstractModel,
+    *,
+    channels: str | None = None,
+    initial_state: str = "free",
+    window: float | None = None,
+) -> ShootingProblem:
+    """The problem of explaining one flight by a model, with the noise levels of the standard sensors.
+
+    **Arguments:**
+
+    - `channels`: `"rates"`, `"attitude"`, `"all"`, or everything that was measured.
+    - `initial_state`: `"free"`: estimated; `"known"`: the first sample is exact.
+    - `window`: cut the flight into windows of about this length [s].
+
+    **Raises:** `InputError`, one line, for arguments out of range and flights that measured too little.
+    """
+    if initial_state not in ("free", "known"):
+        raise InputError(f"`initial_state`: must be free or known, got {initial_state!r}.")
+    known = initial_state == "known"
+    if window is not None and not (math.isfinite(window) and window > 0):
+        raise InputError(f"`window`: must be a positive number of seconds, got {window:g}.")
+    if window is not None and known:
+        raise InputError("`window`: each window has its own initial state; use `initial_state` free.")
+    flight, name = recording.flight, recording.name
+    measured = ~np.isnan(np.asarray(flight.states))
+    chosen = _chosen_channels(name, measured, channels)
+    columns = CASCADE_ORDER[: CHANNELS[chosen]]
+    start = _first_state(recording, measured, columns) if known else None
+    windows = 1 if window is None else _window_count(recording, window)
+    missing = [STATE_NAMES[i] for i in columns if not measured[:, i].any()]
+    if windows > 1 and missing and chosen != "rates":
+        raise InputError(
+            f"{name}: `window`: {', '.join(missing)} were not measured, so that the initial state of a window is not "
+            "identifiable; use `channels` rates."
+        )
+    unknowns = len(model.parameter_names) + (0 if known else windows * len(columns))
+    if measured[:, columns].sum() <= unknowns:
+        remedy = "give a longer flight" if window is None else "give a longer flight, or fewer windows"
+        raise InputError(f"{name}: {measured[:, columns].sum()} measurements for {unknowns} unknowns; {remedy}.")
+    return ShootingProblem(model, flight, sigma=SENSOR_SIGMA, initial_state=start, channels=chosen, windows=windows)
+
+
+def _chosen_channels(name: str, measured: np.ndarray, channels: str | None) -> str:
+    present = {choice: measured[:, CASCADE_ORDER[part]].any() for choice, part in _ADDED.items()}
+    if not (present["rates"] or present["attitude"]):
+        raise InputError(f"{name}: neither rates nor attitude were measured; log p, q, r or phi, theta, psi.")
+    if channels is None:
+        return [choice for choice, measured_any in present.items() if measured_any][-1]
+    if channels not in CHANNELS:
+        raise InputError(f"`channels`: must be one of {', '.join(CHANNELS)}, got {channels!r}.")
+    if not present[channels]:
+        missing = ", ".join(STATE_NAMES[i] for i in CASCADE_ORDER[_ADDED[channels]])
+        raise InputError(f"{name}: `channels` {channels}: none of {missing} was measured; leave it out.")
+    return channels
+
+
+def _first_state(recording: Recording, measured: np.ndarray, columns: np.ndarray) -> Float[Array, "12"]:
+    missing = [STATE_NAMES[i] for i in columns if not measured[0, i]]
+    if missing:
+        raise InputError(
+            f"{recording.name}: first sample: `initial_state` known needs {', '.join(missing)} there; "
+            "use `initial_state` free."
+        )
+    return jnp.nan_to_num(recording.flight.states[0])
+
+
+def _window_count(recording: Recording, window: float) -> int:
+    samples, dt = recording.flight.states.shape[0], float(recording.flight.dt)
+    if window < 2 * dt:
+        raise InputError(f"`window` {window:g}: less than two samples of {recording.name}; give at least {2 * dt:g}.")
+    return min(max(round(samples * dt / window), 1), samples // 2)

@@ -1,0 +1,191 @@
+"""Identification of a real vehicle from one recording or several."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..airframe import Airframe
+from ..bracket import Bracket
+from ..errors import InputError
+from ..estimate import AbstractEstimator, Estimate
+from ..estimators import ESTIMATORS, IBSS, OutputError, make_estimator
+from ..flight import CHANNEL_NAMES
+from ..models.vehicle import FlightModel
+from ..recording.preparation import HOLDOUT, WINDOW, Prepared, prepare
+from ..recording.reading import Recording
+from ..results import result_names
+from ..shooting import ShootingProblem
+from .constants import vehicle_constants
+from .held_out import HeldOut, check_starts, predict_held_out
+from .network import vehicle_network_for
+from .parameters import parameter_table
+from .problem import Intervals, bracket_of
+from .provenance import airframe_name, estimator_name, versions
+from .results import HeldParameter, RigidBody, VehicleIdentification, finite_or_none
+from .terms import chosen_terms, missing_inputs
+from .vehicle import Search, VehicleFit, fit_vehicle, free_bracket
+
+# The first guess of the noise levels [rad/s]: errors of the model rather than of the sensor.
+FIRST_SIGMA = 0.5
+LOSSES = ("huber", "squares")
+# The largest Jacobian of output error [GiB]; a search needs a few of them.
+_LARGEST_JACOBIAN = 1.0
+
+
+def identify_vehicle(
+    recordings: Sequence[Recording],
+    airframe: Airframe,
+    *,
+    estimator: str | AbstractEstimator,
+    bracket: Intervals,
+    terms: Sequence[str] | None,
+    begin: float | None,
+    end: float | None,
+    window: float | None,
+    sample_time: float | None,
+    holdout: float | None,
+    validate: Recording | None,
+    loss: str | None,
+    seed: int,
+    progress: Callable[[str], None],
+) -> VehicleIdentification:
+    """What `jaxos4.identify` does with an airframe; all arguments are its."""
+    name, loss = estimator_name(estimator), "huber" if loss is None else loss
+    if loss not in LOSSES:
+        raise InputError(f"`loss`: must be huber or squares, got {loss!r}.")
+    search = _last_search(estimator, name, seed)
+    started, window = time.perf_counter(), WINDOW if window is None else window
+    share = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
+    part = {"begin": begin, "end": end, "window": window, "sample_time": sample_time, "holdout": share}
+    prepared = prepare(recordings, airframe, **part)
+    chosen = chosen_terms(terms, prepared.available)
+    model = FlightModel(airframe, terms=chosen, recordings=prepared.recordings)
+    where, notes, held_out = bracket_of(bracket, model), prepared.notes, None
+    if validate is not None:
+        other = _prepare_other(recordings, validate, prepared, model, window)
+        held_out, notes = HeldOut(other.fitted, other.seconds[0], validate.name, False), notes + other.notes
+    elif prepared.tested is not None:
+        held_out = HeldOut(prepared.tested, prepared.seconds[1], recordings[0].name, True)
+    if held_out is not None:
+        check_starts(held_out)
+    problem = _problem(prepared, model, recordings[0].name, window)
+    _check_memory(problem, estimator, name)
+    fit = fit_vehicle(problem, where, estimator=search, huber=loss == "huber", progress=progress)
+    predicted = skill = None
+    if fit.answered and held_out is not None:
+        progress("predicting what was not fitted")
+        predicted, skill = predict_held_out(fit, model, held_out)
+    provenance = {
+        "flights": [recording.name for recording in recordings],
+        "validate": None if validate is None else validate.name,
+        "airframe": airframe_name(airframe),
+        "terms": list(model.terms),
+        "window": window,
+        "sample_time": float(prepared.fitted.dt),
+        "fitted_seconds": prepared.seconds[0],
+        "tested_seconds": prepared.seconds[1] if held_out is None else held_out.seconds,
+        "loss": loss,
+        "notes": list(notes),
+        **versions(problem),
+    }
+    result = _result(fit, model, where)
+    spent = time.perf_counter() - started
+    return VehicleIdentification(
+        estimator=name, seconds=spent, skill=skill, predictions=predicted, provenance=provenance, **result
+    )
+
+
+def _result(fit: VehicleFit, model: FlightModel, bracket: Bracket) -> dict[str, Any]:
+    """The fields of a `VehicleIdentification` that follow from the fit; `bracket`: of all parameters of `model`."""
+    estimate, free, noise = fit.estimate, fit.problem.model, np.asarray(fit.problem.sigma)
+    parameters, body = {}, RigidBody()
+    if fit.answered:
+        parameters = parameter_table(free, estimate, fit.bound, free_bracket(bracket, model, fit.held))
+        body = vehicle_constants(free.parameter_names, estimate, bracket, model.airframe)
+    return {
+        "model": "flight",
+        "result": str(result_names(estimate.result)),
+        "rollouts": fit.rollouts,
+        "cost": finite_or_none(estimate.cost),
+        "parameters": parameters,
+        "rigid_body": body,
+        "held": {
+            name: HeldParameter(fit.held[name][0], unit, fit.held[name][1] or "not asked")
+            for name, unit in zip(model.parameter_names, model.parameter_units, strict=True)
+            if name in fit.held
+        },
+        "cut": fit.cut,
+        "noise": {CHANNEL_NAMES[i]: float(noise[i]) for i in fit.problem.columns},
+        "estimate": estimate,
+        "problem": fit.problem,
+    }
+
+
+def _last_search(estimator: str | AbstractEstimator, name: str, seed: int) -> Search | None:
+    """The estimator of the last stage; `None`: IBSS from where the stage before ended."""
+    kind = ESTIMATORS[estimator] if isinstance(estimator, str) else type(estimator)
+    if not kind.shoots:
+        shooting = ", ".join(name for name, one in ESTIMATORS.items() if one.shoots)
+        raise InputError(f"`estimator` {name}: does not shoot, which a vehicle needs; use one of {shooting}.")
+    if not isinstance(estimator, str):
+        return estimator
+    if kind is IBSS:
+        return None
+    if not kind.needs_network:
+        return make_estimator(estimator)
+
+    def with_network(problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        return make_estimator(estimator, vehicle_network_for(problem, bracket, seed))(problem, bracket)
+
+    return with_network
+
+
+def _prepare_other(
+    recordings: Sequence[Recording], validate: Recording, prepared: Prepared, model: FlightModel, window: float
+) -> Prepared:
+    """The recording to predict, with the sample time of those that are fitted."""
+    if any(validate.same_data(recording) for recording in recordings):
+        raise InputError(
+            f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
+        )
+    step = float(prepared.fitted.dt)
+    other = prepare([validate], model.airframe, window=window, sample_time=step, holdout=0.0)
+    # Predictions of the rates need no accelerometer.
+    missing = missing_inputs([term for term in model.terms if term != "accelerometer"], other.available)
+    if missing:
+        raise InputError(
+            f"{validate.name}: `validate` did not measure what the term {next(iter(missing))} needs; give `terms` "
+            "without it."
+        )
+    return other
+
+
+def _problem(prepared: Prepared, model: FlightModel, name: str, window: float) -> ShootingProblem:
+    """The problem, if there are enough measurements."""
+    sigma = np.full(12, FIRST_SIGMA)
+    problem = ShootingProblem(
+        model, prepared.fitted, sigma=sigma, channels="rates", method="rk4", windows=prepared.windows
+    )
+    measured = np.count_nonzero(~np.isnan(np.asarray(problem.measured())))
+    if measured <= _unknowns(problem):
+        raise InputError(
+            f"{name}: {measured} measurements are too few for windows of {window:g} s; give a longer `window`."
+        )
+    return problem
+
+
+def _check_memory(problem: ShootingProblem, estimator: str | AbstractEstimator, name: str) -> None:
+    """Raise `InputError` if output error needs too much memory."""
+    kind = ESTIMATORS[estimator] if isinstance(estimator, str) else type(estimator)
+    gibibytes = problem.flight.time.shape[0] * problem.columns.size * _unknowns(problem) * 8 / 2**30
+    if kind is OutputError and gibibytes > _LARGEST_JACOBIAN:
+        raise InputError(
+            f"`estimator` {name}: its Jacobian would take {gibibytes:.0f} GiB in {problem.windows} windows; use ibss, "
+            "or less of the flight by `begin` and `end`."
+        )
+
+
+def _unknowns(problem: ShootingProblem) -> int:
+    return len(problem.model.parameter_names) + problem.windows * problem.free_size

@@ -1,0 +1,54 @@
+"""Several stretches of flight as one flight."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..flight import STATE_NAMES, Flight
+
+# Sample times that differ by less than this share are equal.
+_EQUAL_STEPS = 1e-6
+
+
+def join(flights: Sequence[Flight], *, length: int) -> Flight:
+    """Put stretches of flight one after the other, as one flight of whole windows.
+
+    Samples at the end of a stretch that do not fill a window are dropped, so that no window reaches into the next
+    stretch. Stretches shorter than one window are dropped. Time becomes a count of samples from 0; what was measured is
+    not changed.
+
+    **Arguments:**
+
+    - `flights`: the stretches.
+    - `length`: of a window, in samples.
+
+    **Raises:** `ValueError` if the sample times differ, or if no stretch is as long as one window.
+    """
+    steps = np.array([float(flight.dt) for flight in flights])
+    if steps.size and np.ptp(steps) > _EQUAL_STEPS * steps[0]:
+        raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
+    counts = [flight.time.shape[0] // length * length for flight in flights]
+    if not any(counts):
+        raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
+    kept = [jax.tree.map(lambda leaf, n=n: leaf[:n], _rows_of(f)) for f, n in zip(flights, counts, strict=True) if n]
+    with_velocity = all(rows[3] is not None for rows in kept)
+    omega, states, force = (np.concatenate([rows[i] for rows in kept]) for i in range(3))
+    velocity = np.concatenate([rows[3] for rows in kept if rows[3] is not None]) if with_velocity else None
+    lengths = [n for n in counts if n]
+    return Flight(
+        time=steps[0] * np.arange(sum(counts)),
+        omega=omega,
+        states=states,
+        specific_force=None if np.isnan(force).all() else force,
+        body_velocity=velocity,
+        stretch=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths)),
+        commanded=any(flight.commanded for flight in flights),
+    )
+
+
+def _rows_of(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    force = np.asarray(flight.channels[:, len(STATE_NAMES) :])
+    velocity = None if flight.body_velocity is None else np.asarray(flight.body_velocity)
+    return np.asarray(flight.omega), np.asarray(flight.states), force, velocity

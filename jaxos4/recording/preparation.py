@@ -1,0 +1,198 @@
+"""Recordings of one vehicle as one flight to fit: usable stretches, longer samples, whole windows, a part held out."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..airframe import Airframe
+from ..errors import InputError
+from ..flight import FORCE_NAMES, STATE_NAMES, Flight
+from ..models.rotation import with_body_velocity
+from ..models.state import CASCADE_ORDER
+from ..models.terms import has_full_scale
+from .averaging import averaged
+from .holdout import hold_out
+from .joining import join
+from .reading import Recording
+from .usable import Stretch, cut, stretches
+
+# Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
+WINDOW, SAMPLE_TIME = 0.25, 0.004
+# The share that is held out by default.
+HOLDOUT = 0.25
+_MOST_REASONS = 3
+_FEWEST_SAMPLES = 4
+# Sample times that differ by less than this factor count as equal.
+_NEARLY_EQUAL = 1.01
+
+
+class Prepared(NamedTuple):
+    """Recordings, ready to be fitted.
+
+    - `fitted`: one flight of all stretches; measurements that are held out are missing.
+    - `tested`: the same samples with only the held-out measurements; `None`: nothing is held out.
+    - `recordings`: for each stretch, the number of its recording, from 0.
+    - `length`: of a window, in samples.
+    - `available`: what every recording offers to the terms of a model, see `available_inputs`.
+    - `seconds`: how long the fitted and the tested measurements last [s].
+    - `notes`: what the reader changed, and which stretches are not used.
+    """
+
+    fitted: Flight
+    tested: Flight | None
+    recordings: tuple[int, ...]
+    length: int
+    available: frozenset[str]
+    seconds: tuple[float, float]
+    notes: tuple[str, ...]
+
+    @property
+    def windows(self) -> int:
+        """The number of windows; each lies in one stretch."""
+        return self.fitted.time.shape[0] // self.length
+
+
+def prepare(
+    recordings: Sequence[Recording],
+    airframe: Airframe,
+    *,
+    begin: float | None = None,
+    end: float | None = None,
+    window: float = WINDOW,
+    sample_time: float | None = None,
+    holdout: float = HOLDOUT,
+) -> Prepared:
+    """Make one flight of the usable stretches of several recordings.
+
+    **Arguments:**
+
+    - `recordings`: of one vehicle, each given once.
+    - `airframe`: the vehicle's constants.
+    - `begin`, `end`: use this part of each recording [s], instead of the usable stretches.
+    - `window`: length of a window [s].
+    - `sample_time`: average to samples of this length [s]; 0.004 s by default if the recordings have shorter ones.
+    - `holdout`: the share of the windows to hold out.
+
+    **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
+    """
+    _check_options(begin, end, window, sample_time, holdout)
+    _check_recordings(recordings)
+    notes: list[str] = []
+    parts: list[tuple[int, Flight]] = []
+    for number, recording in enumerate(recordings):
+        pieces, note = _usable_parts(recording, airframe, begin, end)
+        notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
+        parts += [(number, piece) for piece in pieces]
+    if len({piece.commanded for _, piece in parts}) > 1:
+        raise InputError(
+            f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
+        )
+    step, length = _sampling([piece for _, piece in parts], window, sample_time)
+    shortest = (length - 1) * step / _NEARLY_EQUAL
+    long = [(number, piece) for number, piece in parts if float(piece.time[-1] - piece.time[0]) >= shortest]
+    coarse = [(number, with_body_velocity(averaged(piece, step))) for number, piece in long]
+    kept = [(number, piece) for number, piece in coarse if piece.time.shape[0] >= length]
+    unused = [recording for i, recording in enumerate(recordings) if i not in {number for number, _ in kept}]
+    if unused:
+        remedy = "leave it out or give a shorter one" if kept else "give a shorter one"
+        raise InputError(f"{unused[0].name}: no part is as long as `window` {window:g}; {remedy}.")
+    flight = join([piece for _, piece in kept], length=length)
+    fitted, tested = hold_out(flight, length, holdout)
+    return Prepared(
+        fitted,
+        tested,
+        tuple(number for number, _ in kept),
+        length,
+        available_inputs(flight, [piece for _, piece in kept], airframe),
+        (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
+        tuple(notes),
+    )
+
+
+def available_inputs(flight: Flight, stretches: Sequence[Flight], airframe: Airframe) -> frozenset[str]:
+    """What the flight, joined from these stretches, offers to the terms of a model.
+
+    Some of "commands", "body velocity", "lateral specific force", "vertical specific force", "full scale". A specific
+    force counts if every stretch measured it.
+    """
+    force = [
+        all(not np.isnan(np.asarray(stretch.channels)[:, len(STATE_NAMES) + axis]).all() for stretch in stretches)
+        for axis in range(len(FORCE_NAMES))
+    ]
+    offers = {
+        "commands": flight.commanded,
+        "body velocity": flight.body_velocity is not None,
+        "lateral specific force": force[0] and force[1],
+        "vertical specific force": force[2],
+        "full scale": has_full_scale(airframe),
+    }
+    return frozenset(name for name, offered in offers.items() if offered)
+
+
+def _seconds(flight: Flight) -> float:
+    return float((~jnp.isnan(flight.states[:, CASCADE_ORDER[0]])).sum() * flight.dt)
+
+
+def _sampling(parts: list[Flight], window: float, sample_time: float | None) -> tuple[float, int]:
+    """The sample time [s], and how many samples make a window."""
+    slowest = max(float(flight.dt) for flight in parts)
+    step = max(SAMPLE_TIME if sample_time is None else sample_time, slowest)
+    if sample_time is not None and step > sample_time * _NEARLY_EQUAL:
+        raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
+    length = round(window / step)
+    if length < _FEWEST_SAMPLES:
+        least = _FEWEST_SAMPLES * step
+        raise InputError(f"`window` {window:g}: less than four samples of {step:g} s; give at least {least:g}.")
+    return step, length
+
+
+def _usable_parts(
+    recording: Recording, airframe: Airframe, begin: float | None, end: float | None
+) -> tuple[list[Flight], str | None]:
+    """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used."""
+    flight, name = recording.flight, recording.name
+    first, last = float(flight.time[0]), float(flight.time[-1])
+    if begin is not None or end is not None:
+        try:
+            return [cut(flight, Stretch(first if begin is None else begin, last if end is None else end))], None
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+    every = stretches(flight, airframe)
+    usable = [stretch for stretch in every if not stretch.reason]
+    refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
+    if not usable:
+        raise InputError(
+            f"{name}: no stretch of it can be used (from {refused[0].begin:.1f} s to {refused[0].end:.1f} s: "
+            f"{refused[0].reason}); give `begin` and `end` to use one all the same."
+        )
+    if not refused:
+        return [flight], None
+    reasons = "; ".join(f"{part.begin:.1f} to {part.end:.1f} s: {part.reason}" for part in refused[:_MOST_REASONS])
+    seconds = sum(stretch.length for stretch in usable)
+    return [cut(flight, stretch) for stretch in usable], (
+        f"{seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {reasons}"
+        f"{'; ...' if len(refused) > _MOST_REASONS else ''} (`begin` and `end` override)"
+    )
+
+
+def _check_recordings(recordings: Sequence[Recording]) -> None:
+    for number, recording in enumerate(recordings):
+        if any(recording.same_data(earlier) for earlier in recordings[:number]):
+            raise InputError(f"{recording.name}: given twice; give each log once.")
+        if np.isnan(np.asarray(recording.flight.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
+            raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
+
+
+def _check_options(
+    begin: float | None, end: float | None, window: float, sample_time: float | None, holdout: float
+) -> None:
+    for name, value in (("window", window), ("sample_time", sample_time)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise InputError(f"`{name}`: must be a positive number of seconds, got {value:g}.")
+    if not 0 <= holdout <= 0.5:
+        raise InputError(f"`holdout`: must be a share from 0 to 0.5, got {holdout:g}.")
+    if begin is not None and end is not None and not begin < end:
+        raise InputError(f"`begin` {begin:g} `end` {end:g}: must be in this order.")

@@ -1,0 +1,57 @@
+"""A recorded flight with its name, and the notes of its reader."""
+
+import os
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..airframe import Airframe
+from ..flight import Flight
+from ..logs import read_log
+
+
+class Recording(NamedTuple):
+    """A flight with a name.
+
+    - `flight`: what was recorded.
+    - `name`: in messages and in the provenance. Usually the path of the file.
+    - `notes`: what the reader changed in the data, one line each.
+    """
+
+    flight: Flight
+    name: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def named_notes(self) -> tuple[str, ...]:
+        """The notes, each with the name in front."""
+        return tuple(f"{self.name}: {note}" for note in self.notes)
+
+    def same_data(self, other: "Recording") -> bool:
+        """Whether both hold the same rotor speeds and states."""
+        return all(
+            np.array_equal(np.asarray(one), np.asarray(another), equal_nan=True)
+            for one, another in (
+                (self.flight.omega, other.flight.omega),
+                (self.flight.states, other.flight.states),
+            )
+        )
+
+
+def read_recording(path: str | os.PathLike[str], airframe: Airframe | None = None) -> Recording:
+    """Read a log in any format that `jaxos4.read_log` knows, named by its path. Arguments and errors are the same."""
+    flight, notes = read_log(path, airframe)
+    return Recording(flight, os.fspath(path), tuple(notes))
+
+
+def as_recordings(
+    flights: Flight | Recording | Sequence[Flight | Recording], name: str = "flight"
+) -> tuple[Recording, ...]:
+    """One or several flights as recordings. A flight without a name is called `name`; several are numbered from 1."""
+    several = not isinstance(flights, Flight | Recording)
+    every = tuple(flights) if several else (flights,)
+    numbered = [f"{name} {i + 1}" if len(every) > 1 else name for i in range(len(every))]
+    return tuple(
+        each if isinstance(each, Recording) else Recording(each, own) for each, own in zip(every, numbered, strict=True)
+    )
