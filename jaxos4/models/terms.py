@@ -116,7 +116,7 @@ def _authority(axis: int, speed: float = 1.0) -> Callable[[Airframe], Scalar]:
 
 
 def _reaction(airframe: Airframe) -> Scalar:
-    return airframe.rotor_inertia / jnp.asarray(airframe.inertia)[2]
+    return jnp.asarray(airframe.rotor_inertia) / jnp.asarray(airframe.inertia)[2]
 
 
 def _add_offset(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
