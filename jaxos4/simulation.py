@@ -1,4 +1,4 @@
-"""From rotor speeds to a flight: forward Euler, Runge-Kutta 4, or diffrax's adaptive Tsit5."""
+"""Simulation of a flight from rotor speeds: forward Euler, Runge-Kutta 4, or diffrax's adaptive Tsit5."""
 
 from collections.abc import Callable
 
@@ -20,12 +20,12 @@ Stepper = Callable[[AbstractModel, State, Forcing, Parameters | tuple[Scalar, ..
 
 
 def euler_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
-    """x_{k+1} = x_k + T f(x_k, u_k): the paper-style discrete model, of order 1."""
+    """The paper's discrete model x_{k+1} = x_k + T f(x_k, u_k), of order 1."""
     return _advance(state, model.cascade(state, forcing, parameters), dt)
 
 
 def rk4_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
-    """The classical Runge-Kutta step, of order 4; the forcing is held over the step."""
+    """The classical Runge-Kutta step, of order 4. The forcing is constant over the step."""
     k1 = model.cascade(state, forcing, parameters)
     k2 = model.cascade(_advance(state, k1, dt / 2), forcing, parameters)
     k3 = model.cascade(_advance(state, k2, dt / 2), forcing, parameters)
@@ -39,8 +39,7 @@ def _advance(state: State, derivative: State, dt: Scalar) -> State:
 
 
 def _diffrax_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
-    # One solve per sample holds the input exactly: a solver that looked it up by time would read the next sample at
-    # the right end of its step.
+    # One solve for each sample holds the input exactly: a lookup by time would read the next sample at a step's end.
     eps = float(jnp.finfo(dt.dtype).eps)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: model.cascade(y, *args)),
@@ -72,17 +71,20 @@ def simulate(
     initial_state: StateVector | None = None,
     method: str = "euler",
 ) -> Flight:
-    """Flies `model` with `parameters` through rotor speeds `omega` [rad/s] held over samples of `dt` [s].
+    """Simulate a flight of `model` with rotor speeds that are constant over each sample.
 
     **Arguments:**
 
+    - `parameters`: in the order of `model.parameter_names`.
+    - `omega`: rotor speeds of each sample [rad/s], of shape (samples, 4).
+    - `dt`: the sample time [s].
     - `initial_state`: X at the first sample, in the order of `STATE_NAMES`; rest at the origin by default.
     - `method`: `"euler"` (the discrete model), `"rk4"`, or `"diffrax"` (continuous time: adaptive, slow, a reference).
 
-    **Returns:** a `Flight` whose `result` is `successful`, or says why its states end: `attitude_singularity` where
-    the pitch angle reached +-90 degrees, `nonfinite_trajectory` where a number overflowed. From there on they are NaN.
+    **Returns:** a `Flight`. Its `result` is `successful`, `attitude_singularity` if the pitch angle reached +-90
+    degrees, or `nonfinite_trajectory` if a number overflowed. The states are NaN from the failure on.
 
-    **Raises:** `ValueError` for a method that does not exist, another shape, a `dt` that is not positive.
+    **Raises:** `ValueError` for a method that does not exist, a wrong shape, or a `dt` that is not positive.
     """
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
@@ -94,14 +96,14 @@ def simulate(
         ("dt", dt, ()),
     ):
         if jnp.shape(value) != shape:
-            raise ValueError(f"`{name}` must have shape {shape}, got {jnp.shape(value)}; a batch is made by `vmap`.")
+            raise ValueError(f"`{name}` must have shape {shape}, got {jnp.shape(value)}; use `vmap` for a batch.")
     if not isinstance(dt, Tracer) and not np.asarray(dt) > 0:
         raise ValueError(f"`dt` must be positive, got {dt}.")
-    return _fly(model, as_float(parameters), as_float(omega), as_float(dt), as_float(start), method)
+    return _simulate(model, as_float(parameters), as_float(omega), as_float(dt), as_float(start), method)
 
 
 @eqx.filter_jit
-def _fly(
+def _simulate(
     model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
 ) -> Flight:
     scalars = tuple(parameters)
@@ -120,10 +122,10 @@ def _fly(
 
 def _until_failure(states: States) -> tuple[States, RESULTS]:
     theta = states[:, STATE_NAMES.index("theta")]
-    level = jnp.abs(theta) < jnp.pi / 2
     finite = jnp.isfinite(states).all(axis=1)
-    sound: Array = jnp.cumsum(~(level & finite)) == 0
-    first_failure = jnp.argmin(sound)
+    failed = ~(finite & (jnp.abs(theta) < jnp.pi / 2))
+    valid: Array = jnp.cumsum(failed) == 0
+    first_failure = jnp.argmin(valid)
     result = RESULTS.where(finite[first_failure], RESULTS.attitude_singularity, RESULTS.nonfinite_trajectory)
-    result = RESULTS.where(sound.all(), RESULTS.successful, result)
-    return jnp.where(sound[:, None], states, jnp.nan), result
+    result = RESULTS.where(valid.all(), RESULTS.successful, result)
+    return jnp.where(valid[:, None], states, jnp.nan), result

@@ -1,4 +1,4 @@
-"""A flight cut into windows with an initial state each: its parts, its estimators, and the drift that it stands."""
+"""Multiple shooting: the windows, the estimators, and a drift that one shot cannot follow."""
 
 import equinox as eqx
 import jax
@@ -8,7 +8,7 @@ import pytest
 from helpers import DT, noisy_states, random_starts, standard_flight
 
 import jaxos4
-from jaxos4.shooting import CASCADE_ORDER
+from jaxos4.models.state import CASCADE_ORDER
 
 MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
 SHOOTING = (jaxos4.IBSS(), jaxos4.OutputError())
@@ -50,7 +50,7 @@ def test_windows_are_flights_of_their_own(windows, channels):
     assert float(problem.cost(alpha, jnp.asarray(starts.ravel()))) == pytest.approx(0.5 * float(whole @ whole))
     first = np.concatenate([part.first_state()[0] for part in parts(problem)])
     np.testing.assert_array_equal(problem.first_state()[0], first)
-    # Sample by sample in the order of the flight: what comes before one window's end is what is simulated there.
+    # The predictions follow the order of the flight's samples.
     predicted = np.asarray(problem.predict(alpha, jnp.asarray(starts.ravel())))
     measured = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: problem.size]]
     weight = 1 / problem.sigma[CASCADE_ORDER[: problem.size]]
@@ -59,7 +59,7 @@ def test_windows_are_flights_of_their_own(windows, channels):
 
 @pytest.mark.parametrize("model_class", MODELS)
 @pytest.mark.parametrize("channels", ["rates", "attitude"])
-def test_the_bound_is_that_of_all_unknowns_together(model_class, channels):
+def test_the_bound_counts_all_initial_states_as_unknowns(model_class, channels):
     problem = windowed(5, channels, model_class)
     alpha, starts = problem.model.alpha, problem.first_state()[0]
     jacobian = np.asarray(jax.jacfwd(lambda u: problem.residuals(u[:8], u[8:]))(jnp.concatenate([alpha, starts])))
@@ -68,14 +68,14 @@ def test_the_bound_is_that_of_all_unknowns_together(model_class, channels):
     bound = jaxos4.cramer_rao_bound(problem, alpha, starts)
     std = np.sqrt(np.diagonal(inverse))[:8]
     np.testing.assert_allclose(bound / np.outer(std, std), inverse[:8, :8] / np.outer(std, std), atol=1e-8)
-    # What ties the windows together is lost: less is known than of the flight as a whole.
+    # Windows are not tied together, which loses information.
     whole = jaxos4.cramer_rao_bound(windowed(1, channels, model_class), alpha)
     assert np.all(np.diagonal(bound) > np.diagonal(whole))
 
 
 @pytest.mark.parametrize("estimator", SHOOTING)
 @pytest.mark.parametrize(("model_class", "channels"), [(jaxos4.PublishedOS4, "all"), (jaxos4.CorrectedOS4, "rates")])
-def test_errors_are_those_of_the_bound(estimator, model_class, channels):
+def test_errors_reach_the_bound(estimator, model_class, channels):
     flights, windows = 48, 4
 
     @eqx.filter_jit
@@ -93,7 +93,7 @@ def test_errors_are_those_of_the_bound(estimator, model_class, channels):
     assert np.all(np.abs(np.sqrt(np.square(errors).mean(axis=0)) - 1) < 4 / np.sqrt(2 * flights))
 
 
-def test_both_ways_of_shooting_end_at_the_same_answer():
+def test_both_shooting_methods_find_the_same_answer():
     problem = windowed(6, "attitude")
     bracket = jaxos4.Bracket.around(random_starts(problem.model, 1)[0], problem.model.half_width)
     ibss, output_error = (estimator(problem, bracket) for estimator in SHOOTING)
@@ -102,7 +102,7 @@ def test_both_ways_of_shooting_end_at_the_same_answer():
     np.testing.assert_allclose(ibss.std, output_error.std, rtol=1e-3)
 
 
-def test_a_window_in_which_nothing_was_measured_tells_nothing_and_breaks_nothing():
+def test_a_window_without_measurements_changes_no_estimate():
     whole = windowed(5, "rates")
     gap = eqx.tree_at(lambda p: p.flight.states, whole, whole.flight.states.at[100:201].set(jnp.nan))
     bracket = jaxos4.Bracket.default(whole.model)
@@ -126,7 +126,7 @@ def test_the_hybrid_runs_on_windows():
 
 
 def drifting_states(duration):
-    """A flight whose rotors turn 0.1 % off what was recorded: rates that run away from what the model makes of it."""
+    """A flight whose rotors turn up to 0.1 % faster or slower than recorded, so that simulated rates drift away."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     recorded = standard_flight(duration=duration).omega
     actual = recorded * (1 + 1e-3 * jnp.array([1.0, -0.5, 0.3, 0.8]))
@@ -134,7 +134,7 @@ def drifting_states(duration):
     return jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(truth, key=jax.random.key(0)).states
 
 
-def test_windows_stand_a_drift_that_one_shot_does_not():
+def test_windows_follow_a_drift_that_one_shot_cannot():
     states = drifting_states(20.0)
     errors, results = [], []
     for windows in (1, 20):
@@ -143,7 +143,7 @@ def test_windows_stand_a_drift_that_one_shot_does_not():
         errors.append(np.abs(found.parameters / problem.model.alpha - 1)[np.array([2, 5, 7])])
         results.append(str(jaxos4.result_names(found.result)))
     assert np.isfinite(errors).all()
-    # One shot ends where the brackets do, and says so.
+    # One shot ends at the bounds, and its result says so.
     assert results == ["at_bound", "successful"]
     assert np.all(errors[1] < 0.02)
     assert errors[0].max() > 3 * errors[1].max()
@@ -158,14 +158,14 @@ def test_robust_covariance_of_windows_is_the_bound_under_white_noise():
 
 
 @pytest.mark.parametrize("windows", [0, -1, 251])
-def test_windows_that_cannot_be_are_named(windows):
+def test_impossible_windows_are_named(windows):
     with pytest.raises(ValueError, match="`windows` must be an integer from 1 to 250"):
         windowed(windows)
 
 
-def test_windows_and_estimators_that_have_none_are_refused():
+def test_windows_are_refused_with_a_known_start_and_by_estimators_that_do_not_shoot():
     flight = standard_flight()
-    with pytest.raises(ValueError, match="`initial_state` must be `None` where there are several windows"):
+    with pytest.raises(ValueError, match="`initial_state` must be `None` if there are several windows"):
         jaxos4.ShootingProblem(
             jaxos4.PublishedOS4(), flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0], windows=2
         )
@@ -182,8 +182,8 @@ def test_equation_error_is_the_same_whatever_the_windows():
     np.testing.assert_allclose(found.parameters, same.parameters, rtol=1e-9)
 
 
-def test_the_cost_of_each_estimator_is_that_of_its_answer():
-    """A doublet seen from a bracket that is off: some parameters are not identifiable."""
+def test_the_cost_of_an_estimate_is_that_of_its_parameters():
+    """A doublet does not identify all parameters, and the bracket is not centred on the truth."""
     model = jaxos4.PublishedOS4()
     flight = jaxos4.simulate(model, model.alpha, jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT), dt=DT)
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))

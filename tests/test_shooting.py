@@ -1,3 +1,5 @@
+"""`ShootingProblem` against residuals of the NumPy equations; its derivatives against finite differences."""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ SIGMA = jaxos4.SENSOR_SIGMA
 THETA = jaxos4.STATE_NAMES.index("theta")
 
 
-# Compiled once for each kind of problem, as `cost` and `residuals` are by themselves.
+# Each compiles once for each kind of problem, like `cost` and `residuals`.
 slope_of = eqx.filter_jit(lambda problem, *args: jax.jacfwd(problem.cost)(*args))
 curvature_of = eqx.filter_jit(lambda problem, *args: jax.tree.map(lambda x: x[0], problem.curvatures(*args)))
 
@@ -56,7 +58,7 @@ def test_cost_and_residuals_are_the_weighted_mismatch(model_class, channels, fre
     start = np.asarray(problem.flight.states[0]) if free else np.zeros(12)
     expected = manual_residuals(problem, off(model_class), start)
     if not free:
-        expected[0] = 0  # what is known is no data
+        expected[0] = 0  # a known first sample is no data
     residuals = problem.residuals(off(model_class))
     assert residuals.shape == (101 * CHANNELS[channels],)
     np.testing.assert_allclose(residuals, expected.ravel(), atol=1e-9)
@@ -73,7 +75,7 @@ def test_an_exact_flight_costs_nothing_at_the_truth(channels):
     assert float(problem.cost(off())) > 1
 
 
-def test_the_first_sample_counts_only_where_the_start_is_free():
+def test_the_first_sample_counts_only_if_the_initial_state_is_free():
     for free in (False, True):
         states = measured()
         problem, moved = (problem_of("rates", free=free, states=s) for s in (states, states.at[0].add(0.01)))
@@ -82,7 +84,7 @@ def test_the_first_sample_counts_only_where_the_start_is_free():
         assert same is not free
 
 
-def test_an_initial_state_that_is_free_starts_at_the_first_measurements():
+def test_a_free_initial_state_starts_at_the_first_measurements():
     states = measured()
     order = np.asarray(CASCADE_ORDER)
     value, spread = problem_of(free=True, states=states).first_state()
@@ -97,14 +99,14 @@ def test_an_initial_state_that_is_free_starts_at_the_first_measurements():
     assert spread[0] > 1
     assert spread[6] > 2
     np.testing.assert_array_equal(spread[1:6], 3 * SIGMA[order[1:6]])
-    # Where it is known, it is what was told.
+    # A known initial state is itself.
     value, spread = problem_of().first_state()
     np.testing.assert_array_equal(value, 0)
     np.testing.assert_array_equal(spread, 0)
 
 
 @known_or_free
-def test_what_was_not_measured_contributes_nothing(free):
+def test_missing_measurements_contribute_nothing(free):
     states, lost = measured(), np.random.default_rng(0).random((101, 12)) < 0.3
     lost[0] &= not free
     lost[40:60, THETA] = True
@@ -116,7 +118,7 @@ def test_what_was_not_measured_contributes_nothing(free):
     assert residuals.shape == (101 * 6,)
     np.testing.assert_allclose(residuals, np.nan_to_num(expected.ravel()), atol=1e-9)
     assert float(masked.cost(off())) == pytest.approx(0.5 * np.nansum(expected**2), rel=1e-11)
-    # Whatever stands in the samples that count, the lost ones are not read.
+    # The derivatives do not read the missing samples.
     gradient = slope_of(masked, off())
     curvature = curvature_of(masked, off(), masked.first_state()[0])
     assert np.isfinite(gradient).all()
@@ -191,7 +193,7 @@ CASES = [(jaxos4.PublishedOS4, c, f, "euler") for c in CHANNELS for f in (False,
 @pytest.mark.parametrize(("model_class", "channels", "free", "method"), CASES)
 def test_forward_and_reverse_mode_equal_finite_differences(model_class, channels, free, method):
     problem = problem_of(channels, free=free, model_class=model_class, method=method)
-    # Where the initial state is known the cost still depends on the one it is given.
+    # Even if the initial state is known, the cost depends on the one that is given.
     start = problem.first_state()[0] + 0.01
     (cost, reverse), forward, curvature = all_derivatives(problem, off(model_class), start)
     order = CASCADE_ORDER[: problem.size]
@@ -209,7 +211,7 @@ def test_forward_and_reverse_mode_equal_finite_differences(model_class, channels
     np.testing.assert_allclose(curvature.gradient, forward[:unknowns], rtol=1e-10)
 
 
-def test_a_derivative_that_is_off_would_be_seen():
+def test_a_wrong_derivative_would_fail():
     problem = problem_of("rates")
     start = problem.first_state()[0]
     (_, reverse), _, _ = all_derivatives(problem, off(), start)
@@ -223,10 +225,16 @@ def test_a_derivative_that_is_off_would_be_seen():
 
 @every_channels
 def test_loop_and_vmap_agree(channels):
-    problem = problem_of(channels, free=True)
-    alphas = off() * jnp.linspace(0.9, 1.1, 3)[:, None]
-    looped = [float(problem.cost(alpha)) for alpha in alphas]
-    np.testing.assert_allclose(eqx.filter_vmap(problem.cost)(alphas), looped, rtol=1e-12)
+    """Over parameters, flights and noise levels."""
+    flight = standard_flight(duration=DURATION)
+
+    def cost(alpha, states, sigma):
+        data = eqx.tree_at(lambda f: f.states, flight, states)
+        return jaxos4.ShootingProblem(jaxos4.PublishedOS4(), data, sigma=sigma, channels=channels).cost(alpha)
+
+    alphas, sigmas = off() * jnp.linspace(0.9, 1.1, 3)[:, None], SIGMA * jnp.array([[1.0], [2.0], [0.5]])
+    batch = alphas, noisy_states(3, duration=DURATION), sigmas
+    np.testing.assert_allclose(jax.vmap(cost)(*batch), [cost(*lane) for lane in zip(*batch, strict=True)], rtol=1e-12)
 
 
 def test_jitted_and_not_agree():
@@ -237,7 +245,7 @@ def test_jitted_and_not_agree():
 
 
 @every_channels
-def test_a_trajectory_that_fails_costs_infinitely_much_and_nobody_else_any(channels):
+def test_a_failed_trajectory_costs_infinity_and_changes_no_other_lane(channels):
     problem = problem_of(channels)
     divergent = problem.model.alpha.at[2].set(1e7)
     alphas = jnp.stack([problem.model.alpha, divergent, off(), jnp.full(8, jnp.nan)])
@@ -248,8 +256,8 @@ def test_a_trajectory_that_fails_costs_infinitely_much_and_nobody_else_any(chann
     assert np.isfinite(costs[[0, 2]]).all()
 
 
-def test_a_shot_over_the_top_is_compared_up_to_there():
-    """Its cost means nothing, but its slope still leads back."""
+def test_a_failed_shot_is_compared_up_to_the_failure():
+    """Its cost means nothing, but its derivative is finite."""
     problem = problem_of("attitude")
     start = jnp.zeros(6).at[4].set(1.4)
 
@@ -276,20 +284,20 @@ def test_reweighting_finds_the_noise_level_of_each_channel():
     ratio = np.asarray(again.sigma / SIGMA)
     assert ratio[0] == 1  # never measured
     np.testing.assert_allclose(ratio[1:] / factor[1:], 1, atol=4 / np.sqrt(2 * 500))
-    # Of the fewer channels of a problem only those are judged.
+    # A problem with fewer channels changes only their sigma.
     rates = standard_problem(channels="rates", states=states)
     ratio = np.asarray(rates.reweighted(rates.residuals(problem.model.alpha)).sigma / SIGMA)
     assert (ratio[[0, 1, 2, 3, 4, 5, 6, 8, 10]] == 1).all()
     np.testing.assert_allclose(ratio[[7, 9, 11]] / factor[jnp.array([7, 9, 11])], 1, atol=4 / np.sqrt(2 * 500))
 
 
-def test_reweighting_an_exact_fit_leaves_weights_that_are_finite():
+def test_reweighting_an_exact_fit_gives_finite_weights():
     problem = standard_problem()
     again = problem.reweighted(problem.residuals(problem.model.alpha))
     assert (np.asarray(again.sigma) > 0).all()
     assert (np.asarray(again.sigma) <= 1e-6 * SIGMA).all()
     assert float(again.cost(problem.model.alpha)) < 12 * 501
-    hover = standard_problem(states=jnp.zeros((501, 12)))  # not a number in it but zero
+    hover = standard_problem(states=jnp.zeros((501, 12)))  # all measurements are zero
     np.testing.assert_array_equal(hover.reweighted(jnp.zeros(501 * 12)).sigma, SIGMA)
 
 
@@ -301,19 +309,5 @@ def test_reweighting_an_exact_fit_leaves_weights_that_are_finite():
     ],
 )
 def test_misuse_is_named(arguments, message):
-    model, flight = jaxos4.PublishedOS4(), standard_flight()
     with pytest.raises(ValueError, match=message):
-        jaxos4.ShootingProblem(model, flight, **{"sigma": SIGMA, **arguments})
-
-
-def test_vmaps_over_flights_and_over_noise_levels():
-    states = noisy_states(3, duration=DURATION)
-    sigmas = SIGMA * np.array([[1.0], [2.0], [0.5]])
-    flight = standard_flight(duration=DURATION)
-
-    def cost(states, sigma):
-        data = eqx.tree_at(lambda f: f.states, flight, states)
-        return jaxos4.ShootingProblem(jaxos4.PublishedOS4(), data, sigma=sigma, channels="rates").cost(off())
-
-    batched = jax.vmap(cost)(states, jnp.asarray(sigmas))
-    np.testing.assert_allclose(batched, [cost(*pair) for pair in zip(states, jnp.asarray(sigmas), strict=True)])
+        jaxos4.ShootingProblem(jaxos4.PublishedOS4(), standard_flight(), **{"sigma": SIGMA, **arguments})

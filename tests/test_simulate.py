@@ -1,3 +1,5 @@
+"""`simulate`: orders of convergence, zero-order hold, batches, failures."""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ THETA, Q = jaxos4.STATE_NAMES.index("theta"), jaxos4.STATE_NAMES.index("q")
 SUCCESS, SINGULAR, NONFINITE = "successful", "attitude_singularity", "nonfinite_trajectory"
 
 
-SAMPLES = 26  # one length for all, so that each method compiles once
+SAMPLES = 26  # one length, so that each method compiles once
 
 
 def name(flight):
@@ -33,9 +35,9 @@ COARSE, STEPS = 0.04, (1, 2, 4)
 
 @pytest.fixture(scope="module", params=REFERENCES, ids=lambda c: c.__name__)
 def refinements(request):
-    """Errors at the coarse samples of each method, as the step shrinks and the input stays the same function."""
+    """Errors of each method at the coarse samples, for smaller and smaller steps of the same input."""
     model = request.param()
-    alpha = model.alpha.at[6].set(0.2)  # yaw would be linear without
+    alpha = model.alpha.at[6].set(0.2)  # makes yaw nonlinear
     omega = jaxos4.multisine(model.airframe, duration=1.0, dt=COARSE)
 
     def fly(method, refinement):
@@ -101,7 +103,7 @@ def test_each_row_is_held_until_the_next(method):
     rates = np.asarray(flight.states)[:, [7, 9, 11]]
     held = np.concatenate([np.zeros((1, 3)), dt * np.cumsum(torque[:-1], axis=0)])
     np.testing.assert_allclose(rates, held, atol=1e-12)
-    # Reading the next sample, or the mean of both, would be seen.
+    # A method that read the next sample, or the mean of both, would fail.
     for wrong in (dt * np.cumsum(torque[1:], axis=0), dt * np.cumsum(torque[1:] + torque[:-1], axis=0) / 2):
         assert np.abs(rates[1:] - wrong).max() > 0.01
 
@@ -134,7 +136,7 @@ def test_the_last_row_drives_nothing(method):
 
 
 @every_method
-def test_begins_where_it_is_told(method):
+def test_begins_at_the_initial_state(method):
     model = jaxos4.PublishedOS4()
     start = jnp.linspace(-0.3, 0.4, 12)
     flight = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=start, method=method)
@@ -198,8 +200,7 @@ def test_vmaps_over_flights_models_and_sample_times():
 
 # Failures are values, and stay in their lane.
 
-# Nose up without a trace of roll, so that pitch passes 90 degrees after 0.025 s. With any roll, Euler angles turn
-# sharply just before it instead.
+# Nose up without roll: pitch passes 90 degrees after 0.025 s. With any roll, Euler angles turn sharply before that.
 OVER = np.zeros(12)
 OVER[THETA], OVER[Q] = np.pi / 2 - 0.05, 2.0
 PLANE = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
@@ -238,18 +239,18 @@ def test_failing_lanes_leave_their_neighbours_alone(method):
     def fly(omega, start):
         return jaxos4.simulate(model, PLANE, omega, dt=DT, initial_state=start, method=method)
 
-    sound = eqx.filter_vmap(fly)(jnp.asarray(omega), jnp.asarray(starts))
+    valid = eqx.filter_vmap(fly)(jnp.asarray(omega), jnp.asarray(starts))
     omega[0, 4, 2] = np.nan
     starts[2] = OVER
     mixed = eqx.filter_vmap(fly)(jnp.asarray(omega), jnp.asarray(starts))
-    assert name(sound) == [SUCCESS] * 3
+    assert name(valid) == [SUCCESS] * 3
     assert name(mixed) == [NONFINITE, SUCCESS, SINGULAR]
-    np.testing.assert_array_equal(mixed.states[1], sound.states[1])
+    np.testing.assert_array_equal(mixed.states[1], valid.states[1])
     assert np.isnan(mixed.states[0, 5:]).all()
     assert np.isfinite(mixed.states[0, :5]).all()
 
 
-def test_a_start_that_is_no_number_is_said():
+def test_a_nan_start_is_reported():
     model = jaxos4.PublishedOS4()
     flight = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=jnp.full(12, jnp.nan))
     assert name(flight) == NONFINITE

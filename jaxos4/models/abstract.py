@@ -127,8 +127,6 @@ class AbstractModel(eqx.Module):
 class AbstractOS4(AbstractModel):
     """The part that the two OS4 models share. Their parameters are alpha_1..8, and their sensors show the states."""
 
-    airframe: eqx.AbstractVar[Airframe]
-
     @property
     @abc.abstractmethod
     def gyroscopic_unit(self) -> str:

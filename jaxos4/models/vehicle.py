@@ -130,6 +130,7 @@ class FlightModel(AbstractModel):
         roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
         recording = jnp.asarray(self.recordings)[grid.stretch]
+        force = inputs.force if self._needs(LATERAL_FORCE) else None
         return Forcing(
             roll=roll,
             pitch=pitch,
@@ -140,7 +141,7 @@ class FlightModel(AbstractModel):
             specific_thrust=squares.begin.sum(axis=1) * airframe.thrust_coefficient / mass,
             recording=tuple((recording == i).astype(omega.dtype) for i in range(max(self.recordings) + 1)),
             velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
-            lateral=tuple(inputs.force.T[:2]) if self._needs(LATERAL_FORCE) and inputs.force is not None else None,
+            lateral=None if force is None else tuple(force.T[:2]),
         )
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:

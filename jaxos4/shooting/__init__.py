@@ -1,0 +1,5 @@
+"""The mismatch between a flight and a simulation of it: cost, residuals, gradient and information."""
+
+from .problem import ROUNDING as ROUNDING, ShootingProblem as ShootingProblem
+from .rows import Rows as Rows
+from .scans import FASTEST as FASTEST, Curvature as Curvature, Shot as Shot

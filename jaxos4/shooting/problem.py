@@ -1,0 +1,269 @@
+"""A shooting problem: a model, a flight and weights. The cost says how badly parameters explain the flight."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from .._custom_types import Parameters, Scalar, StateVector, as_float
+from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
+from ..models.abstract import AbstractModel
+from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
+from ..noise import FORCE_SIGMA
+from ..simulation import STEPPERS
+from .rows import Rows, cut, windowed
+from .scans import Curvature, Shot, predict_window, shoot, shoot_with_derivatives
+
+# Rounding errors add up over a flight, to about this many times the rounding of one measurement.
+ROUNDING = 64.0
+
+# How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
+_UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
+
+
+class ShootingProblem(eqx.Module):
+    """A model, a flight and weights: how badly do parameters explain the flight?
+
+    **Arguments:**
+
+    - `model`: its parameters are the unknowns.
+    - `flight`: the measurements. NaN in `flight.states` means missing.
+    - `sigma`: standard deviation of each channel's noise, in the order of `CHANNEL_NAMES`; its reciprocal is the
+      weight. The three values of specific force may be omitted: they are then 0.3 m/s^2.
+    - `initial_state`: X at the first sample. `None`: free, and estimated with the parameters.
+    - `channels`: what is compared and simulated: `"rates"`, `"attitude"` (with the rates), or `"all"`.
+    - `method`: the stepper, `"euler"` or `"rk4"`.
+    - `windows`: number of windows for multiple shooting. The flight is cut into windows of equal length, and each is
+      simulated from its own free initial state, so that errors of the model add up over one window only. Windows are
+      not tied together, which loses the information in a long drift. Each channel should be measured in some windows:
+      nothing else identifies the initial states.
+
+    An *initial state* below is the part of X that the channels need, in cascade order: p, q, r, then phi, theta, psi,
+    then x, vx, y, vy, z, vz. The initial states of several windows follow each other in one array.
+
+    **Raises:** `ValueError` that names the argument.
+    """
+
+    model: AbstractModel
+    flight: Flight
+    sigma: Float[Array, "12"] | Float[Array, "15"] = eqx.field(converter=as_float)
+    initial_state: StateVector | None = None
+    channels: str = eqx.field(static=True, default="all")
+    method: str = eqx.field(static=True, default="euler")
+    windows: int = eqx.field(static=True, default=1)
+
+    def __init__(
+        self,
+        model: AbstractModel,
+        flight: Flight,
+        *,
+        sigma: Float[Array | np.ndarray, "12"] | Float[Array | np.ndarray, "15"],
+        initial_state: Float[Array | np.ndarray, "12"] | None = None,
+        channels: str = "all",
+        method: str = "euler",
+        windows: int = 1,
+    ):
+        if channels not in CHANNELS:
+            raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
+        if method not in STEPPERS:
+            raise ValueError(f"`method` must be one of {', '.join(STEPPERS)}, got {method!r}.")
+        if np.shape(sigma) not in ((len(STATE_NAMES),), (len(CHANNEL_NAMES),)):
+            raise ValueError(
+                "`sigma` must hold one value for each of the 12 states, and may hold three more for specific force, "
+                f"got shape {np.shape(sigma)}."
+            )
+        if not isinstance(sigma, Tracer) and not np.all((np.asarray(sigma) > 0) & np.isfinite(sigma)):
+            raise ValueError(f"`sigma` must be positive and finite, got {np.asarray(sigma).tolist()}.")
+        if initial_state is not None and np.shape(initial_state) != (12,):
+            raise ValueError(f"`initial_state` must be `None` or of shape (12,), got {np.shape(initial_state)}.")
+        most = max(flight.states.shape[-2] // 2, 1)
+        if not isinstance(windows, int) or not 1 <= windows <= most:
+            raise ValueError(f"`windows` must be an integer from 1 to {most}, two samples each, got {windows!r}.")
+        if windows > 1 and initial_state is not None:
+            raise ValueError("`initial_state` must be `None` if there are several windows: each has its own.")
+        if model.force_axes and np.shape(sigma) == (len(STATE_NAMES),):
+            sigma = jnp.concatenate([as_float(sigma), jnp.full(3, FORCE_SIGMA)])
+        self.model, self.flight, self.sigma = model, flight, as_float(sigma)
+        self.initial_state = None if initial_state is None else as_float(initial_state)
+        self.channels, self.method, self.windows = channels, method, windows
+
+    @property
+    def size(self) -> int:
+        """The number of states that the channels need: 3, 6 or 12."""
+        return CHANNELS[self.channels]
+
+    @property
+    def free_size(self) -> int:
+        """The number of unknowns in the initial state of one window: `size`, or 0 if the initial state is known."""
+        return 0 if self.initial_state is not None else self.size
+
+    @property
+    def columns(self) -> Int[np.ndarray, " columns"]:
+        """The positions in `CHANNEL_NAMES` of what is compared: states in cascade order, then specific force."""
+        forces = np.asarray(self.model.force_axes, dtype=int)
+        return np.concatenate([CASCADE_ORDER[: self.size], len(STATE_NAMES) + forces])
+
+    def restrict(self, channels: str) -> "ShootingProblem":
+        """The same problem on fewer channels."""
+        return dataclasses.replace(self, channels=channels)
+
+    def measured(self) -> Float[Array, "samples columns"]:
+        """The measurements that are compared, in the order of `columns`. A known first sample is NaN: it is no data."""
+        measured = (self.flight.channels if self.model.force_axes else self.flight.states)[:, self.columns]
+        return measured if self.initial_state is None else measured.at[0].set(jnp.nan)
+
+    def rows(self, parameters: Parameters | None = None) -> Rows:
+        """The data of all windows for a scan. A shorter window ends with a missing measurement.
+
+        `parameters`: for a forcing that depends on them; `model.alpha` by default.
+        """
+        index, within = self.cut()
+        forcing = windowed(self.forcing(self.model.alpha if parameters is None else parameters), index)
+        return Rows(forcing, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
+
+    def forcing(self, parameters: Parameters) -> Forcing:
+        """The forcing of the whole flight, one row for each sample."""
+        return self.model.forcing(self.flight.inputs, parameters)
+
+    def with_forcing(
+        self, rows: Rows, parameters: Parameters, *, inputs: Inputs | None = None, tangents: bool = False
+    ) -> Rows:
+        """Recompute the forcing for these parameters, optionally with its derivatives.
+
+        Does nothing if the forcing depends on no parameter. `inputs`: `flight.inputs`, prepared outside of a loop.
+        """
+        positions = np.asarray(self.model.forcing_parameters, dtype=int)
+        if not positions.size:
+            return rows
+        inputs = self.flight.inputs if inputs is None else inputs
+        index, _ = self.cut()
+
+        def forcing(values: Float[Array, " positions"]) -> Forcing:
+            new = self.model.forcing(inputs, parameters.at[positions].set(values))
+            return windowed(new._replace(recording=(), velocity=None, lateral=None), index)
+
+        def completed(forcing: Forcing, source: Forcing) -> Forcing:
+            # No parameter changes these fields: they are copied instead of computed again.
+            return forcing._replace(recording=source.recording, velocity=source.velocity, lateral=source.lateral)
+
+        values = parameters[positions]
+        if not tangents:
+            return rows._replace(forcing=completed(forcing(values), rows.forcing))
+        slopes, new = jax.jacfwd(lambda x: (forcing(x),) * 2, has_aux=True)(values)
+        zeros = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), rows.forcing)
+        return rows._replace(forcing=completed(new, rows.forcing), forcing_tangents=completed(slopes, zeros))
+
+    def split(self, initial_state: Float[Array, " starts"]) -> Float[Array, "windows size"]:
+        """The initial state of each window."""
+        return initial_state.reshape(self.windows, self.size)
+
+    def first_state(self) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
+        """The initial state at which a search starts, and how far off it may be.
+
+        It is the known state, or the first measurement of each channel in each window, or 0 if there is none.
+        """
+        order = CASCADE_ORDER[: self.size]
+        if self.initial_state is not None:
+            return self.initial_state[order], jnp.zeros(self.size, dtype=float)
+        states, sigma = jnp.stack(self.rows().measured[: self.size], axis=-1), self.sigma[order]
+        first = jnp.argmin(jnp.isnan(states), axis=1)
+        value = jnp.take_along_axis(states, first[:, None], axis=1)[:, 0]
+        off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
+        return jnp.where(jnp.isnan(value), 0.0, value).ravel(), off.ravel()
+
+    @eqx.filter_jit
+    def cost(self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None) -> Scalar:
+        """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
+
+        Infinite, with an undefined derivative, if the trajectory diverges or reaches theta = +-90 degrees.
+        `initial_state` defaults to `first_state`.
+        """
+        start = self.first_state()[0] if initial_state is None else initial_state
+        cost, sound = self.shots(parameters, start)
+        return jnp.where(sound, cost, jnp.inf)
+
+    @eqx.filter_jit
+    def residuals(
+        self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
+    ) -> Float[Array, " residuals"]:
+        """W (y - x), sample by sample with the channels in the order of `columns`; 0 for a missing measurement."""
+        start = self.first_state()[0] if initial_state is None else initial_state
+        predicted, measured = self.predict(parameters, start), self.measured()
+        return jnp.where(jnp.isnan(measured), 0.0, (measured - predicted) / self.sigma[self.columns]).ravel()
+
+    @eqx.filter_jit
+    def predict(
+        self, parameters: Parameters, initial_state: Float[Array, " starts"]
+    ) -> Float[Array, "samples columns"]:
+        """The output of noise-free sensors, in the order of `columns`."""
+        _, within = self.cut()
+        predict = jax.vmap(lambda forcing, start: predict_window(self._advance, forcing, parameters, start))
+        return predict(self.rows(parameters).forcing, self.split(initial_state))[within]
+
+    def shots(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Shot:
+        """The cost of all windows together."""
+        each = jax.vmap(self.shot, in_axes=(0, None, 0))(self.rows(parameters), parameters, self.split(initial_state))
+        return Shot(each.cost.sum(), each.sound.all())
+
+    def curvatures(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Curvature:
+        """The curvature of each window, in the parameters and the window's own initial state."""
+        rows = self.with_forcing(self.rows(), parameters, tangents=True)
+        return jax.vmap(self.curvature, in_axes=(0, None, 0))(rows, parameters, self.split(initial_state))
+
+    def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
+        """The cost of one window. A shooting method calls this in its inner loop with `rows` prepared once."""
+        return shoot(self._advance, rows, self._weights(), parameters, initial_state)
+
+    def curvature(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Curvature:
+        """Cost, gradient and Fisher information of one window, in the parameters and a free initial state."""
+        return shoot_with_derivatives(
+            self._advance,
+            rows,
+            self._weights(),
+            parameters,
+            initial_state,
+            forcing_parameters=self.model.forcing_parameters,
+            initial_state_is_free=self.initial_state is None,
+        )
+
+    @eqx.filter_jit
+    def reweighted(self, residuals: Float[Array, " residuals"]) -> "ShootingProblem":
+        """The problem with each channel's sigma estimated from the weighted `residuals` of a fit.
+
+        Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
+        freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. Residuals can be rounding
+        errors alone: no sigma falls below the rounding that adds up over a flight.
+        """
+        columns = self.columns
+        measured = self.measured()
+        count = (~jnp.isnan(measured)).sum(axis=0)
+        unknowns = len(self.model.parameter_names) + self.windows * self.free_size
+        freedom = jnp.maximum(1 - unknowns / jnp.maximum(count.sum(), 1), 1e-3)
+        squares = jnp.square(residuals.reshape(-1, columns.size)).sum(axis=0)
+        sigma = self.sigma[columns] * jnp.sqrt(squares / jnp.maximum(count * freedom, 1))
+        rounding = ROUNDING * jnp.finfo(sigma.dtype).eps * jnp.nan_to_num(jnp.nanmax(jnp.abs(measured), axis=0))
+        sigma = jnp.where((count > 1) & jnp.isfinite(sigma), jnp.maximum(sigma, rounding), self.sigma[columns])
+        sigma = jnp.where(sigma > 0, sigma, self.sigma[columns])
+        return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[columns].set(sigma))
+
+    def step(self, state: State, forcing: Forcing, parameters) -> State:
+        """The state one sample later, down to the same level of the cascade."""
+        return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
+
+    def window_of_samples(self) -> Int[np.ndarray, " samples"]:
+        """The window of each sample."""
+        return np.nonzero(self.cut()[1])[0]
+
+    def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
+        """The samples of each window, and which of them belong to it: some windows are one sample shorter."""
+        return cut(self.flight.states.shape[-2], self.windows)
+
+    def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
+        return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)
+
+    def _weights(self) -> tuple[Scalar, ...]:
+        return tuple(1 / self.sigma[self.columns])
