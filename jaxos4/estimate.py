@@ -47,7 +47,8 @@ class Estimate(eqx.Module):
     - `covariance`: of `parameters`; infinite without an estimate. An estimator that shoots takes it from the Fisher
       information at the estimate and the problem's `sigma`, a network from its errors on simulated flights.
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
-    - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels; infinite without an estimate.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own); infinite without
+      an estimate.
     - `rollouts`: number of simulated flights, on whatever channels: one for a shot with its slope, one for each
       unknown of a Fisher information.
     - `sweeps`: number of iterations, summed over the stages.

@@ -10,7 +10,7 @@ ALPHA = jaxos4.PublishedOS4().alpha
 HALF = jaxos4.DEFAULT_HALF_WIDTH
 
 
-def test_a_bracket_reaches_as_far_as_it_is_told():
+def test_a_bracket_reaches_one_half_width_to_each_side():
     bracket = jaxos4.Bracket.around(ALPHA, HALF)
     np.testing.assert_array_equal(bracket.lower, ALPHA - HALF)
     np.testing.assert_array_equal(bracket.upper, ALPHA + HALF)
