@@ -80,7 +80,6 @@ def estimate(
     out: OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
-    console = Console()
     for target in (out, report):
         if target is not None:
             check_output(target, *flights, Path(airframe), bracket, network, validate)
@@ -109,15 +108,25 @@ def estimate(
         other = None if validate is None else read_recording(validate, vehicle)
         subject = vehicle if is_vehicle else MODELS[model](vehicle)
         found = identify(recordings, subject, validate=other, progress=progress, **options)
-    found = _with_command(found, airframe)
+    _publish(Console(), found, airframe, out, report, ", ".join(path.name for path in flights))
+
+
+def _publish(
+    console: Console, found: Identification, airframe: str, out: Path | None, report: Path | None, title: str
+) -> None:
+    """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
+    written = _report(found, airframe)
     if out is not None:
         write_json(found.to_dict(), out)
     for note in found.provenance["notes"]:
         console.print(f"note: {note}", markup=False, highlight=False)
-    print_identification(console, found)
-    if report is not None and isinstance(found, VehicleIdentification):
-        write_flight_page(report, found, title=", ".join(path.name for path in flights))
-        console.print(f"report: {report}", markup=False, highlight=False)
+    if isinstance(found, VehicleIdentification):
+        print_vehicle(console, written)
+        if report is not None:
+            write_flight_page(report, report=written, predicted=found.predictions, title=title)
+            console.print(f"report: {report}", markup=False, highlight=False)
+    else:
+        print_flight(console, written)
     if not found.successful:
         typer.echo(f"jaxos4: {found.result}: {RESULTS[getattr(RESULTS, found.result)]}", err=True)
         raise typer.Exit(1)

@@ -46,7 +46,7 @@ def identify(
         found = jaxos4.identify(flight, jaxos4.PublishedOS4())
         found.parameters["alpha3"].ci95
 
-    The noise levels of the sensors are estimated too. This is what `jaxos4 estimate` computes, prints and writes.
+    The noise levels of the sensors are estimated too. `jaxos4 estimate` calls this function.
 
     **Arguments:**
 
@@ -74,35 +74,43 @@ def identify(
     - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
     - `loss`: `"huber"` cuts outliers, `"squares"` does not; by default `"huber"`.
 
-    **Returns:** a `FlightIdentification` for a model, a `VehicleIdentification` for an airframe. An estimate that
-    failed or cannot be trusted says so in `result`.
+    **Returns:** a `FlightIdentification` for a model, a `VehicleIdentification` for an airframe. Check `result`.
 
     **Raises:** `InputError`, one line, for arguments and flights that cannot be used; `TrainingError` if a network
     cannot be trained.
     """
     recordings = as_recordings(flights)
     other = None if validate is None else as_recordings(validate, "validation flight")[0]
-    if not recordings:
-        raise InputError("`flights`: holds no flight; give at least one.")
     common = {"estimator": estimator, "bracket": bracket, "window": window, "seed": seed, "progress": progress}
     of_model = {"channels": channels, "network": network}
     of_vehicle = {"terms": terms, "begin": begin, "end": end, "sample_time": sample_time}
     of_vehicle |= {"holdout": holdout, "loss": loss}
     if isinstance(subject, Airframe):
-        _refuse(of_model, "a vehicle is identified from its rates and specific force, and trains its own network")
-        if initial_state != "free":
-            raise InputError(f"`initial_state` {initial_state}: each window has its own initial state; leave it out.")
+        _check_vehicle(recordings, initial_state, of_model)
         return identify_vehicle(recordings, subject, validate=other, **of_vehicle, **common)
+    _check_model(recordings, subject, of_vehicle)
+    return identify_flight(recordings[0], subject, initial_state=initial_state, validate=other, **of_model, **common)
+
+
+def _check_vehicle(recordings: Sequence[Recording], initial_state: str, of_model: dict[str, Any]) -> None:
+    if not recordings:
+        raise InputError("`flights`: holds no flight; give at least one.")
+    _refuse(of_model, "a vehicle is identified from its rates and specific force, and trains its own network")
+    if initial_state != "free":
+        raise InputError(f"`initial_state` {initial_state}: each window has its own initial state; leave it out.")
+
+
+def _check_model(recordings: Sequence[Recording], subject: AbstractModel, of_vehicle: dict[str, Any]) -> None:
     if subject.parameter_names != PARAMETER_NAMES:
         raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(subject).__name__}.")
     name = choice(subject, MODELS)
     _refuse(of_vehicle, f"is for an `Airframe` as `subject`, not for the {name} model")
-    first, *others = recordings
-    if others:
+    if not recordings:
+        raise InputError("`flights`: holds no flight; give one.")
+    if len(recordings) > 1:
         raise InputError(
             f"{others[0].name}: `subject` {name} explains one flight; use an `Airframe` as `subject` for several."
         )
-    return identify_flight(first, subject, initial_state=initial_state, validate=other, **of_model, **common)
 
 
 def _refuse(options: dict[str, Any], why: str) -> None:
