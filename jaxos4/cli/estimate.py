@@ -16,7 +16,6 @@ from ..identification import Identification, VehicleIdentification, identify
 from ..models import MODELS
 from ..recording import read_recording
 from ..report.flight_page import write_flight_page
-from ..report.identification_page import print_identification
 from ..results import RESULTS
 from ._check_output import check_output
 from ._choices import (
