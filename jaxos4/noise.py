@@ -181,6 +181,12 @@ def _normal(key: Key, like: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
 # Correlation time [s] of coloured noise, offset and step in multiples of the white noise, share of lost samples.
 _MEMORY, _OFFSET, _STEP, _LOST = 0.05, 0.5, 2.0, 0.1
 
+
+def measure(flight: Flight, noise: AbstractNoise, *, seed: int) -> Flight:
+    """The flight as noisy sensors record it, with random numbers from `seed`."""
+    return noise(flight, key=jax.random.key(seed))
+
+
 NOISES: dict[str, Callable[[ArrayLike], AbstractNoise]] = {
     "white": WhiteNoise,
     "coloured": lambda sigma: GaussMarkov(sigma, _MEMORY),

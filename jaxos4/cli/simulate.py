@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import typer
 
 from ..airframe import load_airframe
@@ -11,7 +10,7 @@ from ..errors import InputError
 from ..excitation import EXCITATIONS
 from ..logs import write_flight
 from ..models import MODELS
-from ..noise import SENSOR_SIGMA, WhiteNoise
+from ..noise import SENSOR_SIGMA, WhiteNoise, measure
 from ..results import RESULTS, result_names
 from ..simulation import simulate as fly
 from ._check_output import check_output
@@ -48,6 +47,6 @@ def simulate(
     if flight.result != RESULTS.successful:
         typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
         raise typer.Exit(1)
-    flight = WhiteNoise(noise * SENSOR_SIGMA)(flight, key=jax.random.key(seed))
+    flight = measure(flight, WhiteNoise(noise * SENSOR_SIGMA), seed=seed)
     write_flight(flight, out)
     typer.echo(f"{out}: {omega.shape[0]} samples of {dt:g} s, {model.value} model, {method.value}, noise {noise:g}")
