@@ -16,6 +16,7 @@ from ..identification import Identification, VehicleIdentification, identify
 from ..models import MODELS
 from ..recording import read_recording
 from ..report.flight_page import write_flight_page
+from ..report.identification_page import print_identification
 from ..results import RESULTS
 from ._check_output import check_output
 from ._choices import (
@@ -107,25 +108,20 @@ def estimate(
         other = None if validate is None else read_recording(validate, vehicle)
         subject = vehicle if is_vehicle else MODELS[model](vehicle)
         found = identify(recordings, subject, validate=other, progress=progress, **options)
-    _publish(Console(), found, airframe, out, report, ", ".join(path.name for path in flights))
+    title = ", ".join(path.name for path in flights)
+    _publish(Console(), _with_command(found, airframe), out=out, report=report, title=title)
 
 
-def _publish(
-    console: Console, found: Identification, airframe: str, out: Path | None, report: Path | None, title: str
-) -> None:
+def _publish(console: Console, found: Identification, *, out: Path | None, report: Path | None, title: str) -> None:
     """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
-    written = _report(found, airframe)
     if out is not None:
         write_json(found.to_dict(), out)
     for note in found.provenance["notes"]:
         console.print(f"note: {note}", markup=False, highlight=False)
-    if isinstance(found, VehicleIdentification):
-        print_vehicle(console, written)
-        if report is not None:
-            write_flight_page(report, report=written, predicted=found.predictions, title=title)
-            console.print(f"report: {report}", markup=False, highlight=False)
-    else:
-        print_flight(console, written)
+    print_identification(console, found)
+    if report is not None and isinstance(found, VehicleIdentification):
+        write_flight_page(report, found, title=title)
+        console.print(f"report: {report}", markup=False, highlight=False)
     if not found.successful:
         typer.echo(f"jaxos4: {found.result}: {RESULTS[getattr(RESULTS, found.result)]}", err=True)
         raise typer.Exit(1)

@@ -109,7 +109,7 @@ def _check_model(recordings: Sequence[Recording], subject: AbstractModel, of_veh
         raise InputError("`flights`: holds no flight; give one.")
     if len(recordings) > 1:
         raise InputError(
-            f"{others[0].name}: `subject` {name} explains one flight; use an `Airframe` as `subject` for several."
+            f"{recordings[1].name}: `subject` {name} explains one flight; use an `Airframe` as `subject` for several."
         )
 
 
