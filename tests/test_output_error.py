@@ -98,57 +98,9 @@ def test_many_lanes_at_once_come_back():
     assert np.isfinite(short(states, starts).parameters).all()
 
 
-def test_a_poisoned_lane_leaves_the_others_alone():
-    states, starts = noisy_states(8, seed=5), random_starts(jaxos4.PublishedOS4(), 8, seed=5)
-    poisoned = states.at[3, 20].set(jnp.inf)
-    before, after = (identify(s, starts, jaxos4.PublishedOS4, "rates") for s in (states, poisoned))
-    names = jaxos4.result_names(after.result)
-    assert names[3] == "nonfinite_trajectory"
-    assert set(np.delete(names, 3)) == {"successful"}
-    assert eqx.tree_equal(*(jnp.delete(e.parameters, 3, axis=0) for e in (before, after)))
-    for leaf in (after.parameters, after.initial_state):
-        assert np.isfinite(leaf).all()
-
-
-def test_loop_and_vmap_agree():
-    states, starts = noisy_states(3, seed=6), random_starts(jaxos4.PublishedOS4(), 3, seed=6)
-    batch = identify(states, starts, jaxos4.PublishedOS4, "rates")
-    for i in range(3):
-        alone = OutputError()(
-            standard_problem(channels="rates", states=states[i]), around(jaxos4.PublishedOS4, starts[i])
-        )
-        assert np.abs((alone.parameters - batch.parameters[i]) / alone.std).max() < 1e-3
-
-
-def test_missing_samples_only_cost_precision():
-    states = noisy_states(1, seed=8)[0]
-    holes = states.at[100:200].set(jnp.nan)
-    whole, gappy = (
-        OutputError()(p, jaxos4.Bracket.default(p.model))
-        for p in (standard_problem(states=states), standard_problem(states=holes))
-    )
-    assert jaxos4.result_names(gappy.result) == "successful"
-    assert np.all(gappy.std > whole.std)
-    assert np.abs((gappy.parameters - whole.parameters) / gappy.std).max() < 3
-
-
-def test_what_cannot_be_told_is_said():
+def test_a_truth_far_from_the_bracket_is_reported():
     problem = standard_problem(channels="rates")
-    hover = jnp.full_like(problem.flight.omega, problem.model.airframe.hover_speed)
-    still = jaxos4.simulate(problem.model, problem.model.alpha, hover, dt=0.01)
-    lost = eqx.tree_at(lambda p: p.flight, problem, still)
-    assert jaxos4.result_names(OutputError()(lost, jaxos4.Bracket.default(problem.model)).result) == "unidentifiable"
-    center = problem.model.alpha
-    invalid = OutputError()(problem, jaxos4.Bracket(center, center))
-    assert jaxos4.result_names(invalid.result) == "bracket_invalid"
-    assert np.isfinite(invalid.parameters).all()
-    narrow = jaxos4.Bracket.around(center + 0.8 * problem.model.half_width, 0.15 * problem.model.half_width)
+    narrow = jaxos4.Bracket.around(
+        problem.model.alpha + 0.8 * problem.model.half_width, 0.15 * problem.model.half_width
+    )
     assert jaxos4.result_names(OutputError()(problem, narrow).result) == "at_bound"
-
-
-@pytest.mark.parametrize("settings", [{"tolerance": 0.0}, {"tolerance": -1.0}, {"max_steps": 0}])
-def test_settings_out_of_range_are_named(settings):
-    with pytest.raises(ValueError, match=f"`{next(iter(settings))}` must be"):
-        OutputError(**settings)
-    with pytest.raises(ValueError, match="`bracket` must hold 8 parameters"):
-        OutputError()(standard_problem(), jaxos4.Bracket(jnp.zeros(3), jnp.ones(3)))

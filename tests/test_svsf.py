@@ -2,56 +2,22 @@
 
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, noisy_states, published_derivative, random_starts, standard_flight, standard_problem
+from helpers import DT, noisy_states, published_derivative, random_starts, standard_problem
+from lanes import HALF, LANES, bound, identify, lanes, names
 
 import jaxos4
 from jaxos4.estimators.svsf import SVSF
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
-HALF = jaxos4.DEFAULT_HALF_WIDTH
 RATES = [7, 9, 11]
-LANES = 64
-
-
-@eqx.filter_jit
-def identify(estimator, problem, states, omega, lower, upper):
-    """One estimate for each lane of the last four arguments."""
-
-    @eqx.filter_vmap
-    def lane(states, omega, lower, upper):
-        flight = eqx.tree_at(lambda f: (f.states, f.omega), problem.flight, (states, omega))
-        return estimator(eqx.tree_at(lambda p: p.flight, problem, flight), jaxos4.Bracket(lower, upper))
-
-    return lane(states, omega, lower, upper)
-
-
-def lanes(states, model_class=PUBLISHED, *, free=False, channels="rates", scale=1.0):
-    """Arguments of `identify`: brackets whose centers are off by up to 80 % of their half-width."""
-    center = random_starts(model_class(), len(states), seed=150)
-    omega = jnp.tile(standard_flight(model_class).omega, (len(states), 1, 1))
-    problem = standard_problem(model_class, channels, free=free)
-    problem = eqx.tree_at(lambda p: p.sigma, problem, scale * problem.sigma)
-    return problem, states, omega, center - HALF, center + HALF
-
-
-@functools.cache
-def bound(model_class=PUBLISHED):
-    """Standard deviations at the Cramer-Rao bound of the rates."""
-    problem = standard_problem(model_class, "rates")
-    return np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model_class().alpha)))
 
 
 def errors(estimates, model_class=PUBLISHED):
     return np.asarray(estimates.parameters - model_class().alpha)
-
-
-def names(estimates):
-    return jaxos4.result_names(estimates.result)
 
 
 @functools.cache
@@ -127,7 +93,7 @@ def plain(states, omega, center, *, gamma, rates_layer, parameter_layer, damping
         full[RATES] = x
         return x + DT * published_derivative(full, row, center + u * HALF)[RATES]
 
-    x, u, left, phi, energy, history = np.zeros(3), np.zeros(8), np.zeros(3), np.zeros((3, 8)), np.zeros(8), []
+    x, u, remaining, phi, energy, history = np.zeros(3), np.zeros(8), np.zeros(3), np.zeros((3, 8)), np.zeros(8), []
     for k, y in enumerate(states):
         seen = ~np.isnan(y) & (k > 0)
         e = np.where(seen, y - x, 0.0)
@@ -141,9 +107,9 @@ def plain(states, omega, center, *, gamma, rates_layer, parameter_layer, damping
         layer = parameter_layer * np.sqrt((inverse**2) @ sigma**2)
         with np.errstate(divide="ignore", invalid="ignore"):
             sat = np.where(layer > 0, np.clip(w / layer, -1, 1), 0)
-        x = x + (np.abs(e) + gamma * left) * np.clip(e / (rates_layer * sigma), -1, 1)
+        x = x + (np.abs(e) + gamma * remaining) * np.clip(e / (rates_layer * sigma), -1, 1)
         u = np.clip(u + unit * (np.abs(w) + gamma * np.abs(w)) * sat, -4, 4)
-        left = np.where(seen, np.abs(y - x), left)
+        remaining = np.where(seen, np.abs(y - x), remaining)
         history.append(center + u * HALF)
         phi = np.stack([(step(x, u + d, omega[k]) - step(x, u - d, omega[k])) / 2 for d in np.eye(8)], axis=1)
         x = step(x, u, omega[k])
@@ -169,7 +135,12 @@ def test_agrees_with_plain_numpy():
         assert np.abs(other / HALF - history / HALF).max() > 1e-6, name
 
 
-# When things go wrong: the others do not notice.
+def test_other_channels_do_not_matter():
+    states, (_, _, _, lower, upper) = noisy_states(LANES, seed=50), lanes(noisy_states(LANES, seed=50))
+    alone = SVSF()(standard_problem(channels="all", states=states[1]), jaxos4.Bracket(lower[1], upper[1]))
+    assert (np.abs(alone.parameters - noisy().parameters[1]) / bound()).max() < 1e-6
+    np.testing.assert_allclose(alone.covariance, noisy().covariance[1], rtol=1e-5, atol=1e-15)
+    assert alone.initial_state.shape == (12,)
 
 
 def test_missing_samples_only_cost_precision():
@@ -181,78 +152,3 @@ def test_missing_samples_only_cost_precision():
     error = errors(estimates)
     assert np.sqrt(np.mean((error / bound()) ** 2, axis=0)).max() < 5
     assert np.mean(np.abs(error) < 1.96 * np.asarray(estimates.std)) > 0.87
-
-
-def test_failing_lanes_leave_their_neighbours_alone():
-    problem, states, omega, lower, upper = lanes(noisy_states(LANES, seed=50))
-    states, omega, lower, upper = (np.array(x) for x in (states, omega, lower, upper))
-    p, sound, expected = 7, noisy(), {}
-
-    def broken_lane(lane, result):
-        expected[lane] = result
-        return lane
-
-    omega[broken_lane(1, "nonfinite_trajectory"), 250, 2] = np.nan
-    omega[broken_lane(3, "nonfinite_trajectory"), 30, 0] = np.inf
-    states[broken_lane(5, "nonfinite_trajectory"), 100, p] = np.inf
-    states[broken_lane(7, "nonfinite_trajectory"), 500, p] = -np.inf
-    lane = broken_lane(9, "bracket_invalid")
-    lower[lane, 0], upper[lane, 0] = upper[lane, 0], lower[lane, 0]
-    lower[broken_lane(11, "bracket_invalid"), 2] = np.nan
-    upper[broken_lane(13, "bracket_invalid"), 3] = np.inf
-    broken = identify(SVSF(), problem, *(jnp.asarray(x) for x in (states, omega, lower, upper)))
-    assert {lane: str(names(broken)[lane]) for lane in expected} == expected
-    others = np.setdiff1d(np.arange(LANES), list(expected))
-    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(sound), strict=True):
-        np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
-    for leaf in (broken.parameters, broken.initial_state, broken.history):
-        assert np.isfinite(leaf).all()
-    for lane in expected:
-        assert np.isinf(broken.std[lane]).all()
-        assert np.isinf(broken.cost[lane])
-
-
-def test_nothing_measured_leaves_the_bracket():
-    problem = standard_problem(channels="rates", states=jnp.full((501, 12), jnp.nan))
-    bracket = jaxos4.Bracket.default(PUBLISHED())
-    estimate = SVSF()(problem, bracket)
-    np.testing.assert_allclose(estimate.parameters, bracket.center)
-    np.testing.assert_allclose(estimate.std, HALF)
-
-
-def test_loop_jit_and_vmap_agree_and_other_channels_do_not_matter():
-    states = noisy_states(LANES, seed=50)
-    _, _, _, lower, upper = lanes(states)
-    batched = noisy()
-    for lane, channels in enumerate(("rates", "all")):
-        problem = standard_problem(channels=channels, states=states[lane])
-        alone = SVSF()(problem, jaxos4.Bracket(lower[lane], upper[lane]))
-        assert (np.abs(alone.parameters - batched.parameters[lane]) / bound()).max() < 1e-6
-        np.testing.assert_allclose(alone.covariance, batched.covariance[lane], rtol=1e-5, atol=1e-15)
-        if channels == "rates":
-            np.testing.assert_allclose(alone.cost, batched.cost[lane], rtol=1e-6)
-        assert alone.initial_state.shape == (problem.size,)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"gamma": 1.0}, r"`gamma` must be at least 0 and below 1, got 1.0"),
-        ({"gamma": -0.1}, r"`gamma` must be at least 0 and below 1"),
-        ({"gamma": np.nan}, r"`gamma` must be at least 0 and below 1"),
-        ({"rates_layer": 0.0}, r"`rates_layer` must be positive and finite, got 0.0"),
-        ({"parameter_layer": -1.0}, r"`parameter_layer` must be positive and finite"),
-        ({"damping": np.inf}, r"`damping` must be positive and finite, got inf"),
-        ({"equilibration": 0.5}, r"`equilibration` must be finite and at least 1, got 0.5"),
-        ({"passes": 0}, r"`passes` must be an integer of at least 1, got 0"),
-    ],
-)
-def test_settings_out_of_range_are_named(settings, message):
-    with pytest.raises(ValueError, match=message):
-        SVSF(**settings)
-
-
-def test_brackets_of_another_length_are_named():
-    problem = standard_problem(channels="rates", duration=0.1)
-    with pytest.raises(ValueError, match=r"`bracket` must hold 8 parameters, got 7"):
-        SVSF()(problem, jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)))

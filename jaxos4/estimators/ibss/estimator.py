@@ -191,7 +191,7 @@ class IBSS(AbstractEstimator):
         sweep = functools.partial(self._sweep, stage, spread=spread, before=progress.sweeps, last=last)
         search = jax.lax.while_loop(lambda search: ~search.ended, sweep, search)
         if self.directions == "coordinate":
-            covariance = covariances(search.curvature.information + stage.prior, stage.parameters)
+            covariance = covariances(search.curvature.information + stage.prior, stage.parameter_count)
         else:
             covariance = (search.basis[:, :, None, :] * search.basis[:, None, :, :]).sum(axis=-1)
         noise = jnp.maximum(misfit(search.curvature.shot.cost.sum(), stage.rows), 1.0)

@@ -41,7 +41,7 @@ class Stage(NamedTuple):
     finest: Scalar
 
     @property
-    def parameters(self) -> int:
+    def parameter_count(self) -> int:
         """Number of parameters."""
         return len(self.problem.model.parameter_names)
 
@@ -53,17 +53,18 @@ class Stage(NamedTuple):
     @property
     def size(self) -> int:
         """Number of unknowns of one window."""
-        return self.parameters + self.own
+        return self.parameter_count + self.own
 
     def with_forcing(self, unknowns: Float[Array, "windows unknowns"], *, tangents: bool = False) -> Rows:
         """The rows with the forcing of these parameters, and its derivatives if wanted."""
-        first = unknowns[0, : self.parameters]
-        return self.problem.with_forcing(self.rows, first, inputs=self.inputs, tangents=tangents)
+        return self.problem.with_forcing(
+            self.rows, unknowns[0, : self.parameter_count], inputs=self.inputs, tangents=tangents
+        )
 
     def fly(self, function: Callable, rows: Rows, unknowns: Float[Array, "windows unknowns"]):
         """`function` (`problem.shot` or `problem.curvature`) of every window."""
-        starts = unknowns[:, self.parameters :] if self.own else self.starts
-        return jax.vmap(function)(rows, unknowns[:, : self.parameters], starts)
+        starts = unknowns[:, self.parameter_count :] if self.own else self.starts
+        return jax.vmap(function)(rows, unknowns[:, : self.parameter_count], starts)
 
     def summed(self, number: Int[Array, ""], slopes: Float[Array, " windows"]) -> Float[Array, " windows"]:
         """Slopes along direction `number`: summed over the windows, if the direction belongs to all of them."""

@@ -40,9 +40,9 @@ def look_around(stage: Stage, unknowns: Float[Array, "windows unknowns"], *, whi
     curvature = stage.fly(stage.problem.curvature, rows, unknowns)
     information = curvature.information + stage.prior
     if whitened:
-        factor, basis = whitened_directions(information, stage.parameters, stage.problem.model.forcing_parameters)
+        factor, basis = whitened_directions(information, stage.parameter_count, stage.problem.model.forcing_parameters)
     else:
-        factor, basis = coordinate_directions(information, stage.parameters)
+        factor, basis = coordinate_directions(information, stage.parameter_count)
     slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
     slopes = slopes.at[:, stage.own :].set(slopes[:, stage.own :].sum(axis=0))
     rooms = jax.vmap(lambda direction: room(unknowns, direction, stage.limits), -1, -1)(basis)

@@ -1,0 +1,144 @@
+"""Laws that hold for every estimator of the registry that needs no network: one batch of noisy flights, one program."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import noisy_states, standard_flight, standard_problem
+from lanes import HALF, LANES, bound, identify, lanes, names
+
+import jaxos4
+from jaxos4.bracket import GAUSSIAN_PRIOR
+from jaxos4.estimators import ESTIMATORS, make_estimator
+from jaxos4.models.state import CHANNELS
+
+MODEL, P = jaxos4.PublishedOS4(), jaxos4.STATE_NAMES.index("p")
+NAMES = [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
+every_estimator = pytest.mark.parametrize("name", NAMES)
+
+
+@functools.cache
+def noisy(name, scale=1.0):
+    return identify(make_estimator(name), *lanes(noisy_states(LANES, seed=50, scale=scale), scale=scale))
+
+
+@every_estimator
+def test_tiny_noise_gives_the_truth(name):
+    estimates = noisy(name, 1e-4)
+    assert set(names(estimates)) == {"successful"}
+    most = 0.02 * HALF if name == "svsf" else 10 * 1e-4 * bound()
+    assert (np.abs(estimates.parameters - MODEL.alpha) < most).all()
+
+
+@every_estimator
+def test_loop_jit_and_vmap_agree(name):
+    batched, (problem, states, _, lower, upper) = noisy(name), lanes(noisy_states(LANES, seed=50))
+    assert set(names(batched)) == {"successful"}
+    for lane in range(2):
+        data = eqx.tree_at(lambda p: p.flight.states, problem, states[lane])
+        alone = make_estimator(name)(data, jaxos4.Bracket(lower[lane], upper[lane]))
+        most = 1e-3 if name == "output-error" else 1e-6
+        assert (np.abs(alone.parameters - batched.parameters[lane]) / bound()).max() < most
+        np.testing.assert_allclose(alone.covariance, batched.covariance[lane], rtol=1e-5, atol=1e-15)
+        np.testing.assert_allclose(alone.cost, batched.cost[lane], rtol=1e-6)
+        assert (names(alone), int(alone.rollouts)) == (names(batched)[lane], int(batched.rollouts[lane]))
+
+
+@every_estimator
+def test_failing_lanes_leave_their_neighbours_alone(name):
+    problem, *arrays = lanes(noisy_states(LANES, seed=50))
+    states, omega, lower, upper = (np.array(x) for x in arrays)
+    failed, vague = np.arange(1, 16, 2), np.array([2, 4, 6])
+    omega[1, 250, 2] = np.nan
+    omega[3, 30, 0] = np.inf
+    states[5, 100, P] = np.inf
+    states[7, 500, P] = -np.inf
+    lower[9, 0], upper[9, 0] = upper[9, 0], lower[9, 0]
+    lower[11, 2] = np.nan
+    upper[13, 3] = np.inf
+    upper[15, 4] = lower[15, 4]
+    states[2, :, P] = np.nan  # roll was not measured
+    states[4] -= standard_flight().states  # a hover
+    omega[4] = MODEL.airframe.hover_speed
+    states[6] = np.nan  # nothing was measured
+    broken = identify(make_estimator(name), problem, *map(jnp.asarray, (states, omega, lower, upper)))
+    expected = np.full(LANES, "successful", dtype=object)
+    expected[failed], expected[vague] = ["nonfinite_trajectory"] * 4 + ["bracket_invalid"] * 4, "unidentifiable"
+    assert names(broken).tolist() == expected.tolist()
+    others = np.setdiff1d(np.arange(LANES), [*failed, *vague])
+    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(noisy(name)), strict=True):
+        np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
+    # Every parameter is finite. A lane without an answer is infinitely uncertain.
+    assert all(np.isfinite(leaf).all() for leaf in (broken.parameters, broken.initial_state))
+    assert broken.history is None or np.isfinite(broken.history).all()
+    assert np.isinf(np.asarray(broken.std)[failed]).all()
+    assert np.isinf(np.asarray(broken.cost)[failed]).all()
+    np.testing.assert_allclose(broken.parameters[1:9:2], (lower[1:9:2] + upper[1:9:2]) / 2)
+    # A flight without measurements adds nothing to the bracket.
+    prior = ESTIMATORS[name].prior
+    assert (np.asarray(broken.std)[vague] > prior * HALF).any(axis=1).all()
+    np.testing.assert_allclose(broken.parameters[6], (lower[6] + upper[6]) / 2)
+    if prior == GAUSSIAN_PRIOR:
+        np.testing.assert_allclose(broken.std[6], HALF)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "svsf"])
+def test_missing_samples_only_cost_precision(name):
+    """Three of ten measurements are lost, and the covariance still describes the errors."""
+    states = noisy_states(LANES, seed=7)
+    lost = jax.random.bernoulli(jax.random.key(8), 0.3, states.shape)
+    estimates = identify(make_estimator(name), *lanes(jnp.where(lost, jnp.nan, states)))
+    assert set(names(estimates)) == {"successful"}
+    assert (np.median(estimates.std, axis=0) > 1.05 * bound()).all()
+    error = np.asarray(estimates.parameters - MODEL.alpha)
+    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimates.covariance), error) / 8
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
+
+
+@every_estimator
+def test_brackets_of_another_length_are_named(name):
+    problem = standard_problem(channels="rates", duration=0.1)
+    with pytest.raises(ValueError, match=r"`bracket` must hold 8 parameters, got 7"):
+        make_estimator(name)(problem, jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)))
+
+
+def test_the_registry_makes_every_estimator_and_names_misuse():
+    for name, kind in ESTIMATORS.items():
+        assert kind.looks_at in CHANNELS
+        if kind.needs_network:
+            with pytest.raises(ValueError, match="`network` must be a trained network"):
+                make_estimator(name)
+    with pytest.raises(ValueError, match="`name` must be one of ibss, .*, got 'newton'"):
+        make_estimator("newton")
+
+
+@pytest.mark.parametrize(
+    ("make", "setting", "values", "message"),
+    [
+        (jaxos4.IBSS, "directions", ["steepest"], "must be one of whitened, coordinate"),
+        (jaxos4.IBSS, "halvings", [1], "must be an integer of at least 2"),
+        (jaxos4.IBSS, "max_sweeps", [0], "must be an integer of at least 1"),
+        (jaxos4.IBSS, "tolerance", [0.0, np.nan], "must be positive"),
+        (jaxos4.IBSS, "reach", [-1.0], "must be positive"),
+        (jaxos4.OutputError, "tolerance", [0.0, -1.0], "must be positive"),
+        (jaxos4.OutputError, "max_steps", [0], "must be an integer of at least 1"),
+        (jaxos4.EquationError, "memory", [-0.1, 1.5, np.nan], r"must lie in \[0, 1\]"),
+        (jaxos4.EquationError, "bridge", [-1], "must be an integer of at least 0"),
+        (jaxos4.RecursiveLeastSquares, "forgetting", [0.0, 1.1], r"must lie in \(0, 1\]"),
+        (jaxos4.RecursiveLeastSquares, "memory", [2.0], r"must lie in \[0, 1\]"),
+        (jaxos4.SVSF, "gamma", [1.0, -0.1, np.nan], "must be at least 0 and below 1"),
+        (jaxos4.SVSF, "rates_layer", [0.0], "must be positive and finite"),
+        (jaxos4.SVSF, "parameter_layer", [-1.0], "must be positive and finite"),
+        (jaxos4.SVSF, "damping", [np.inf], "must be positive and finite"),
+        (jaxos4.SVSF, "equilibration", [0.5], "must be finite and at least 1"),
+        (jaxos4.SVSF, "passes", [0], "must be an integer of at least 1"),
+        (jaxos4.JointEKF, "passes", [0, -1], "must be an integer of at least 1"),
+    ],
+)
+def test_settings_out_of_range_are_named(make, setting, values, message):
+    for value in values:
+        with pytest.raises(ValueError, match=f"`{setting}` {message}.*, got '?{value}'?"):
+            make(**{setting: value})
