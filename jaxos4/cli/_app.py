@@ -24,12 +24,13 @@ for command in (simulate, estimate, train, inspect, identifiability, compare, st
     app.command()(command)
 
 
-def _show_version(wanted: bool) -> None:
+def _show_version(wanted: bool) -> bool:
     if wanted:
         from .. import __version__
 
         typer.echo(f"jaxos4 {__version__}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()
