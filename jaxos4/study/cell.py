@@ -34,20 +34,17 @@ _KEPT = ("parameters", "std", "cost", "rollouts", "initial_state", "result", "se
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
-    """Identifies the flights of a cell on the default device. Raises as the estimator does.
+    """Identifies the flights of a cell on the default device. `network`: that of `job_of`, if the estimator needs one.
 
-    **Arguments:**
-
-    - `network`: the network of `job_of`, if the estimator needs one.
+    Raises as the estimator does.
     """
     with jax.enable_x64(study.double):
         scenario = cell.scenario
         with one_core():
             fleet = fleet_of(study, scenario)
             flights = fly(study, fleet, cell)
-            bound = scenario.scale * np.asarray(
-                cramer_rao_std(blank_problem(study, fleet, 1.0, scenario.seen), flights)
-            )
+            standard = blank_problem(study, fleet, 1.0, scenario.seen)
+            bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
             blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
         found = _identify(_estimator(scenario.estimator, network), blank, fleet.bracket, flights.measured)
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))

@@ -80,8 +80,7 @@ def center_error(dataset: xr.Dataset) -> xr.Dataset:
     `reason` is that of the estimator with the smallest bound.
     """
     truth = dataset["truth"]
-    reason = _no_percentage(truth, dataset["bound"].min("estimator"))
-    return _both(dataset["center"] - truth, truth, reason)
+    return _both(dataset["center"] - truth, truth, _no_percentage(truth, dataset["bound"].min("estimator")))
 
 
 def normalised_error(dataset: xr.Dataset) -> xr.DataArray:
@@ -163,13 +162,9 @@ def _no_percentage(truth: xr.DataArray, bound: xr.DataArray) -> xr.DataArray:
     return xr.where(zero, 1, xr.where(below, 2, 0))
 
 
-def _percent(values: xr.DataArray, truth: xr.DataArray, reason: xr.DataArray) -> xr.DataArray:
-    return (100 * values / abs(truth.where(truth != 0))).where(reason == 0)
-
-
 def _both(values: xr.DataArray, truth: xr.DataArray, reason: xr.DataArray) -> xr.Dataset:
-    percent = _rms(_percent(values, truth, reason))
-    return xr.Dataset({"percent": percent, "absolute": _rms(values), "reason": reason})
+    percent = (100 * values / abs(truth.where(truth != 0))).where(reason == 0)
+    return xr.Dataset({"percent": _rms(percent), "absolute": _rms(values), "reason": reason})
 
 
 def _rms(values: xr.DataArray) -> xr.DataArray:

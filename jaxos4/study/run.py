@@ -34,7 +34,7 @@ class Step(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """A task for a device: its name, the call, and what to do with the result."""
+    """A task for a device: its name, the call with the device, and what to do with the result."""
 
     label: str
     call: Callable[[Any], Any]
@@ -71,7 +71,9 @@ class _Work:
             return self._cell(program.waiting.popleft(), program)
         if (program := self._untried()) is not None:
             program.devices.add(device)
-            return self._compilation(program.waiting[0])
+            cell = program.waiting[0]
+            label = f"compiling {cell.scenario.estimator}"
+            return _Task(label, lambda device: _compile(self.study, cell, device), lambda _: None)
         return None
 
     def _ready(self, device: Any) -> _Program | None:
@@ -105,13 +107,6 @@ class _Work:
             self.done += 1
 
         return _Task(label_of(self.study, cell), lambda device: _compute(self.study, cell, network, device), keep)
-
-    def _compilation(self, cell: Cell) -> _Task:
-        return _Task(
-            f"compiling {cell.scenario.estimator}",
-            lambda device: _compile(self.study, cell, device),
-            lambda _: None,
-        )
 
 
 def run_here(store: Store) -> Iterator[Step]:

@@ -57,6 +57,16 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     hybrid_channels: Literal["rates", "attitude", "all"] = "all"
     seed: Seed = 0
 
+    def estimator(self, **settings: Any) -> NetworkEstimator:
+        """The network to be trained. Raises `ValueError` as `NetworkEstimator` does."""
+        return NetworkEstimator(
+            features=self.features,
+            approximator=self.approximator,
+            steps=self.steps,
+            held_out=self.held_out,
+            **settings,
+        )
+
 
 class Scenario(NamedTuple):
     """One point of the grid: what is flown, how it is measured, and which estimator identifies it."""
@@ -185,9 +195,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
         estimates = math.prod(self.shape) * self.flights
         if estimates > _MOST_ESTIMATES:
-            raise InputError(
-                f"{estimates} estimates, more than {_MOST_ESTIMATES}; reduce `flights`, or shorten an axis."
-            )
+            most = f"more than {_MOST_ESTIMATES}"
+            raise InputError(f"{estimates} estimates, {most}; reduce `flights`, or shorten an axis.")
 
     def check_computable(self) -> None:
         """Raises `InputError` for an excitation that an airframe cannot fly, or a network that cannot be trained."""
@@ -196,14 +205,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 EXCITATIONS[excitation](self.vehicle(name), duration=duration, dt=self.dt)
             except ValueError as error:
                 raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
-        settings = self.network
         try:
-            NetworkEstimator(
-                features=settings.features,
-                approximator=settings.approximator,
-                steps=settings.steps,
-                held_out=settings.held_out,
-            )
+            self.network.estimator()
         except ValueError as error:
             raise InputError(f"`network`: {error}") from None
 
@@ -215,9 +218,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             except InputError as error:
                 raise InputError(f"[airframe.{name}]: {error}") from None
         if name not in PRESETS:
-            raise InputError(
-                f"`airframes`: unknown {name!r}; choose from {', '.join(PRESETS)}, or add [airframe.{name}]."
-            )
+            presets = ", ".join(PRESETS)
+            raise InputError(f"`airframes`: unknown {name!r}; choose from {presets}, or add [airframe.{name}].")
         return PRESETS[name]
 
     @property
@@ -269,22 +271,12 @@ def load_study(path: Path) -> Study:
     return study
 
 
-# The types of values, in the words of msgspec and of TOML.
-_WORDS = {
-    "object": "a table",
-    "array": "a list",
-    "int": "a whole number",
-    "float": "a number",
-    "str": "a string",
-    "bool": "true or false",
-}
-
-
 def _in_words(message: str) -> str:
-    """Rewrites a message of msgspec: first the key, then what is wrong in the words of TOML, then the choices."""
+    """A message of msgspec with the key first, types in the words of TOML, and the choices last."""
     complaint, _, place = message.partition(" - at `$")
     key = place.strip(".`")
-    for kind, word in _WORDS.items():
+    words = {"object": "a table", "array": "a list", "int": "a whole number"}
+    for kind, word in (words | {"float": "a number", "str": "a string", "bool": "true or false"}).items():
         complaint = complaint.replace(f"`{kind}`", word)
     known = Training if key.startswith("network") else Study
     if complaint.startswith("Object contains unknown field "):
@@ -293,9 +285,7 @@ def _in_words(message: str) -> str:
     if complaint.startswith("Invalid enum value "):
         choices = get_args(get_type_hints(known)[key.removeprefix("network.")])
         return f"`{key}`: unknown {complaint.removeprefix('Invalid enum value ')}; choose from {', '.join(choices)}"
-    if not key:
-        return complaint
-    return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}"
+    return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}" if key else complaint
 
 
 def differences(now: Study, before: Study) -> list[str]:
