@@ -108,7 +108,7 @@ def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
 
 
 def truth_of(study: Study, cell: Cell) -> np.ndarray:
-    """The true parameters of a cell's flights; they are known even if no estimator can be run."""
+    """The true parameters of a cell's flights."""
     with jax.enable_x64(study.double):
         fleet = fleet_of(study, cell.scenario)
         truths = _truths(fleet, *_draws(study, cell), drawn=study.truth == "drawn")
@@ -132,7 +132,7 @@ def _truth(fleet: Fleet, key: Key, drawn: bool) -> Parameters:
 def _truths(
     fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, *, drawn: bool
 ) -> Float[Array, "lanes parameters"]:
-    """True parameters alone, from the draws of `_fly`."""
+    """The true parameters that `_fly` draws."""
     return jax.vmap(lambda number: _truth(fleet, jax.random.split(jax.random.fold_in(key, number))[0], drawn))(numbers)
 
 

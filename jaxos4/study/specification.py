@@ -1,7 +1,7 @@
 """The specification of a study: the axes of a grid of simulated flights, and the cells of that grid.
 
-A cell is `batch` flights of one scenario, identified by one estimator. Flight i has the same parameters and the same
-random numbers in every scenario. Differences between estimators, or between scales of noise, are thus paired.
+A scenario is a point of the grid, and a cell is `batch` flights of a scenario. Flight i has the same random numbers in
+every scenario, so that differences between estimators, or between scales of noise, are paired.
 """
 
 import itertools
@@ -129,7 +129,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At scale 0 flights are exact, and
       estimators assume the noise of scale 1.
     - `widths`: widths of the brackets, in multiples of the model's default half-width.
-    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's center is off them by a
+    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's centre is off them by a
       random offset within 80 % of its half-width; `"drawn"`: each flight has its own parameters, uniform in a bracket
       around the airframe's.
     - `initial_state`: `"known"`, or `"free"`: estimated too.

@@ -71,7 +71,7 @@ class Store:
             file.write(json.dumps(entry) + "\n")
 
     def end_line(self) -> None:
-        """Ends a line of the log that a kill or a full disk cut, so that the next entry has its own line."""
+        """Ends a line of the log that a kill or a full disk cut."""
         with contextlib.suppress(FileNotFoundError), open(self.directory / _LOG, "rb+") as file:
             if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
                 file.write(b"\n")
