@@ -101,7 +101,9 @@ def synthetic_study(
             bound[cell] = np.nan if name == "not_run" else bound[cell]
         failures.append(
             {
-                "cell": {"scale": scales[-1], "estimator": estimators[last]},
+                "cell": 7,
+                **{name: values[-1] for name, values in coordinates.items()},
+                "estimator": estimators[last],
                 "message": "FloatingPointError: <b>the filter's covariance</b> is not positive definite",
             }
         )

@@ -275,7 +275,7 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
         model=[f"{evil} {{{{ 1 }}}}"],
         parameter=["$\\frac{<b>}$", *study["parameter"].values[1:]],
     )
-    failures = json.dumps([{"cell": {"model": evil}, "message": evil}])
+    failures = json.dumps([{"cell": 0, "scale": 1.0, "estimator": evil, "message": evil}])
     study.attrs |= {"title": evil, "specification": f"</pre>{evil}", "command": evil, "failures": failures}
     text = write_report(study, tmp_path)[0].read_text(encoding="utf-8")
     assert "<script>alert" not in text

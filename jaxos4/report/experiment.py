@@ -66,10 +66,7 @@ def identify(
     brackets: Bracket,
     states: Float[Array, "flights samples 12"],
 ) -> Estimate:
-    """Identifies many flights in one call; flight i has the measurements `states[i]` and the bracket `brackets[i]`.
-
-    The program is compiled once for an estimator and these shapes; noise and start do not matter.
-    """
+    """Identifies many flights in one call; flight i has the measurements `states[i]` and the bracket `brackets[i]`."""
 
     def one(bracket: Bracket, states: States) -> Estimate:
         return estimator(eqx.tree_at(lambda p: p.flight.states, problem, states), bracket)
@@ -89,8 +86,8 @@ def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: 
 
 def count_results(names: np.ndarray) -> dict[str, int]:
     """The number of estimates by result, from their `result_names`."""
-    names, counts = np.unique(names, return_counts=True)
-    return dict(zip(names.tolist(), counts.tolist(), strict=True))
+    found, counts = np.unique(names, return_counts=True)
+    return dict(zip(found.tolist(), counts.tolist(), strict=True))
 
 
 def in_words(counts: dict[str, int]) -> str:
@@ -99,7 +96,7 @@ def in_words(counts: dict[str, int]) -> str:
 
 
 def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) -> None:
-    """Draws a figure in the style of this library and writes it as SVG and PDF, or nothing if `draw` gives nothing."""
+    """Draws a figure in the style of this library and writes it as SVG and PDF; nothing if `draw` returns `None`."""
     directory.mkdir(parents=True, exist_ok=True)
     with drawing():
         figure = draw()
@@ -117,10 +114,5 @@ def draw_spread(panel: Axes, x: np.ndarray, values: xr.DataArray, look: Style, l
     logarithm = xr.apply_ufunc(np.log, values.where(values > 0))
     mean = np.exp(logarithm.mean("parameter").values)
     panel.plot(x, mean, color=look.color, marker=look.marker, linestyle=look.dash, label=label)
-    panel.vlines(
-        x[finite],
-        values.min("parameter").values[finite],
-        values.max("parameter").values[finite],
-        color=look.color,
-        linewidth=1.0,
-    )
+    low, high = (end.values[finite] for end in (values.min("parameter"), values.max("parameter")))
+    panel.vlines(x[finite], low, high, color=look.color, linewidth=1.0)

@@ -15,7 +15,7 @@ class Kind(NamedTuple):
     """A figure that a study can have.
 
     - `draw`: returns nothing if the data are absent.
-    - `of_scale`: it shows one noise scale. The files show the scale nearest 1, the page lets the reader choose.
+    - `of_scale`: it shows one noise scale: the files the one nearest 1, the page the one that the reader chooses.
     """
 
     name: str
@@ -133,33 +133,33 @@ OF_EXAMPLE = (
 def of_scenario(scenario: Scenario, *, numbered: bool, with_pdf: bool = True) -> Iterator[Drawn]:
     """The figures of one scenario. `numbered`: file names hold the number of the scenario."""
     for kind in OF_SCENARIOS:
-        drawn = _draw(kind, scenario.data, f"{kind.name}-{scenario.number}" if numbered else kind.name, with_pdf)
-        if drawn is not None:
-            yield drawn
+        stem = f"{kind.name}-{scenario.number}" if numbered else kind.name
+        yield from _draw(kind, scenario.data, stem, with_pdf)
 
 
 def of_example(dataset: xr.Dataset, *, with_pdf: bool = True) -> Iterator[Drawn]:
     """The figures that do not belong to a scenario."""
     for kind in OF_EXAMPLE:
-        drawn = _draw(kind, dataset, kind.name, with_pdf)
-        if drawn is not None:
-            yield drawn
+        yield from _draw(kind, dataset, kind.name, with_pdf)
 
 
-def _draw(kind: Kind, data: xr.Dataset, stem: str, with_pdf: bool) -> Drawn | None:
+def _draw(kind: Kind, data: xr.Dataset, stem: str, with_pdf: bool) -> Iterator[Drawn]:
     with drawing():
         figure = kind.draw(data)
         if figure is None:
-            return None
+            return
         as_svg = svg(figure)
-        as_pdf = pdf(figure) if with_pdf else None
-        choices = dict(_of_each_scale(kind, data, as_svg)) if kind.of_scale else {"": as_svg}
-        return Drawn(stem, kind, as_svg, as_pdf, choices)
+        choices = _of_each_scale(kind, data, as_svg) if kind.of_scale else {"": as_svg}
+        drawn = Drawn(stem, kind, as_svg, pdf(figure) if with_pdf else None, choices)
+    yield drawn
 
 
-def _of_each_scale(kind: Kind, data: xr.Dataset, nearest: bytes) -> Iterator[tuple[str, bytes]]:
+def _of_each_scale(kind: Kind, data: xr.Dataset, nearest: bytes) -> dict[str, bytes]:
+    choices = {}
     for place, scale in enumerate(data["scale"].values):
-        chosen = place == figures_spread.nearest_scale(data)
-        figure = None if chosen else kind.draw(data.isel(scale=[place]))
-        if chosen or figure is not None:
-            yield f"noise x {scale:g}", nearest if figure is None else svg(figure)
+        label = f"noise x {scale:g}"
+        if place == figures_spread.nearest_scale(data):
+            choices[label] = nearest
+        elif (figure := kind.draw(data.isel(scale=[place]))) is not None:
+            choices[label] = svg(figure)
+    return choices

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from .legend import legend
 from .scenario import names
-from .style import FAINT, INK, estimator_gid, grid, log_axis, styles
+from .style import FAINT, INK, estimator_gid, grid, label_edges, log_axis, styles
 
 # Styles of lines that belong to a parameter, not to an estimator.
 _LOOKS = ("o-", "s--", "D-.", "^:", "v-", "P--", "X-.", "*:")
@@ -65,10 +65,7 @@ def path(data: xr.Dataset) -> Figure | None:
     """The example flight in space."""
     if "example_true" not in data:
         return None
-    states = names(data, "state")
-    if not {"x", "y", "z"} <= set(states):
-        return None
-    at = [states.index(axis) for axis in "xyz"]
+    at = [names(data, "state").index(axis) for axis in "xyz"]
     if not np.isfinite(data["example_true"].isel(state=at).values).any():
         return None
     figure = Figure(figsize=(6.5, 5.0), layout="constrained")
@@ -120,8 +117,7 @@ def _each_state(data: xr.Dataset, draw: Callable[[Axes, int], None]) -> Figure |
         draw(panel, state)
         one = data["state"].isel(state=state)
         panel.set_title(f"{one.item()} [{data['state_unit'].isel(state=state).item()}]")
-        if state in shown[-3:]:
-            panel.set_xlabel("time [s]")
+    label_edges(axes, 3, x="time [s]")
     legend(figure, data, markers=False)
     return figure
 

@@ -8,7 +8,7 @@ from ..study import metrics
 from .legend import legend
 from .numbers import plain
 from .scenario import bounds, names
-from .style import BOUND_DASHES, FAINT, INK, estimator_gid, grid, log_axis, scale_axis, styles
+from .style import BOUND_DASHES, FAINT, INK, estimator_gid, grid, label_edges, log_axis, scale_axis, styles
 
 _COLUMNS = 4
 # The markers of all estimators are spread over this share of the gap between two noise scales.
@@ -25,15 +25,13 @@ def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
 
     Absolute if the percentage of any point is meaningless, so that a panel has one scale.
     """
-    one = data.isel(parameter=parameter)
     reason = metrics.no_percentage(data).isel(parameter=parameter)
     if not (reason > 0).any():
         return "percent", "%", ""
-    unit = str(one["unit"].item())
     worst = int(reason.where(reason > 0).min())
     at = [f"{scale:g}" for scale in data["scale"].values[(reason > 0).any("estimator").values]]
     where = f" at noise {', '.join(at)}" if len(at) < data.sizes["scale"] else ""
-    return "absolute", unit, metrics.NO_PERCENTAGE[worst] + where
+    return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
 
 
 def errors(data: xr.Dataset) -> Figure | None:
@@ -57,10 +55,7 @@ def errors(data: xr.Dataset) -> Figure | None:
             low, high = panel.get_ylim()
             panel.set_ylim(low, high * (high / low) ** 0.22)
             panel.text(0.03, 0.98, f"absolute: {why}", transform=panel.transAxes, va="top", fontsize=7)
-        if place >= len(axes) - _COLUMNS:
-            panel.set_xlabel("noise scale")
-        if place % _COLUMNS == 0:
-            panel.set_ylabel("RMS error")
+    label_edges(axes, _COLUMNS, x="noise scale", y="RMS error")
     legend(figure, data, with_bounds=True)
     return figure
 
@@ -79,10 +74,7 @@ def efficiency(data: xr.Dataset) -> Figure | None:
         scale_axis(panel, data["scale"].values)
         panel.set_yscale("log")
         panel.set_title(name)
-        if place >= len(axes) - _COLUMNS:
-            panel.set_xlabel("noise scale")
-        if place % _COLUMNS == 0:
-            panel.set_ylabel("RMSE / bound")
+    label_edges(axes, _COLUMNS, x="noise scale", y="RMSE / bound")
     lows, highs = zip(*(panel.get_ylim() for panel in axes), strict=True)
     for panel in axes:
         panel.set_ylim(min(lows), max(highs))
@@ -107,11 +99,11 @@ def frontier(data: xr.Dataset) -> Figure | None:
         y = np.arange(len(parameters)) + 0.36 * (row - (len(seen) - 1) / 2)
         x = limits.isel(estimator=estimator).values
         finite = x > 0
-        panel.plot(x[finite], y[finite], "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=channels)
+        label = f"bound of channels: {channels}"
+        panel.plot(x[finite], y[finite], "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=label)
         for a, b in zip(x[finite], y[finite], strict=True):
             panel.annotate(plain(a, 2), (a, b), (6, 0), textcoords="offset points", va="center", fontsize=7)
-    zero = (limits == 0).any("estimator").values
-    for y in np.flatnonzero(zero):
+    for y in np.flatnonzero((limits == 0).any("estimator").values):
         panel.text(least, float(y), "the truth is 0: no noise is small enough", va="center", fontsize=7.5)
     panel.set_xscale("log")
     log_axis(panel, "x")
@@ -121,10 +113,7 @@ def frontier(data: xr.Dataset) -> Figure | None:
     panel.set_ylim(len(parameters) - 0.5, -0.5)
     panel.set_xlabel("noise scale below which |truth| exceeds 1.96 bounds (dashed: the scales of this study)")
     if len(seen) > 1:
-        handles, labels = panel.get_legend_handles_labels()
-        figure.legend(
-            handles, [f"bound of channels: {label}" for label in labels], loc="outside lower center", ncols=len(seen)
-        )
+        figure.legend(loc="outside lower center", ncols=len(seen))
     return figure
 
 

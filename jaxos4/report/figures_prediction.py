@@ -16,17 +16,15 @@ _INCHES_A_SECOND, _NARROWEST, _WIDEST = 0.25, 9.0, 30.0
 
 
 def predicted_rates(predicted: Predictions, sample_time: float, horizon: int, look: Style) -> Figure:
-    """Measured and predicted p, q, r against the time that is predicted.
+    """Measured and predicted p, q, r against the time that is predicted, with a band that holds 95 % of the errors.
 
     **Arguments:**
 
     - `sample_time`: of the flight [s].
     - `horizon`: index into `predicted.horizons`.
-    - `look`: the style of the estimator.
-
-    The band holds 95 % of the errors of its rate at this horizon. Lines break between stretches.
     """
     time = predicted.start * sample_time + predicted.horizons[horizon]
+    # Lines break between stretches.
     usual = np.median(np.diff(predicted.start)) if predicted.start.size > 1 else 1
     breaks = np.flatnonzero(np.diff(predicted.start) > 1.5 * usual) + 1
     width = float(np.clip(_INCHES_A_SECOND * np.ptp(time), _NARROWEST, _WIDEST))

@@ -13,12 +13,12 @@ from .figures_noise import positive_scales
 from .legend import legend
 from .numbers import plain
 from .scenario import names
-from .style import FAINT, INK, estimator_gid, grid, log_axis, styles
+from .style import FAINT, INK, estimator_gid, grid, label_edges, log_axis, styles
 
 # The quantiles that a box shows. The whiskers hold 95 % of the flights.
-QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+_QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 # The place on a logarithmic axis for an estimator without rollouts.
-NO_ROLLOUTS = 0.5
+_NO_ROLLOUTS = 0.5
 
 
 def nearest_scale(data: xr.Dataset) -> int:
@@ -28,21 +28,17 @@ def nearest_scale(data: xr.Dataset) -> int:
     return int(np.argmin(np.abs(np.log(positive))))
 
 
-def error_quantiles(data: xr.Dataset) -> xr.DataArray:
-    """`QUANTILES` of the errors in bounds, over the converged flights."""
-    found = metrics.normalised_error(data)
-    some = found.notnull().any("flight")
-    return found.where(some, 0.0).quantile(list(QUANTILES), dim="flight").where(some)
-
-
 def distribution(data: xr.Dataset) -> Figure | None:
     """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1."""
-    found = error_quantiles(data.isel(scale=nearest_scale(data)))
-    if not found.notnull().any():
+    every = metrics.normalised_error(data.isel(scale=nearest_scale(data)))
+    some = every.notnull().any("flight")
+    if not some.any():
         return None
+    found = every.where(some, 0.0).quantile(list(_QUANTILES), dim="flight").where(some)
     style = styles(names(data, "estimator"))
     figure, axes = grid(data.sizes["parameter"], columns=4, height=0.28 * len(style) + 0.75)
-    reach = _reach(found)
+    # Wide enough for the boxes, but limited in case one estimator is very bad.
+    reach = float(np.clip(1.08 * np.nanmax(np.abs(found.values), initial=0.0), 3.0, 12.0))
     for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
         for x in (-NINETY_FIVE, NINETY_FIVE):
             panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
@@ -62,8 +58,7 @@ def distribution(data: xr.Dataset) -> Figure | None:
         panel.set_ylim(len(style) - 0.4, -0.6)
         panel.set_yticks(range(len(style)), list(style) if place % 4 == 0 else [])
         panel.grid(axis="y", visible=False)
-        if place >= len(axes) - 4:
-            panel.set_xlabel("error / bound")
+    label_edges(axes, 4, x="error / bound")
     return figure
 
 
@@ -108,7 +103,7 @@ def rollouts(data: xr.Dataset) -> Figure | None:
     panel.axhline(1, color=INK, linewidth=1.1)
     for row, look in enumerate(styles(names(data, "estimator")).values()):
         at = known[:, row]
-        across, up = price(x.isel(estimator=row).values[at]), y.isel(estimator=row).values[at]
+        across, up = np.maximum(x.isel(estimator=row).values[at], _NO_ROLLOUTS), y.isel(estimator=row).values[at]
         panel.plot(across, up, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(row))
         for place, a, b in zip(np.flatnonzero(at), across, up, strict=True):
             tip = f"noise x {data['scale'].values[place]:g}: {plain(float(x[place, row]))} rollouts, {plain(float(b))}"
@@ -124,20 +119,9 @@ def rollouts(data: xr.Dataset) -> Figure | None:
     return figure
 
 
-def price(spent: np.ndarray) -> np.ndarray:
-    """Rollouts on a logarithmic axis; no rollouts at all are drawn at `NO_ROLLOUTS`."""
-    return np.where(spent > 0, np.maximum(spent, NO_ROLLOUTS), NO_ROLLOUTS)
-
-
 def _rollout_ticks(panel, spent: np.ndarray) -> None:
     top = int(np.ceil(np.log10(max(float(spent.max()), 10.0))))
-    ticks = {NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
+    ticks = {_NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
     ticks |= {10.0**power: f"{10**power:,}" for power in range(top + 1)}
     panel.set_xticks(list(ticks), list(ticks.values()))
     panel.set_xlim(min(ticks) / 1.5 if 0 in np.floor(spent) else None, max(ticks) * 1.2)
-
-
-def _reach(found: xr.DataArray) -> float:
-    """Half the width of the panels: wide enough for the boxes, but limited in case one estimator is very bad."""
-    largest = np.nanmax(np.abs(found.values), initial=0.0)
-    return float(np.clip(1.08 * largest, 3.0, 12.0))

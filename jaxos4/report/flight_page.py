@@ -35,23 +35,14 @@ class ParameterRow(NamedTuple):
 
 
 def write_flight_page(path: str | os.PathLike[str], found: VehicleIdentification, *, title: str) -> None:
-    """Writes the page of an identified vehicle, completely or not at all.
-
-    **Arguments:**
-
-    - `found`: what `jaxos4.identify` returns for a vehicle.
-    - `title`: of the page.
-
-    **Raises:** `OSError` if the file cannot be written.
-    """
+    """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
     check_writable(path)
-    text = flight_page(found, title)
+    text = _page(found, title)
     with write_atomically(path) as beside:
         beside.write_text(text, encoding="utf-8")
 
 
-def flight_page(found: VehicleIdentification, title: str) -> str:
-    """The page as text."""
+def _page(found: VehicleIdentification, title: str) -> str:
     body, provenance = found.rigid_body, found.provenance
     look = styles([found.estimator])[found.estimator]
     return (
@@ -83,15 +74,12 @@ def _drawn(predicted: Predictions, sample_time: float, look: Style) -> tuple[Dra
 
 
 def _about(found: VehicleIdentification) -> str:
-    cost = "" if found.cost is None else f", cost {plain(found.cost)}"
-    return (
-        f"{found.estimator}, {found.model} model, {found.result.replace('_', ' ')}, {found.rollouts} rollouts, "
-        f"{plain(found.seconds)} s{cost}"
-    )
+    parts = [found.estimator, f"{found.model} model", found.result.replace("_", " "), f"{found.rollouts} rollouts"]
+    cost = [] if found.cost is None else [f"cost {plain(found.cost)}"]
+    return ", ".join([*parts, f"{plain(found.seconds)} s", *cost])
 
 
 def _parameters(found: VehicleIdentification) -> list[ParameterRow]:
-    """Estimated parameters, then held parameters with the reason."""
     estimated = [
         ParameterRow(name, row.unit, _number(row.estimate), _interval(row.ci95), _number(row.bound, 2), row.note)
         for name, row in found.parameters.items()
@@ -111,24 +99,19 @@ def _constant(name: str, row: Constant) -> ParameterRow:
 
 def _skill(skill: PredictionSkill) -> list[tuple[str, list[dict[str, str]]]]:
     """For each rate, a row for each horizon: all as text."""
-    rates: dict[str, RateSkill] = {"p": skill.p, "q": skill.q, "r": skill.r}
-    return [
-        (
-            name,
-            [
-                {
-                    "horizon": plain(horizon),
-                    "skill": _share(rate.skill[i]),
-                    "error": "" if rate.std[i] is None else f"± {_share(rate.std[i])}",
-                    "equation_error": _share(rate.equation_error[i]),
-                    "rmse": _number(rate.rmse[i], 3),
-                    "persistence": _number(rate.persistence[i], 3),
-                }
-                for i, horizon in enumerate(skill.horizons)
-            ],
-        )
-        for name, rate in rates.items()
-    ]
+
+    def row(rate: RateSkill, i: int) -> dict[str, str]:
+        return {
+            "horizon": plain(skill.horizons[i]),
+            "skill": _share(rate.skill[i]),
+            "error": "" if rate.std[i] is None else f"± {_share(rate.std[i])}",
+            "equation_error": _share(rate.equation_error[i]),
+            "rmse": _number(rate.rmse[i], 3),
+            "persistence": _number(rate.persistence[i], 3),
+        }
+
+    rates = {"p": skill.p, "q": skill.q, "r": skill.r}
+    return [(name, [row(rate, i) for i in range(len(skill.horizons))]) for name, rate in rates.items()]
 
 
 def _share(value: float | None) -> str:

@@ -1,5 +1,7 @@
 """An identification as text, for a terminal."""
 
+from collections.abc import Iterator
+
 import rich.box
 from rich.console import Console
 from rich.table import Table
@@ -17,79 +19,79 @@ from ..identification.results import (
 from ..identification.vehicle import NO_ANSWER
 from ..results import NINETY_FIVE
 
-SIGNIFICANCE = 0.01
-"""The share of fits of true models that a test of all channels' residuals may reject."""
+# The share of fits of true models that a test of all channels' residuals may reject.
+_SIGNIFICANCE = 0.01
 
 
 def print_identification(console: Console, found: Identification) -> None:
     """Prints parameters, moments of inertia and the quality of the fit. Without an answer it prints why."""
+    for part in _parts(found):
+        console.print(part, markup=False, highlight=False if isinstance(part, str) else None)
+
+
+def _parts(found: Identification) -> Iterator[str | Table]:
     if found.result == "nonfinite_trajectory" and isinstance(found, FlightIdentification):
         shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
-        _say(
-            console,
+        yield (
             "No estimate: the model's trajectory diverged wherever the search went. The vehicle may do something that "
             f"the model lacks{' (try --window, or a shorter window)' if shoots else ''}, or the airframe's constants "
-            "or the units of the flight are wrong.",
+            "or the units of the flight are wrong."
         )
     if found.result in NO_ANSWER:
         return
     if isinstance(found, FlightIdentification):
-        _print_flight(console, found)
+        yield from _of_flight(found)
     elif isinstance(found, VehicleIdentification):
-        _print_vehicle(console, found)
+        yield from _of_vehicle(found)
 
 
-def _print_flight(console: Console, found: FlightIdentification) -> None:
-    _print_parameters(console, found, digits=5, with_bound=True)
+def _of_flight(found: FlightIdentification) -> Iterator[str | Table]:
+    yield _parameters(found, digits=5, with_bound=True)
     limits = [
         f"{name} {row.noise_limit:.2g}"
         for name, row in found.parameters.items()
         if "below noise" in row.note and row.noise_limit
     ]
     if limits:
-        _say(
-            console,
+        yield (
             "below noise: cannot be distinguished from 0. The airframe's values could be distinguished at this "
-            f"multiple of the noise: {', '.join(limits)}.",
+            f"multiple of the noise: {', '.join(limits)}."
         )
-    _say(console, "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found.")
+    yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
     percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
-    _say(console, f"fit [%], 100 is a perfect prediction: {', '.join(percents)}.")
-    _print_residuals(console, found)
-    _print_rigid_body(console, found.rigid_body)
-    _print_validation(console, found.validation)
-    _say(
-        console,
+    yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
+    yield from _residuals(found)
+    yield from _rigid_body(found.rigid_body)
+    if found.validation is not None:
+        yield _validation(found.validation)
+    yield (
         f"{found.estimator}, {found.model} model, {found.provenance['channels']} channels: {found.result}, "
-        f"{found.rollouts} rollouts, {found.seconds:.1f} s",
+        f"{found.rollouts} rollouts, {found.seconds:.1f} s"
     )
 
 
-def _print_residuals(console: Console, found: FlightIdentification) -> None:
+def _residuals(found: FlightIdentification) -> Iterator[str]:
     coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
     if coloured and found.estimator == "network":
-        _say(
-            console,
+        yield (
             f"The residuals of {coloured} are not white noise: the network's answer is not the best fit, but lies "
-            "within its intervals of it. The hybrid continues the search from there and tests the model.",
+            "within its intervals of it. The hybrid continues the search from there and tests the model."
         )
     elif coloured:
-        _say(
-            console,
+        yield (
             f"The residuals of {coloured} are not white noise: the model does not explain this flight completely. The "
-            "intervals of estimators that shoot allow for correlated residuals, but are too narrow for slow errors.",
+            "intervals of estimators that shoot allow for correlated residuals, but are too narrow for slow errors."
         )
     tests = {"free of the inputs (cross-correlation)": "input_p"}
     if found.provenance["windows"] == 1:  # the free initial states of windows mislead the test
         tests = {"white (Ljung-Box)": "white_p"} | tests
-    for property_, p_value in tests.items():
-        failed = [name for name, row in found.fit.items() if getattr(row, p_value) * len(found.fit) < SIGNIFICANCE]
-        if found.fit:
-            answer = f"not those of {', '.join(failed)}" if failed else "all"
-            _say(console, f"residuals {property_}, tests at {SIGNIFICANCE:.0%}: {answer}.")
+    for property_, p_value in tests.items() if found.fit else ():
+        failed = [name for name, row in found.fit.items() if getattr(row, p_value) * len(found.fit) < _SIGNIFICANCE]
+        answer = f"not those of {', '.join(failed)}" if failed else "all"
+        yield f"residuals {property_}, tests at {_SIGNIFICANCE:.0%}: {answer}."
 
 
-def _print_rigid_body(console: Console, body: RigidBody) -> None:
+def _rigid_body(body: RigidBody) -> Iterator[str]:
     if not body.constants or body.consistency_p is None:
         return
     inertias = [
@@ -98,78 +100,68 @@ def _print_rigid_body(console: Console, body: RigidBody) -> None:
         else f"{name} below noise"
         for name, row in body.constants.items()
     ]
-    if body.consistency_p < SIGNIFICANCE:
+    if body.consistency_p < _SIGNIFICANCE:
         verdict = f"the alphas are not those of one rigid body, p = {body.consistency_p:.1g}"
     elif not body.is_rigid_body:
         verdict = "no rigid body has such inertias: one exceeds the sum of the other two"
     else:
         verdict = f"the alphas agree with one rigid body, p = {body.consistency_p:.2g}"
-    _say(console, f"inertias [kg m^2], 95 %: {', '.join(inertias)}; {verdict}.")
+    yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}; {verdict}."
 
 
-def _print_validation(console: Console, validation: Validation | None) -> None:
-    if validation is None:
-        return
+def _validation(validation: Validation) -> str:
     if validation.fit is None:
-        _say(console, f"validation on {validation.flight}: the model's trajectory diverges before the flight ends.")
-        return
+        return f"validation on {validation.flight}: the model's trajectory diverges before the flight ends."
     channels = [
         f"{name} {row.percent:.1f} ({row.level**0.5:.2g})"
         for name, row in validation.fit.items()
         if row.percent is not None
     ]
-    _say(
-        console,
-        f"validation on {validation.flight} [%] (residuals in multiples of the noise): {', '.join(channels)}.",
-    )
+    return f"validation on {validation.flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
 
 
-def _print_vehicle(console: Console, found: VehicleIdentification) -> None:
-    _print_parameters(console, found, digits=4, with_bound=False)
+def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Table]:
+    yield _parameters(found, digits=4, with_bound=False)
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
         reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
     for reason, held in reasons.items():
-        _say(console, f"held, {reason}: {', '.join(held)}.")
+        yield f"held, {reason}: {', '.join(held)}."
     inertias = [
         f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g} ({row.note})"
         for name, row in found.rigid_body.constants.items()
     ]
     if inertias:
-        _say(console, f"inertias [kg m^2], 95 %: {', '.join(inertias)}.")
+        yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}."
     noise = ", ".join(f"{name} {sigma:.2g}" for name, sigma in found.noise.items())
-    _say(
-        console,
+    yield (
         f"residuals in a window [rad/s, m/s^2]: {noise}; the intervals allow for their correlation. "
-        f"Outliers cut: {100 * found.cut:.0f} % (18 % is normal for Gaussian noise).",
+        f"Outliers cut: {100 * found.cut:.0f} % (18 % is normal for Gaussian noise)."
     )
     if found.skill is not None:
-        _print_skill(console, found.skill)
+        yield (
+            "Predictions of data that were not fitted: 1 is perfect, 0 as good as constant rates; +- one standard "
+            f"error ({found.skill.starts} starts)."
+        )
+        yield _skill(found.skill)
     used = found.provenance
-    _say(
-        console,
+    yield (
         f"{found.estimator}, flight model ({', '.join(used['terms'])}), {used['fitted_seconds']:.0f} s in windows of "
         f"{used['window']:g} s, a sample every {1e3 * used['sample_time']:g} ms: {found.result}, {found.rollouts} "
-        f"rollouts, {found.seconds:.0f} s",
+        f"rollouts, {found.seconds:.0f} s"
     )
 
 
-def _print_skill(console: Console, skill: PredictionSkill) -> None:
-    _say(
-        console,
-        "Predictions of data that were not fitted: 1 is perfect, 0 as good as constant rates; +- one standard error "
-        f"({skill.starts} starts).",
-    )
+def _skill(skill: PredictionSkill) -> Table:
     table = _table(("ahead", "p", "q", "r", "equation error: p, q, r"))
     rates = (skill.p, skill.q, skill.r)
     for i, horizon in enumerate(skill.horizons):
         cells = [f"{_share(rate.skill[i])} +- {_share(rate.std[i])}" for rate in rates]
-        regression = ", ".join(_share(rate.equation_error[i]) for rate in rates)
-        table.add_row(f"{horizon:.2f} s", *cells, regression)
-    console.print(table, markup=False)
+        table.add_row(f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates))
+    return table
 
 
-def _print_parameters(console: Console, found: Identification, *, digits: int, with_bound: bool) -> None:
+def _parameters(found: Identification, *, digits: int, with_bound: bool) -> Table:
     table = _table(("parameter", "unit", "estimate", "95 % interval", *["bound"] * with_bound, "note"))
     for name, row in found.parameters.items():
         cells = ["-", "-", "-"]
@@ -178,15 +170,11 @@ def _print_parameters(console: Console, found: Identification, *, digits: int, w
             bound = "-" if row.bound is None else f"{row.bound:.2g}"
             cells = [f"{row.estimate:.{digits}g}", f"[{low:.{digits}g}, {high:.{digits}g}]", bound]
         table.add_row(name, row.unit, *cells[: 2 + with_bound], row.note)
-    console.print(table, markup=False)
+    return table
 
 
 def _share(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False)
 
 
 def _table(headings: tuple[str, ...]) -> Table:

@@ -34,11 +34,10 @@ def drawings(
 
     **Arguments:**
 
-    - `labels`: of the files, for the page's list of choices.
-    - `chosen`: the index of the file that is shown first.
+    - `labels`, `chosen`: of the files in the page's list of choices; the index of the first choice.
     - `stem`: the ids in the elements begin with it.
     - `description`: what a screen reader says.
-    - `estimators`: names for the tooltips of what belongs to one estimator.
+    - `estimators`: their names, for tooltips.
     """
     made = []
     for i, (file, label) in enumerate(zip(files, labels, strict=True)):

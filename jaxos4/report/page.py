@@ -1,6 +1,5 @@
 """The report of a study as one HTML page that needs no other file."""
 
-import json
 from typing import Any
 
 import jinja2
@@ -16,20 +15,13 @@ MOST_DRAWN = 12
 """At most so many scenarios have figures. All scenarios have tables."""
 
 # Attributes of the Dataset, and their labels on the page.
-_PROVENANCE = (
-    ("version", "jaxos4"),
-    ("jax", "jax"),
-    ("precision", "precision"),
-    ("device", "device"),
-    ("seed", "seed"),
-)
+_PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
 
 
 def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once: list[Drawn]) -> str:
     """The page. `sections`: each scenario with its figures; `once`: figures that belong to no scenario."""
     attributes = {name: str(value) for name, value in dataset.attrs.items()}
     known = styles(names(dataset, "estimator"))
-    shown = [_section(scenario, drawn) for scenario, drawn in sections]
     missing, cells = tables.cells_not_run(dataset)
     return (
         environment()
@@ -37,10 +29,10 @@ def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once
         .render(
             title=attributes.get("title", "") or "A study",
             command=attributes.get("command", ""),
-            specification=_indented(attributes.get("specification", "")),
-            provenance=[(label, attributes[name]) for name, label in _PROVENANCE if name in attributes],
+            specification=attributes.get("specification", ""),
+            provenance=[(label, attributes[name]) for name, label in _PROVENANCE.items() if name in attributes],
             estimators=[(place, name, look.color) for place, (name, look) in enumerate(known.items())],
-            sections=shown,
+            sections=[_section(scenario, drawn) for scenario, drawn in sections],
             once=[_figure(drawn, list(known)) for drawn in once],
             failed=tables.failed_cells(dataset),
             missing=missing,
@@ -53,21 +45,18 @@ def page(dataset: xr.Dataset, sections: list[tuple[Scenario, list[Drawn]]], once
 
 def _section(scenario: Scenario, drawn: list[Drawn]) -> dict[str, Any]:
     data = scenario.data
-    figures = {figure.kind.name: _figure(figure, names(data, "estimator")) for figure in drawn}
+    made = (
+        tables.error_table(data),
+        tables.efficiency_table(data),
+        tables.coverage_table(data),
+        tables.levels_table(data),
+        tables.result_table(data),
+    )
     return {
         "number": scenario.number,
         "label": scenario.label,
-        "figures": figures,
-        "tables": {
-            table.name: table
-            for table in (
-                tables.error_table(data),
-                tables.efficiency_table(data),
-                tables.coverage_table(data),
-                tables.levels_table(data),
-                tables.result_table(data),
-            )
-        },
+        "figures": {figure.kind.name: _figure(figure, names(data, "estimator")) for figure in drawn},
+        "tables": {table.name: table for table in made},
         "trouble": tables.troubled_flights(data),
     }
 
@@ -85,18 +74,6 @@ def _figure(drawn: Drawn, estimators: list[str]) -> dict[str, Any]:
             estimators=estimators,
         ),
     }
-
-
-def _indented(specification: str) -> str:
-    """A JSON object with one line for each name; any other text unchanged."""
-    try:
-        table = json.loads(specification)
-    except ValueError:
-        return specification
-    if not isinstance(table, dict):
-        return specification
-    lines = (f"  {json.dumps(name)}: {json.dumps(value, ensure_ascii=False)}" for name, value in table.items())
-    return "{\n" + ",\n".join(lines) + "\n}"
 
 
 def environment() -> jinja2.Environment:

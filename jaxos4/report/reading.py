@@ -38,13 +38,12 @@ def read_results(directory: Path) -> xr.Dataset:
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         what = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
-    missing = what_is_missing(dataset)
-    if missing:
+    if missing := _what_is_missing(dataset):
         raise InputError(f"{path}: not the results of a study: {missing}; give a folder that `jaxos4 study` wrote.")
     return dataset
 
 
-def what_is_missing(dataset: xr.Dataset) -> str:
+def _what_is_missing(dataset: xr.Dataset) -> str:
     """Why a Dataset is not the results of a study, or an empty string."""
     for name, dimensions in _VARIABLES.items():
         if name not in dataset.variables:

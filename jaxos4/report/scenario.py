@@ -1,4 +1,4 @@
-"""A study divided into scenarios: one table or figure shows one scenario."""
+"""A study divided into the parts that one table or figure compares: scenarios of all noise scales and estimators."""
 
 import itertools
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ _PHRASES = {
 
 
 class Scenario(NamedTuple):
-    """One value of each dimension except noise scale and estimator."""
+    """The data of one value on each axis except noise scale and estimator."""
 
     number: int
     label: str
@@ -51,13 +51,9 @@ def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
 
 
 def bounds(data: xr.Dataset) -> dict[str, int]:
-    """The bounds to compare with: the channels that estimators use, each with the index of one estimator that does.
-
-    Estimators whose cells were run come first.
-    """
+    """The channels that estimators look at, each with the index of an estimator that has their bound."""
     found: dict[str, int] = {}
     known = data["bound"].notnull().any([name for name in data["bound"].dims if name != "estimator"])
-    order = sorted(range(data.sizes["estimator"]), key=lambda i: not known[i])
-    for place in order:
+    for place in sorted(range(data.sizes["estimator"]), key=lambda i: not known[i]):  # first those that were run
         found.setdefault(str(data["seen"].isel(estimator=place).item()), place)
     return dict(sorted(found.items(), key=lambda item: item[1]))

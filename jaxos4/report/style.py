@@ -17,14 +17,11 @@ GRID = "#d9dce1"
 PAPER = "#ffffff"
 FAINT = "#8a9099"
 
-
+# A dash pattern: its offset, then lengths of ink and gap, in line widths.
 Dash = tuple[float, tuple[float, ...]]
-"""A dash pattern: its offset, then lengths of ink and gap, in line widths."""
-
-SOLID: Dash = (0, ())
+_SOLID: Dash = (0, ())
 _DASHED: Dash = (0, (4, 1.6))
 _DOTTED: Dash = (0, (1, 1.65))
-_DASH_DOT: Dash = (0, (6.4, 1.6, 1, 1.6))
 
 
 class Style(NamedTuple):
@@ -37,9 +34,9 @@ class Style(NamedTuple):
 
 # After Okabe and Ito (2008), some darkened. The contrast is at least 3:1 on white and on dark paper.
 _STYLES = (
-    Style("#0072b2", "o", SOLID),
+    Style("#0072b2", "o", _SOLID),
     Style("#d55e00", "s", _DASHED),
-    Style("#009e73", "D", _DASH_DOT),
+    Style("#009e73", "D", (0, (6.4, 1.6, 1, 1.6))),
     Style("#c46a9b", "^", _DOTTED),
     Style("#b97f00", "v", (0, (5, 1))),
     Style("#3b97ce", "P", (0, (3, 1, 1, 1))),
@@ -47,20 +44,16 @@ _STYLES = (
     Style("#8e5ea8", "*", (0, (7, 2, 1, 2))),
 )
 _KNOWN = ("ibss", "network", "hybrid", "output-error", "equation-error", "rls", "svsf", "kalman")
-# For more estimators than styles: each colour again, with the marker and the dash of other styles.
-_MIXED = [Style(one.color, _STYLES[i - 3].marker, _STYLES[i - 5].dash) for i, one in enumerate(_STYLES)]
-BOUND_DASHES = (SOLID, _DOTTED, _DASHED)
+BOUND_DASHES = (_SOLID, _DOTTED, _DASHED)
 
+_INKED = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color", "xtick.color", "ytick.color")
 _RC: dict[Any, Any] = {
-    "axes.edgecolor": INK,
-    "axes3d.xaxis.panecolor": "none",
-    "axes3d.yaxis.panecolor": "none",
-    "axes3d.zaxis.panecolor": "none",
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
+    **dict.fromkeys(_INKED, INK),
+    **dict.fromkeys((f"axes3d.{axis}axis.panecolor" for axis in "xyz"), "none"),
+    **dict.fromkeys(("axes.labelsize", "font.size", "legend.fontsize"), 8.5),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), 8),
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.labelsize": 8.5,
     "axes.linewidth": 0.7,
     "axes.spines.right": False,
     "axes.spines.top": False,
@@ -69,28 +62,21 @@ _RC: dict[Any, Any] = {
     "figure.facecolor": PAPER,
     "axes.facecolor": "none",
     "font.family": "DejaVu Sans",
-    "font.size": 8.5,
     "grid.color": GRID,
     "grid.linewidth": 0.6,
-    "legend.fontsize": 8.5,
     "legend.frameon": False,
     "lines.linewidth": 1.4,
     "lines.markersize": 5,
     "pdf.fonttype": 42,
     "svg.fonttype": "path",
     "svg.hashsalt": "jaxos4",
-    "text.color": INK,
     "text.parse_math": False,  # names come from files: a dollar sign in one is a dollar sign
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
 }
 
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Applies the style of this library inside the context, and restores the user's matplotlib settings after it."""
+    """Applies the style of this library inside the context."""
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(_RC)
@@ -104,7 +90,7 @@ def styles(estimators: Sequence[str]) -> dict[str, Style]:
 
 
 def _style(place: int) -> Style:
-    """Style number `place`. After the end of the table, a colour comes with the marker and dashes of another row."""
+    """Style number `place`. Beyond the table, a colour comes with the marker and dashes of another row."""
     count = len(_STYLES)
     return _STYLES[(place + place // count) % count]._replace(color=_STYLES[place % count].color)
 
@@ -119,8 +105,15 @@ def grid(panels: int, *, columns: int, width: float = 9.0, height: float = 2.1) 
     columns = min(columns, panels)
     rows = -(-panels // columns)
     figure = Figure(figsize=(width, height * rows + 0.5), layout="constrained")
-    axes = [figure.add_subplot(rows, columns, i + 1) for i in range(panels)]
-    return figure, axes
+    return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(panels)]
+
+
+def label_edges(panels: list[Axes], columns: int, *, x: str, y: str = "") -> None:
+    """Labels the x axes of the lowest panel in each column of a grid, and the y axes of its first column."""
+    for panel in panels[-columns:]:
+        panel.set_xlabel(x)
+    for panel in panels[::columns] if y else ():
+        panel.set_ylabel(y)
 
 
 def log_axis(axes: Axes, which: str) -> None:

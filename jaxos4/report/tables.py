@@ -1,7 +1,7 @@
 """The tables of a study as rows of text, for the page and for the terminal."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +11,10 @@ from ..study import metrics
 from .numbers import MISSING, percent, plain
 from .scenario import bounds, names
 
-MARKS = ("", "†", "‡")
-"""The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`."""
-
-LEVEL = 0.95
-"""The table of coverage by parameter shows this level, or the nearest one in the study."""
-
+# The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
+_MARKS = ("", "†", "‡")
+# The table of coverage by parameter shows this level, or the nearest one in the study.
+_LEVEL = 0.95
 _MOST_LISTED = 20
 
 
@@ -71,7 +69,7 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
             one = of.isel(parameter=place)
             reason = int(one["reason"])
             value = float(one["absolute" if reason else "percent"])
-            mark = "" if np.isnan(value) else MARKS[reason]
+            mark = "" if np.isnan(value) else _MARKS[reason]
             used.update({reason} if mark else ())
             made.append(Cell(plain(value, digits), mark=mark))
         return tuple(made)
@@ -93,8 +91,8 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         tuple(groups),
         units=tuple(names(data, "unit")),
         notes=tuple(
-            f"{MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, so a percentage is "
-            "meaningless."
+            f"{_MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, so a percentage "
+            "is meaningless."
             for code in sorted(used)
         ),
     )
@@ -103,30 +101,25 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
 def efficiency_table(data: xr.Dataset) -> Table:
     """RMSE / bound with Monte-Carlo intervals."""
     found = metrics.efficiency(data)
-
-    def cells(one: xr.Dataset) -> tuple[Cell, ...]:
-        numbers = (one[name].values for name in ("efficiency", "low", "high"))
-        return tuple(Cell(plain(value), _interval(plain(a), plain(b))) for value, a, b in zip(*numbers, strict=True))
-
     return Table(
         "efficiency",
         "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do",
         "estimate, truth, bound, result (metrics.efficiency)",
         tuple(names(data, "parameter")),
-        _groups(data, lambda at: cells(found.isel(at))),
+        _groups(data, lambda at: _with_intervals(found.isel(at), "efficiency", plain)),
     )
 
 
 def coverage_table(data: xr.Dataset) -> Table:
-    """Coverage of each parameter at `LEVEL`."""
-    level = int(np.argmin(np.abs(data["level"].values - LEVEL)))
+    """Coverage of each parameter at the level nearest 95 %."""
+    level = int(np.argmin(np.abs(data["level"].values - _LEVEL)))
     found = metrics.coverage(data).isel(level=level)
     return Table(
         "coverage",
         f"Intervals of {100 * data['level'].values[level]:g} % that hold the truth [%], with 95 % Wilson intervals",
         "estimate, truth, half_width, result (metrics.coverage)",
         tuple(names(data, "parameter")),
-        _groups(data, lambda at: _shares(found.isel(at), "coverage")),
+        _groups(data, lambda at: _with_intervals(found.isel(at), "coverage", percent)),
     )
 
 
@@ -138,7 +131,7 @@ def levels_table(data: xr.Dataset) -> Table:
         "Intervals that hold the truth [%] by the level that they claim, averaged over the parameters",
         "estimate, truth, half_width, result (metrics.mean_coverage)",
         tuple(f"{100 * level:g} %" for level in data["level"].values),
-        _groups(data, lambda at: _shares(found.isel(at), "coverage")),
+        _groups(data, lambda at: _with_intervals(found.isel(at), "coverage", percent)),
     )
 
 
@@ -149,10 +142,9 @@ def result_table(data: xr.Dataset) -> Table:
     occurs = [place for place in range(len(known)) if bool((counts.isel(code=place) > 0).any())]
 
     def cells(at: dict[str, int]) -> tuple[Cell, ...]:
-        hit = hits.isel(at)
-        last = _shares(hit.expand_dims("parameter"), "hit_rate")[0]
+        hit = _with_intervals(hits.isel(at).expand_dims("parameter"), "hit_rate", percent)
         numbers = [Cell(str(int(counts.isel(at).isel(code=place)))) for place in occurs]
-        return (*numbers, Cell(plain(float(spent.isel(at)))), last)
+        return (*numbers, Cell(plain(float(spent.isel(at)))), *hit)
 
     return Table(
         "results",
@@ -173,10 +165,10 @@ class Trouble(NamedTuple):
 def troubled_flights(data: xr.Dataset) -> Trouble:
     """The flights that were run and did not converge."""
     bad = (metrics.was_run(data) & ~metrics.converged(data)).transpose("scale", "estimator", "flight").values
-    known = {value: name.replace("_", " ") for name, value in metrics.codes(data).items()}
+    known = {code: name.replace("_", " ") for name, code in metrics.codes(data).items()}
     results = data["result"].transpose("scale", "estimator", "flight").values
     estimators, flights = names(data, "estimator"), names(data, "flight")
-    places = [tuple(int(i) for i in place) for place in np.argwhere(bad)]
+    places = np.argwhere(bad).tolist()
     listed = tuple(
         f"{_noise(data, scale)}, {estimators[at]}, flight {flights[flight]}: "
         f"{known.get(int(results[scale, at, flight]), 'unknown result')}"
@@ -188,7 +180,11 @@ def troubled_flights(data: xr.Dataset) -> Trouble:
 def failed_cells(dataset: xr.Dataset) -> Trouble:
     """The cells of a study that raised an error, with the error's message."""
     failures: list[dict[str, Any]] = json.loads(dataset.attrs.get("failures", "[]"))
-    listed = tuple(f"{_cell_name(failure['cell'])}: {failure['message']}" for failure in failures[:_MOST_LISTED])
+    shown = [name for name in metrics.SCENARIO if dataset.sizes[name] > 1] or ["estimator"]
+    listed = tuple(
+        f"cell {failure['cell']}, {', '.join(f'{name} {failure[name]}' for name in shown)}: {failure['message']}"
+        for failure in failures[:_MOST_LISTED]
+    )
     return Trouble(listed, len(failures))
 
 
@@ -198,29 +194,25 @@ def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
     return int(missing.sum()), missing.size
 
 
-def _cell_name(cell: Any) -> str:
-    if not isinstance(cell, dict):
-        return str(cell)
-    return ", ".join(f"{name} {value}" for name, value in cell.items())
-
-
 def _noise(data: xr.Dataset, place: int) -> str:
     return f"noise x {data['scale'].values[place]:g}"
 
 
-def _groups(data: xr.Dataset, cells) -> tuple[Group, ...]:
-    return tuple(Group(_noise(data, place), tuple(_rows(data, place, cells))) for place in range(data.sizes["scale"]))
+def _groups(data: xr.Dataset, cells: Callable[[dict[str, int]], tuple[Cell, ...]]) -> tuple[Group, ...]:
+    """The groups of a table; `cells` gives those of a row, from its indices along `scale` and `estimator`."""
+    estimators = list(enumerate(names(data, "estimator")))
+    return tuple(
+        Group(
+            _noise(data, place),
+            tuple(Row(name, cells({"scale": place, "estimator": at}), at) for at, name in estimators),
+        )
+        for place in range(data.sizes["scale"])
+    )
 
 
-def _rows(data: xr.Dataset, scale: int, cells) -> Iterator[Row]:
-    for at, name in enumerate(names(data, "estimator")):
-        yield Row(name, cells({"scale": scale, "estimator": at}), at)
-
-
-def _shares(one: xr.Dataset, name: str) -> tuple[Cell, ...]:
-    numbers = (one[part].values for part in (name, "low", "high"))
-    return tuple(Cell(percent(value), _interval(percent(a), percent(b))) for value, a, b in zip(*numbers, strict=True))
-
-
-def _interval(low: str, high: str) -> str:
-    return "" if MISSING in (low, high) else f"{low} to {high}"
+def _with_intervals(one: xr.Dataset, name: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
+    made = []
+    for number, *ends in zip(*(one[part].values for part in (name, "low", "high")), strict=True):
+        low, high = map(text, ends)
+        made.append(Cell(text(number), "" if MISSING in (low, high) else f"{low} to {high}"))
+    return tuple(made)

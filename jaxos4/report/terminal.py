@@ -11,11 +11,7 @@ from .scenario import scenarios
 
 
 def error_table(dataset: xr.Dataset) -> RenderableType:
-    """RMS errors in percent of the truth by parameter, estimator and noise scale, one table for each scenario.
-
-    The tables have rows for the Cramer-Rao bound and for the centre of the bracket. Marks show absolute errors, and
-    notes below the tables explain the marks.
-    """
+    """`tables.error_table` of each scenario, then the notes that explain the marks."""
     parts: list[RenderableType] = []
     notes: dict[str, None] = {}
     for scenario in scenarios(dataset):

@@ -1,8 +1,7 @@
 """The results of a cell: a pure function of the specification, the cell's index, and its network.
 
-A cell is `batch` flights in one call of one program on one device. Vectorised arithmetic differs in its last digits
-with the length of a batch, and with the number of devices that share a program. With whole cells the results are the
-same bit for bit, in any order and in any process.
+A cell is one call of one program on one device. Last digits depend on the length of a batch and on the number of
+devices that share a program; with whole cells they are the same in any order and in any process.
 """
 
 import dataclasses
@@ -34,20 +33,17 @@ _KEPT = ("parameters", "std", "cost", "rollouts", "initial_state", "result", "se
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
-    """Identifies the flights of a cell on the default device. Raises as the estimator does.
+    """Identifies the flights of a cell on the default device. `network`: that of `job_of`, if the estimator needs one.
 
-    **Arguments:**
-
-    - `network`: the network of `job_of`, if the estimator needs one.
+    Raises as the estimator does.
     """
     with jax.enable_x64(study.double):
         scenario = cell.scenario
         with one_core():
             fleet = fleet_of(study, scenario)
             flights = fly(study, fleet, cell)
-            bound = scenario.scale * np.asarray(
-                cramer_rao_std(blank_problem(study, fleet, 1.0, scenario.seen), flights)
-            )
+            standard = blank_problem(study, fleet, 1.0, scenario.seen)
+            bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
             blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
         found = _identify(_estimator(scenario.estimator, network), blank, fleet.bracket, flights.measured)
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
@@ -63,7 +59,7 @@ def program_of(study: Study, cell: Cell) -> tuple:
 def _identify(
     estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"]
 ) -> dict[str, Any]:
-    """What is kept of each flight's `Estimate`, by the names of its attributes."""
+    """The attributes of each flight's `Estimate` that are kept, by name."""
 
     def one(states: States) -> dict[str, Any]:
         found: Estimate = estimator(eqx.tree_at(lambda p: p.flight.states, blank, states), bracket)
@@ -84,24 +80,24 @@ def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:
 def _results(
     study: Study, cell: Cell, flights: Flights, bound: np.ndarray, found: dict[str, Any]
 ) -> dict[str, np.ndarray]:
-    """The arrays of a cell's file. A flight without an answer has NaN, and a result that says why."""
+    """The arrays of a cell's file. A flight without an estimate has NaN, and a result that says why."""
     count = min(study.batch, study.flights - cell.first)
     truth, seed, hit = np.asarray(flights.truth), found["seed"], np.full(study.batch, -1)
     if seed is not None:
         hit = ((truth >= seed.lower) & (truth <= seed.upper)).all(axis=-1)
     finite = np.isfinite(found["std"]).all(axis=-1) & np.isfinite(found["parameters"]).all(axis=-1)
 
-    def answer(name: str) -> np.ndarray:
+    def kept(name: str) -> np.ndarray:
         return np.where(finite.reshape(-1, *[1] * (found[name].ndim - 1)), found[name], np.nan)
 
     results = {
         "truth": truth,
-        "estimate": answer("parameters"),
-        "std": answer("std"),
-        "half_width": answer("half_width"),
+        "estimate": kept("parameters"),
+        "std": kept("std"),
+        "half_width": kept("half_width"),
         "bound": bound,
-        "initial_state": answer("initial_state"),
-        "cost": answer("cost"),
+        "initial_state": kept("initial_state"),
+        "cost": kept("cost"),
         "rollouts": found["rollouts"].astype(np.int32),
         "result": np.array([OUTCOMES.index(name) for name in result_names(found["result"])], np.int8),
         "hit": hit.astype(np.int8),

@@ -1,7 +1,6 @@
 """Runs the cells of a study on a Dask cluster, one task for each; results are the same bit for bit as on one machine.
 
-Workers need only this package. They get the specification, the number of a cell and the bytes of its network's file,
-and return the bytes of the cell's file. If a worker is lost, another worker repeats its tasks.
+Workers need only this package. If a worker is lost, another worker repeats its tasks.
 """
 
 import collections
@@ -33,12 +32,8 @@ _RETRIES = 2
 def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
     """Computes the remaining cells on a cluster, in the order in which they finish.
 
-    **Arguments:**
-
-    - `client`: a client of `distributed`, made with `set_as_default=False`: under a default client, the Dataset would
-      be written under a lock of the cluster.
-
-    **Raises:** `InputError` if the cluster has no workers, or loses a cell more often than it allows.
+    `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
+    lock of the cluster. Raises `InputError` if the cluster has no workers, or loses a cell more often than it allows.
     """
     from distributed import as_completed
 

@@ -16,6 +16,7 @@ from .._files import write_atomically
 from ..errors import InputError
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
+from ..models.abstract import AbstractModel
 from ..networks import CHECK
 from .cell_file import LEVELS, OUTCOMES
 from .flights import bracket_of, fly_again, truth_of
@@ -57,16 +58,14 @@ _AXES_ATTRIBUTES = {
 def assemble(store: Store) -> xr.Dataset:
     """The Dataset of a study's finished cells; the result of all others is `not_run`.
 
-    The dimensions are all axes of the grid, also those of length 1; `flight`, `parameter`, `level`; and those of the
-    example flight and of the networks' training.
-
-    **Raises:** `InputError` if a cell's file is damaged.
+    Its dimensions are all axes of the grid, `flight`, `parameter`, `level`, and those of the example flight and of the
+    networks' training. Raises `InputError` if a cell's file is damaged.
     """
     study = store.study
-    names = MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_names
+    model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
     sizes = dict(zip(SCENARIO, study.shape, strict=True)) | {
         "flight": study.flights,
-        "parameter": len(names),
+        "parameter": len(model.parameter_names),
         "level": len(LEVELS),
     }
     arrays = {
@@ -84,9 +83,8 @@ def assemble(store: Store) -> xr.Dataset:
         lanes, shared = (*cell.place, flights), (*cell.place[:-1], flights)
         if "failed" in results:
             arrays["result"][lanes] = OUTCOMES.index("failed")
-            if np.isnan(
-                arrays["truth"][shared]
-            ).all():  # unless another estimator has run: its truths are the same bit for bit
+            # Another estimator that has run has stored the same truths, bit for bit.
+            if np.isnan(arrays["truth"][shared]).all():
                 arrays["truth"][shared] = truth_of(study, cell)
             where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
@@ -99,10 +97,10 @@ def assemble(store: Store) -> xr.Dataset:
             raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
     dataset = xr.Dataset(
         {
-            name: (_dims(name), arrays[name], {"long_name": long_name, "units": unit})
+            name: (_dims(name), arrays[name], _named(long_name, unit))
             for name, (_, _, unit, long_name) in _VARIABLES.items()
         },
-        coords=_coordinates(study, names),
+        coords=_coordinates(study, model),
         attrs=provenance(study, store.device)
         | {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)},
     )
@@ -132,15 +130,11 @@ def save_dataset(dataset: xr.Dataset, directory: Path) -> Path:
     return path
 
 
-def _coordinates(study: Study, names: tuple[str, ...]) -> dict:
+def _coordinates(study: Study, model: AbstractModel) -> dict:
     values = {dim: list(getattr(study, axis)) for dim, axis in zip(SCENARIO, AXES, strict=True)}
-    values |= {"flight": np.arange(study.flights), "parameter": list(names), "level": list(LEVELS)}
-    coordinates = {
-        dim: (dim, values[dim], {"long_name": long_name, "units": unit})
-        for dim, (long_name, unit) in _AXES_ATTRIBUTES.items()
-    }
-    units = list(MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_units)
-    return coordinates | {"unit": ("parameter", units, {"long_name": "unit of the parameter", "units": "1"})}
+    values |= {"flight": np.arange(study.flights), "parameter": list(model.parameter_names), "level": list(LEVELS)}
+    coordinates = {dim: (dim, values[dim], _named(*attributes)) for dim, attributes in _AXES_ATTRIBUTES.items()}
+    return coordinates | {"unit": ("parameter", list(model.parameter_units), _named("unit of the parameter", "1"))}
 
 
 def provenance(study: Study, device: str) -> dict[str, str | int]:
@@ -192,25 +186,20 @@ def _example(store: Store) -> dict:
     true, measured = some["true"], some["measured"]
     simulated = np.full((len(study.estimators), *true.shape), np.nan)
     simulated[[study.estimators.index(name) for name in found]] = fly_again(study, cells[name], list(found.values()))
-    time = study.dt * np.arange(len(true))
-    both = ("sample", "state")
+    both, along = ("sample", "state"), ("sweep", "parameter")
+    about = _named("its states as simulated with the estimate", "state_unit")
     variables = {
-        "time": ("sample", time, _named("time", "s")),
+        "time": ("sample", study.dt * np.arange(len(true)), _named("time", "s")),
         "state": ("state", list(STATE_NAMES), _named("state", "1")),
         "state_unit": ("state", list(STATE_UNITS), _named("unit of the state", "1")),
         "example_true": (both, true, _named("true states of the example flight", "state_unit")),
         "example_measured": (both, measured, _named("its measured states", "state_unit")),
-        "example_simulated": (
-            ("estimator", *both),
-            simulated,
-            _named("its states as simulated with the estimate", "state_unit"),
-        ),
+        "example_simulated": (("estimator", *both), simulated, about),
     }
     recorded = [results["brackets"] for results in found.values() if "brackets" in results]
     if recorded:
         brackets = recorded[0][np.isfinite(recorded[0]).all(axis=(1, 2))]
         lower, upper = brackets[:, 0], brackets[:, 1]
-        along = ("sweep", "parameter")
         variables |= {
             "sweep": ("sweep", np.arange(1, len(brackets) + 1), _named("sweep of IBSS over the example flight", "1")),
             "search_half_width": (along, (upper - lower) / 2, _named("half the width of the sweep's bracket", "unit")),

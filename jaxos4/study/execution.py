@@ -25,7 +25,7 @@ def carry_out(
 
     - `out`: the study's folder; a new one, or one that the same study wrote.
     - `device`: what computes, in words, for the provenance.
-    - `run`: computes the missing cells: `run_here`, or `run_on_cluster` with its client.
+    - `run`: `run_here`, or `run_on_cluster` with its client.
     - `progress`: is called after each step.
 
     **Raises:** what `open_store` and `run` raise.

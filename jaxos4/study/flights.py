@@ -65,9 +65,8 @@ def _bracket(study: Study, model: AbstractModel, width: float) -> Bracket:
 def _offset_bracket(model: AbstractModel, width: Float[Numeric, ""], seed: int, *, offset: bool) -> Bracket:
     center, half_width = model.alpha, width * model.half_width
     if offset:
-        u = jax.random.uniform(
-            key_of(seed, 0), center.shape, minval=-_LARGEST_OFFSET, maxval=_LARGEST_OFFSET, dtype=float
-        )
+        key, most = key_of(seed, 0), _LARGEST_OFFSET
+        u = jax.random.uniform(key, center.shape, minval=-most, maxval=most, dtype=float)
         center = center + half_width * u
     return Bracket.around(center, half_width)
 
@@ -81,9 +80,7 @@ def key_of(seed: int, number: int) -> Key:
 def blank_problem(study: Study, fleet: Fleet, scale: float, channels: str) -> ShootingProblem:
     """The problem that all flights of a scenario share: everything measured, at rest at the start.
 
-    **Arguments:**
-
-    - `scale`: the noise in multiples of the standard sensors'.
+    `scale`: the noise in multiples of the standard sensors'.
     """
     samples, dtype = fleet.omega.shape[0], jnp.result_type(float)
     # By NumPy: outside jit, JAX would compile a program for each operation, on each device.
@@ -111,7 +108,7 @@ def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
 
 
 def truth_of(study: Study, cell: Cell) -> np.ndarray:
-    """The true parameters of a cell's flights; they are known even if no estimator can be run."""
+    """The true parameters of a cell's flights."""
     with jax.enable_x64(study.double):
         fleet = fleet_of(study, cell.scenario)
         truths = _truths(fleet, *_draws(study, cell), drawn=study.truth == "drawn")
@@ -135,7 +132,7 @@ def _truth(fleet: Fleet, key: Key, drawn: bool) -> Parameters:
 def _truths(
     fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, *, drawn: bool
 ) -> Float[Array, "lanes parameters"]:
-    """True parameters alone, from the draws of `_fly`."""
+    """The true parameters that `_fly` draws."""
     return jax.vmap(lambda number: _truth(fleet, jax.random.split(jax.random.fold_in(key, number))[0], drawn))(numbers)
 
 
@@ -171,13 +168,9 @@ def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "la
 
 
 def fly_again(study: Study, cell: Cell, answers: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Simulates a cell's first flight with the answer of each estimator.
+    """Simulates a cell's first flight with the estimate of each estimator; states, (estimators, samples, 12).
 
-    **Arguments:**
-
-    - `answers`: for each estimator, the results of its cell of the same flights; NaN without an answer.
-
-    **Returns:** states, (estimators, samples, 12).
+    `answers`: for each estimator, the results of its cell of the same flights; NaN without an estimate.
     """
     with jax.enable_x64(study.double):
         fleet = fleet_of(study, cell.scenario)

@@ -14,7 +14,7 @@ from ..results import NINETY_FIVE
 from .specification import Scenario
 
 SCENARIO = Scenario._fields
-"""The dimensions of a study's cells."""
+"""The dimensions of a study's scenarios."""
 
 CONVERGED = ("successful", "unidentifiable")
 """The results of flights whose estimates count in errors."""
@@ -56,10 +56,10 @@ def error(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def no_percentage(dataset: xr.Dataset) -> xr.DataArray:
-    """Why the percentages of a cell and parameter have no meaning: an index into `NO_PERCENTAGE`; 0: they have.
+    """Why percentages of the truth have no meaning, for each scenario and parameter: an index into `NO_PERCENTAGE`.
 
-    1 if the truth of any flight is 0; else 2 if the truth of any flight is below its noise floor, `NINETY_FIVE` bounds.
-    A parameter below the noise floor cannot be distinguished from 0, so that its relative error is arbitrary.
+    1 if the truth of any flight is 0; else 2 if the truth of any flight is below its noise floor, `NINETY_FIVE` bounds:
+    it cannot be distinguished from 0, so that its relative error is arbitrary. 0 otherwise.
     """
     return _no_percentage(dataset["truth"], dataset["bound"])
 
@@ -75,13 +75,9 @@ def bound_error(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def center_error(dataset: xr.Dataset) -> xr.Dataset:
-    """The error of the bracket's center, in the form of `estimator_error`: the error before any flight is seen.
-
-    `reason` is that of the estimator with the smallest bound.
-    """
+    """The error of the bracket's centre, in the form of `estimator_error`; `reason` is by the smallest bound."""
     truth = dataset["truth"]
-    reason = _no_percentage(truth, dataset["bound"].min("estimator"))
-    return _both(dataset["center"] - truth, truth, reason)
+    return _both(dataset["center"] - truth, truth, _no_percentage(truth, dataset["bound"].min("estimator")))
 
 
 def normalised_error(dataset: xr.Dataset) -> xr.DataArray:
@@ -163,13 +159,9 @@ def _no_percentage(truth: xr.DataArray, bound: xr.DataArray) -> xr.DataArray:
     return xr.where(zero, 1, xr.where(below, 2, 0))
 
 
-def _percent(values: xr.DataArray, truth: xr.DataArray, reason: xr.DataArray) -> xr.DataArray:
-    return (100 * values / abs(truth.where(truth != 0))).where(reason == 0)
-
-
 def _both(values: xr.DataArray, truth: xr.DataArray, reason: xr.DataArray) -> xr.Dataset:
-    percent = _rms(_percent(values, truth, reason))
-    return xr.Dataset({"percent": percent, "absolute": _rms(values), "reason": reason})
+    percent = (100 * values / abs(truth.where(truth != 0))).where(reason == 0)
+    return xr.Dataset({"percent": _rms(percent), "absolute": _rms(values), "reason": reason})
 
 
 def _rms(values: xr.DataArray) -> xr.DataArray:

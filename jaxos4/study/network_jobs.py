@@ -53,13 +53,6 @@ def blank_network(study: Study, job: Job) -> TrainedNetwork:
 
 def _training(study: Study, job: Job) -> tuple[NetworkEstimator, ShootingProblem, Bracket]:
     scales = [scale or 1.0 for scale in study.scales]
-    settings = NetworkEstimator(
-        features=study.network.features,
-        approximator=study.network.approximator,
-        channels=job.channels,
-        noise=(min(scales), max(scales)),
-        steps=study.network.steps,
-        held_out=study.network.held_out,
-    )
+    settings = study.network.estimator(channels=job.channels, noise=(min(scales), max(scales)))
     fleet = fleet_of(study, job)
     return settings, blank_problem(study, fleet, 1.0, job.channels), fleet.bracket

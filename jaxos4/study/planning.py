@@ -14,10 +14,9 @@ from .store import Store, check_store
 class Plan(NamedTuple):
     """The remaining work of an estimator.
 
-    - `cells`, `flights`: how many are to be run and identified.
     - `programs`, `networks`: how many are to be compiled, and to be trained.
-    - `seconds`: how long the cells take on this process's devices if each takes as long as this estimator's finished
-      cells on average; `None` if none is finished. The training of networks is not included.
+    - `seconds`: for the cells on this process's devices, without the training of networks, from the mean time of this
+      estimator's finished cells; `None` if none is finished.
     """
 
     estimator: str
@@ -29,10 +28,7 @@ class Plan(NamedTuple):
 
 
 def plan(study: Study, directory: Path) -> list[Plan]:
-    """A row for each estimator; nothing is written. A network counts for the first estimator that needs it.
-
-    **Raises:** `InputError` as `open_store` does.
-    """
+    """A row for each estimator; a network counts for the first that needs it. Raises `InputError` as `open_store`."""
     store = check_store(directory, study)
     remaining = [study.cell(index) for index in store.missing()]
     means, rows = _mean_seconds(store), []

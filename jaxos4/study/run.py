@@ -34,7 +34,7 @@ class Step(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """A task for a device: its name, the call, and what to do with the result."""
+    """A task for a device: its name, the call with the device, and what to do with the result."""
 
     label: str
     call: Callable[[Any], Any]
@@ -71,7 +71,9 @@ class _Work:
             return self._cell(program.waiting.popleft(), program)
         if (program := self._untried()) is not None:
             program.devices.add(device)
-            return self._compilation(program.waiting[0])
+            cell = program.waiting[0]
+            label = f"compiling {cell.scenario.estimator}"
+            return _Task(label, lambda device: _compile(self.study, cell, device), lambda _: None)
         return None
 
     def _ready(self, device: Any) -> _Program | None:
@@ -99,27 +101,23 @@ class _Work:
     def _cell(self, cell: Cell, program: _Program) -> _Task:
         network = None if program.network is None else self.networks[program.network]
 
+        def call(device: Any) -> tuple[bytes, float]:
+            with jax.default_device(device):
+                return compute(self.study, cell, network)
+
         def keep(result: tuple[bytes, float]) -> None:
             data, seconds = result
             self.store.write(self.store.cell_file(cell.number), data, cell=cell.number, seconds=seconds)
             self.done += 1
 
-        return _Task(label_of(self.study, cell), lambda device: _compute(self.study, cell, network, device), keep)
-
-    def _compilation(self, cell: Cell) -> _Task:
-        return _Task(
-            f"compiling {cell.scenario.estimator}",
-            lambda device: _compile(self.study, cell, device),
-            lambda _: None,
-        )
+        return _Task(label_of(self.study, cell), call, keep)
 
 
 def run_here(store: Store) -> Iterator[Step]:
-    """Computes the remaining cells; each device computes its own.
+    """Computes the remaining cells, each on one device: a divided program gives other last digits.
 
-    No program is divided among devices: its results would differ in the last digits. A device first takes a program
-    that no other device runs, then helps with the longest one. While a network is trained, the programs that wait for
-    it are compiled. A cell that cannot be computed is kept as failed; delete its file to try it again.
+    While a network is trained, the programs that wait for it are compiled. A cell that cannot be computed is kept as
+    failed; delete its file to try it again.
     """
     work, free = _Work(store), deque(jax.local_devices())
     running: dict[concurrent.futures.Future, tuple[Any, _Task]] = {}
@@ -150,7 +148,7 @@ def _compile(study: Study, cell: Cell, device: Any) -> None:
 
 
 def _train(store: Store, number: int, job: Job, device: Any) -> TrainedNetwork | str | None:
-    """The network as read from its file, as a resumed run reads it; or a message that says why there is none."""
+    """The network, read from its file as in a resumed run; or a message that says why there is none."""
     begin = time.perf_counter()
     with jax.default_device(device):
         if (network := store.read_network(number)) is not None:
@@ -165,13 +163,8 @@ def _train(store: Store, number: int, job: Job, device: Any) -> TrainedNetwork |
         return store.read_network(number)
 
 
-def _compute(study: Study, cell: Cell, network: TrainedNetwork | str | None, device: Any) -> tuple[bytes, float]:
-    with jax.default_device(device):
-        return compute(study, cell, network)
-
-
 def compute(study: Study, cell: Cell, network: TrainedNetwork | str | None) -> tuple[bytes, float]:
-    """The bytes of a cell's file, and the seconds of its computation. A string as network: why there is none."""
+    """The bytes of a cell's file, and the seconds of its computation. `network` is a message if there is none."""
     begin = time.perf_counter()
     try:
         results = failed(network) if isinstance(network, str) else run_cell(study, cell, network)

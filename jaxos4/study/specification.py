@@ -1,7 +1,7 @@
 """The specification of a study: the axes of a grid of simulated flights, and the cells of that grid.
 
-A cell is `batch` flights of one scenario, identified by one estimator. Flight i has the same parameters and the same
-random numbers in every scenario. Differences between estimators, or between scales of noise, are thus paired.
+A scenario is a point of the grid, and a cell is `batch` flights of a scenario. Flight i has the same random numbers in
+every scenario, so that differences between estimators, or between scales of noise, are paired.
 """
 
 import itertools
@@ -56,6 +56,16 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     held_out: Annotated[int, msgspec.Meta(ge=1000)] = NetworkEstimator.held_out
     hybrid_channels: Literal["rates", "attitude", "all"] = "all"
     seed: Seed = 0
+
+    def estimator(self, **settings: Any) -> NetworkEstimator:
+        """The network to be trained. Raises `ValueError` as `NetworkEstimator` does."""
+        return NetworkEstimator(
+            features=self.features,
+            approximator=self.approximator,
+            steps=self.steps,
+            held_out=self.held_out,
+            **settings,
+        )
 
 
 class Scenario(NamedTuple):
@@ -119,7 +129,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At scale 0 flights are exact, and
       estimators assume the noise of scale 1.
     - `widths`: widths of the brackets, in multiples of the model's default half-width.
-    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's center is off them by a
+    - `truth`: `"airframe"`: all flights have the airframe's parameters, and the bracket's centre is off them by a
       random offset within 80 % of its half-width; `"drawn"`: each flight has its own parameters, uniform in a bracket
       around the airframe's.
     - `initial_state`: `"known"`, or `"free"`: estimated too.
@@ -185,9 +195,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
         estimates = math.prod(self.shape) * self.flights
         if estimates > _MOST_ESTIMATES:
-            raise InputError(
-                f"{estimates} estimates, more than {_MOST_ESTIMATES}; reduce `flights`, or shorten an axis."
-            )
+            most = f"more than {_MOST_ESTIMATES}"
+            raise InputError(f"{estimates} estimates, {most}; reduce `flights`, or shorten an axis.")
 
     def check_computable(self) -> None:
         """Raises `InputError` for an excitation that an airframe cannot fly, or a network that cannot be trained."""
@@ -196,14 +205,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 EXCITATIONS[excitation](self.vehicle(name), duration=duration, dt=self.dt)
             except ValueError as error:
                 raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
-        settings = self.network
         try:
-            NetworkEstimator(
-                features=settings.features,
-                approximator=settings.approximator,
-                steps=settings.steps,
-                held_out=settings.held_out,
-            )
+            self.network.estimator()
         except ValueError as error:
             raise InputError(f"`network`: {error}") from None
 
@@ -215,9 +218,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             except InputError as error:
                 raise InputError(f"[airframe.{name}]: {error}") from None
         if name not in PRESETS:
-            raise InputError(
-                f"`airframes`: unknown {name!r}; choose from {', '.join(PRESETS)}, or add [airframe.{name}]."
-            )
+            presets = ", ".join(PRESETS)
+            raise InputError(f"`airframes`: unknown {name!r}; choose from {presets}, or add [airframe.{name}].")
         return PRESETS[name]
 
     @property
@@ -269,22 +271,12 @@ def load_study(path: Path) -> Study:
     return study
 
 
-# The types of values, in the words of msgspec and of TOML.
-_WORDS = {
-    "object": "a table",
-    "array": "a list",
-    "int": "a whole number",
-    "float": "a number",
-    "str": "a string",
-    "bool": "true or false",
-}
-
-
 def _in_words(message: str) -> str:
-    """Rewrites a message of msgspec: first the key, then what is wrong in the words of TOML, then the choices."""
+    """A message of msgspec with the key first, types in the words of TOML, and the choices last."""
     complaint, _, place = message.partition(" - at `$")
     key = place.strip(".`")
-    for kind, word in _WORDS.items():
+    words = {"object": "a table", "array": "a list", "int": "a whole number"}
+    for kind, word in (words | {"float": "a number", "str": "a string", "bool": "true or false"}).items():
         complaint = complaint.replace(f"`{kind}`", word)
     known = Training if key.startswith("network") else Study
     if complaint.startswith("Object contains unknown field "):
@@ -293,9 +285,7 @@ def _in_words(message: str) -> str:
     if complaint.startswith("Invalid enum value "):
         choices = get_args(get_type_hints(known)[key.removeprefix("network.")])
         return f"`{key}`: unknown {complaint.removeprefix('Invalid enum value ')}; choose from {', '.join(choices)}"
-    if not key:
-        return complaint
-    return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}"
+    return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}" if key else complaint
 
 
 def differences(now: Study, before: Study) -> list[str]:

@@ -71,7 +71,7 @@ class Store:
             file.write(json.dumps(entry) + "\n")
 
     def end_line(self) -> None:
-        """Ends a line of the log that a kill or a full disk cut, so that the next entry has its own line."""
+        """Ends a line of the log that a kill or a full disk cut."""
         with contextlib.suppress(FileNotFoundError), open(self.directory / _LOG, "rb+") as file:
             if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
                 file.write(b"\n")
@@ -115,9 +115,8 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
     try:
         lock.acquire()
     except filelock.Timeout:
-        raise InputError(
-            f"{directory}: another run is at work on this study; wait for its end, or give another folder."
-        ) from None
+        what = "another run is at work on this study; wait for its end, or give another folder."
+        raise InputError(f"{directory}: {what}") from None
     try:
         if specification.exists():
             store = read_store(directory)
@@ -185,6 +184,5 @@ def _check_folder(directory: Path) -> None:
 
 
 def _check_same(directory: Path, wanted: Study, stored: Study) -> None:
-    changed = differences(wanted, stored)
-    if changed:
+    if changed := differences(wanted, stored):
         raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")
