@@ -11,9 +11,8 @@ from rich.table import Table
 from ..airframe import load_airframe
 from ..logs import FORMATS
 from ..recording.inspection import RATES, AxisExcitation, IdentifiableParameters, Inspection, inspect_log
-from ._check_output import check_output
 from ._choices import OutOption
-from ._json import write_json
+from ._output import check_output, write_json
 
 LABELS = {each.name: each.label for each in FORMATS}
 # At most so many parts are printed, the longest ones.
@@ -31,8 +30,7 @@ CHANNELS = (
 def inspect(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox CSV or Crazyflie.")],
     airframe: Annotated[
-        str | None,
-        typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters."),
+        str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
     ] = None,
     out: OutOption = None,
 ) -> None:
@@ -42,6 +40,8 @@ def inspect(
     if out is not None:
         check_output(out, log, None if airframe is None else Path(airframe))
     found = inspect_log(log, vehicle)
+    if out is not None:
+        write_json(found.to_dict(), out)
     _print_contents(console, found)
     _print_parts(console, found)
     if found.identifiable is not None:
@@ -52,8 +52,6 @@ def inspect(
         console.print("give --airframe to see which parameters are identifiable.")
     else:
         console.print("identifiable parameters are computed only if p, q and r were measured.")
-    if out is not None:
-        write_json(found.to_dict(), out)
 
 
 def _print_contents(console: Console, found: Inspection) -> None:
