@@ -10,7 +10,7 @@ from rich.table import Table
 
 from ..airframe import load_airframe
 from ..logs import FORMATS
-from ..recording.inspection import RATES, AxisExcitation, IdentifiableParameters, Inspection, inspect_log
+from ..recording.inspection import RATES, IdentifiableParameters, Inspection, inspect_log
 from ._choices import OutOption
 from ._output import check_output, write_json
 
@@ -83,16 +83,12 @@ def _print_parts(console: Console, found: Inspection) -> None:
         table.add_column(heading, no_wrap=True)
     shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:MOST_PARTS]
     for part in sorted(shown, key=lambda part: part.begin):
-        axes = [_excitation(axis) for axis in part.excitation.values()] or ["", "", ""]
-        table.add_row(f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *axes)
+        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
+        table.add_row(f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""]))
     console.print(table)
     if len(found.parts) > len(shown):
         console.print(f"and {len(found.parts) - len(shown)} shorter parts")
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
-
-
-def _excitation(axis: AxisExcitation) -> str:
-    return axis.verdict if axis.rate is None else f"{axis.verdict} ({axis.rate:.2g})"
 
 
 def _print_identifiable(console: Console, found: IdentifiableParameters) -> None:

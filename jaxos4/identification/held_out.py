@@ -28,7 +28,7 @@ class HeldOut(NamedTuple):
     - `flight`: with these measurements.
     - `seconds`: how long they last [s].
     - `name`: of the recording.
-    - `fitted_vehicle`: whether the flight consists of the fitted recordings, with their offsets.
+    - `fitted_vehicle`: whether they are a part of the fitted recordings, which have their own offsets.
     """
 
     flight: Flight
