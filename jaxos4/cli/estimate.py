@@ -12,13 +12,12 @@ from rich.console import Console
 from .._files import read_toml
 from ..airframe import load_airframe
 from ..errors import InputError
-from ..identification import Identification, VehicleIdentification, identify
+from ..identification import VehicleIdentification, identify
 from ..models import MODELS
 from ..recording import read_recording
 from ..report.flight_page import write_flight_page
 from ..report.identification_page import print_identification
 from ..results import RESULTS
-from ._check_output import check_output
 from ._choices import (
     AirframeOption,
     BracketOption,
@@ -31,8 +30,8 @@ from ._choices import (
     VehicleModel,
     WindowOption,
 )
-from ._json import write_json
 from ._messages import in_options, option_names
+from ._output import check_output, write_json
 from ._progress import stages
 
 
@@ -48,15 +47,13 @@ def estimate(
     initial_state: InitialStateOption = InitialState["free"],
     window: WindowOption = None,
     network: Annotated[
-        Path | None,
-        typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now."),
+        Path | None, typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
     ] = None,
     validate: Annotated[
         Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
     ] = None,
     terms: Annotated[
-        str | None,
-        typer.Option(help="With --model flight: offset,damping,...; default: what the logs allow."),
+        str | None, typer.Option(help="With --model flight: offset,damping,...; default: what the logs allow.")
     ] = None,
     begin: Annotated[
         float | None,
@@ -66,12 +63,10 @@ def estimate(
         float | None, typer.Option("--to", metavar="SECONDS", help="With --model flight: use the logs up to this time.")
     ] = None,
     sample_time: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", help="With --model flight: the sample time to average to."),
+        float | None, typer.Option(metavar="SECONDS", help="With --model flight: the sample time to average to.")
     ] = None,
     holdout: Annotated[
-        float | None,
-        typer.Option(metavar="SHARE", help="With --model flight: the share to predict; default: 0.25."),
+        float | None, typer.Option(metavar="SHARE", help="With --model flight: the share to predict; default: 0.25.")
     ] = None,
     loss: Annotated[Loss | None, typer.Option(help="With --model flight: huber (default) cuts outliers.")] = None,
     report: Annotated[
@@ -108,30 +103,20 @@ def estimate(
         other = None if validate is None else read_recording(validate, vehicle)
         subject = vehicle if is_vehicle else MODELS[model](vehicle)
         found = identify(recordings, subject, validate=other, progress=progress, **options)
-    title = ", ".join(path.name for path in flights)
-    _publish(Console(), _with_command(found, airframe), out=out, report=report, title=title)
-
-
-def _publish(console: Console, found: Identification, *, out: Path | None, report: Path | None, title: str) -> None:
-    """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
+    asked = {
+        "airframe": airframe,
+        "notes": [in_options(note) for note in found.provenance["notes"]],
+        "command": shlex.join(["jaxos4", *sys.argv[1:]]),
+    }
+    found, console = msgspec.structs.replace(found, provenance=found.provenance | asked), Console()
     if out is not None:
         write_json(found.to_dict(), out)
     for note in found.provenance["notes"]:
         console.print(f"note: {note}", markup=False, highlight=False)
     print_identification(console, found)
     if report is not None and isinstance(found, VehicleIdentification):
-        write_flight_page(report, found, title=title)
+        write_flight_page(report, found, title=", ".join(path.name for path in flights))
         console.print(f"report: {report}", markup=False, highlight=False)
     if not found.successful:
         typer.echo(f"jaxos4: {found.result}: {RESULTS[getattr(RESULTS, found.result)]}", err=True)
         raise typer.Exit(1)
-
-
-def _with_command(found: Identification, airframe: str) -> Identification:
-    """The identification with the command in its provenance, and its notes in the words of the command line."""
-    asked = {
-        "airframe": airframe,
-        "notes": [in_options(note) for note in found.provenance["notes"]],
-        "command": shlex.join(["jaxos4", *sys.argv[1:]]),
-    }
-    return msgspec.structs.replace(found, provenance=found.provenance | asked)

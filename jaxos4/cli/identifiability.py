@@ -11,7 +11,6 @@ from ..airframe import load_airframe
 from ..identification import FlightInformation, assess
 from ..models import MODELS
 from ..recording import read_recording
-from ._check_output import check_output
 from ._choices import (
     AirframeOption,
     BracketOption,
@@ -24,12 +23,12 @@ from ._choices import (
     OutOption,
     WindowOption,
 )
-from ._json import write_json
 from ._messages import option_names
+from ._output import check_output, write_json
 from ._progress import stages
 
 # Parameters with less than this share of the largest one are not shown in a direction.
-SMALL = 0.1
+_SMALL = 0.1
 _MOST_HALF_WIDTHS = 1e3
 
 
@@ -44,7 +43,6 @@ def identifiability(
     out: OutOption = None,
 ) -> None:
     """Find which of alpha_1..8 a flight can identify, and why not the others."""
-    console = Console()
     if out is not None:
         check_output(out, flight, Path(airframe), bracket)
     subject = MODELS[model](load_airframe(airframe))
@@ -59,11 +57,12 @@ def identifiability(
             window=window,
             progress=progress,
         )
+    if out is not None:
+        write_json(found.to_dict(), out)
+    console = Console()
     for note in recording.notes:
         console.print(f"note: {note}", markup=False, highlight=False)
     _print_information(console, found)
-    if out is not None:
-        write_json(found.to_dict(), out)
 
 
 def _print_information(console: Console, found: FlightInformation) -> None:
@@ -93,7 +92,7 @@ def _print_information(console: Console, found: FlightInformation) -> None:
 def _print_weakest(console: Console, eigenvalue: float, direction: dict[str, float]) -> None:
     largest = max(abs(part) for part in direction.values())
     ordered = sorted(direction.items(), key=lambda item: -abs(item[1]))
-    parts = " ".join(f"{part:+.2f} {name}" for name, part in ordered if abs(part) > SMALL * largest)
+    parts = " ".join(f"{part:+.2f} {name}" for name, part in ordered if abs(part) > _SMALL * largest)
     spread = max(eigenvalue, 1e-300) ** -0.5
     size = f"{spread:.2g}" if spread < _MOST_HALF_WIDTHS else f"over {_MOST_HALF_WIDTHS:g}"
     console.print(

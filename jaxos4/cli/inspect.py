@@ -10,10 +10,9 @@ from rich.table import Table
 
 from ..airframe import load_airframe
 from ..logs import FORMATS
-from ..recording.inspection import RATES, AxisExcitation, IdentifiableParameters, Inspection, inspect_log
-from ._check_output import check_output
+from ..recording.inspection import RATES, IdentifiableParameters, Inspection, inspect_log
 from ._choices import OutOption
-from ._json import write_json
+from ._output import check_output, write_json
 
 LABELS = {each.name: each.label for each in FORMATS}
 # At most so many parts are printed, the longest ones.
@@ -31,8 +30,7 @@ CHANNELS = (
 def inspect(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox CSV or Crazyflie.")],
     airframe: Annotated[
-        str | None,
-        typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters."),
+        str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
     ] = None,
     out: OutOption = None,
 ) -> None:
@@ -42,6 +40,8 @@ def inspect(
     if out is not None:
         check_output(out, log, None if airframe is None else Path(airframe))
     found = inspect_log(log, vehicle)
+    if out is not None:
+        write_json(found.to_dict(), out)
     _print_contents(console, found)
     _print_parts(console, found)
     if found.identifiable is not None:
@@ -52,8 +52,6 @@ def inspect(
         console.print("give --airframe to see which parameters are identifiable.")
     else:
         console.print("identifiable parameters are computed only if p, q and r were measured.")
-    if out is not None:
-        write_json(found.to_dict(), out)
 
 
 def _print_contents(console: Console, found: Inspection) -> None:
@@ -85,16 +83,12 @@ def _print_parts(console: Console, found: Inspection) -> None:
         table.add_column(heading, no_wrap=True)
     shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:MOST_PARTS]
     for part in sorted(shown, key=lambda part: part.begin):
-        axes = [_excitation(axis) for axis in part.excitation.values()] or ["", "", ""]
-        table.add_row(f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *axes)
+        axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
+        table.add_row(f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""]))
     console.print(table)
     if len(found.parts) > len(shown):
         console.print(f"and {len(found.parts) - len(shown)} shorter parts")
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
-
-
-def _excitation(axis: AxisExcitation) -> str:
-    return axis.verdict if axis.rate is None else f"{axis.verdict} ({axis.rate:.2g})"
 
 
 def _print_identifiable(console: Console, found: IdentifiableParameters) -> None:

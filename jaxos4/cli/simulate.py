@@ -13,8 +13,8 @@ from ..models import MODELS
 from ..noise import SENSOR_SIGMA, WhiteNoise, measure
 from ..results import RESULTS, result_names
 from ..simulation import simulate as fly
-from ._check_output import check_output
 from ._choices import AirframeOption, Excitation, Method, Model, ModelOption
+from ._output import check_output
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
 

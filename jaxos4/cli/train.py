@@ -14,7 +14,6 @@ from ..models import MODELS
 from ..networks import NetworkEstimator
 from ..networks.file import save_network
 from ..recording import read_recording
-from ._check_output import check_output
 from ._choices import (
     AirframeOption,
     Approximator,
@@ -27,6 +26,7 @@ from ._choices import (
     ModelOption,
 )
 from ._messages import option_names
+from ._output import check_output
 
 
 def train(
@@ -73,7 +73,6 @@ def train(
             channels=None if channels is None else channels.value,
             initial_state=str(initial_state.value),
             seed=seed,
-            progress=True,
         )
     save_network(network, out)
     low, high = noise

@@ -12,7 +12,6 @@ from ..models.corrected import CorrectedOS4
 from .results import Constant, RigidBody
 
 _UNIT = "kg m^2"
-_CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
 # The place of the alpha that is torque over this moment of inertia.
 _INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
@@ -27,24 +26,16 @@ def flight_constants(model: AbstractModel, estimate: Estimate) -> RigidBody:
     values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
     if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
         return RigidBody()
-    table = zip(_CONSTANTS, values.tolist(), std.tolist(), strict=True)
-    return RigidBody(
-        {name: Constant(value, error, _UNIT) for name, value, error in table},
-        consistency_p=float(rigid.p_value),
-        is_rigid_body=bool(rigid.is_rigid_body),
-    )
+    table = zip(("Ix", "Iy", "Iz", "J_R"), values.tolist(), std.tolist(), strict=True)
+    constants = {name: Constant(value, error, _UNIT) for name, value, error in table}
+    return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
 
 def vehicle_constants(names: tuple[str, ...], estimate: Estimate, bracket: Bracket, airframe: Airframe) -> RigidBody:
     """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated.
 
-    Torques exceed the airframe's by the same factor as thrust: with `thrust_gain` estimated, the alphas are divided by
-    it.
-
-    **Arguments:**
-
-    - `names`: of the estimated parameters.
-    - `bracket`: of all parameters of the model, alpha_1..8 first.
+    Torques exceed the airframe's by the same factor as thrust: an estimated `thrust_gain` divides the alphas.
+    `names`: of the estimated parameters. `bracket`: of all parameters of the model, alpha_1..8 first.
     """
     values = np.asarray(estimate.parameters)
     gain = names.index("thrust_gain") if "thrust_gain" in names else None

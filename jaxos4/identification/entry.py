@@ -14,7 +14,7 @@ from ..networks import TrainedNetwork
 from ..recording.reading import Recording, as_recordings
 from .flight import identify_flight
 from .problem import Intervals
-from .provenance import choice
+from .provenance import class_name
 from .recordings import identify_vehicle
 from .results import FlightIdentification, VehicleIdentification
 
@@ -80,37 +80,28 @@ def identify(
     cannot be trained.
     """
     recordings = as_recordings(flights)
+    if not recordings:
+        raise InputError("`flights`: holds no flight; give one.")
     other = None if validate is None else as_recordings(validate, "validation flight")[0]
     common = {"estimator": estimator, "bracket": bracket, "window": window, "seed": seed, "progress": progress}
     of_model = {"channels": channels, "network": network}
     of_vehicle = {"terms": terms, "begin": begin, "end": end, "sample_time": sample_time}
     of_vehicle |= {"holdout": holdout, "loss": loss}
     if isinstance(subject, Airframe):
-        _check_vehicle(recordings, initial_state, of_model)
+        _refuse(of_model, "a vehicle is identified from its rates and specific force, and trains its own network")
+        if initial_state != "free":
+            raise InputError(f"`initial_state` {initial_state}: each window has its own initial state; leave it out.")
         return identify_vehicle(recordings, subject, validate=other, **of_vehicle, **common)
-    _check_model(recordings, subject, of_vehicle)
-    return identify_flight(recordings[0], subject, initial_state=initial_state, validate=other, **of_model, **common)
-
-
-def _check_vehicle(recordings: Sequence[Recording], initial_state: str, of_model: dict[str, Any]) -> None:
-    if not recordings:
-        raise InputError("`flights`: holds no flight; give at least one.")
-    _refuse(of_model, "a vehicle is identified from its rates and specific force, and trains its own network")
-    if initial_state != "free":
-        raise InputError(f"`initial_state` {initial_state}: each window has its own initial state; leave it out.")
-
-
-def _check_model(recordings: Sequence[Recording], subject: AbstractModel, of_vehicle: dict[str, Any]) -> None:
-    if subject.parameter_names != PARAMETER_NAMES:
+    if getattr(subject, "parameter_names", None) != PARAMETER_NAMES:
         raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(subject).__name__}.")
-    name = choice(subject, MODELS)
+    name = class_name(subject, MODELS)
     _refuse(of_vehicle, f"is for an `Airframe` as `subject`, not for the {name} model")
-    if not recordings:
-        raise InputError("`flights`: holds no flight; give one.")
-    if len(recordings) > 1:
+    recording, *others = recordings
+    if others:
         raise InputError(
-            f"{recordings[1].name}: `subject` {name} explains one flight; use an `Airframe` as `subject` for several."
+            f"{others[0].name}: `subject` {name} explains one flight; use an `Airframe` as `subject` for several."
         )
+    return identify_flight(recording, subject, initial_state=initial_state, validate=other, **of_model, **common)
 
 
 def _refuse(options: dict[str, Any], why: str) -> None:

@@ -52,20 +52,6 @@ def fit_flight(
     The covariance of an estimator that shoots is the Cramer-Rao bound, or `robust_covariance` if residuals are
     coloured. The other estimators have their own, and estimate once more with the last noise levels.
     """
-    fit = _with_noise_levels(estimator, problem, bracket, progress)
-    if not has_answer(fit.estimate):
-        return fit
-    problem, estimate = fit.problem, fit.estimate
-    diagnostics = diagnose(problem, estimate.parameters, estimate.initial_state, fitted=True)
-    if estimator.shoots and (diagnostics.colour > COLOURED).any():
-        covariance = robust_covariance(problem, estimate.parameters, estimate.initial_state)
-        estimate = eqx.tree_at(lambda e: e.covariance, estimate, covariance)
-    return fit._replace(estimate=estimate, diagnostics=diagnostics)
-
-
-def _with_noise_levels(
-    estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket, progress: Callable[[str], None]
-) -> FlightFit:
     passes = 0
 
     def search(weighted: ShootingProblem, previous: Estimate | None, colour: float) -> Estimate:
@@ -80,17 +66,18 @@ def _with_noise_levels(
 
     refined = refine(problem, search, passes=_PASSES, stop=failed)
     problem, estimate, rollouts = refined.problem, refined.estimate, refined.rollouts
+    if has_answer(estimate):
+        if not refined.settled:
+            problem = problem.reweighted(problem.residuals(estimate.parameters, estimate.initial_state))
+        if not estimator.shoots:
+            estimate = search(problem, estimate, refined.colour)
+            rollouts += int(estimate.rollouts)
     if not has_answer(estimate):
         return FlightFit(problem, estimate, estimate.std, rollouts)
-    if not refined.settled:
-        problem = problem.reweighted(problem.residuals(estimate.parameters, estimate.initial_state))
-    if not estimator.shoots:
-        estimate = search(problem, estimate, refined.colour)
-        rollouts += int(estimate.rollouts)
-        if not has_answer(estimate):
-            return FlightFit(problem, estimate, estimate.std, rollouts)
-    bound = cramer_rao_bound(problem, estimate.parameters, estimate.initial_state)
-    cost = problem.cost(estimate.parameters, estimate.initial_state)
-    covariance = bound if estimator.shoots else estimate.covariance
+    at = (estimate.parameters, estimate.initial_state)
+    bound, cost = cramer_rao_bound(problem, *at), problem.cost(*at)
+    covariance, diagnostics = estimate.covariance, diagnose(problem, *at, fitted=True)
+    if estimator.shoots:
+        covariance = robust_covariance(problem, *at) if (diagnostics.colour > COLOURED).any() else bound
     estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, (covariance, cost))
-    return FlightFit(problem, estimate, jnp.sqrt(jnp.diagonal(bound)), rollouts)
+    return FlightFit(problem, estimate, jnp.sqrt(jnp.diagonal(bound)), rollouts, diagnostics)

@@ -28,7 +28,7 @@ class HeldOut(NamedTuple):
     - `flight`: with these measurements.
     - `seconds`: how long they last [s].
     - `name`: of the recording.
-    - `fitted_vehicle`: whether the flight consists of the fitted recordings, with their offsets.
+    - `fitted_vehicle`: whether they are a part of the fitted recordings, which have their own offsets.
     """
 
     flight: Flight
@@ -64,15 +64,9 @@ def predict_held_out(fit: VehicleFit, model: FlightModel, held_out: HeldOut) -> 
 
     predicted, own = scored(fit.estimate.parameters)
     _, regressed = scored(_regression(fit.problem, fit.estimate.parameters))
+    tables = (own.skill, own.std, own.rmse, own.persistence, regressed.skill)
     rates = {
-        rate: RateSkill(
-            skill=[finite_or_none(x) for x in own.skill[:, i]],
-            std=[finite_or_none(x) for x in own.std[:, i]],
-            rmse=[finite_or_none(x) for x in own.rmse[:, i]],
-            persistence=[finite_or_none(x) for x in own.persistence[:, i]],
-            equation_error=[finite_or_none(x) for x in regressed.skill[:, i]],
-        )
-        for i, rate in enumerate("pqr")
+        rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
     }
     return predicted, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
 
@@ -80,7 +74,7 @@ def predict_held_out(fit: VehicleFit, model: FlightModel, held_out: HeldOut) -> 
 def _on_another_flight(
     fit: VehicleFit, model: FlightModel, parameters: Array, flight: Flight
 ) -> tuple[ShootingProblem, Array]:
-    """The problem of another flight, and its parameters: the mean of those that each recording has its own of."""
+    """The problem of another flight, and its parameters: the mean where each recording has its own."""
     values = fit._replace(estimate=eqx.tree_at(lambda e: e.parameters, fit.estimate, parameters)).values
     stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
     other = FlightModel(model.airframe, terms=model.terms, recordings=(0,) * stretches)
@@ -96,10 +90,10 @@ def _on_another_flight(
 @eqx.filter_jit
 def _regression(problem: ShootingProblem, parameters: Array) -> Array:
     """The parameters by regression, except lag, delay and thrust curve, which regression cannot estimate."""
-    names = problem.model.parameter_names
+    names, regression = problem.model.parameter_names, EquationError(memory=_MEMORY)
     known = {names[i]: parameters[i] for i in problem.model.forcing_parameters}
     if not known:
-        return EquationError(memory=_MEMORY).solution(problem, Bracket.default(problem.model))
+        return regression.solution(problem, Bracket.default(problem.model))
     linear = hold(problem.model, known)
     problem = eqx.tree_at(lambda p: p.model, problem, linear)
-    return linear.complete(EquationError(memory=_MEMORY).solution(problem, Bracket.default(linear)))
+    return linear.complete(regression.solution(problem, Bracket.default(linear)))

@@ -35,9 +35,7 @@ def assess(
     problem, estimate, fitted = fit.problem, fit.estimate, has_answer(fit.estimate)
     known = identifiability(problem, where, estimate.parameters, estimate.initial_state if fitted else None)
     names, notes = model.parameter_names, known.notes(model.parameter_names)
-    std, alone, half_width, limit = (
-        np.asarray(x) for x in (known.std, known.std_alone, known.half_width, known.noise_limit)
-    )
+    std, alone, half_width, limit = map(np.asarray, (known.std, known.std_alone, known.half_width, known.noise_limit))
     finite = bool(np.isfinite(std).all())
     return FlightInformation(
         flight=recording.name,

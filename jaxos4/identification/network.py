@@ -17,6 +17,8 @@ from ..recording.reading import Recording
 from ..shooting import ShootingProblem
 from .problem import Intervals, bracket_of, flight_problem
 
+GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
+
 # Steps of training for a network that only gives a search its start.
 _SEED_STEPS = 2000
 # The same for a vehicle's flights in windows.
@@ -26,45 +28,40 @@ _VEHICLE_TRAINING = NetworkEstimator(steps=500, batch=64, noise=(1.0, 1.0), held
 def train_network(
     recording: Recording,
     model: AbstractModel,
-    settings: NetworkEstimator | None = None,
+    settings: NetworkEstimator,
     *,
     bracket: Intervals = None,
     channels: str | None = None,
     initial_state: str = "free",
     seed: int = 0,
-    progress: bool = False,
 ) -> TrainedNetwork:
-    """Train a network that identifies any flight with the inputs of this one. Arguments as of `jaxos4.identify`.
+    """Train a network that identifies any flight with the inputs of this one, with a bar. Arguments as of `identify`.
 
-    - `settings`: of the training, but for the channels.
+    - `settings`: of the training, except the channels.
     - `channels`: what the network looks at; by default the rates, and the attitude if a rate was not measured.
-    - `progress`: whether to show a bar.
     """
     problem = flight_problem(recording, model, channels=channels, initial_state=initial_state)
-    seen = channels or _seen_channels(problem)
-    settings = dataclasses.replace(settings or NetworkEstimator(), channels=seen)
-    return _train(settings, problem, bracket_of(bracket, model), recording.name, seed, progress)
+    settings = dataclasses.replace(settings, channels=channels or _seen_channels(problem))
+    return _train(settings, problem, bracket_of(bracket, model), recording.name, seed, progress=True)
 
 
 def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
     """Train a network for one flight, named `name`: briefly if shooting follows (`shoots`)."""
     steps = _SEED_STEPS if shoots else NetworkEstimator.steps
-    return _train(NetworkEstimator(channels=_seen_channels(problem), steps=steps), problem, bracket, name, seed, False)
+    return _train(NetworkEstimator(channels=_seen_channels(problem), steps=steps), problem, bracket, name, seed)
 
 
-def vehicle_network_for(problem: ShootingProblem, bracket: Bracket, seed: int) -> TrainedNetwork:
+def vehicle_network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, seed: int) -> TrainedNetwork:
     """Train a network for a vehicle's flights in windows, at the noise levels of the problem."""
-    return _VEHICLE_TRAINING.fit(problem, bracket, key=jax.random.key(seed))
+    return _train(_VEHICLE_TRAINING, problem, bracket, name, seed)
 
 
-def loaded(network: TrainedNetwork | str | os.PathLike[str] | None) -> TrainedNetwork | None:
+def loaded(network: GivenNetwork) -> TrainedNetwork | None:
     """A network, or the one in a file. Raises as `jaxos4.load_network`."""
     return network if network is None or isinstance(network, TrainedNetwork) else load_network(network)
 
 
-def network_provenance(
-    given: TrainedNetwork | str | os.PathLike[str] | None, network: TrainedNetwork
-) -> dict[str, Any]:
+def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:
     """Where a network is from and how it was trained, for JSON."""
     bracket = network.bracket
     return {
@@ -80,7 +77,7 @@ def _seen_channels(problem: ShootingProblem) -> str:
 
 
 def _train(
-    settings: NetworkEstimator, problem: ShootingProblem, bracket: Bracket, name: str, seed: int, progress: bool
+    settings: NetworkEstimator, problem: ShootingProblem, bracket: Bracket, name: str, seed: int, progress: bool = False
 ) -> TrainedNetwork:
     try:
         return settings.fit(problem, bracket, key=jax.random.key(seed), progress=progress)

@@ -1,4 +1,4 @@
-"""The noise levels of the sensors, found together with the parameters."""
+"""Where noise levels are estimated: from the residuals of an estimate, repeated until both settle."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,9 +14,8 @@ from .results import has_answer
 
 # Noise levels have settled if none changes by more than this share. Weights this close to the right ones cost less
 # than 1 % of the efficiency.
-SETTLED = 0.2
-# With outliers, no parameter may move by more than this many of its standard deviations either, coloured noise allowed
-# for.
+_SETTLED = 0.2
+# With outliers, no parameter may move by more than this many of its standard deviations (for coloured noise) either.
 _SETTLED_PARAMETERS = 0.2
 # Beyond this correlation of neighbouring residuals, the number of independent ones cannot be estimated.
 _MOST_CORRELATION = 0.98
@@ -29,7 +28,7 @@ class Refined(NamedTuple):
     - `estimate`: the last one.
     - `rollouts`: of all searches together.
     - `settled`: whether the noise levels stopped changing, or `stop` ended the passes.
-    - `colour`: by how much standard errors exceed those of white noise, see `colour_factor`.
+    - `colour`: by how much standard errors exceed those of white noise, see `_colour_factor`.
     - `kept`: the share of the measurements that were not cut.
     """
 
@@ -52,10 +51,8 @@ def refine(
 ) -> Refined:
     """Alternate an estimate and the noise levels of its residuals until both settle.
 
-    **Arguments:**
-
     - `problem`: its `sigma` is the first guess of the noise levels.
-    - `search`: makes an estimate of a problem, the previous estimate (`None` at first) and its `colour_factor`.
+    - `search`: makes an estimate of a problem, the previous estimate (`None` at first) and its `_colour_factor`.
     - `passes`: how often noise levels are computed at most.
     - `start`: where the first search starts; needed with `huber`.
     - `huber`: whether outliers are cut, see `jaxos4.winsorised`.
@@ -74,8 +71,8 @@ def refine(
         else:
             residuals = before.residuals(estimate.parameters, estimate.initial_state)
             weighted = before.reweighted(residuals)
-        colour = colour_factor(np.asarray(residuals).reshape(-1, problem.columns.size))
-        settled = bool((jnp.abs(weighted.sigma / before.sigma - 1) < SETTLED).all())
+        colour = _colour_factor(np.asarray(residuals).reshape(-1, problem.columns.size))
+        settled = bool((jnp.abs(weighted.sigma / before.sigma - 1) < _SETTLED).all())
         if huber and previous is not None:
             moved = jnp.abs(estimate.parameters - previous) / estimate.std
             settled = settled and bool(moved.max() < _SETTLED_PARAMETERS * colour)
@@ -88,14 +85,11 @@ def refine(
     return Refined(weighted, estimate, rollouts, settled, colour, kept)
 
 
-def colour_factor(residuals: np.ndarray) -> float:
+def _colour_factor(residuals: np.ndarray) -> float:
     """By how much standard errors exceed those of white noise, if residuals are a first-order process.
 
-    The root of (1 + rho) / (1 - rho) of the worst channel, where neighbouring residuals correlate by rho.
-
-    **Arguments:**
-
-    - `residuals`: a row a sample, a column a channel; 0: not measured.
+    The root of (1 + rho) / (1 - rho) of the worst channel, for neighbouring residuals that correlate by rho.
+    `residuals`: a row a sample, a column a channel; 0: not measured.
     """
     products = residuals[1:] * residuals[:-1]
     pairs = products != 0

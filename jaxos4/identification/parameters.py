@@ -22,19 +22,14 @@ def parameter_table(
     reason: Callable[[int], str] = lambda i: "not identifiable from these flights",
     noise_limit: Callable[[int], float | None] | None = None,
 ) -> dict[str, ParameterEstimate]:
-    """Estimates by parameter name.
-
-    **Arguments:**
+    """Estimates by parameter name. `bracket` and `prior` decide which are identifiable, see `Bracket.identifies`.
 
     - `bound`: standard deviations of the Cramer-Rao bound.
-    - `bracket`: of the model's parameters; decides with `prior` which are identifiable, see `Bracket.identifies`.
     - `reason`: why a parameter is not identifiable, by its place.
     - `noise_limit`: by place; see `ParameterEstimate`.
     """
-    identifiable, half_width = (
-        np.asarray(bracket.identifies(estimate.std, prior)),
-        np.asarray(estimate.half_width(0.95)),
-    )
+    identifiable = np.asarray(bracket.identifies(estimate.std, prior))
+    half_width = np.asarray(estimate.half_width(0.95))
     values, std, bounds = (np.asarray(x) for x in (estimate.parameters, estimate.std, bound))
     return {
         name: ParameterEstimate(

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ..bracket import Bracket
 from ..errors import InputError
@@ -17,21 +16,14 @@ from ..noise import SENSOR_SIGMA
 from ..recording.reading import Recording
 from ..shooting import ShootingProblem
 
-# A bracket, or `[lower, upper]` by parameter name.
+# A bracket, or `[lower, upper]` by parameter name; the model's default for all others.
 Intervals = Bracket | Mapping[str, Any] | None
 # The states that each choice of channels adds to the one before, in cascade order.
 _ADDED = {"rates": slice(0, 3), "attitude": slice(3, 6), "all": slice(6, 12)}
 
 
 def bracket_of(bracket: Intervals, model: AbstractModel) -> Bracket:
-    """The bracket of a model's parameters.
-
-    **Arguments:**
-
-    - `bracket`: a bracket, or `[lower, upper]` by parameter name; the model's default for all others.
-
-    **Raises:** `InputError` for unknown parameters, or intervals that are not two rising numbers.
-    """
+    """The bracket of a model's parameters. Raises `InputError` for unknown parameters and impossible intervals."""
     names = model.parameter_names
     if isinstance(bracket, Bracket):
         if bracket.lower.shape != (len(names),):
@@ -40,7 +32,7 @@ def bracket_of(bracket: Intervals, model: AbstractModel) -> Bracket:
     default = Bracket.default(model)
     if bracket is None:
         return default
-    ends = np.stack([np.asarray(end) for end in (default.lower, default.upper)], axis=1)
+    ends = np.stack([default.lower, default.upper], axis=1)
     for name, value in bracket.items():
         if name not in names:
             raise InputError(f"`bracket`: knows no parameter `{name}`; the parameters are {', '.join(names)}.")
@@ -64,13 +56,7 @@ def flight_problem(
     initial_state: str = "free",
     window: float | None = None,
 ) -> ShootingProblem:
-    """The problem of explaining one flight by a model, with the noise levels of the standard sensors.
-
-    **Arguments:**
-
-    - `channels`: `"rates"`, `"attitude"`, `"all"`, or everything that was measured.
-    - `initial_state`: `"free"`: estimated; `"known"`: the first sample is exact.
-    - `window`: cut the flight into windows of about this length [s].
+    """The problem of explaining one flight by a model, at the standard sensors' noise. Arguments as of `identify`.
 
     **Raises:** `InputError`, one line, for arguments out of range and flights that measured too little.
     """
@@ -85,7 +71,12 @@ def flight_problem(
     measured = ~np.isnan(np.asarray(flight.states))
     chosen = _chosen_channels(name, measured, channels)
     columns = CASCADE_ORDER[: CHANNELS[chosen]]
-    start = _first_state(recording, measured, columns) if known else None
+    start = jnp.nan_to_num(flight.states[0]) if known else None
+    unknown = [STATE_NAMES[i] for i in columns if not measured[0, i]]
+    if known and unknown:
+        raise InputError(
+            f"{name}: first sample: `initial_state` known needs {', '.join(unknown)} there; use `initial_state` free."
+        )
     windows = 1 if window is None else _window_count(recording, window)
     missing = [STATE_NAMES[i] for i in columns if not measured[:, i].any()]
     if windows > 1 and missing and chosen != "rates":
@@ -112,16 +103,6 @@ def _chosen_channels(name: str, measured: np.ndarray, channels: str | None) -> s
         missing = ", ".join(STATE_NAMES[i] for i in CASCADE_ORDER[_ADDED[channels]])
         raise InputError(f"{name}: `channels` {channels}: none of {missing} was measured; leave it out.")
     return channels
-
-
-def _first_state(recording: Recording, measured: np.ndarray, columns: np.ndarray) -> Float[Array, "12"]:
-    missing = [STATE_NAMES[i] for i in columns if not measured[0, i]]
-    if missing:
-        raise InputError(
-            f"{recording.name}: first sample: `initial_state` known needs {', '.join(missing)} there; "
-            "use `initial_state` free."
-        )
-    return jnp.nan_to_num(recording.flight.states[0])
 
 
 def _window_count(recording: Recording, window: float) -> int:

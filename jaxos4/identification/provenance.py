@@ -27,15 +27,20 @@ def airframe_name(airframe: Airframe) -> str:
     return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")
 
 
-def choice(instance: object, kinds: Mapping[str, type]) -> str:
+def class_name(instance: object, kinds: Mapping[str, type]) -> str:
     """The name of an object's class in a table of classes, or else the class's own name."""
     return next((name for name, kind in kinds.items() if type(instance) is kind), type(instance).__name__)
 
 
-def estimator_name(estimator: str | AbstractEstimator) -> str:
-    """The name of an estimator. Raises `InputError` for an unknown name."""
+def name_and_class(estimator: str | AbstractEstimator) -> tuple[str, type[AbstractEstimator]]:
+    """The name and the class of an estimator. Raises `InputError` for an unknown name."""
     if not isinstance(estimator, str):
-        return choice(estimator, ESTIMATORS)
+        return class_name(estimator, ESTIMATORS), type(estimator)
     if estimator not in ESTIMATORS:
         raise InputError(f"`estimator`: must be one of {', '.join(ESTIMATORS)}, got {estimator!r}.")
-    return estimator
+    return estimator, ESTIMATORS[estimator]
+
+
+def shooting_names() -> str:
+    """The names of the estimators that shoot."""
+    return ", ".join(name for name, kind in ESTIMATORS.items() if kind.shoots)

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -10,8 +9,9 @@ from ..airframe import Airframe
 from ..bracket import Bracket
 from ..errors import InputError
 from ..estimate import AbstractEstimator, Estimate
-from ..estimators import ESTIMATORS, IBSS, OutputError, make_estimator
+from ..estimators import IBSS, OutputError, make_estimator
 from ..flight import CHANNEL_NAMES
+from ..models.terms import FULL_SCALE, TERMS, default_terms
 from ..models.vehicle import FlightModel
 from ..recording.preparation import HOLDOUT, WINDOW, Prepared, prepare
 from ..recording.reading import Recording
@@ -22,14 +22,12 @@ from .held_out import HeldOut, check_starts, predict_held_out
 from .network import vehicle_network_for
 from .parameters import parameter_table
 from .problem import Intervals, bracket_of
-from .provenance import airframe_name, estimator_name, versions
+from .provenance import airframe_name, name_and_class, shooting_names, versions
 from .results import HeldParameter, RigidBody, VehicleIdentification, finite_or_none
-from .terms import chosen_terms, missing_inputs
-from .vehicle import Search, VehicleFit, fit_vehicle, free_bracket
+from .vehicle import Search, fit_vehicle, free_bracket
 
 # The first guess of the noise levels [rad/s]: errors of the model rather than of the sensor.
-FIRST_SIGMA = 0.5
-LOSSES = ("huber", "squares")
+_FIRST_SIGMA = 0.5
 # The largest Jacobian of output error [GiB]; a search needs a few of them.
 _LARGEST_JACOBIAN = 1.0
 
@@ -52,15 +50,16 @@ def identify_vehicle(
     progress: Callable[[str], None],
 ) -> VehicleIdentification:
     """What `jaxos4.identify` does with an airframe; all arguments are its."""
-    name, loss = estimator_name(estimator), "huber" if loss is None else loss
-    if loss not in LOSSES:
+    (name, kind), loss = name_and_class(estimator), "huber" if loss is None else loss
+    if loss not in ("huber", "squares"):
         raise InputError(f"`loss`: must be huber or squares, got {loss!r}.")
-    search = _last_search(estimator, name, seed)
+    if not kind.shoots:
+        raise InputError(f"`estimator` {name}: does not shoot, which a vehicle needs; use one of {shooting_names()}.")
     started, window = time.perf_counter(), WINDOW if window is None else window
     share = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
     part = {"begin": begin, "end": end, "window": window, "sample_time": sample_time, "holdout": share}
     prepared = prepare(recordings, airframe, **part)
-    chosen = chosen_terms(terms, prepared.available)
+    chosen = default_terms(prepared.available) if terms is None else _checked_terms(terms, prepared.available)
     model = FlightModel(airframe, terms=chosen, recordings=prepared.recordings)
     where, notes, held_out = bracket_of(bracket, model), prepared.notes, None
     if validate is not None:
@@ -71,64 +70,62 @@ def identify_vehicle(
     if held_out is not None:
         check_starts(held_out)
     problem = _problem(prepared, model, recordings[0].name, window)
-    _check_memory(problem, estimator, name)
+    gibibytes = problem.flight.time.shape[0] * problem.columns.size * _unknowns(problem) * 8 / 2**30
+    if kind is OutputError and gibibytes > _LARGEST_JACOBIAN:
+        raise InputError(
+            f"`estimator` {name}: its Jacobian would take {gibibytes:.0f} GiB in {problem.windows} windows; use ibss, "
+            "or less of the flight by `begin` and `end`."
+        )
+    search = _last_search(estimator, kind, recordings[0].name, seed)
     fit = fit_vehicle(problem, where, estimator=search, huber=loss == "huber", progress=progress)
-    predicted = skill = None
+    estimate, free, noise = fit.estimate, fit.problem.model, np.asarray(fit.problem.sigma)
+    parameters, body, predicted, skill = {}, RigidBody(), None, None
     if fit.answered and held_out is not None:
         progress("predicting what was not fitted")
         predicted, skill = predict_held_out(fit, model, held_out)
-    provenance = {
-        "flights": [recording.name for recording in recordings],
-        "validate": None if validate is None else validate.name,
-        "airframe": airframe_name(airframe),
-        "terms": list(model.terms),
-        "window": window,
-        "sample_time": float(prepared.fitted.dt),
-        "fitted_seconds": prepared.seconds[0],
-        "tested_seconds": prepared.seconds[1] if held_out is None else held_out.seconds,
-        "loss": loss,
-        "notes": list(notes),
-        **versions(problem),
-    }
-    result = _result(fit, model, where)
-    spent = time.perf_counter() - started
-    return VehicleIdentification(
-        estimator=name, seconds=spent, skill=skill, predictions=predicted, provenance=provenance, **result
-    )
-
-
-def _result(fit: VehicleFit, model: FlightModel, bracket: Bracket) -> dict[str, Any]:
-    """The fields of a `VehicleIdentification` that follow from the fit; `bracket`: of all parameters of `model`."""
-    estimate, free, noise = fit.estimate, fit.problem.model, np.asarray(fit.problem.sigma)
-    parameters, body = {}, RigidBody()
     if fit.answered:
-        parameters = parameter_table(free, estimate, fit.bound, free_bracket(bracket, model, fit.held))
-        body = vehicle_constants(free.parameter_names, estimate, bracket, model.airframe)
-    return {
-        "model": "flight",
-        "result": str(result_names(estimate.result)),
-        "rollouts": fit.rollouts,
-        "cost": finite_or_none(estimate.cost),
-        "parameters": parameters,
-        "rigid_body": body,
-        "held": {
+        parameters = parameter_table(free, estimate, fit.bound, free_bracket(where, model, fit.held))
+        body = vehicle_constants(free.parameter_names, estimate, where, airframe)
+    return VehicleIdentification(
+        estimator=name,
+        model="flight",
+        result=str(result_names(estimate.result)),
+        rollouts=fit.rollouts,
+        cost=finite_or_none(estimate.cost),
+        seconds=time.perf_counter() - started,
+        parameters=parameters,
+        rigid_body=body,
+        held={
             name: HeldParameter(fit.held[name][0], unit, fit.held[name][1] or "not asked")
             for name, unit in zip(model.parameter_names, model.parameter_units, strict=True)
             if name in fit.held
         },
-        "cut": fit.cut,
-        "noise": {CHANNEL_NAMES[i]: float(noise[i]) for i in fit.problem.columns},
-        "estimate": estimate,
-        "problem": fit.problem,
-    }
+        cut=fit.cut,
+        noise={CHANNEL_NAMES[i]: float(noise[i]) for i in fit.problem.columns},
+        skill=skill,
+        predictions=predicted,
+        provenance={
+            "flights": [recording.name for recording in recordings],
+            "validate": None if validate is None else validate.name,
+            "airframe": airframe_name(airframe),
+            "terms": list(model.terms),
+            "window": window,
+            "sample_time": float(prepared.fitted.dt),
+            "fitted_seconds": prepared.seconds[0],
+            "tested_seconds": 0.0 if held_out is None else held_out.seconds,
+            "loss": loss,
+            "notes": list(notes),
+            **versions(problem),
+        },
+        estimate=estimate,
+        problem=fit.problem,
+    )
 
 
-def _last_search(estimator: str | AbstractEstimator, name: str, seed: int) -> Search | None:
-    """The estimator of the last stage; `None`: IBSS from where the stage before ended."""
-    kind = ESTIMATORS[estimator] if isinstance(estimator, str) else type(estimator)
-    if not kind.shoots:
-        shooting = ", ".join(name for name, one in ESTIMATORS.items() if one.shoots)
-        raise InputError(f"`estimator` {name}: does not shoot, which a vehicle needs; use one of {shooting}.")
+def _last_search(
+    estimator: str | AbstractEstimator, kind: type[AbstractEstimator], name: str, seed: int
+) -> Search | None:
+    """The search of the last stage; `None`: IBSS from the end of the stage before. `name`: of the first recording."""
     if not isinstance(estimator, str):
         return estimator
     if kind is IBSS:
@@ -137,9 +134,24 @@ def _last_search(estimator: str | AbstractEstimator, name: str, seed: int) -> Se
         return make_estimator(estimator)
 
     def with_network(problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        return make_estimator(estimator, vehicle_network_for(problem, bracket, seed))(problem, bracket)
+        return make_estimator(estimator, vehicle_network_for(problem, bracket, name, seed=seed))(problem, bracket)
 
     return with_network
+
+
+def _checked_terms(terms: Sequence[str], available: frozenset[str]) -> tuple[str, ...]:
+    """The terms in the order of `TERMS`. Raises `InputError` for one that is unknown or not available."""
+    for term in terms:
+        if term not in TERMS:
+            raise InputError(f"`terms`: knows no `{term[:40]}`; the terms are {', '.join(TERMS)}.")
+    for term in terms:
+        missing = TERMS[term].needs - available
+        if FULL_SCALE in missing:
+            raise InputError(f"`terms`: {term} needs `max_rotor_speed` in the airframe; set it or leave it out.")
+        if missing:
+            what = " and ".join(sorted(missing))
+            raise InputError(f"`terms`: {term} needs {what}, which these logs did not measure; leave it out.")
+    return tuple(term for term in TERMS if term in terms)
 
 
 def _prepare_other(
@@ -152,39 +164,24 @@ def _prepare_other(
         )
     step = float(prepared.fitted.dt)
     other = prepare([validate], model.airframe, window=window, sample_time=step, holdout=0.0)
-    # Predictions of the rates need no accelerometer.
-    missing = missing_inputs([term for term in model.terms if term != "accelerometer"], other.available)
-    if missing:
-        raise InputError(
-            f"{validate.name}: `validate` did not measure what the term {next(iter(missing))} needs; give `terms` "
-            "without it."
-        )
+    for term in model.terms:
+        # Predictions of the rates need no accelerometer.
+        if term != "accelerometer" and not TERMS[term].needs <= other.available:
+            raise InputError(
+                f"{validate.name}: `validate` did not measure what the term {term} needs; give `terms` without it."
+            )
     return other
 
 
 def _problem(prepared: Prepared, model: FlightModel, name: str, window: float) -> ShootingProblem:
-    """The problem, if there are enough measurements."""
-    sigma = np.full(12, FIRST_SIGMA)
-    problem = ShootingProblem(
-        model, prepared.fitted, sigma=sigma, channels="rates", method="rk4", windows=prepared.windows
-    )
+    sigma, windows = np.full(12, _FIRST_SIGMA), prepared.windows
+    problem = ShootingProblem(model, prepared.fitted, sigma=sigma, channels="rates", method="rk4", windows=windows)
     measured = np.count_nonzero(~np.isnan(np.asarray(problem.measured())))
     if measured <= _unknowns(problem):
         raise InputError(
             f"{name}: {measured} measurements are too few for windows of {window:g} s; give a longer `window`."
         )
     return problem
-
-
-def _check_memory(problem: ShootingProblem, estimator: str | AbstractEstimator, name: str) -> None:
-    """Raise `InputError` if output error needs too much memory."""
-    kind = ESTIMATORS[estimator] if isinstance(estimator, str) else type(estimator)
-    gibibytes = problem.flight.time.shape[0] * problem.columns.size * _unknowns(problem) * 8 / 2**30
-    if kind is OutputError and gibibytes > _LARGEST_JACOBIAN:
-        raise InputError(
-            f"`estimator` {name}: its Jacobian would take {gibibytes:.0f} GiB in {problem.windows} windows; use ibss, "
-            "or less of the flight by `begin` and `end`."
-        )
 
 
 def _unknowns(problem: ShootingProblem) -> int:

@@ -53,10 +53,7 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
 
 
 class Constant(msgspec.Struct, frozen=True):
-    """A physical constant that follows from the parameters, with its standard deviation.
-
-    `note`: the constants of the airframe that must be right. Only for a vehicle.
-    """
+    """A physical constant that follows from the parameters. `note`: what of the airframe must be right (vehicle)."""
 
     estimate: float
     std: float
@@ -83,10 +80,7 @@ class RigidBody(msgspec.Struct, frozen=True):
 
 
 class ChannelFit(msgspec.Struct, frozen=True):
-    """How well the model explains one channel; `jaxos4.Diagnostics` defines the numbers.
-
-    `correlation`: of neighbouring residuals.
-    """
+    """How well the model explains one channel; see `jaxos4.Diagnostics`. `correlation`: of neighbouring residuals."""
 
     rms: float
     unit: str
@@ -116,10 +110,7 @@ class HeldParameter(msgspec.Struct, frozen=True):
 
 
 class RateSkill(msgspec.Struct, frozen=True):
-    """Skill of the predictions of one body rate, by horizon; `jaxos4.Skill` defines the numbers.
-
-    `equation_error`: the skill of a regression with the same terms.
-    """
+    """Predictions of one body rate by horizon; see `jaxos4.Skill`. `equation_error`: skill of a regression."""
 
     skill: list[float | None]
     std: list[float | None]
@@ -129,10 +120,7 @@ class RateSkill(msgspec.Struct, frozen=True):
 
 
 class PredictionSkill(msgspec.Struct, frozen=True):
-    """Skill of predictions of measurements that were not fitted, by horizon [s].
-
-    `starts`: the number of predictions.
-    """
+    """Skill of `starts` predictions of measurements that were not fitted, by horizon [s]."""
 
     horizons: list[float]
     starts: int
@@ -179,8 +167,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON."""
-        apart = ("rigid_body", "estimate", "problem", "predictions")
-        fields = {name: getattr(self, name) for name in self.__struct_fields__ if name not in apart}
+        fields = _fields(self, "rigid_body", "estimate", "problem", "predictions")
         return msgspec.to_builtins(fields | {"constants": self.rigid_body.to_dict()})
 
 
@@ -252,5 +239,8 @@ class FlightInformation(msgspec.Struct, frozen=True, eq=False):
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 identifiability` writes as JSON."""
-        names = (name for name in self.__struct_fields__ if name != "identifiability")
-        return msgspec.to_builtins({name: getattr(self, name) for name in names})
+        return msgspec.to_builtins(_fields(self, "identifiability"))
+
+
+def _fields(struct: msgspec.Struct, *apart: str) -> dict[str, Any]:
+    return {name: getattr(struct, name) for name in struct.__struct_fields__ if name not in apart}

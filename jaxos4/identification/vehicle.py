@@ -27,6 +27,7 @@ from ..shooting import ShootingProblem
 from .noise_levels import Refined, refine
 from .results import NO_ANSWER as NO_ANSWER, has_answer
 
+# Value and reason of each parameter that is held.
 Held = dict[str, tuple[float, str]]
 Search = Callable[[ShootingProblem, Bracket], Estimate] | AbstractEstimator
 
@@ -39,7 +40,6 @@ _PASSES = 12
 _TOLERANCE = 0.1
 # A damping this many standard deviations below 0 is held at 0.
 _NEGATIVE = 2.0
-_NOT_IDENTIFIABLE = "not identifiable from these flights"
 
 
 class VehicleFit(NamedTuple):
@@ -100,7 +100,7 @@ def fit_vehicle(
     free = free_bracket(bracket, model, held)
     first = _refined(_holding(problem, model, held), free, free.center, huber=False)
     if not has_answer(first.estimate):
-        return _without_answer(first, held, first.rollouts)
+        return VehicleFit(first.problem, first.estimate, held, first.estimate.std, 0.0, first.rollouts)
 
     progress("choosing the identifiable parameters")
     values[_free(model, held)] = np.asarray(first.estimate.parameters)
@@ -112,7 +112,7 @@ def fit_vehicle(
     last = _refined(_holding(start, model, held), free, jnp.asarray(values[_free(model, held)]), huber=huber)
     rollouts = first.rollouts + last.rollouts
     if not has_answer(last.estimate):
-        return _without_answer(last, held, rollouts)
+        return VehicleFit(last.problem, last.estimate, held, last.estimate.std, 0.0, rollouts)
 
     def ibss(weighted: ShootingProblem, bracket: Bracket) -> Estimate:
         return IBSS()(weighted, bracket, start=last.estimate.parameters, spread=last.estimate.covariance)
@@ -129,14 +129,9 @@ def refit(
     held: Held | None = None,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> VehicleFit:
-    """Repeat the last search of a fit: same noise levels, same cut outliers.
+    """Repeat the last search of a fit: same noise levels, same cut outliers. Other arguments as of `fit_vehicle`.
 
-    **Arguments:**
-
-    - `estimator`: one that shoots.
-    - `bracket`: of all parameters of the model, held or not.
     - `held`: value and reason of the parameters to hold; those of the fit by default.
-    - `progress`: called with the name of each stage.
     """
     model = fit.problem.model.model if isinstance(fit.problem.model, HeldParameters) else fit.problem.model
     held = fit.held if held is None else held
@@ -167,15 +162,15 @@ def _refined(problem: ShootingProblem, bracket: Bracket, start: Parameters, *, h
     return refine(problem, search, passes=_PASSES, start=start, huber=huber)
 
 
-def _free(model: AbstractModel, held: Held) -> np.ndarray:
-    """The places of the parameters that are not held."""
-    return np.array([i for i, name in enumerate(model.parameter_names) if name not in held])
-
-
 def _holding(problem: ShootingProblem, model: AbstractModel, held: Held) -> ShootingProblem:
     """The problem for `model` with the parameters in `held` known."""
     free = hold(model, {name: value for name, (value, _) in held.items()}) if held else model
     return eqx.tree_at(lambda p: p.model, problem, free)
+
+
+def _free(model: AbstractModel, held: Held) -> np.ndarray:
+    """The places of the parameters that are not held."""
+    return np.array([i for i, name in enumerate(model.parameter_names) if name not in held])
 
 
 def free_bracket(bracket: Bracket, model: AbstractModel, held: Held) -> Bracket:
@@ -185,22 +180,16 @@ def free_bracket(bracket: Bracket, model: AbstractModel, held: Held) -> Bracket:
 
 
 def _not_identifiable(problem: ShootingProblem, values: np.ndarray, first: Refined, bracket: Bracket) -> Held:
-    """The parameters to hold: those that are not identifiable at these noise levels, and negative damping.
-
-    Standard errors are the Cramer-Rao bound's, times the colour of the residuals.
-    """
+    """The parameters to hold: those that are not identifiable at these noise levels, and negative damping."""
     names, start = problem.model.parameter_names, first.estimate.initial_state
+    # The noise is coloured, and the Cramer-Rao bound assumes that it is white.
     std = first.colour * np.sqrt(np.diagonal(np.asarray(cramer_rao_bound(problem, jnp.asarray(values), start))))
     center, identifiable = np.asarray(bracket.center), np.asarray(bracket.identifies(std))
     held = {}
     for i, name in enumerate(names):
         if not identifiable[i]:
-            held[name] = (float(center[i]), _NOT_IDENTIFIABLE)
+            held[name] = (float(center[i]), "not identifiable from these flights")
         elif name in _DAMPING and values[i] < -_NEGATIVE * std[i]:
             held[name] = (0.0, "came out negative, which is impossible in air")
     # At least one parameter must be free.
     return held if len(held) < len(names) else {name: held[name] for name in SECONDARY if name in held}
-
-
-def _without_answer(refined: Refined, held: Held, rollouts: int) -> VehicleFit:
-    return VehicleFit(refined.problem, refined.estimate, held, refined.estimate.std, 0.0, rollouts)

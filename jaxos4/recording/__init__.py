@@ -4,9 +4,4 @@ from .averaging import averaged as averaged
 from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
 from .joining import join as join
 from .reading import Recording as Recording, read_recording as read_recording
-from .usable import (
-    Stretch as Stretch,
-    cut as cut,
-    stretches as stretches,
-    usable_stretches as usable_stretches,
-)
+from .usable import Stretch as Stretch, cut as cut, stretches as stretches, usable_stretches as usable_stretches

@@ -32,11 +32,7 @@ def average(
 
     Each measurement becomes the mean over `dt` around its time, which removes vibration above the new rate without a
     delay. It is missing (NaN) if less than about half of that time was measured. Each rotor speed becomes the root mean
-    square over the sample that follows, as in `resample`.
-
-    **Arguments:** times [s], rotor speeds [rad/s], channels, and the new sample time [s].
-
-    **Returns:** times, rotor speeds and channels of the longer samples.
+    square over the sample that follows, as in `resample`. `t`: times [s]; `omega`: rotor speeds [rad/s].
     """
     own = (t[-1] - t[0]) / (t.size - 1)
     grid = t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + UNIFORM) + 1)

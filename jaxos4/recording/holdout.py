@@ -7,7 +7,7 @@ import numpy as np
 from ..flight import Flight
 
 # Length of a block that is held out [s]: each part of a flight then has blocks of both kinds.
-BLOCK = 5.0
+_BLOCK = 5.0
 
 
 def hold_out(flight: Flight, length: int, share: float) -> tuple[Flight, Flight | None]:
@@ -26,7 +26,7 @@ def hold_out(flight: Flight, length: int, share: float) -> tuple[Flight, Flight 
         return flight, None
     windows = flight.time.shape[0] // length
     period = round(1 / share)
-    block = max(min(round(BLOCK / (length * float(flight.dt))), windows // (2 * period)), 1)
+    block = max(min(round(_BLOCK / (length * float(flight.dt))), windows // (2 * period)), 1)
     held_out = np.repeat((np.arange(windows) // block) % period == period - 1, length)
     if not held_out.any() or held_out.all():
         return flight, None
@@ -34,7 +34,6 @@ def hold_out(flight: Flight, length: int, share: float) -> tuple[Flight, Flight 
 
 
 def _without(rows: np.ndarray, flight: Flight, *, force: bool) -> Flight:
-    """The flight with the states, and optionally the specific force, missing in these rows."""
     blank = eqx.tree_at(lambda f: f.states, flight, jnp.where(rows[:, None], jnp.nan, flight.states))
     if not force or flight.specific_force is None:
         return blank

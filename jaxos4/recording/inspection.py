@@ -10,7 +10,7 @@ import numpy as np
 from ..airframe import Airframe
 from ..analysis.identifiability import identifiability
 from ..bracket import Bracket
-from ..flight import STATE_NAMES, Flight
+from ..flight import CHANNEL_NAMES, Flight
 from ..logs import log_format, read_log
 from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
@@ -52,10 +52,7 @@ class Part(msgspec.Struct, frozen=True):
 
 
 class ParameterBound(msgspec.Struct, frozen=True):
-    """One alpha: the airframe's value, the Cramer-Rao bound (`None`: infinite), their unit.
-
-    `note`: why the parameter is not identifiable, or an empty string.
-    """
+    """One alpha: the airframe's value, the Cramer-Rao bound (`None`: infinite), and why it is not identifiable."""
 
     airframe: float
     bound: float | None
@@ -100,18 +97,13 @@ class Inspection(msgspec.Struct, frozen=True):
 
 
 def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
-    """Reads a log of any known format and describes it.
-
-    **Arguments:**
-
-    - `airframe`: of the vehicle that was flown. Without it, torques and the identifiable parameters are unknown.
+    """Reads a log of any known format and describes it. Without an airframe, torques and parameters are unknown.
 
     **Raises:** `InputError` for a file that cannot be read as a log.
     """
     flight, notes = read_log(path, airframe, full_scale=1.0)
     found = stretches(flight, airframe)
-    usable = [stretch for stretch in found if not stretch.reason]
-    longest = max(usable, key=lambda stretch: stretch.length, default=None)
+    longest = max((part for part in found if not part.reason), key=lambda part: part.length, default=None)
     rates_measured = not np.isnan(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=0).any()
     identifiable = None
     if longest is not None and airframe is not None and rates_measured:
@@ -131,37 +123,22 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
 
 
 def _measured(flight: Flight) -> dict[str, Channel]:
-    columns = dict(zip(STATE_NAMES, np.asarray(flight.states).T, strict=True))
-    if flight.specific_force is not None:
-        columns |= dict(zip(("ax", "ay", "az"), np.asarray(flight.specific_force).T, strict=True))
+    columns = dict(zip(CHANNEL_NAMES, np.asarray(flight.channels).T, strict=True))
     columns |= {f"rotor{i + 1}": speed for i, speed in enumerate(np.asarray(flight.omega).T)}
     time, channels = np.asarray(flight.time), {}
     for name, values in columns.items():
         at = np.flatnonzero(np.isfinite(values))
-        if at.size == 0:
-            continue
-        edges = np.concatenate([time[:1], time[at], time[-1:]])
-        channels[name] = Channel(
-            rate=at.size / float(flight.time[-1] - flight.time[0]),
-            longest_gap=float(np.diff(edges).max()),
-            least=float(values[at].min()),
-            most=float(values[at].max()),
-        )
+        if at.size:
+            rate = at.size / float(flight.time[-1] - flight.time[0])
+            gaps = np.diff(np.concatenate([time[:1], time[at], time[-1:]]))
+            channels[name] = Channel(rate, float(gaps.max()), float(values[at].min()), float(values[at].max()))
     return channels
 
 
 def _part(flight: Flight, stretch: Stretch, airframe: Airframe | None) -> Part:
     axes = () if stretch.reason else excitation(cut(flight, stretch), airframe)
-    return Part(
-        stretch.begin,
-        stretch.end,
-        not stretch.reason,
-        stretch.reason,
-        {
-            axis.axis: AxisExcitation(_finite(axis.torque), _finite(axis.rate), _finite(axis.noise), axis.verdict)
-            for axis in axes
-        },
-    )
+    excited = {a.axis: AxisExcitation(_finite(a.torque), _finite(a.rate), _finite(a.noise), a.verdict) for a in axes}
+    return Part(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited)
 
 
 def _identifiable(flight: Flight, stretch: Stretch, airframe: Airframe) -> IdentifiableParameters:
@@ -174,15 +151,12 @@ def _identifiable(flight: Flight, stretch: Stretch, airframe: Airframe) -> Ident
     problem = ShootingProblem(model, part, sigma=sigma, channels="rates", windows=windows)
     known = identifiability(problem, Bracket.default(model), model.alpha)
     notes = known.notes(model.parameter_names)
-    return IdentifiableParameters(
-        stretch.begin,
-        stretch.end,
-        {name: float(sigma[column]) for name, column in zip(RATES, RATE_COLUMNS, strict=True)},
-        {
-            name: ParameterBound(float(model.alpha[i]), _finite(known.std[i]), unit, notes.get(name, ""))
-            for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True))
-        },
-    )
+    parameters = {
+        name: ParameterBound(float(model.alpha[i]), _finite(known.std[i]), unit, notes.get(name, ""))
+        for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True))
+    }
+    noise = {name: float(sigma[column]) for name, column in zip(RATES, RATE_COLUMNS, strict=True)}
+    return IdentifiableParameters(stretch.begin, stretch.end, noise, parameters)
 
 
 def _finite(x: SupportsFloat) -> float | None:

@@ -15,9 +15,8 @@ _EQUAL_STEPS = 1e-6
 def join(flights: Sequence[Flight], *, length: int) -> Flight:
     """Put stretches of flight one after the other, as one flight of whole windows.
 
-    Samples at the end of a stretch that do not fill a window are dropped, so that no window reaches into the next
-    stretch. Stretches shorter than one window are dropped. Time becomes a count of samples from 0; what was measured is
-    not changed.
+    Samples at the end of a stretch that do not fill a window are dropped, as are stretches shorter than one window.
+    Time becomes a count of samples from 0. Measurements do not change.
 
     **Arguments:**
 

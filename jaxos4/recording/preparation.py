@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
 from ..models.rotation import with_body_velocity
 from ..models.state import CASCADE_ORDER
-from ..models.terms import has_full_scale
+from ..models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, has_full_scale
 from .averaging import averaged
 from .holdout import hold_out
 from .joining import join
@@ -36,7 +36,7 @@ class Prepared(NamedTuple):
     - `tested`: the same samples with only the held-out measurements; `None`: nothing is held out.
     - `recordings`: for each stretch, the number of its recording, from 0.
     - `length`: of a window, in samples.
-    - `available`: what every recording offers to the terms of a model, see `available_inputs`.
+    - `available`: what every recording offers to the terms of a model, see `Term.needs`.
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
     """
@@ -65,16 +65,7 @@ def prepare(
     sample_time: float | None = None,
     holdout: float = HOLDOUT,
 ) -> Prepared:
-    """Make one flight of the usable stretches of several recordings.
-
-    **Arguments:**
-
-    - `recordings`: of one vehicle, each given once.
-    - `airframe`: the vehicle's constants.
-    - `begin`, `end`: use this part of each recording [s], instead of the usable stretches.
-    - `window`: length of a window [s].
-    - `sample_time`: average to samples of this length [s]; 0.004 s by default if the recordings have shorter ones.
-    - `holdout`: the share of the windows to hold out.
+    """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
@@ -95,39 +86,30 @@ def prepare(
     long = [(number, piece) for number, piece in parts if float(piece.time[-1] - piece.time[0]) >= shortest]
     coarse = [(number, with_body_velocity(averaged(piece, step))) for number, piece in long]
     kept = [(number, piece) for number, piece in coarse if piece.time.shape[0] >= length]
-    unused = [recording for i, recording in enumerate(recordings) if i not in {number for number, _ in kept}]
+    numbers, pieces = tuple(number for number, _ in kept), [piece for _, piece in kept]
+    unused = [recording for i, recording in enumerate(recordings) if i not in numbers]
     if unused:
         remedy = "leave it out or give a shorter one" if kept else "give a shorter one"
         raise InputError(f"{unused[0].name}: no part is as long as `window` {window:g}; {remedy}.")
-    flight = join([piece for _, piece in kept], length=length)
+    flight = join(pieces, length=length)
     fitted, tested = hold_out(flight, length, holdout)
-    return Prepared(
-        fitted,
-        tested,
-        tuple(number for number, _ in kept),
-        length,
-        available_inputs(flight, [piece for _, piece in kept], airframe),
-        (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
-        tuple(notes),
-    )
+    available = _available_inputs(flight, pieces, airframe)
+    seconds = _seconds(fitted), 0.0 if tested is None else _seconds(tested)
+    return Prepared(fitted, tested, numbers, length, available, seconds, tuple(notes))
 
 
-def available_inputs(flight: Flight, stretches: Sequence[Flight], airframe: Airframe) -> frozenset[str]:
-    """What the flight, joined from these stretches, offers to the terms of a model.
-
-    Some of "commands", "body velocity", "lateral specific force", "vertical specific force", "full scale". A specific
-    force counts if every stretch measured it.
-    """
+def _available_inputs(flight: Flight, stretches: Sequence[Flight], airframe: Airframe) -> frozenset[str]:
+    """What the flight joined from these stretches offers to `Term.needs`; a force, if every stretch measured it."""
     force = [
         all(not np.isnan(np.asarray(stretch.channels)[:, len(STATE_NAMES) + axis]).all() for stretch in stretches)
         for axis in range(len(FORCE_NAMES))
     ]
     offers = {
-        "commands": flight.commanded,
-        "body velocity": flight.body_velocity is not None,
-        "lateral specific force": force[0] and force[1],
-        "vertical specific force": force[2],
-        "full scale": has_full_scale(airframe),
+        COMMANDS: flight.commanded,
+        BODY_VELOCITY: flight.body_velocity is not None,
+        LATERAL_FORCE: force[0] and force[1],
+        VERTICAL_FORCE: force[2],
+        FULL_SCALE: has_full_scale(airframe),
     }
     return frozenset(name for name, offered in offers.items() if offered)
 

@@ -30,13 +30,8 @@ class Recording(NamedTuple):
 
     def same_data(self, other: "Recording") -> bool:
         """Whether both hold the same rotor speeds and states."""
-        return all(
-            np.array_equal(np.asarray(one), np.asarray(another), equal_nan=True)
-            for one, another in (
-                (self.flight.omega, other.flight.omega),
-                (self.flight.states, other.flight.states),
-            )
-        )
+        pairs = ((self.flight.omega, other.flight.omega), (self.flight.states, other.flight.states))
+        return all(np.array_equal(np.asarray(a), np.asarray(b), equal_nan=True) for a, b in pairs)
 
 
 def read_recording(path: str | os.PathLike[str], airframe: Airframe | None = None) -> Recording:
@@ -49,9 +44,8 @@ def as_recordings(
     flights: Flight | Recording | Sequence[Flight | Recording], name: str = "flight"
 ) -> tuple[Recording, ...]:
     """One or several flights as recordings. A flight without a name is called `name`; several are numbered from 1."""
-    several = not isinstance(flights, Flight | Recording)
-    every = tuple(flights) if several else (flights,)
-    numbered = [f"{name} {i + 1}" if len(every) > 1 else name for i in range(len(every))]
+    every = (flights,) if isinstance(flights, Flight | Recording) else tuple(flights)
     return tuple(
-        each if isinstance(each, Recording) else Recording(each, own) for each, own in zip(every, numbered, strict=True)
+        each if isinstance(each, Recording) else Recording(each, f"{name} {i + 1}" if len(every) > 1 else name)
+        for i, each in enumerate(every)
     )

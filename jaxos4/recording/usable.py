@@ -4,6 +4,7 @@ A part is usable if the rotors carry the vehicle, no rotor rests or is at its li
 is not clipped, no samples are lost, and the vehicle does not crash.
 """
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -78,9 +79,10 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
     for begin, end in _runs(labels == _USABLE):
         if time[end - 1] - time[begin] < SHORTEST - dt / 2:
             labels[begin:end] = _SHORT
+    edges = [0, *(np.flatnonzero(np.diff(labels)) + 1).tolist(), labels.size]
     return tuple(
         Stretch(float(time[begin]), float(time[end - 1]), _reason(int(labels[begin]), begin, end, saturations))
-        for begin, end in _equal_runs(labels)
+        for begin, end in itertools.pairwise(edges)
     )
 
 
@@ -126,7 +128,10 @@ def _ground(share: np.ndarray, dt: float) -> np.ndarray:
             inside = begin > 0 and end < carried.size
             if (end - begin) * dt < _SUSTAINED and inside:
                 carried[begin:end] = value
-    return _widened(~carried, _samples(_MARGIN, dt), _samples(_MARGIN, dt))
+    ground, margin = ~carried, _samples(_MARGIN, dt)
+    for begin, end in _runs(~carried):
+        ground[max(begin - margin, 0) : end + margin] = True
+    return ground
 
 
 def _clipped(rates: np.ndarray) -> np.ndarray:
@@ -143,8 +148,7 @@ def _clipped(rates: np.ndarray) -> np.ndarray:
 
 def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> list[_Saturation]:
     """The runs in which a rotor rests, or is at its limit, for longer than a moment."""
-    found = []
-    full_scale = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    found, full_scale = [], math.inf if airframe is None else float(airframe.max_rotor_speed)
     for i, speed in enumerate(omega.T):
         largest, least, usual = float(speed.max()), float(speed.min()), float(np.median(speed))
         same = _LIMIT * largest
@@ -171,11 +175,8 @@ def _steady(speed: np.ndarray, same: float) -> np.ndarray:
 
 def _lost(states: np.ndarray, dt: float) -> np.ndarray:
     """The samples in gaps of the rates; without any rate, in gaps of all channels together."""
-    out = np.zeros(states.shape[0], dtype=bool)
-    seen = np.isfinite(states)
-    columns = [c for c in RATE_COLUMNS if seen[:, c].any()]
-    groups = [seen[:, c] for c in columns] or [seen.any(axis=1)]
-    for measured in groups:
+    out, seen = np.zeros(states.shape[0], dtype=bool), np.isfinite(states)
+    for measured in [seen[:, c] for c in RATE_COLUMNS if seen[:, c].any()] or [seen.any(axis=1)]:
         at = np.flatnonzero(measured)
         usual = float(np.median(np.diff(at))) * dt if at.size > 1 else 0.0
         for begin, end in _runs(np.asarray(~measured)):
@@ -186,13 +187,12 @@ def _lost(states: np.ndarray, dt: float) -> np.ndarray:
 
 def _crashed(flight: Flight, share: np.ndarray, ground: np.ndarray, dt: float) -> np.ndarray:
     """The samples of a crash: from before an impact until the rotors stop, or the recording ends, soon after."""
-    out = np.zeros(share.size, dtype=bool)
-    impact = np.zeros(share.size, dtype=bool)
+    out, impact = np.zeros(share.size, dtype=bool), np.zeros(share.size, dtype=bool)
     if flight.specific_force is not None:
         impact = np.nan_to_num(np.linalg.norm(np.asarray(flight.specific_force), axis=1)) > _IMPACT_FORCE
-    rates = np.nan_to_num(np.asarray(flight.states)[:, RATE_COLUMNS])
+    rates = np.asarray(flight.states)[:, RATE_COLUMNS]
+    measured, rates = np.asarray(np.isfinite(rates).all(axis=1)), np.nan_to_num(rates)
     lag = min(max(_samples(_IMPACT_TIME, dt), 1), share.size - 1)
-    measured: np.ndarray = np.asarray(np.isfinite(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=1))
     jump = np.abs(rates[lag:] - rates[:-lag]).max(axis=1) > _IMPACT_RATE * max(lag * dt / _IMPACT_TIME, 1.0)
     impact[lag:] |= jump & measured[lag:] & measured[:-lag]
     after, before = _samples(_AFTER_IMPACT, dt), _samples(_BEFORE_IMPACT, dt)
@@ -235,16 +235,4 @@ def _anywhere(saturations: list[_Saturation], size: int) -> np.ndarray:
     out = np.zeros(size, dtype=bool)
     for each in saturations:
         out[each.begin : each.end] = True
-    return out
-
-
-def _equal_runs(labels: np.ndarray) -> list[tuple[int, int]]:
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(labels)) + 1, [labels.size]])
-    return [(int(begin), int(end)) for begin, end in zip(edges[:-1], edges[1:], strict=True)]
-
-
-def _widened(where: np.ndarray, before: int, after: int) -> np.ndarray:
-    out = where.copy()
-    for begin, end in _runs(where):
-        out[max(begin - before, 0) : end + after] = True
     return out

@@ -1,0 +1,22 @@
+"""Output files: checked before the work that fills them, never one of the inputs, and written whole or not at all."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from .._files import check_writable, write_atomically
+from ..errors import InputError
+
+
+def check_output(out: Path, *inputs: Path | None) -> None:
+    """Refuses an output that cannot be written, or that would overwrite an input."""
+    target = check_writable(out)
+    for source in inputs:
+        if source is not None and source.exists() and target.exists() and source.samefile(target):
+            raise InputError(f"{out}: would overwrite an input; give the output another name.")
+
+
+def write_json(report: dict[str, Any], out: Path) -> None:
+    """Writes a JSON file. A number that is not finite is an error of the program."""
+    with write_atomically(out) as beside:
+        beside.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
