@@ -10,17 +10,7 @@ from .._custom_types import Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_bracket, check_one_window
 from ..shooting import ShootingProblem
-from ._regression import (
-    answer,
-    check_bridge,
-    check_share,
-    covariance_of,
-    normal_equations,
-    parameters_of,
-    propagated_covariance,
-    regression,
-    solve,
-)
+from ._regression import answer, check_settings, normal_equations, regression, solve
 
 
 class RecursiveLeastSquares(AbstractEstimator):
@@ -56,9 +46,7 @@ class RecursiveLeastSquares(AbstractEstimator):
     bridge: int = eqx.field(static=True, default=4)
 
     def __check_init__(self):
-        check_share("forgetting", self.forgetting, open_below=True)
-        check_share("memory", self.memory, open_below=False)
-        check_bridge(self.bridge)
+        check_settings(self.memory, self.bridge, self.forgetting)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
@@ -71,7 +59,6 @@ class RecursiveLeastSquares(AbstractEstimator):
         check_one_window(problem)
         usable = bracket.usable
         data = regression(problem, usable, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
-        rows = data.rows(data.rates)
 
         def update(carry, row):
             information, moment = carry
@@ -81,9 +68,5 @@ class RecursiveLeastSquares(AbstractEstimator):
 
         count = usable.center.shape[0]
         zero = jnp.zeros((count, count), dtype=float), jnp.zeros(count, dtype=float)
-        (information, moment), history = jax.lax.scan(update, zero, rows)
-        steps, inverse = solve(information, moment)
-        history = parameters_of(usable, history)
-        parameters = history[-1]
-        covariance = covariance_of(usable, propagated_covariance(data, steps, inverse))
-        return answer(problem, bracket, parameters, covariance, history=history)
+        last, history = jax.lax.scan(update, zero, data.rows(data.rates))
+        return answer(data, bracket, *solve(*last), history=usable.center + usable.half_width * history)

@@ -6,7 +6,6 @@ NaN, and neither gives the row of the file and the name of the column.
 
 import csv
 import math
-import os
 import re
 from collections.abc import Collection, Iterator
 from operator import itemgetter
@@ -14,7 +13,7 @@ from typing import TextIO
 
 import numpy as np
 
-from .table import MAX_ROWS, Table, opened, quoted, refuse
+from .table import MAX_ROWS, Path, Table, opened, quoted, refuse
 
 _LONGEST_LINE = 1 << 20
 _BLOCK = 1 << 20  # characters parsed at once: the whole text never has to fit in memory
@@ -23,19 +22,14 @@ _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "-",
 _EMPTY = "leave the cell empty if it was not measured"
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
-Path = str | os.PathLike[str]
-
 
 def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = ()) -> Table:
-    """Read the columns of a CSV file whose names are `known`.
+    """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
 
-    The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored. The
-    names of the other columns are listed in the table; their cells are not read.
+    The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored.
 
     **Arguments:**
 
-    - `path`: the file.
-    - `known`: the names of the columns to read.
     - `skip`: number of lines before the header.
     - `missing`: cells that mean "not measured", in addition to the empty cell.
 

@@ -40,11 +40,8 @@ def widest_gap(t: Float[np.ndarray, " rows"], dt: float) -> Gap:
 
 
 def resample(
-    t: Float[np.ndarray, " rows"],
-    omega: Float[np.ndarray, "rows 4"],
-    channels: Float[np.ndarray, "rows channels"],
-    dt: float,
-) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 4"], Float[np.ndarray, "samples channels"], str]:
+    t: Float[np.ndarray, " rows"], omega: Float[np.ndarray, "rows 4"], channels: Float[np.ndarray, "rows n"], dt: float
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 4"], Float[np.ndarray, "samples n"], str]:
     """Resample rows at uneven times to the grid t_0, t_0 + dt, ...
 
     **Arguments:**

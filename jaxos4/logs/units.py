@@ -24,24 +24,20 @@ class Limit(NamedTuple):
 
 _TIME = Limit(1e11, "s", "t is in seconds: if these are milli-, micro- or nanoseconds, divide")
 _SPEED = Limit(1e5, "rad/s", "rotor speeds are in rad/s: if these are rpm, divide by 9.549")
-_POSITION = Limit(1e6, "m", "positions are in metres from a point near the flight; subtract an offset")
-_VELOCITY = Limit(1e3, "m/s", "velocities are in m/s: if these are mm/s, divide by 1000")
-_RATE = Limit(60.0, "rad/s", "it looks like deg/s: divide by 57.3")
-_ROLL = Limit(2 * math.pi, "rad", "it looks like degrees: divide by 57.3")
-_PITCH = Limit(math.nextafter(math.pi / 2, 0), "rad", "pitch lies within +-pi/2: if this is in degrees, divide by 57.3")
 _YAW = Limit(1e4, "rad", "it looks like degrees: divide by 57.3")
-_FORCE = Limit(1e3, "m/s^2", "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665")
+_PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
+_FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
 
 LIMITS = {
     "t": _TIME,
     **dict.fromkeys(("omega1", "omega2", "omega3", "omega4"), _SPEED),
-    **dict.fromkeys(("x", "y", "z"), _POSITION),
-    **dict.fromkeys(("vx", "vy", "vz"), _VELOCITY),
-    **dict.fromkeys(("p", "q", "r"), _RATE),
-    "phi": _ROLL,
-    "theta": _PITCH,
+    **dict.fromkeys("xyz", Limit(1e6, "m", "positions are in metres from a point near the flight; subtract an offset")),
+    **dict.fromkeys(("vx", "vy", "vz"), Limit(1e3, "m/s", "velocities are in m/s: if these are mm/s, divide by 1000")),
+    **dict.fromkeys("pqr", Limit(60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
+    "phi": Limit(2 * math.pi, "rad", _YAW.advice),
+    "theta": Limit(math.nextafter(math.pi / 2, 0), "rad", _PITCH),
     "psi": _YAW,
-    **dict.fromkeys(("ax", "ay", "az"), _FORCE),
+    **dict.fromkeys(("ax", "ay", "az"), Limit(1e3, "m/s^2", _FORCE)),
 }
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
 _ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
@@ -59,20 +55,18 @@ def check_units(table: Table) -> None:
     **Raises:** `InputError`.
     """
     columns = table.columns
-    ratios = {
-        name: scale_ratio(*(columns[c] for c in ("t", name, rate)))
-        for name, rate in _ANGLES
-        if rate in columns and name in columns
-    }
+    flips = False
     for name, rate in _ANGLES:
-        ratio = ratios.get(name)
-        if ratio is not None and 1 / _SPREAD < ratio / DEGREES < _SPREAD:
+        ratio = scale_ratio(columns["t"], columns[name], columns[rate]) if {name, rate} <= columns.keys() else None
+        if ratio is None:
+            continue
+        flips |= name == "phi" and 1 / 3 < ratio < 3
+        if 1 / _SPREAD < ratio / DEGREES < _SPREAD:
             what = table.remedy or "it looks like degrees, divide by 57.3"
             table.refuse(f"changes {ratio:.3g} times as fast as {rate}: {what}", column=name)
-        if ratio is not None and 1 / _SPREAD < ratio * DEGREES < _SPREAD:
+        if 1 / _SPREAD < ratio * DEGREES < _SPREAD:
             what = table.remedy or "it looks like deg/s, divide by 57.3"
             table.refuse(f"is {1 / ratio:.3g} times as fast as {name} changes: {what}", column=rate)
-    flips = ratios.get("phi") is not None and 1 / 3 < (ratios["phi"] or 0) < 3
     for name, values in columns.items():
         limit = LIMITS.get(name)
         if limit is None:
@@ -116,10 +110,8 @@ def check_time(table: Table) -> float:
     if dt < SHORTEST_STEP:
         table.refuse(f"has rows {dt:.3g} s apart, less than a microsecond; t is in seconds: multiply", column="t")
     if dt > LONGEST_STEP:
-        table.refuse(
-            f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide",
-            column="t",
-        )
+        what = f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide"
+        table.refuse(what, column="t")
     return dt
 
 

@@ -44,12 +44,11 @@ class ErrorTable(NamedTuple):
 
         def interpolate(table):
             flat = table.reshape(table.shape[0], -1)
-            return jax.vmap(lambda column: jnp.interp(jnp.log(scale), knots, column), in_axes=1)(flat).reshape(
-                table.shape[1:]
-            )
+            values = jax.vmap(lambda column: jnp.interp(jnp.log(scale), knots, column), in_axes=1)(flat)
+            return values.reshape(table.shape[1:])
 
-        rms, correlation, factors, simultaneous = self[1:]
-        return interpolate(rms), interpolate(correlation), interpolate(factors), interpolate(simultaneous)
+        rms, correlation, factors, simultaneous = map(interpolate, self[1:])
+        return rms, correlation, factors, simultaneous
 
 
 def uncalibrated(noise: tuple[float, float], parameters: int) -> ErrorTable:
