@@ -29,12 +29,10 @@ class EquationError(AbstractEstimator):
       splits the integration in two.
 
     A known initial state is exact for a `memory` of 1, and one more sample for a smaller one. Without noise the answer
-    is exact for flights simulated by forward Euler. For another `method` the trapezoidal rule leaves errors of a tenth
-    of the Cramer-Rao bound on the standard flight.
+    is exact for forward Euler; for another `method` the trapezoidal rule leaves a small error.
 
-    The covariance contains the white noise of the problem's `sigma` in regressors and outputs, to first order. It does
-    not contain the bias, nor forces that the model lacks. If a rate was never measured, its parameters stay at the
-    bracket's center with a huge variance, and the result is `unidentifiable`.
+    The covariance contains the white noise of the problem's `sigma` in regressors and outputs, to first order, but
+    neither the bias nor forces that the model lacks. Without measurements of a rate the result is `unidentifiable`.
 
     References: Klein and Morelli, Aircraft System Identification, ch. 5; Jategaonkar, Flight Vehicle System
     Identification, ch. 6; Ljung, System Identification, section 7.3.

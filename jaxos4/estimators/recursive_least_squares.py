@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from .._custom_types import Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_bracket, check_one_window
+from ..estimate import AbstractEstimator, Estimate, check_recursive
 from ..shooting import ShootingProblem
 from ._regression import answer, check_settings, normal_equations, regression, solve
 
@@ -16,10 +16,9 @@ from ._regression import answer, check_settings, normal_equations, regression, s
 class RecursiveLeastSquares(AbstractEstimator):
     """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
 
-    The recursion carries the information form: the normal matrix and its right-hand side. It needs no initial
-    covariance, and unlike the covariance form it stays symmetric and positive in single precision. A diffuse prior (a
-    million half-widths) is added only to solve and is not forgotten, so that nothing overflows without excitation. A
-    parameter stays at the bracket's center until it is excited.
+    The recursion carries the normal matrix and its right-hand side: unlike a covariance, they stay symmetric and
+    positive in single precision. A diffuse prior (a million half-widths) is added only to solve and is not forgotten.
+    A parameter stays at the bracket's center until it is excited.
 
     **Arguments:**
 
@@ -55,8 +54,7 @@ class RecursiveLeastSquares(AbstractEstimator):
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model that is not linear
         in them, or a flight that is cut into windows.
         """
-        check_bracket(problem, bracket)
-        check_one_window(problem)
+        check_recursive(problem, bracket)
         usable = bracket.usable
         data = regression(problem, usable, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
 

@@ -36,7 +36,7 @@ def flight_of(
     commanded = not any(name in table.columns for name in SPEED_NAMES)
     if airframe is not None:
         thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient
-        _add(notes, thrust_note(float(thrust / (airframe.mass * airframe.gravity))))
+        notes.extend(thrust_note(float(thrust / (airframe.mass * airframe.gravity))))
     channels = _channels(table, notes)
     with_force = any(name in table.columns for name in FORCE_NAMES)
     time, omega, channels = _evenly(table._replace(columns={"t": table.columns["t"]}), dt, omega, channels, notes)
@@ -128,7 +128,7 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
             channels[:, i], jumps = unwrap(table.columns[name])
             if jumps:
                 notes.append(f"{name}: {jumps} {'jump' if jumps == 1 else 'jumps'} of 2 pi removed")
-    _add(notes, force_note(channels[:, 12:]))
+    notes.extend(force_note(channels[:, 12:]))
     return channels
 
 
@@ -149,8 +149,3 @@ def _evenly(
     if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
         table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
     return time, omega, channels
-
-
-def _add(notes: list[str], note: str | None) -> None:
-    if note is not None:
-        notes.append(note)

@@ -103,10 +103,8 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
         if name in raw:
             values = sign * raw[name]
             log.add(column, name, values * 0.1 * _DEGREE if name.startswith("attitude") else values / 100)
-    log.notes.append(
-        f"rotors keep the log's order ({log.names.get('omega1', log.names.get('command1'))} is rotor 1): "
-        "rotor_positions and rotor_spins must be in the same order"
-    )
+    what = f"rotors keep the log's order ({log.names.get('omega1', log.names.get('command1'))} is rotor 1)"
+    log.notes.append(f"{what}: rotor_positions and rotor_spins must be in the same order")
     return table._replace(columns=log.columns, unknown=(), names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
@@ -190,10 +188,8 @@ def _add_rotors(log: _Log) -> None:
             what = "is missing; log the motors, or eRPM (bidirectional DShot)"
             refuse(log.path, what, row=log.header, column=name)
     low, high = _ends(np.column_stack([raw[name] for name in commands]), log)
-    log.notes.append(
-        f"commands are motor[0..3] from {low:g} to {high:g}, taken as fractions of full-scale rotor speed"
-        + ("" if log.settings else "; the protocol is assumed from their range")
-    )
+    what = f"commands are motor[0..3] from {low:g} to {high:g}, taken as fractions of full-scale rotor speed"
+    log.notes.append(what + ("" if log.settings else "; the protocol is assumed from their range"))
     for i, name in enumerate(commands):
         log.add(f"command{i + 1}", name, np.clip((raw[name] - low) / (high - low), 0.0, 1.0))
 

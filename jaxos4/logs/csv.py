@@ -39,7 +39,6 @@ def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
 
     **Arguments:**
 
-    - `path`: the file.
     - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds. A file with `omega1..4` needs none.
 
     **Returns:** a `Flight`. Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such

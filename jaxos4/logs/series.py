@@ -51,8 +51,7 @@ def gyro_rows(
 def at_rows(rows: Float[np.ndarray, " rows"], series: Series) -> Float[np.ndarray, "rows columns"]:
     """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
 
-    Values are interpolated between neighbouring samples to the time of the row, with an error of second order in the
-    sensor's step, so that no value is early or late. Nothing is interpolated across a gap. Angles must be unwrapped.
+    Values are interpolated linearly to the time of the row, but not across a gap. Angles must be unwrapped.
     """
     out = np.full((rows.size, series.values.shape[1]), np.nan)
     step = float(np.median(np.diff(rows))) if rows.size > 1 else 0.0
@@ -77,15 +76,10 @@ def at_rows(rows: Float[np.ndarray, " rows"], series: Series) -> Float[np.ndarra
 
 
 def rotor_rms(rows: Float[np.ndarray, " rows"], series: Series, *, measured: bool) -> Float[np.ndarray, "rows columns"]:
-    """Root mean square of each rotor's speed or command from each row to the next.
+    """Root mean square of each rotor's speed or command from each row to the next, so that its impulse is conserved.
 
-    **Arguments:**
-
-    - `rows`: times [s], none before the first sample of `series`.
-    - `series`: rotor speeds or commands, all finite.
-    - `measured`: measured speeds are interpolated linearly in their squares; commands are held until the next one.
-
-    Thrust and torque are proportional to the square, so each rotor's impulse is conserved.
+    Measured speeds are interpolated linearly in their squares; commands are held until the next one. No row lies before
+    the first sample of `series`.
     """
     squares = np.square(series.values)
     mean = (squares[:-1] + squares[1:]) / 2 if measured else squares[:-1]

@@ -124,10 +124,8 @@ def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
     for names, series in others.items():
         if series is not None:
             columns.update(zip(names, at_rows(rows, series).T, strict=True))
-    log.notes.append(
-        f"rotors keep the log's numbers ({rotors.names[0]} is rotor 1): rotor_positions and rotor_spins must be in "
-        "the same order"
-    )
+    what = f"rotors keep the log's numbers ({rotors.names[0]} is rotor 1)"
+    log.notes.append(f"{what}: rotor_positions and rotor_spins must be in the same order")
     return Table(path, columns, first_row=None, names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 

@@ -51,8 +51,6 @@ def check_units(table: Table) -> None:
     """Refuse numbers beyond `LIMITS`, speeds and commands out of range, and angles that contradict their rates.
 
     Roll may pass 2 pi if its rate agrees: the vehicle made a flip.
-
-    **Raises:** `InputError`.
     """
     columns = table.columns
     flips = False
@@ -86,10 +84,7 @@ def check_units(table: Table) -> None:
 
 
 def check_time(table: Table) -> float:
-    """The median time between rows [s].
-
-    **Raises:** `InputError` if a time is missing, does not increase, or cannot be in seconds.
-    """
+    """The median time between rows [s]. Refuses a time that is missing, does not increase, or is not in seconds."""
     t = table.columns["t"]
     index = _first(np.isnan(t))
     if index is not None:
@@ -117,11 +112,6 @@ def check_time(table: Table) -> float:
 
 def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | None:
     """How much faster an angle changes than its rate, or None if the flight does not show it.
-
-    **Arguments:**
-
-    - `t`: [s], increasing.
-    - `angle`, `rate`: in unknown units. NaN means not measured.
 
     Increments of the angle over 0.2 s are compared with the integral of the rate, so that noise averages out. In a
     steep attitude the axes are coupled, and the increments no longer resemble the integral: the result is then None.
@@ -151,26 +141,24 @@ def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | N
     return sizes[0] / sizes[1]
 
 
-def force_note(force: np.ndarray) -> str | None:
-    """A note if specific force [m/s^2], shape (samples, 3), seems to be in multiples of g."""
+def force_note(force: np.ndarray) -> list[str]:
+    """A note, if specific force [m/s^2], shape (samples, 3), seems to be in multiples of g."""
     size = np.sqrt((force**2).sum(axis=1))
     size = size[np.isfinite(size)]
     if size.size == 0 or not 0.5 < np.median(size) < 2:
-        return None
-    return f"ax, ay, az have a median magnitude of {np.median(size):.2g} m/s^2: if they are in g, multiply by 9.80665"
+        return []
+    return [f"ax, ay, az have a median magnitude of {np.median(size):.2g} m/s^2: if they are in g, multiply by 9.80665"]
 
 
-def thrust_note(ratio: float) -> str | None:
-    """A note if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
+def thrust_note(ratio: float) -> list[str]:
+    """A note, if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
     if 1 / 25 < ratio < 25:
-        return None
+        return []
     if ratio == 0:
-        return "the rotors do not turn for at least half of the flight: keep only the part in the air"
+        return ["the rotors do not turn for at least half of the flight: keep only the part in the air"]
     unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
-    return (
-        f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight: check the airframe, and whether "
-        f"rotor speeds are in {unit}"
-    )
+    what = f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight"
+    return [f"{what}: check the airframe, and whether rotor speeds are in {unit}"]
 
 
 def _check_command(table: Table, name: str) -> None:

@@ -84,10 +84,9 @@ class Regressor(eqx.Module):
         def perceptron(width: int, depth: int, key: Key) -> eqx.nn.MLP:
             return eqx.nn.MLP(inputs, unknowns, width, depth, activation=jax.nn.silu, dtype=float, key=key)
 
+        tiles = approximator == "cmac"
         self.skip = skip
-        self.approximator = (
-            CMAC(inputs, unknowns) if approximator == "cmac" else perceptron(width, depth, approximator_key)
-        )
+        self.approximator = CMAC(inputs, unknowns) if tiles else perceptron(width, depth, approximator_key)
         self.spread = perceptron(_SPREAD_WIDTH, _SPREAD_DEPTH, spread_key)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> NetworkOutput:

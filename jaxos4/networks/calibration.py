@@ -17,10 +17,8 @@ from .training import Pair, draw_many
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
 LEVELS = np.array([2 * _NORMAL.cdf(z) - 1 for z in np.linspace(_NORMAL.inv_cdf(0.75), _NORMAL.inv_cdf(0.9995), 28)])
-CHUNK = 1000
-"""Flights that are simulated at once."""
-# Noise scales at which intervals are calibrated, evenly spaced in the logarithm.
-_SCALES = 9
+CHUNK = 1000  # flights that are simulated at once
+_SCALES = 9  # noise scales at which intervals are calibrated, evenly spaced in the logarithm
 
 
 class ErrorTable(NamedTuple):

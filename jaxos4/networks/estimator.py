@@ -151,6 +151,5 @@ class NetworkEstimator(eqx.Module):
                 raise ValueError(f"`bracket` of {name} must have a positive, finite width, got [{lower}, {upper}].")
         numbers = problem.flight.time.shape[0] * CHANNELS[self.channels]
         if self.features == "raw" and numbers > _MOST_FEATURES:
-            raise ValueError(
-                f'`features` "raw" of this flight are {numbers} numbers, more than {_MOST_FEATURES}: use "score".'
-            )
+            what = f"of this flight are {numbers} numbers, more than {_MOST_FEATURES}"
+            raise ValueError(f'`features` "raw" {what}: use "score".')

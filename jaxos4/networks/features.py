@@ -20,11 +20,7 @@ from ..shooting import FASTEST, ShootingProblem
 
 
 class FlightFeatures(NamedTuple):
-    """The features of a measured flight.
-
-    - `values`: the network's input.
-    - `inflation`: for each parameter, the factor by which missing samples enlarge its standard deviation.
-    """
+    """The features of a flight, and the factor by which missing samples enlarge each standard deviation."""
 
     values: Float[Array, " features"]
     inflation: Parameters
@@ -62,11 +58,9 @@ class Coordinates(eqx.Module):
 
 
 class AbstractFeatures(eqx.Module):
-    """Features prepared for one input, start, sampling and bracket.
+    """Features prepared for one input, start, sampling and bracket; `reference` is the trajectory at its center.
 
-    - `problem`: the problem of training. Of its states only the first counts, and which samples were measured.
-    - `coordinates`: bracket coordinates of the unknowns.
-    - `reference`: the trajectory at the bracket's center.
+    Only the first state of `problem` is used, and which samples were measured.
     """
 
     problem: eqx.AbstractVar[ShootingProblem]
@@ -120,7 +114,7 @@ class Score(AbstractFeatures):
 
     @classmethod
     def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Score":
-        """Prepares the features for a problem's inputs, start and missing samples."""
+        """Prepares the features."""
         reference, size = _reference(problem, coordinates), coordinates.center.shape[0]
         bare = cls(problem, coordinates, reference, jnp.zeros((*reference.shape, size)), jnp.eye(size))
         jacobian = jax.jacfwd(bare._deviation)(jnp.zeros(size))
@@ -154,7 +148,7 @@ class Raw(AbstractFeatures):
 
     @classmethod
     def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Raw":
-        """Prepares the features for a problem's inputs, start and missing samples."""
+        """Prepares the features."""
         return cls(problem, coordinates, _reference(problem, coordinates))
 
     @property

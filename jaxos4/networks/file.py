@@ -115,9 +115,9 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
 
     network = jax.tree_util.tree_map_with_path(fill, blank)
     scaling, coordinates = network.scaling, network.features.coordinates
-    for positive in (*jax.tree.leaves(scaling), coordinates.width, airframe.mass, airframe.inertia):
-        if not (np.asarray(positive) > 0).all():
-            raise ValueError("a scale is not positive")
+    scales = (*jax.tree.leaves(scaling), coordinates.width, airframe.mass, airframe.inertia)
+    if not all((np.asarray(scale) > 0).all() for scale in scales):
+        raise ValueError("a scale is not positive")
     return network
 
 

@@ -23,10 +23,8 @@ from .features import AbstractFeatures
 if TYPE_CHECKING:
     from .estimator import NetworkEstimator
 
-# If missing samples enlarge any standard deviation by more than this factor, the problem is another one.
-_LARGEST_INFLATION = 2.0
-# Numbers within this relative tolerance are equal: files round them.
-_SAME = 1e-6
+_LARGEST_INFLATION = 2.0  # if missing samples enlarge a standard deviation by more, the problem is another one
+_SAME = 1e-6  # relative tolerance of equal numbers: files round them
 
 
 class TrainedNetwork(AbstractEstimator):

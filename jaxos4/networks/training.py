@@ -127,10 +127,8 @@ def train(
 def _check_trainable(held_out: Pair, weights: PyTree) -> None:
     flyable = np.isfinite(np.asarray(held_out.features)).all(axis=1).mean()
     if not flyable > _FLYABLE:
-        raise TrainingError(
-            f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end: narrow the "
-            "bracket, or shorten the flight."
-        )
+        what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
+        raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(weights)):
         raise TrainingError(
             "the network's first weights are not finite, because the flight at the bracket's center diverges or too "
