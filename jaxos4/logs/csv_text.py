@@ -80,10 +80,12 @@ def _parse(
             i = next(i for i, width in enumerate(widths) if width != len(header))
             if not lines[i].strip():
                 refuse(path, "is blank; delete it", row=row + i)
-            cells = "1 cell" if widths[i] == 1 else f"{widths[i]} cells"
-            refuse(path, f"has {cells}, but the header has {len(header)}; repair or delete the row", row=row + i)
+            count = "1 cell" if widths[i] == 1 else f"{widths[i]} cells"
+            refuse(path, f"has {count}, but the header has {len(header)}; repair or delete the row", row=row + i)
         for name, cell in wanted:
-            parts[name].append(_numbers(path, name, _without(missing, list(map(cell, rows))), row))
+            cells = list(map(cell, rows))
+            cells = ["" if text.strip() in missing else text for text in cells] if missing else cells
+            parts[name].append(_numbers(path, name, cells, row))
         row += len(rows)
         if row - first_row > MAX_ROWS:
             refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
@@ -117,10 +119,6 @@ def _cells(path: Path, line: str, row: int) -> list[str]:
         return next(csv.reader([line]), [])  # line by line, so that an open quote ends with its line
     except csv.Error:
         refuse(path, "contains a cell that is too long; repair or delete the row", row=row)
-
-
-def _without(missing: frozenset[str], cells: list[str]) -> list[str]:
-    return ["" if cell.strip() in missing else cell for cell in cells] if missing else cells
 
 
 def _numbers(path: Path, column: str, cells: list[str], row: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from .stage import Limits
 _OPENING, _FIRST = 4.0, 0.05
 # A later bracket is the last relative error of the predictions, at least the second number, times the first.
 _SAFETY, _LEAST = 2.0, 0.01
-_GROWTH = 4.0  # of a bracket whose search ended at one of its ends
+GROWTH = 4.0  # of a bracket whose search ended at one of its ends
 
 
 class Brackets(NamedTuple):
@@ -32,11 +32,6 @@ def open_brackets(
     """The brackets of one sweep: in the first sweep from the covariance `spread` of the start, then `later`."""
     opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", factor, spread, factor))
     return Brackets(jnp.where(first, _FIRST * opening, later), jnp.where(first, opening, jnp.inf))
-
-
-def grow(growth: Float[Array, "windows n"], at_end: Bool[Array, "windows n"]) -> Float[Array, "windows n"]:
-    """The factor by which the next brackets are wider than the predictions' errors ask for."""
-    return jnp.where(at_end, _GROWTH * growth, 1.0)
 
 
 def relative_error(

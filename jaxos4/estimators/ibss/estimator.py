@@ -24,10 +24,10 @@ from ...linalg import covariance_of_shared, covariances
 from ...models.state import CHANNELS
 from ...shooting import Curvature, ShootingProblem, Shot
 from .bisection import move_along_all
-from .brackets import grow, open_brackets, relative_error
+from .brackets import GROWTH, open_brackets, relative_error
 from .progress import Progress, Search, record_brackets
 from .stage import Limits, Stage, join, keep_first, make_stage, misfit, prior_std
-from .view import View, look_around
+from .view import look_around
 
 DIRECTIONS = ("whitened", "coordinate")
 
@@ -217,7 +217,9 @@ class IBSS(AbstractEstimator):
         """Looks around, and unless the search ends here moves along each direction. `before`: sweeps so far."""
         whitened, first = self.directions == "whitened", search.sweeps == 0
         view = look_around(stage, search.unknowns, whitened=whitened)
-        done = ~first & (view.longest_step <= self._close_enough(stage, view, last=last))
+        fine = jnp.maximum(self.tolerance * view.misfit, stage.smallest_step)
+        close_enough = jnp.where(last, fine, _COARSE * jnp.maximum(view.misfit, 1.0))
+        done = ~first & (view.longest_step <= close_enough)
         finite = jnp.isfinite(view.curvature.shot.cost).all()
         stay = done | ~finite | (search.sweeps >= self.max_sweeps)
 
@@ -232,17 +234,12 @@ class IBSS(AbstractEstimator):
             curvature=view.curvature._replace(shot=Shot(cost, trusted & sound)),
             basis=view.basis,
             relative_error=relative_error(moves.errors, moves.steps, stage.smallest_step),
-            growth=grow(search.growth, moves.at_end),
+            growth=jnp.where(moves.at_end, GROWTH * search.growth, 1.0),
             sweeps=search.sweeps + jnp.where(stay, 0, 1),
             done=done | ~sound,
             ended=stay | ~sound,
             brackets=record_brackets(search.brackets, before + search.sweeps, view, brackets.half_width, skip=stay),
         )
-
-    def _close_enough(self, stage: Stage, view: View, *, last: Bool[Array, ""]) -> Scalar:
-        """The longest predicted step with which a stage ends [standard deviations]."""
-        coarse = _COARSE * jnp.maximum(view.misfit, 1.0)
-        return jnp.where(last, jnp.maximum(self.tolerance * view.misfit, stage.smallest_step), coarse)
 
     def _finish(self, problem: ShootingProblem, bracket: Bracket, progress: Progress, curvature: Curvature) -> Estimate:
         count = bracket.lower.shape[0]
