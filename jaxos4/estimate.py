@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 else:
     from equinox import AbstractClassVar
 
-# How many half-widths an answer may lie away from the center of its bracket.
-REACH = 4.0
+REACH = 4.0  # how many half-widths an answer may lie away from the center of its bracket
 # Gauss-Newton steps to an initial state, with the parameters known: the trajectory is nearly linear in that state.
 _START_STEPS = 4
 
@@ -95,9 +94,8 @@ class Estimate(eqx.Module):
         knots, quantile = _deviations(self.calibration.levels), _deviations(jnp.asarray(level, dtype=float))
         at = functools.partial(jnp.interp, quantile)
         if simultaneous:
-            return (
-                jnp.vectorize(at, signature="(l),(l)->()")(knots, self.calibration.simultaneous)[..., None] * self.std
-            )
+            factor = jnp.vectorize(at, signature="(l),(l)->()")(knots, self.calibration.simultaneous)
+            return factor[..., None] * self.std
         each_parameter = jax.vmap(at, in_axes=(None, 1))
         return jnp.vectorize(each_parameter, signature="(l),(l,p)->(p)")(knots, self.calibration.factors) * self.std
 
@@ -160,7 +158,7 @@ def fit_start(
 
     A free initial state takes a few Gauss-Newton steps from the first measurements, with their errors as its prior.
 
-    Returns the initial state, the cost there, whether the trajectory is sound, and the number of rollouts.
+    **Returns:** initial state, cost, whether the trajectory is sound, and number of rollouts.
     """
     first, off = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
@@ -177,12 +175,12 @@ def fit_start(
     return start, cost, sound, 1 + (_START_STEPS * (count + free) if free else 0)
 
 
-def check_one_window(problem: ShootingProblem) -> None:
-    """Raises `ValueError` for a problem that a filter cannot process sample by sample."""
+def check_recursive(problem: ShootingProblem, bracket: Bracket) -> None:
+    """Raises `ValueError` for a problem that a filter cannot process sample by sample, or as `check_bracket` does."""
+    check_bracket(problem, bracket)
     if problem.windows > 1:
-        raise ValueError(
-            f"`problem.windows` must be 1 for this estimator, got {problem.windows}: use an estimator that shoots."
-        )
+        got = problem.windows
+        raise ValueError(f"`problem.windows` must be 1 for this estimator, got {got}: use an estimator that shoots.")
     if problem.model.forcing_parameters or not problem.model.observes_states:
         raise ValueError(
             "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
@@ -216,11 +214,7 @@ class AbstractEstimator(eqx.Module):
 
     @classmethod
     def of(cls, network: "AbstractEstimator | None" = None) -> "AbstractEstimator":
-        """The estimator with its default settings.
-
-        **Arguments:**
-
-        - `network`: a trained network, for an estimator that needs one: it is that network, or has a field `network`.
+        """The estimator with its default settings. If it needs a network, it is `network`, or has a field `network`.
 
         **Raises:** `ValueError` if the estimator needs a network and there is none.
         """

@@ -25,11 +25,7 @@ ESTIMATORS: dict[str, type[AbstractEstimator]] = {
 
 
 def make_estimator(name: str, network: TrainedNetwork | None = None) -> AbstractEstimator:
-    """The estimator of that name, with its default settings.
-
-    **Arguments:**
-
-    - `network`: a trained network, for an estimator that needs one.
+    """The estimator of that name, with its default settings, made from `network` if it needs one.
 
     **Raises:** `ValueError` for an unknown name, or if the estimator needs a network and there is none.
     """

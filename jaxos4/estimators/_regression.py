@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import Scalar
 from ..bracket import Bracket
 from ..estimate import Estimate, conclude, fit_start
 from ..linalg import invert
@@ -30,7 +30,7 @@ DIFFUSE = 1e6
 class Regression(NamedTuple):
     """A flight as a regression for the parameters, in half-widths from the bracket's center.
 
-    - `rates`: measured; NaN if not measured, and at the first sample if the initial state is known.
+    - `rates`: NaN if not measured, and at the first sample if the initial state is known.
     - `anchor`: the known initial rates; NaN if they are free. `anchored`: whether they are known.
     - `memory`, `forgetting`, `bridge`: see `RecursiveLeastSquares`.
     """
@@ -47,8 +47,7 @@ class Regression(NamedTuple):
     def rows(self, rates: Float[Array, "samples 3"]) -> Float[Array, "samples 3 columns"]:
         """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
 
-        A sample that was not measured gets a row of zeros. `rates` replaces the measured rates, with the same samples
-        missing.
+        Missing samples get rows of zeros. `rates` replaces the measured rates, with the same samples missing.
         """
         measured, (filled, known) = ~jnp.isnan(self.rates), self._fill(rates)
         increments = self._increments(filled)
@@ -75,11 +74,6 @@ class Regression(NamedTuple):
         zero = jnp.zeros_like(increments[0])
         start = (zero, zero.at[:, -1].set(first), jnp.where(self.anchored, exact, 0.0) * jnp.ones(3))
         return jax.lax.scan(step, start, (increments, usable, output, measured))[1]
-
-    def weights(self) -> Float[Array, " samples"]:
-        """The weight of each sample at the end of the flight."""
-        age = jnp.arange(self.rates.shape[0])[::-1]
-        return self.forgetting**age
 
     def _fill(self, rates) -> tuple[Float[Array, "samples 3"], Bool[Array, "samples 3"]]:
         """Rates with short gaps bridged by straight lines and other gaps set to 0, and which of them are known."""
@@ -121,9 +115,9 @@ class Regression(NamedTuple):
 
 
 def regression(
-    problem: ShootingProblem, bracket: Bracket, *, memory: Scalar, forgetting: Scalar | float, bridge: int
+    problem: ShootingProblem, bracket: Bracket, *, memory: Scalar, bridge: int, forgetting: Scalar | float = 1.0
 ) -> Regression:
-    """The regression of a flight's body rates; other channels of the problem are ignored."""
+    """The regression of a flight's body rates."""
     if not problem.model.is_linear:
         raise ValueError(
             "`problem.model` must have rate equations that are linear in its parameters for a regression: identify "
@@ -169,7 +163,8 @@ def propagated_covariance(
     carries the noise through both the regressors and the outputs. So errors in variables are included, and the result
     holds for coloured differences and any weights. The bias, a second-order effect of the noise, is not included.
     """
-    root = jnp.sqrt(regression.weights())[:, None, None]
+    age = jnp.arange(regression.rates.shape[0])[::-1]
+    root = jnp.sqrt(regression.forgetting**age)[:, None, None]
 
     def score(rates):
         rows = root * regression.rows(rates)
@@ -186,44 +181,34 @@ def propagated_covariance(
     return (covariance + covariance.T) / 2
 
 
-def parameters_of(bracket: Bracket, steps: Float[Array, "*samples parameters"]) -> Float[Array, "*samples parameters"]:
-    """Parameters from steps in half-widths from the bracket's center."""
-    return bracket.center + bracket.half_width * steps
-
-
-def covariance_of(bracket: Bracket, covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A covariance of steps in half-widths, in the parameters' units."""
-    return bracket.half_width[:, None] * covariance * bracket.half_width[None, :]
-
-
-def check_share(name: str, value: Scalar, *, open_below: bool) -> None:
-    """Raises `ValueError` for a setting outside 0 to 1."""
-    if not isinstance(value, Tracer):
-        number = np.asarray(value)
-        if number.shape != () or not ((number > 0 if open_below else number >= 0) and number <= 1):
-            raise ValueError(f"`{name}` must lie in {'(' if open_below else '['}0, 1], got {number}.")
-
-
-def check_bridge(value: int) -> None:
-    """Raises `ValueError` unless the setting is a number of samples."""
-    if not isinstance(value, int) or value < 0:
-        raise ValueError(f"`bridge` must be an integer of at least 0, got {value!r}.")
+def check_settings(memory: Scalar, bridge: int, forgetting: Scalar | None = None) -> None:
+    """Raises `ValueError` for a setting of a regression that is out of range."""
+    for name, value, positive in (("forgetting", forgetting, True), ("memory", memory, False)):
+        if value is not None and not isinstance(value, Tracer):
+            number = np.asarray(value)
+            if number.shape != () or not ((number > 0 if positive else number >= 0) and number <= 1):
+                raise ValueError(f"`{name}` must lie in {'(' if positive else '['}0, 1], got {number}.")
+    if not isinstance(bridge, int) or bridge < 0:
+        raise ValueError(f"`bridge` must be an integer of at least 0, got {bridge!r}.")
 
 
 def answer(
-    problem: ShootingProblem,
+    data: Regression,
     bracket: Bracket,
-    parameters: Parameters,
-    covariance: Float[Array, "parameters parameters"],
+    steps: Float[Array, " parameters"],
+    inverse: Float[Array, "parameters parameters"],
     *,
     history: Float[Array, "samples parameters"] | None = None,
 ) -> Estimate:
-    """A regression's parameters as an estimate, with the initial state and the cost of a simulation with them.
+    """A regression's solution as an estimate, with the initial state and the cost of a simulation.
 
     A parameter that is not identifiable can have any value. If the flight cannot be simulated with it, the estimate is
-    the bracket's center.
+    the bracket's center. If there is a `history`, its last row is the estimate.
     """
-    usable = bracket.usable
+    problem, usable = data.problem, data.bracket
+    parameters = usable.center + usable.half_width * steps if history is None else history[-1]
+    covariance = propagated_covariance(data, steps, inverse)
+    covariance = usable.half_width[:, None] * covariance * usable.half_width[None, :]
     identifiable = usable.identifies(jnp.sqrt(jnp.diagonal(covariance))).all()
     flies = jnp.isfinite(problem.cost(parameters))
     parameters = jnp.where(identifiable | flies, parameters, usable.center)

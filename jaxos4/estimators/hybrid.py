@@ -15,8 +15,7 @@ from ..results import RESULTS
 from ..shooting import ShootingProblem
 from .ibss import IBSS
 
-# The share of flights in which the seed's intervals hold all parameters at once.
-_LEVEL = 0.999
+_LEVEL = 0.999  # the share of flights in which the seed's intervals hold all parameters at once
 # The seed was wrong if the answer is this many half-widths of these intervals away from the seed,
 _MISSED = 2.0
 # or if the cost is this many standard deviations above the cost of pure noise.
@@ -30,8 +29,8 @@ class Hybrid(AbstractEstimator):
     at once. If the search shows that the seed was wrong, or if the network had no answer, IBSS searches the whole
     bracket as it would alone, and the better answer is returned.
 
-    The estimate's `seed` is the bracket that the network's intervals make (99.9 % for all parameters at once), so that
-    hits can be counted. `rollouts` are those of network and search together.
+    The estimate's `seed` is the bracket of the network's 99.9 % intervals for all parameters at once. `rollouts` are
+    those of network and search together.
 
     **Arguments:**
 
@@ -54,12 +53,7 @@ class Hybrid(AbstractEstimator):
 
 @eqx.filter_jit
 def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> Estimate:
-    """Searches near another estimator's answer, and in the whole bracket if that answer was wrong.
-
-    **Arguments:**
-
-    - `seed`: an estimate of the same flight, of whatever quality.
-    """
+    """Searches near the `seed`, another estimator's answer, and in the whole bracket if that answer was wrong."""
     answered = jnp.isfinite(seed.covariance).all()
     near = ibss.search(problem, bracket, start=seed.parameters, spread=seed.covariance, cascade=False, skip=~answered)
     half_width = seed.half_width(_LEVEL, simultaneous=True)

@@ -14,12 +14,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_bracket, check_one_window, conclude
+from ..estimate import AbstractEstimator, Estimate, check_recursive, conclude
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
 
-# The passes end once one of them moves no parameter by more than this many standard deviations.
-_SETTLED = 0.1
+_SETTLED = 0.1  # standard deviations: the passes end once one of them moves no parameter by more
 
 
 class _Filter(NamedTuple):
@@ -34,7 +33,9 @@ class _Filter(NamedTuple):
     nominal: Float[Array, " size"]
 
 
-class _Filtered(NamedTuple):
+class _Pass(NamedTuple):
+    """The result of a pass, the number of passes so far, and whether they are over."""
+
     joint: Float[Array, " joint"]
     root: Float[Array, "joint unknowns"]
     history: Float[Array, "samples parameters"]
@@ -53,11 +54,10 @@ class JointEKF(AbstractEstimator):
       more than a tenth of its standard deviation; otherwise the result is `max_sweeps`. With `passes=1` the first
       answer is accepted as it is; on more channels than the rates its covariance can be far too small.
 
-    The bracket is a Gaussian prior: its center is the mean, its half-width the standard deviation. The prior is part of
-    the answer and of the covariance: if the center is off by half of the half-width, the answer is off by half of
-    std^2 / half_width. A free initial state has the first measurements as its prior, and is a constant part of the
-    joint state. There is no process noise: parameters do not drift. `history` is that of the last pass, and its last
-    row is the answer. A pass counts as one rollout for each unknown and one for the state; `sweeps` are the passes.
+    The bracket is a Gaussian prior: its center is the mean, its half-width the standard deviation. If the center is off
+    by half of the half-width, the answer is off by half of std^2 / half_width. A free initial state has the first
+    measurements as its prior, and is a constant part of the joint state. There is no process noise. `history` is that
+    of the last pass. A pass counts as one rollout for each unknown and one for the state; `sweeps` are the passes.
 
     Reference: Ljung 1979, IEEE Trans. Autom. Control 24(1), on the filter; Bierman 1977, Factorization Methods for
     Discrete Sequential Estimation, on Potter's update; Bell and Cathey 1993, IEEE Trans. Autom. Control 38(2), on
@@ -79,16 +79,10 @@ class JointEKF(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight.
 
-        **Arguments:**
-
-        - `problem`: the flight to filter; NaN means not measured.
-        - `bracket`: the prior of the parameters.
-
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
         windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
-        check_bracket(problem, bracket)
-        check_one_window(problem)
+        check_recursive(problem, bracket)
         rows, prior = jax.tree.map(lambda leaf: leaf[0], problem.rows()), bracket.usable
         count, size = prior.center.shape[0], problem.size
         start = problem.first_state()[0]
@@ -96,16 +90,16 @@ class JointEKF(AbstractEstimator):
         def split(joint: Float[Array, " joint"]) -> tuple[Parameters, Float[Array, " size"]]:
             return joint[size : size + count], joint[size + count :] if problem.free_size else start
 
-        def again(filtered: _Filtered) -> _Filtered:
-            before = split(filtered.joint)
+        def again(last: _Pass) -> _Pass:
+            before = split(last.joint)
             joint, root, history = _run(problem, rows, prior, before)
             std = jnp.sqrt(jnp.square(root[size : size + count]).sum(axis=1))
             moved = (jnp.abs(split(joint)[0] - before[0]) / std).max()
             # A NaN ends the passes: it stays NaN.
-            return _Filtered(joint, root, history, filtered.passes + 1, ~(moved > _SETTLED))
+            return _Pass(joint, root, history, last.passes + 1, ~(moved > _SETTLED))
 
         once = jnp.ones((), dtype=int)
-        first = _Filtered(*_run(problem, rows, prior, None), once, jnp.asarray(self.passes == 1))
+        first = _Pass(*_run(problem, rows, prior, None), once, jnp.asarray(self.passes == 1))
         last = jax.lax.while_loop(lambda f: ~f.done & (f.passes < self.passes), again, first)
         parameters, initial_state = split(last.joint)
         cost, sound = problem.shots(parameters, initial_state)
@@ -130,9 +124,7 @@ def _run(
 ) -> tuple[Float[Array, " joint"], Float[Array, "joint unknowns"], Float[Array, "samples parameters"]]:
     """One pass: the joint estimate, the root of its covariance, and the parameters after each sample.
 
-    **Arguments:**
-
-    - `about`: parameters and initial state of the trajectory to linearise around; `None`: the running estimate.
+    The model is linearised around the trajectory of `about`, or around the running estimate.
     """
     count, size = prior.center.shape[0], problem.size
     start, off = problem.first_state()

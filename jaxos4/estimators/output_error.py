@@ -28,11 +28,7 @@ class OutputError(AbstractEstimator):
     """Levenberg-Marquardt on the weighted residuals, from the bracket's center.
 
     The rates are fitted first, then the attitude with them, then all channels: from a wide bracket, a direct fit of all
-    channels can end in another minimum. Unknowns are scaled by the bracket's half-widths (an initial state by how far
-    off it may be), so that the damping treats all of them alike.
-
-    The Jacobian is dense. If the flight is cut into windows, it grows with the square of their number; `IBSS`
-    eliminates the windows one by one instead.
+    channels can end in another minimum. The Jacobian is dense: it grows with the square of the number of windows.
 
     **Arguments:**
 
@@ -73,6 +69,7 @@ class OutputError(AbstractEstimator):
                 continue
             stage = problem.restrict(channels)
             free = stage.free_size
+            # The damping treats all unknowns alike in these units.
             scale = jnp.concatenate([usable.half_width, off[:, :free].ravel()])
             solution = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free].ravel()]), scale)
             found = solution.value * scale
@@ -114,13 +111,11 @@ class NormalCholesky(lx.AbstractLinearSolver):
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict) -> tuple:
         """The matrix, and its inverse Cholesky factor."""
-        del options
         matrix = operator.as_matrix()
         return matrix, invert_factor(cholesky(jnp.einsum("ij,ik->jk", matrix, matrix)))
 
     def compute(self, state: tuple, vector, options: dict):
         """Solves for one right-hand side."""
-        del options
         matrix, inverse = state
         flat = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(vector)])
         solution = inverse.T @ (inverse @ (matrix.T @ flat))

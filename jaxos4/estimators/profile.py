@@ -31,11 +31,7 @@ class Profile(NamedTuple):
 
 
 def profile_likelihood(
-    estimator: AbstractEstimator,
-    problem: ShootingProblem,
-    bracket: Bracket,
-    name: str,
-    values: Float[Array, " values"],
+    estimator: AbstractEstimator, problem: ShootingProblem, bracket: Bracket, name: str, values: Float[Array, " values"]
 ) -> Profile:
     """Fits one flight with one of its parameters held at each of `values`, all in one batch.
 

@@ -8,28 +8,17 @@ import jax.numpy as jnp
 
 from .._custom_types import Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_bracket, check_one_window
+from ..estimate import AbstractEstimator, Estimate, check_recursive
 from ..shooting import ShootingProblem
-from ._regression import (
-    answer,
-    check_bridge,
-    check_share,
-    covariance_of,
-    normal_equations,
-    parameters_of,
-    propagated_covariance,
-    regression,
-    solve,
-)
+from ._regression import answer, check_settings, normal_equations, regression, solve
 
 
 class RecursiveLeastSquares(AbstractEstimator):
     """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
 
-    The recursion carries the information form: the normal matrix and its right-hand side. It needs no initial
-    covariance, and unlike the covariance form it stays symmetric and positive in single precision. A diffuse prior (a
-    million half-widths) is added only to solve and is not forgotten, so that nothing overflows without excitation. A
-    parameter stays at the bracket's center until it is excited.
+    The recursion carries the normal matrix and its right-hand side: unlike a covariance, they stay symmetric and
+    positive in single precision. A diffuse prior (a million half-widths) is added only to solve and is not forgotten.
+    A parameter stays at the bracket's center until it is excited.
 
     **Arguments:**
 
@@ -56,9 +45,7 @@ class RecursiveLeastSquares(AbstractEstimator):
     bridge: int = eqx.field(static=True, default=4)
 
     def __check_init__(self):
-        check_share("forgetting", self.forgetting, open_below=True)
-        check_share("memory", self.memory, open_below=False)
-        check_bridge(self.bridge)
+        check_settings(self.memory, self.bridge, self.forgetting)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
@@ -67,11 +54,9 @@ class RecursiveLeastSquares(AbstractEstimator):
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model that is not linear
         in them, or a flight that is cut into windows.
         """
-        check_bracket(problem, bracket)
-        check_one_window(problem)
+        check_recursive(problem, bracket)
         usable = bracket.usable
         data = regression(problem, usable, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
-        rows = data.rows(data.rates)
 
         def update(carry, row):
             information, moment = carry
@@ -81,9 +66,5 @@ class RecursiveLeastSquares(AbstractEstimator):
 
         count = usable.center.shape[0]
         zero = jnp.zeros((count, count), dtype=float), jnp.zeros(count, dtype=float)
-        (information, moment), history = jax.lax.scan(update, zero, rows)
-        steps, inverse = solve(information, moment)
-        history = parameters_of(usable, history)
-        parameters = history[-1]
-        covariance = covariance_of(usable, propagated_covariance(data, steps, inverse))
-        return answer(problem, bracket, parameters, covariance, history=history)
+        last, history = jax.lax.scan(update, zero, data.rows(data.rates))
+        return answer(data, bracket, *solve(*last), history=usable.center + usable.half_width * history)

@@ -21,21 +21,12 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, as_float
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import (
-    REACH,
-    AbstractEstimator,
-    Estimate,
-    check_bracket,
-    check_one_window,
-    conclude,
-    fit_start,
-)
+from ..estimate import REACH, AbstractEstimator, Estimate, check_recursive, conclude, fit_start
 from ..linalg import invert
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
 
-# The share of the last pass over which the parameters are averaged.
-_AVERAGED = 0.5
+_AVERAGED = 0.5  # the share of the last pass over which the parameters are averaged
 
 
 class _Filter(NamedTuple):
@@ -73,17 +64,15 @@ class SVSF(AbstractEstimator):
     - `memory`: whether Phi12 is the derivative of a prediction through all corrections before it (`True`), or of one
       step alone, as in Habibi's paper. One step's errors are small against the noise; their sum is not.
 
-    The defaults were tuned at a tenth, one and ten times the sensors' noise; `docs/measured.md` has the errors.
+    The defaults were tuned on simulated flights; `docs/measured.md` has the errors.
 
     The answer is the mean of the parameters over the second half of the last pass; `history` holds the parameters of
     that pass. Only the body rates are used. A free initial state is not filtered for: each pass begins from the first
     measurements, and the returned state is fitted to the parameters at the end.
 
     The method itself gives no covariance. Ours follows the errors through the slope of each correction, from the
-    bracket's half-widths on (in the manner of Gadsden and Habibi 2010). It contains the noise and what remains of the
-    initial error, but not that all passes see the same noise. It has the right size, and no more.
-
-    A pass counts as one rollout for each rate and parameter, and one for the state.
+    bracket's half-widths on (in the manner of Gadsden and Habibi 2010). It ignores that all passes see the same noise:
+    only its size is right. A pass counts as one rollout for each rate and parameter, and one for the state.
 
     Reference: Habibi 2007, Proc. IEEE 95(5), 1026-1059; Al-Shabi and Habibi 2011, ISRN Signal Processing 725108, for
     the idea of iterating it.
@@ -116,18 +105,12 @@ class SVSF(AbstractEstimator):
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        """Identifies one flight.
-
-        **Arguments:**
-
-        - `problem`: the flight whose rates are filtered; NaN means not measured.
-        - `bracket`: its center is where the filter begins.
+        """Identifies one flight. The filter begins at the bracket's center.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
         windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
-        check_bracket(problem, bracket)
-        check_one_window(problem)
+        check_recursive(problem, bracket)
         box, rates = bracket.usable, problem.restrict("rates")
         rows, start = jax.tree.map(lambda leaf: leaf[0], rates.rows()), rates.first_state()
         count, samples = box.center.shape[0], rows.measured[0].shape[0]
@@ -148,18 +131,16 @@ class SVSF(AbstractEstimator):
         def fly(begin: _Filter) -> tuple[_Filter, Array]:
             return jax.lax.scan(lambda f, row: self._step(rates, box, f, *row), begin, (rows, shares))
 
-        first = fly(
-            _Filter(
-                rates=start[0],
-                parameters=jnp.zeros(count, dtype=float),
-                residual=jnp.zeros(3, dtype=float),
-                influence=jnp.zeros((3, count), dtype=float),
-                energy=jnp.zeros(count, dtype=float),
-                samples=jnp.zeros((), dtype=float),
-                covariance=jnp.diag(jnp.square(spread)),
-            )
+        at_center = _Filter(
+            rates=start[0],
+            parameters=jnp.zeros(count, dtype=float),
+            residual=jnp.zeros(3, dtype=float),
+            influence=jnp.zeros((3, count), dtype=float),
+            energy=jnp.zeros(count, dtype=float),
+            samples=jnp.zeros((), dtype=float),
+            covariance=jnp.diag(jnp.square(spread)),
         )
-        (last, history), _ = jax.lax.scan(again, first, length=self.passes - 1)
+        (last, history), _ = jax.lax.scan(again, fly(at_center), length=self.passes - 1)
         parameters = box.center + box.half_width * (shares[:, None] * history).sum(axis=0)
         initial_state, cost, sound, rollouts = fit_start(problem, parameters)
         return conclude(
@@ -214,21 +195,16 @@ class SVSF(AbstractEstimator):
         influence = by_parameters + (_product(by_rates, remembered) if self.memory else 0.0)
 
         # Errors and noise pass through the slope of each correction.
-        correct = jnp.concatenate(
-            [
-                jnp.diag(jnp.where(valid, rate_slope, 0.0)),
-                ((1 + self.gamma) * unit * slope)[:, None] * inverse,
-                jnp.zeros((count, 3), dtype=float),
-            ]
-        )
+        correct_rates = jnp.diag(jnp.where(valid, rate_slope, 0.0))
+        correct_parameters = ((1 + self.gamma) * unit * slope)[:, None] * inverse
+        correct = jnp.concatenate([correct_rates, correct_parameters, jnp.zeros((count, 3), dtype=float)])
         identity = jnp.eye(3 + 2 * count, dtype=float)
         advanced = identity.at[:3, :3].set(by_rates).at[:3, 3 : 3 + count].set(by_parameters)
         advanced = advanced.at[3 + count :, 3 : 3 + count].set(share * jnp.eye(count, dtype=float))
         entering = _product(advanced, correct)
         passing = advanced.at[:, :3].add(-entering)
-        covariance = _product(_product(passing, covariance), passing.T) + _product(
-            jnp.square(sigma) * entering, entering.T
-        )
+        added = _product(jnp.square(sigma) * entering, entering.T)
+        covariance = _product(_product(passing, covariance), passing.T) + added
         return _Filter(following, parameters, residual, influence, energy, samples, covariance), parameters
 
 

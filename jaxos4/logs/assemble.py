@@ -17,18 +17,9 @@ COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES)
 
 _OTHER_NAMES = {  # names that other loggers use, for the question "should 'time' be t?"
-    "time": "t",
-    "timestamp": "t",
-    "times": "t",
-    "roll": "phi",
-    "pitch": "theta",
-    "yaw": "psi",
-    "gyrox": "p",
-    "gyroy": "q",
-    "gyroz": "r",
-    "accx": "ax",
-    "accy": "ay",
-    "accz": "az",
+    **dict.fromkeys(("time", "timestamp", "times"), "t"),
+    **{"roll": "phi", "pitch": "theta", "yaw": "psi"},
+    **{"gyrox": "p", "gyroy": "q", "gyroz": "r", "accx": "ax", "accy": "ay", "accz": "az"},
 }
 MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
 
@@ -36,18 +27,7 @@ MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of ga
 def flight_of(
     table: Table, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
-    """Make a flight from the columns of a log.
-
-    **Arguments:**
-
-    - `table`: columns with the names in `COLUMN_NAMES`.
-    - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds.
-    - `full_scale`: rotor speed of command 1 [rad/s] if the airframe gives none. With 1, commands stay as they are.
-
-    **Returns:** the flight, and notes on what was changed: one line each, without the file's name.
-
-    **Raises:** `InputError`, one line: file, row and column (if the format has them), what is wrong, what to do.
-    """
+    """Make a flight from the columns of a log, and notes on what was changed; see `read_log`."""
     notes = [_unknown_note(table.unknown)] if table.unknown else []
     table = _measured(table)
     dt = check_time(table)
@@ -56,7 +36,7 @@ def flight_of(
     commanded = not any(name in table.columns for name in SPEED_NAMES)
     if airframe is not None:
         thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient
-        _add(notes, thrust_note(float(thrust / (airframe.mass * airframe.gravity))))
+        notes.extend(thrust_note(float(thrust / (airframe.mass * airframe.gravity))))
     channels = _channels(table, notes)
     with_force = any(name in table.columns for name in FORCE_NAMES)
     time, omega, channels = _evenly(table._replace(columns={"t": table.columns["t"]}), dt, omega, channels, notes)
@@ -77,10 +57,8 @@ def _measured(table: Table) -> Table:
     if "t" not in columns:
         table.refuse(_missing("there is no time", ("t",), table) + "; each row needs its time [s]", column="t")
     if not any(name in columns for name in STATE_NAMES):
-        table.refuse(
-            _missing("no state was measured", STATE_NAMES, table)
-            + f"; a flight needs at least one of the columns {', '.join(STATE_NAMES)}"
-        )
+        what = _missing("no state was measured", STATE_NAMES, table)
+        table.refuse(f"{what}; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
     return table
 
 
@@ -119,10 +97,8 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
     if full_scale is None or np.isfinite(known):
         full_scale = known
     if not np.isfinite(full_scale):
-        table.refuse(
-            "the rotor speed of full command is not known; set max_rotor_speed [rad/s] in the airframe's TOML file",
-            column=names[0],
-        )
+        what = "the rotor speed of full command is not known; set max_rotor_speed [rad/s] in the airframe's TOML file"
+        table.refuse(what, column=names[0])
     return omega * full_scale
 
 
@@ -142,7 +118,7 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
 
 
 def _channels(table: Table, notes: list[str]) -> np.ndarray:
-    """States and specific force, shape (rows, 15). NaN means not measured. Angles are unwrapped."""
+    """States and specific force, shape (rows, 15), with unwrapped angles."""
     channels = np.full((table.columns["t"].size, len(CHANNEL_NAMES)), np.nan)
     for i, name in enumerate(CHANNEL_NAMES):
         if name not in table.columns:
@@ -152,7 +128,7 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
             channels[:, i], jumps = unwrap(table.columns[name])
             if jumps:
                 notes.append(f"{name}: {jumps} {'jump' if jumps == 1 else 'jumps'} of 2 pi removed")
-    _add(notes, force_note(channels[:, 12:]))
+    notes.extend(force_note(channels[:, 12:]))
     return channels
 
 
@@ -166,18 +142,10 @@ def _evenly(
         return time, omega, channels
     gap = widest_gap(t, dt)
     if gap.samples > min(MAX_ROWS, MOST_SAMPLES + 10 * t.size):
-        what = (
-            f"comes after a gap of {gap.length:.6g} s: at the median step of {dt:.3g} s the flight would have "
-            f"{gap.samples:.3g} samples; cut the file there"
-        )
-        table.refuse(what, index=gap.row + 1, column="t")
+        what = f"comes after a gap of {gap.length:.6g} s: at the median step of {dt:.3g} s the flight would have "
+        table.refuse(what + f"{gap.samples:.3g} samples; cut the file there", index=gap.row + 1, column="t")
     time, omega, channels, figures = resample(t, omega, channels, dt)
     notes.append(figures)
     if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
         table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
     return time, omega, channels
-
-
-def _add(notes: list[str], note: str | None) -> None:
-    if note is not None:
-        notes.append(note)

@@ -32,13 +32,12 @@ Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight and IN
 
 import csv
 import math
-import os
 from typing import NamedTuple
 
 import numpy as np
 
 from .csv_text import read_table
-from .table import LogFormat, Table, opened, refuse
+from .table import LogFormat, Path, Table, opened, refuse
 
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
 _RAW = b"H Product:Blackbox"
@@ -53,15 +52,9 @@ _RATE_UNITS = {"": _DEGREE, " (deg/s)": _DEGREE, " (rad/s)": 1.0}
 _FORCE_UNITS = {"": None, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
 _INAV = {  # column: column of the log, sign
-    "phi": ("attitude[0]", 1),
-    "theta": ("attitude[1]", 1),
-    "psi": ("attitude[2]", -1),
-    "x": ("navPos[0]", 1),
-    "y": ("navPos[1]", -1),
-    "z": ("navPos[2]", 1),
-    "vx": ("navVel[0]", 1),
-    "vy": ("navVel[1]", -1),
-    "vz": ("navVel[2]", 1),
+    **{"phi": ("attitude[0]", 1), "theta": ("attitude[1]", 1), "psi": ("attitude[2]", -1)},
+    **{"x": ("navPos[0]", 1), "y": ("navPos[1]", -1), "z": ("navPos[2]", 1)},
+    **{"vx": ("navVel[0]", 1), "vy": ("navVel[1]", -1), "vz": ("navVel[2]", 1)},
 }
 _EXPORT = "export it as CSV by Blackbox Explorer"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
@@ -77,7 +70,7 @@ _KNOWN = (
 class _Log(NamedTuple):
     """A blackbox log: its own columns `raw` and `settings`, and our `columns`, the log's `names` of them, `notes`."""
 
-    path: str | os.PathLike[str]
+    path: Path
     header: int
     settings: dict[str, str]
     raw: dict[str, np.ndarray]
@@ -93,11 +86,8 @@ class _Log(NamedTuple):
         return _number(self.settings.get(name, ""), least, most)
 
 
-def read_blackbox(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
-    """Read the columns of a blackbox log (listed in `jaxos4.logs.blackbox`), and notes on what was assumed.
-
-    **Raises:** `InputError`, one line: file, row, column, what is wrong and what to do.
-    """
+def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
+    """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
     settings, skip = _settings(path)
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
@@ -113,10 +103,8 @@ def read_blackbox(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]
         if name in raw:
             values = sign * raw[name]
             log.add(column, name, values * 0.1 * _DEGREE if name.startswith("attitude") else values / 100)
-    log.notes.append(
-        f"rotors keep the log's order ({log.names.get('omega1', log.names.get('command1'))} is rotor 1): "
-        "rotor_positions and rotor_spins must be in the same order"
-    )
+    what = f"rotors keep the log's order ({log.names.get('omega1', log.names.get('command1'))} is rotor 1)"
+    log.notes.append(f"{what}: rotor_positions and rotor_spins must be in the same order")
     return table._replace(columns=log.columns, unknown=(), names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
@@ -134,7 +122,7 @@ def _is_header(line: str) -> bool:
     return any(mark in line for mark in _HEADER_MARKS) and line.count(",") > 2
 
 
-def _settings(path: str | os.PathLike[str]) -> tuple[dict[str, str], int]:
+def _settings(path: Path) -> tuple[dict[str, str], int]:
     """The settings above the header, and the number of their lines."""
     settings: dict[str, str] = {}
     with opened(path) as file:
@@ -195,15 +183,13 @@ def _add_rotors(log: _Log) -> None:
         for i, name in enumerate(speeds):
             log.add(f"omega{i + 1}", name, raw[name] * factor)
         return
-    lacking = next((name for name in commands if name not in raw), None)
-    if lacking is not None:
-        what = "is missing; log the motors, or eRPM (bidirectional DShot)"
-        refuse(log.path, what, row=log.header, column=lacking)
+    for name in commands:
+        if name not in raw:
+            what = "is missing; log the motors, or eRPM (bidirectional DShot)"
+            refuse(log.path, what, row=log.header, column=name)
     low, high = _ends(np.column_stack([raw[name] for name in commands]), log)
-    log.notes.append(
-        f"commands are motor[0..3] from {low:g} to {high:g}, taken as fractions of full-scale rotor speed"
-        + ("" if log.settings else "; the protocol is assumed from their range")
-    )
+    what = f"commands are motor[0..3] from {low:g} to {high:g}, taken as fractions of full-scale rotor speed"
+    log.notes.append(what + ("" if log.settings else "; the protocol is assumed from their range"))
     for i, name in enumerate(commands):
         log.add(f"command{i + 1}", name, np.clip((raw[name] - low) / (high - low), 0.0, 1.0))
 

@@ -30,7 +30,6 @@ Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 
 import array
 import math
-import os
 import re
 import struct
 import zlib
@@ -39,7 +38,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from .series import Series, at_rows, euler_angles, gyro_rows, in_order, unwrapped
-from .table import LogFormat, Table, opened_bytes, quoted, refuse
+from .table import LogFormat, Path, Table, opened_bytes, quoted, refuse
 
 _MAGIC = b"\xbc"
 _MOST_TYPES, _MOST_VARIABLES = 64, 256
@@ -70,11 +69,8 @@ class _Type(NamedTuple):
     layout: np.dtype
 
 
-def read_crazyflie(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
-    """Read the columns of a Crazyflie's log (listed in `jaxos4.logs.crazyflie`), and notes on what was assumed.
-
-    **Raises:** `InputError`, one line: file, variable, what is wrong and what to do.
-    """
+def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
+    """Read the columns of a Crazyflie's log, and notes on what was assumed. Raises `InputError`."""
     content = bytearray()
     with opened_bytes(path) as file:
         while part := file.read(_AT_ONCE):
@@ -105,9 +101,7 @@ def read_crazyflie(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]
 CRAZYFLIE = LogFormat("Crazyflie", "Crazyflie micro-SD log", lambda begin: begin.startswith(_MAGIC), read_crazyflie)
 
 
-def _events(
-    path: str | os.PathLike[str], content: bytes, notes: list[str]
-) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+def _events(path: Path, content: bytes, notes: list[str]) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Times [s] and variables of each event type. An incomplete event at the end is ignored."""
     header = _Header(path, content)
     types, version = header.types()
@@ -143,7 +137,7 @@ def _events(
 class _Header:
     """Reads the header of a file. `at` is the number of bytes read."""
 
-    def __init__(self, path: str | os.PathLike[str], content: bytes):
+    def __init__(self, path: Path, content: bytes):
         self.path, self.content, self.at = path, content, 0
 
     def types(self) -> tuple[list[_Type], int]:
@@ -204,7 +198,7 @@ class _Header:
 
 
 def _places(
-    path: str | os.PathLike[str], content: bytes, types: list[_Type], begin: int, end: int, *, valid: bool
+    path: Path, content: bytes, types: list[_Type], begin: int, end: int, *, valid: bool
 ) -> tuple[dict[int, array.array], int]:
     """The position of each event by its type, and the number of bytes after the last complete event."""
     sizes = {each.number: each.layout.itemsize for each in types}
@@ -235,7 +229,7 @@ def _series(variables: Variables, wanted: dict[str, tuple[str, float]], names: d
     return Series(times[0], np.column_stack(values))
 
 
-def _rotors(path: str | os.PathLike[str], variables: Variables, names: dict[str, str]) -> tuple[Series, bool]:
+def _rotors(path: Path, variables: Variables, names: dict[str, str]) -> tuple[Series, bool]:
     """Rotor speeds [rad/s] or commands [0..1], and whether they are measured speeds."""
     for variable, factor in (("rpm.m{}", _RPM), ("motor.m{}", 1 / _FULL), ("pwm.m{}_pwm", 1 / _FULL)):
         measured = factor == _RPM
@@ -258,7 +252,7 @@ def _attitude(variables: Variables, names: dict[str, str]) -> Series | None:
     if series is not None:
         return unwrapped(series.t, series.values)
     series = _series(variables, _QUATERNION, {})
-    if series is None:
-        return None
-    names.update(dict.fromkeys(_ANGLES, "stateEstimate.q"))
-    return unwrapped(series.t, euler_angles(series.values))
+    if series is not None:
+        names.update(dict.fromkeys(_ANGLES, "stateEstimate.q"))
+        return unwrapped(series.t, euler_angles(series.values))
+    return None

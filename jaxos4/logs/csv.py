@@ -29,17 +29,16 @@ from ..errors import InputError
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
 from .assemble import COLUMN_NAMES as COLUMN_NAMES, SPEED_NAMES, flight_of
 from .csv_text import read_table
-from .table import LogFormat, Table, printable
+from .table import LogFormat, Path, printable
 
 _ROWS_AT_ONCE = 8192
 
 
-def read_flight(path: str | os.PathLike[str], airframe: Airframe | None = None) -> Flight:
+def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
     """Read a flight from a CSV file. The columns are listed in `jaxos4.logs.csv`.
 
     **Arguments:**
 
-    - `path`: the file.
     - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds. A file with `omega1..4` needs none.
 
     **Returns:** a `Flight`. Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such
@@ -56,23 +55,16 @@ def read_flight(path: str | os.PathLike[str], airframe: Airframe | None = None) 
 
 
 def read_flight_and_notes(
-    path: str | os.PathLike[str], airframe: Airframe | None = None, *, full_scale: float | None = None
+    path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
-    """Read a flight as `read_flight` does, and return its warnings as notes: one line each, without the file's name.
-
-    `full_scale` is the rotor speed of command 1 [rad/s] if the airframe gives none.
-    """
+    """Read a flight, and return the warnings of `read_flight` as notes; `full_scale` is as in `read_log`."""
     return flight_of(read_table(path, COLUMN_NAMES), airframe, full_scale=full_scale)
 
 
-def _read(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
-    return read_table(path, COLUMN_NAMES), ()
+CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()))
 
 
-CSV = LogFormat("CSV", "flight CSV", lambda begin: True, _read)
-
-
-def write_flight(flight: Flight, path: str | os.PathLike[str]) -> None:
+def write_flight(flight: Flight, path: Path) -> None:
     """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of the states and the specific force.
 
     Reading the file gives back every bit. If writing fails, an older file at `path` is unchanged.
@@ -104,7 +96,7 @@ def write_flight(flight: Flight, path: str | os.PathLike[str]) -> None:
             writer.writerows(zip(*cells, strict=True))
 
 
-def _check_cells(path: str | os.PathLike[str], name: str, column: np.ndarray, usable: np.ndarray) -> None:
+def _check_cells(path: Path, name: str, column: np.ndarray, usable: np.ndarray) -> None:
     if not usable.all():
         index = int(np.argmin(usable))
         raise InputError(

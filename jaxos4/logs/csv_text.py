@@ -6,7 +6,6 @@ NaN, and neither gives the row of the file and the name of the column.
 
 import csv
 import math
-import os
 import re
 from collections.abc import Collection, Iterator
 from operator import itemgetter
@@ -14,7 +13,7 @@ from typing import TextIO
 
 import numpy as np
 
-from .table import MAX_ROWS, Table, opened, quoted, refuse
+from .table import MAX_ROWS, Path, Table, opened, quoted, refuse
 
 _LONGEST_LINE = 1 << 20
 _BLOCK = 1 << 20  # characters parsed at once: the whole text never has to fit in memory
@@ -23,19 +22,14 @@ _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "-",
 _EMPTY = "leave the cell empty if it was not measured"
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
-Path = str | os.PathLike[str]
-
 
 def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = ()) -> Table:
-    """Read the columns of a CSV file whose names are `known`.
+    """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
 
-    The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored. The
-    names of the other columns are listed in the table; their cells are not read.
+    The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored.
 
     **Arguments:**
 
-    - `path`: the file.
-    - `known`: the names of the columns to read.
     - `skip`: number of lines before the header.
     - `missing`: cells that mean "not measured", in addition to the empty cell.
 
@@ -86,10 +80,12 @@ def _parse(
             i = next(i for i, width in enumerate(widths) if width != len(header))
             if not lines[i].strip():
                 refuse(path, "is blank; delete it", row=row + i)
-            cells = "1 cell" if widths[i] == 1 else f"{widths[i]} cells"
-            refuse(path, f"has {cells}, but the header has {len(header)}; repair or delete the row", row=row + i)
+            count = "1 cell" if widths[i] == 1 else f"{widths[i]} cells"
+            refuse(path, f"has {count}, but the header has {len(header)}; repair or delete the row", row=row + i)
         for name, cell in wanted:
-            parts[name].append(_numbers(path, name, _without(missing, list(map(cell, rows))), row))
+            cells = list(map(cell, rows))
+            cells = ["" if text.strip() in missing else text for text in cells] if missing else cells
+            parts[name].append(_numbers(path, name, cells, row))
         row += len(rows)
         if row - first_row > MAX_ROWS:
             refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
@@ -123,10 +119,6 @@ def _cells(path: Path, line: str, row: int) -> list[str]:
         return next(csv.reader([line]), [])  # line by line, so that an open quote ends with its line
     except csv.Error:
         refuse(path, "contains a cell that is too long; repair or delete the row", row=row)
-
-
-def _without(missing: frozenset[str], cells: list[str]) -> list[str]:
-    return ["" if cell.strip() in missing else cell for cell in cells] if missing else cells
 
 
 def _numbers(path: Path, column: str, cells: list[str], row: int) -> np.ndarray:

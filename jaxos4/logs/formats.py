@@ -1,29 +1,22 @@
 """The registry of log formats, and the reader that chooses among them."""
 
-import os
-
 from ..airframe import Airframe
 from ..flight import Flight
 from .assemble import flight_of
 from .blackbox import BLACKBOX
 from .crazyflie import CRAZYFLIE
 from .csv import CSV
-from .table import LogFormat, opened_bytes
+from .table import LogFormat, Path, opened_bytes
 from .ulog import ULOG
 
-FORMATS: tuple[LogFormat, ...] = (
-    ULOG,
-    CRAZYFLIE,
-    BLACKBOX,
-    CSV,
-)
+FORMATS: tuple[LogFormat, ...] = (ULOG, CRAZYFLIE, BLACKBOX, CSV)
 """The formats in the order in which they are tried. A new format is one line here, before the last."""
 
 _FIRST_BYTES = 1 << 18
 
 
 def read_log(
-    path: str | os.PathLike[str], airframe: Airframe | None = None, *, full_scale: float | None = None
+    path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
     """Read a log of any known format.
 
@@ -33,7 +26,6 @@ def read_log(
 
     **Arguments:**
 
-    - `path`: the file.
     - `airframe`: its `max_rotor_speed` turns commands into rotor speeds. A log with rotor speeds needs no airframe.
     - `full_scale`: rotor speed of command 1 [rad/s] if the airframe gives none. With 1, commands stay as they are.
 
@@ -46,7 +38,7 @@ def read_log(
     return flight, (*notes, *more)
 
 
-def log_format(path: str | os.PathLike[str]) -> LogFormat:
+def log_format(path: Path) -> LogFormat:
     """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
 
     A pipe can be read only once, so it always counts as the last.

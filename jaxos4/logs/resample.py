@@ -40,19 +40,12 @@ def widest_gap(t: Float[np.ndarray, " rows"], dt: float) -> Gap:
 
 
 def resample(
-    t: Float[np.ndarray, " rows"],
-    omega: Float[np.ndarray, "rows 4"],
-    channels: Float[np.ndarray, "rows channels"],
-    dt: float,
-) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 4"], Float[np.ndarray, "samples channels"], str]:
+    t: Float[np.ndarray, " rows"], omega: Float[np.ndarray, "rows 4"], channels: Float[np.ndarray, "rows n"], dt: float
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples 4"], Float[np.ndarray, "samples n"], str]:
     """Resample rows at uneven times to the grid t_0, t_0 + dt, ...
 
-    **Arguments:**
-
-    - `t`: [s], increasing.
-    - `omega`: rotor speeds [rad/s], each held until the next row.
-    - `channels`: measurements. NaN means not measured. Angles must be unwrapped.
-    - `dt`: step of the grid [s].
+    **Arguments:** times [s], rotor speeds [rad/s], each held until the next row, measurements with unwrapped angles
+    (NaN means not measured), and the step of the grid [s].
 
     **Returns:** time, rotor speeds, channels, and a note with the figures of the resampling.
 

@@ -1,16 +1,13 @@
 """Samples of sensors and motors that were logged at different rates, brought to the rows of the gyro."""
 
-import os
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .resample import unwrap
-from .table import MAX_ROWS, refuse
+from .resample import REACH, UNIFORM, unwrap
+from .table import MAX_ROWS, Path, refuse
 
-_REACH = 1.5  # times a sensor's own step: samples further apart have a gap between them
-_EXACT = 0.01  # of the rows' step: a sample this close to a row belongs to the row
 _DISORDER = 0.01  # share of samples that may be late or repeated in an intact log
 
 
@@ -31,16 +28,9 @@ def in_order(t: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"] |
 
 
 def gyro_rows(
-    path: str | os.PathLike[str], rates: Series, rotors: Series, *, measured: bool
+    path: Path, rates: Series, rotors: Series, *, measured: bool
 ) -> tuple[Float[np.ndarray, " rows"], dict[str, np.ndarray]]:
-    """Use the gyro's samples as rows, and bring the rotors to them.
-
-    **Arguments:**
-
-    - `path`: the log, for error messages.
-    - `rates`: body rates p, q, r [rad/s].
-    - `rotors`: measured speeds [rad/s], or commands [0..1]; all finite.
-    - `measured`: whether `rotors` are measured speeds.
+    """Use the gyro's samples as rows, and bring the rotors to them: `measured` speeds [rad/s], or commands [0..1].
 
     **Returns:** the times of the rows [s], and the columns `t` (from 0), `p, q, r`, and `omega1..4` or `command1..4`.
 
@@ -61,8 +51,7 @@ def gyro_rows(
 def at_rows(rows: Float[np.ndarray, " rows"], series: Series) -> Float[np.ndarray, "rows columns"]:
     """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
 
-    Values are interpolated between neighbouring samples to the time of the row, with an error of second order in the
-    sensor's step, so that no value is early or late. Nothing is interpolated across a gap. Angles must be unwrapped.
+    Values are interpolated linearly to the time of the row, but not across a gap. Angles must be unwrapped.
     """
     out = np.full((rows.size, series.values.shape[1]), np.nan)
     step = float(np.median(np.diff(rows))) if rows.size > 1 else 0.0
@@ -78,24 +67,19 @@ def at_rows(rows: Float[np.ndarray, " rows"], series: Series) -> Float[np.ndarra
         left = right - 1
         right = np.minimum(right, t.size - 1)
         own_step = max(float(np.median(np.diff(t))) if t.size > 1 else 0.0, step)
-        joined = (t[left] <= time) & (time <= t[right]) & (t[right] - t[left] <= _REACH * own_step)
+        joined = (t[left] <= time) & (time <= t[right]) & (t[right] - t[left] <= REACH * own_step)
         out[at[joined], column] = np.interp(time, t, values)[joined]
         close = _nearest(t, time)
-        exact = ~joined & (np.abs(t[close] - time) <= _EXACT * step)
+        exact = ~joined & (np.abs(t[close] - time) <= UNIFORM * step)
         out[at[exact], column] = values[close[exact]]
     return out
 
 
 def rotor_rms(rows: Float[np.ndarray, " rows"], series: Series, *, measured: bool) -> Float[np.ndarray, "rows columns"]:
-    """Root mean square of each rotor's speed or command from each row to the next.
+    """Root mean square of each rotor's speed or command from each row to the next, so that its impulse is conserved.
 
-    **Arguments:**
-
-    - `rows`: times [s], none before the first sample of `series`.
-    - `series`: rotor speeds or commands, all finite.
-    - `measured`: measured speeds are interpolated linearly in their squares; commands are held until the next one.
-
-    Thrust and torque are proportional to the square, so each rotor's impulse is conserved.
+    Measured speeds are interpolated linearly in their squares; commands are held until the next one. No row lies before
+    the first sample of `series`.
     """
     squares = np.square(series.values)
     mean = (squares[:-1] + squares[1:]) / 2 if measured else squares[:-1]
@@ -117,7 +101,7 @@ def rotor_rms(rows: Float[np.ndarray, " rows"], series: Series, *, measured: boo
 def covered(rows: Float[np.ndarray, " rows"], t: Float[np.ndarray, " samples"]) -> Bool[np.ndarray, " rows"]:
     """Which rows lie between the first sample at `t` and one step after the last."""
     step = float(np.median(np.diff(t))) if t.size > 1 else 0.0
-    return (rows >= t[0]) & (rows <= t[-1] + _REACH * step)
+    return (rows >= t[0]) & (rows <= t[-1] + REACH * step)
 
 
 def euler_angles(quaternion: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "samples 3"]:

@@ -10,15 +10,14 @@ import numpy as np
 
 from ..errors import InputError
 
+Path = str | os.PathLike[str]
+
 MAX_ROWS = 5_000_000  # 83 minutes at 1 kHz; a longer flight does not fit in the memory of an ordinary machine
 
 
 class Table(NamedTuple):
     """Columns of a log. NaN means not measured; all other values are finite.
 
-    **Arguments:**
-
-    - `path`: the file.
     - `columns`: arrays of one length, with the names, units and frame of the flight CSV (see `jaxos4.logs.csv`).
     - `unknown`: names of the columns that the reader ignored.
     - `first_row`: the row of the file, counted from 1, that holds entry 0; `None` if the format has no rows.
@@ -26,7 +25,7 @@ class Table(NamedTuple):
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
     """
 
-    path: str | os.PathLike[str]
+    path: Path
     columns: dict[str, np.ndarray]
     unknown: tuple[str, ...] = ()
     first_row: int | None = 2
@@ -57,28 +56,25 @@ class LogFormat(NamedTuple):
     name: str
     label: str
     recognises: Callable[[bytes], bool]
-    read: Callable[[str | os.PathLike[str]], tuple[Table, tuple[str, ...]]]
+    read: Callable[[Path], tuple[Table, tuple[str, ...]]]
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike[str]) -> Iterator[TextIO]:
-    """Open a log as UTF-8 text. Bytes that cannot be decoded are escaped.
-
-    **Raises:** `InputError`, one line, if the file cannot be opened or read.
-    """
+def opened(path: Path) -> Iterator[TextIO]:
+    """Open a log as UTF-8 text, with other bytes escaped. Raises `InputError` if it cannot be opened or read."""
     with _explained(path), open(path, encoding="utf-8-sig", errors="surrogateescape", newline=None) as file:
         yield file
 
 
 @contextlib.contextmanager
-def opened_bytes(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def opened_bytes(path: Path) -> Iterator[BinaryIO]:
     """Open a log as bytes. Raises the errors of `opened`."""
     with _explained(path), open(path, "rb") as file:
         yield file
 
 
 @contextlib.contextmanager
-def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
+def _explained(path: Path) -> Iterator[None]:
     if "\0" in os.fspath(path):
         refuse(path, "is not a file name, because it contains a null character; give the path of a log")
     try:
@@ -95,22 +91,9 @@ def _explained(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def refuse(
-    path: str | os.PathLike[str],
-    what: str,
-    *,
-    row: int | None = None,
-    column: str | None = None,
-    kind: str = "column",
+    path: Path, what: str, *, row: int | None = None, column: str | None = None, kind: str = "column"
 ) -> NoReturn:
-    """Raise an `InputError` of one line.
-
-    **Arguments:**
-
-    - `path`: the file.
-    - `what`: what is wrong; what to do. No full stop at the end.
-    - `row`, `column`: the place in the file, if there is one.
-    - `kind`: "column" or "field".
-    """
+    """Raise an `InputError` of one line: the place, `what` is wrong and what to do, without its full stop."""
     place = ", ".join([f"row {row}"] * (row is not None) + [f"{kind} {printable(column or '')}"] * (column is not None))
     raise InputError(": ".join(filter(None, (printable(os.fspath(path)), place, what))) + ".")
 

@@ -37,7 +37,7 @@ import numpy as np
 from .._files import BROKEN
 from ..errors import InputError
 from .series import Series, at_rows, euler_angles, gyro_rows, in_order, unwrapped
-from .table import LogFormat, Table, printable, refuse
+from .table import LogFormat, Path, Table, printable, refuse
 from .ulog_messages import MAGIC, needed_messages
 
 TOPICS = (
@@ -72,7 +72,7 @@ class _Rotors(NamedTuple):
 class _Log(NamedTuple):
     """The decoded topics, each with its instances; the log's names of our columns; the notes."""
 
-    path: str | os.PathLike[str]
+    path: Path
     topics: dict[str, list[Fields]]
     names: dict[str, str]
     notes: list[str]
@@ -104,11 +104,8 @@ class _Log(NamedTuple):
         return None
 
 
-def read_ulog(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
-    """Read the columns of a PX4 log (listed in `jaxos4.logs.ulog`), and notes on what was assumed.
-
-    **Raises:** `InputError`, one line: file, topic and field, what is wrong and what to do.
-    """
+def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
+    """Read the columns of a PX4 log, and notes on what was assumed. Raises `InputError`."""
     log = _decoded(path)
     rates = log.vector(_RATES, ("p", "q", "r"))
     if rates is None:
@@ -127,29 +124,26 @@ def read_ulog(path: str | os.PathLike[str]) -> tuple[Table, tuple[str, ...]]:
     for names, series in others.items():
         if series is not None:
             columns.update(zip(names, at_rows(rows, series).T, strict=True))
-    log.notes.append(
-        f"rotors keep the log's numbers ({rotors.names[0]} is rotor 1): rotor_positions and rotor_spins must be in "
-        "the same order"
-    )
+    what = f"rotors keep the log's numbers ({rotors.names[0]} is rotor 1)"
+    log.notes.append(f"{what}: rotor_positions and rotor_spins must be in the same order")
     return Table(path, columns, first_row=None, names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
 ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(MAGIC[:4]), read_ulog)
 
 
-def _decoded(path: str | os.PathLike[str]) -> _Log:
-    needed = needed_messages(path, TOPICS)
-    notes = [f"the log ends abruptly: its last {needed.cut} bytes are ignored"] if needed.cut else []
+def _decoded(path: Path) -> _Log:
+    content, cut = needed_messages(path, TOPICS)
+    notes = [f"the log ends abruptly: its last {cut} bytes are ignored"] if cut else []
     try:
         from pyulog.core import ULog
         from pyulog.exceptions import ULogException
     except ImportError:
-        raise InputError(
-            f"{printable(os.fspath(path))}: reading a ULog file needs pyulog; install jaxos4[ulog]."
-        ) from None
+        name = printable(os.fspath(path))
+        raise InputError(f"{name}: reading a ULog file needs pyulog; install jaxos4[ulog].") from None
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            decoded = ULog(io.BytesIO(needed.content))
+            decoded = ULog(io.BytesIO(content))
     except (*BROKEN, ULogException) as error:
         refuse(path, f"cannot be decoded ({type(error).__name__}); copy the log again from the vehicle")
     if decoded.file_corruption:
@@ -204,9 +198,8 @@ def _outputs(log: _Log) -> _Rotors | None:
     series = max(found, key=lambda each: float(each.values.std(axis=0).min()))
     turning = series.values[series.values > 1]
     kind, (low, high) = ("DShot", _DSHOT) if (turning < _LEAST_PWM).any() else ("PWM", _PWM)
-    log.notes.append(
-        f"commands are actuator_outputs.output, {kind} {low:g}..{high:g}, taken as fractions of full-scale rotor speed"
-    )
+    what = f"{kind} {low:g}..{high:g}, taken as fractions of full-scale rotor speed"
+    log.notes.append(f"commands are actuator_outputs.output, {what}")
     series = Series(series.t, np.clip((series.values - low) / (high - low), 0.0, 1.0))
     return _Rotors(series, False, tuple(f"actuator_outputs.{name}" for name in names))
 

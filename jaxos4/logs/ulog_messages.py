@@ -8,13 +8,12 @@ Reference: the ULog file format in the PX4 user guide.
 """
 
 import math
-import os
 import re
 import struct
 from collections.abc import Collection
-from typing import BinaryIO, NamedTuple, NoReturn
+from typing import BinaryIO, NoReturn
 
-from .table import opened_bytes, printable, refuse
+from .table import Path, opened_bytes, printable, refuse
 
 MAGIC = b"ULog\x01\x12\x35"
 _MOST_FIELDS = 1024  # of one message, with those of arrays and nested messages; the largest of PX4 have about 200
@@ -27,15 +26,8 @@ _BASIC = {
 }  # fmt: skip
 
 
-class Messages(NamedTuple):
-    """A smaller ULog file with only the needed topics, and the number of bytes cut off at the end of the log."""
-
-    content: bytes
-    cut: int
-
-
-def needed_messages(path: str | os.PathLike[str], topics: Collection[str]) -> Messages:
-    """The messages of `topics`, and the formats that they need.
+def needed_messages(path: Path, topics: Collection[str]) -> tuple[bytes, int]:
+    """A smaller ULog file with only the needed `topics`, and the number of bytes cut off at the end of the log.
 
     A loss of power ends a log in the middle of a message or fills its end with zeros. All messages before are kept.
 
@@ -48,7 +40,7 @@ def needed_messages(path: str | os.PathLike[str], topics: Collection[str]) -> Me
 class _Walk:
     """One pass through a file."""
 
-    def __init__(self, path: str | os.PathLike[str], topics: Collection[bytes]):
+    def __init__(self, path: Path, topics: Collection[bytes]):
         self.path, self.topics = path, topics
         self.position = 0
         self.formats: dict[bytes, bytes] = {}
@@ -58,7 +50,7 @@ class _Walk:
         self.wanted: set[int] = set()
         self.others: set[int] = set()
 
-    def through(self, file: BinaryIO) -> Messages:
+    def through(self, file: BinaryIO) -> tuple[bytes, int]:
         start = file.read(16)
         if not start.startswith(MAGIC):
             refuse(self.path, "is not a ULog file of version 1; give a .ulg file")
@@ -81,7 +73,7 @@ class _Walk:
                 break
             self._take(kind, header, body)
             self.position += len(header) + length
-        return Messages(bytes(start + self.definitions + self.data), cut)
+        return bytes(start + self.definitions + self.data), cut
 
     def _take(self, kind: int, header: bytes, body: bytes) -> None:
         if kind == ord("D"):

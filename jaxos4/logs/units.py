@@ -24,24 +24,20 @@ class Limit(NamedTuple):
 
 _TIME = Limit(1e11, "s", "t is in seconds: if these are milli-, micro- or nanoseconds, divide")
 _SPEED = Limit(1e5, "rad/s", "rotor speeds are in rad/s: if these are rpm, divide by 9.549")
-_POSITION = Limit(1e6, "m", "positions are in metres from a point near the flight; subtract an offset")
-_VELOCITY = Limit(1e3, "m/s", "velocities are in m/s: if these are mm/s, divide by 1000")
-_RATE = Limit(60.0, "rad/s", "it looks like deg/s: divide by 57.3")
-_ROLL = Limit(2 * math.pi, "rad", "it looks like degrees: divide by 57.3")
-_PITCH = Limit(math.nextafter(math.pi / 2, 0), "rad", "pitch lies within +-pi/2: if this is in degrees, divide by 57.3")
 _YAW = Limit(1e4, "rad", "it looks like degrees: divide by 57.3")
-_FORCE = Limit(1e3, "m/s^2", "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665")
+_PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
+_FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
 
 LIMITS = {
     "t": _TIME,
     **dict.fromkeys(("omega1", "omega2", "omega3", "omega4"), _SPEED),
-    **dict.fromkeys(("x", "y", "z"), _POSITION),
-    **dict.fromkeys(("vx", "vy", "vz"), _VELOCITY),
-    **dict.fromkeys(("p", "q", "r"), _RATE),
-    "phi": _ROLL,
-    "theta": _PITCH,
+    **dict.fromkeys("xyz", Limit(1e6, "m", "positions are in metres from a point near the flight; subtract an offset")),
+    **dict.fromkeys(("vx", "vy", "vz"), Limit(1e3, "m/s", "velocities are in m/s: if these are mm/s, divide by 1000")),
+    **dict.fromkeys("pqr", Limit(60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
+    "phi": Limit(2 * math.pi, "rad", _YAW.advice),
+    "theta": Limit(math.nextafter(math.pi / 2, 0), "rad", _PITCH),
     "psi": _YAW,
-    **dict.fromkeys(("ax", "ay", "az"), _FORCE),
+    **dict.fromkeys(("ax", "ay", "az"), Limit(1e3, "m/s^2", _FORCE)),
 }
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
 _ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
@@ -55,24 +51,20 @@ def check_units(table: Table) -> None:
     """Refuse numbers beyond `LIMITS`, speeds and commands out of range, and angles that contradict their rates.
 
     Roll may pass 2 pi if its rate agrees: the vehicle made a flip.
-
-    **Raises:** `InputError`.
     """
     columns = table.columns
-    ratios = {
-        name: scale_ratio(*(columns[c] for c in ("t", name, rate)))
-        for name, rate in _ANGLES
-        if rate in columns and name in columns
-    }
+    flips = False
     for name, rate in _ANGLES:
-        ratio = ratios.get(name)
-        if ratio is not None and 1 / _SPREAD < ratio / DEGREES < _SPREAD:
+        ratio = scale_ratio(columns["t"], columns[name], columns[rate]) if {name, rate} <= columns.keys() else None
+        if ratio is None:
+            continue
+        flips |= name == "phi" and 1 / 3 < ratio < 3
+        if 1 / _SPREAD < ratio / DEGREES < _SPREAD:
             what = table.remedy or "it looks like degrees, divide by 57.3"
             table.refuse(f"changes {ratio:.3g} times as fast as {rate}: {what}", column=name)
-        if ratio is not None and 1 / _SPREAD < ratio * DEGREES < _SPREAD:
+        if 1 / _SPREAD < ratio * DEGREES < _SPREAD:
             what = table.remedy or "it looks like deg/s, divide by 57.3"
             table.refuse(f"is {1 / ratio:.3g} times as fast as {name} changes: {what}", column=rate)
-    flips = ratios.get("phi") is not None and 1 / 3 < (ratios["phi"] or 0) < 3
     for name, values in columns.items():
         limit = LIMITS.get(name)
         if limit is None:
@@ -92,10 +84,7 @@ def check_units(table: Table) -> None:
 
 
 def check_time(table: Table) -> float:
-    """The median time between rows [s].
-
-    **Raises:** `InputError` if a time is missing, does not increase, or cannot be in seconds.
-    """
+    """The median time between rows [s]. Refuses a time that is missing, does not increase, or is not in seconds."""
     t = table.columns["t"]
     index = _first(np.isnan(t))
     if index is not None:
@@ -116,20 +105,13 @@ def check_time(table: Table) -> float:
     if dt < SHORTEST_STEP:
         table.refuse(f"has rows {dt:.3g} s apart, less than a microsecond; t is in seconds: multiply", column="t")
     if dt > LONGEST_STEP:
-        table.refuse(
-            f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide",
-            column="t",
-        )
+        what = f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide"
+        table.refuse(what, column="t")
     return dt
 
 
 def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | None:
     """How much faster an angle changes than its rate, or None if the flight does not show it.
-
-    **Arguments:**
-
-    - `t`: [s], increasing.
-    - `angle`, `rate`: in unknown units. NaN means not measured.
 
     Increments of the angle over 0.2 s are compared with the integral of the rate, so that noise averages out. In a
     steep attitude the axes are coupled, and the increments no longer resemble the integral: the result is then None.
@@ -159,26 +141,24 @@ def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | N
     return sizes[0] / sizes[1]
 
 
-def force_note(force: np.ndarray) -> str | None:
-    """A note if specific force [m/s^2], shape (samples, 3), seems to be in multiples of g."""
+def force_note(force: np.ndarray) -> list[str]:
+    """A note, if specific force [m/s^2], shape (samples, 3), seems to be in multiples of g."""
     size = np.sqrt((force**2).sum(axis=1))
     size = size[np.isfinite(size)]
     if size.size == 0 or not 0.5 < np.median(size) < 2:
-        return None
-    return f"ax, ay, az have a median magnitude of {np.median(size):.2g} m/s^2: if they are in g, multiply by 9.80665"
+        return []
+    return [f"ax, ay, az have a median magnitude of {np.median(size):.2g} m/s^2: if they are in g, multiply by 9.80665"]
 
 
-def thrust_note(ratio: float) -> str | None:
-    """A note if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
+def thrust_note(ratio: float) -> list[str]:
+    """A note, if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
     if 1 / 25 < ratio < 25:
-        return None
+        return []
     if ratio == 0:
-        return "the rotors do not turn for at least half of the flight: keep only the part in the air"
+        return ["the rotors do not turn for at least half of the flight: keep only the part in the air"]
     unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
-    return (
-        f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight: check the airframe, and whether "
-        f"rotor speeds are in {unit}"
-    )
+    what = f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight"
+    return [f"{what}: check the airframe, and whether rotor speeds are in {unit}"]
 
 
 def _check_command(table: Table, name: str) -> None:

@@ -13,10 +13,8 @@ from .._custom_types import Key, Scalar
 
 # Features grow linearly up to this size and logarithmically beyond: flights that nearly diverge have huge features.
 _LINEAR = 4.0
-# Width and depth of the perceptron that predicts the size of the error.
-_SPREAD_WIDTH, _SPREAD_DEPTH = 32, 2
-# Limit of the logarithm of that size.
-_LARGEST_LOGARITHM = 7.0
+# The perceptron that predicts the size of the error: its width and depth, and the limit of its logarithm.
+_SPREAD_WIDTH, _SPREAD_DEPTH, _LARGEST_LOGARITHM = 32, 2, 7.0
 
 
 class Scaling(eqx.Module):
@@ -52,7 +50,7 @@ class CMAC(eqx.Module):
     """Tile coding (cerebellar model articulation controller): shifted grids of cells cover every pair of inputs.
 
     The output is a sum over the pairs. Each pair contributes the mean, over its grids, of the entry of the cell that
-    holds the two inputs. A grid over all inputs at once would need a number of cells that grows exponentially.
+    holds the two inputs.
     """
 
     tables: Float[Array, "pairs tilings cells cells out"]
@@ -86,10 +84,9 @@ class Regressor(eqx.Module):
         def perceptron(width: int, depth: int, key: Key) -> eqx.nn.MLP:
             return eqx.nn.MLP(inputs, unknowns, width, depth, activation=jax.nn.silu, dtype=float, key=key)
 
+        tiles = approximator == "cmac"
         self.skip = skip
-        self.approximator = (
-            CMAC(inputs, unknowns) if approximator == "cmac" else perceptron(width, depth, approximator_key)
-        )
+        self.approximator = CMAC(inputs, unknowns) if tiles else perceptron(width, depth, approximator_key)
         self.spread = perceptron(_SPREAD_WIDTH, _SPREAD_DEPTH, spread_key)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> NetworkOutput:
@@ -115,8 +112,7 @@ def squared_error(
 ) -> Scalar:
     """The loss of one flight: mean square error in units of `Scaling.bound`, plus the likelihood of the spread.
 
-    The likelihood trains the spread alone: its gradient does not reach `u`. If errors were weighted by a spread that
-    is learnt at the same time, training could settle at a bad answer with a large spread.
+    The likelihood trains the spread alone; otherwise training could settle at a bad answer with a large spread.
     """
     output = regressor(features, scale, scaling)
     error = (output.u - u) / scaling.bound(scale)

@@ -17,10 +17,8 @@ from .training import Pair, draw_many
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
 LEVELS = np.array([2 * _NORMAL.cdf(z) - 1 for z in np.linspace(_NORMAL.inv_cdf(0.75), _NORMAL.inv_cdf(0.9995), 28)])
-CHUNK = 1000
-"""Flights that are simulated at once."""
-# Noise scales at which intervals are calibrated, evenly spaced in the logarithm.
-_SCALES = 9
+CHUNK = 1000  # flights that are simulated at once
+_SCALES = 9  # noise scales at which intervals are calibrated, evenly spaced in the logarithm
 
 
 class ErrorTable(NamedTuple):
@@ -44,12 +42,11 @@ class ErrorTable(NamedTuple):
 
         def interpolate(table):
             flat = table.reshape(table.shape[0], -1)
-            return jax.vmap(lambda column: jnp.interp(jnp.log(scale), knots, column), in_axes=1)(flat).reshape(
-                table.shape[1:]
-            )
+            values = jax.vmap(lambda column: jnp.interp(jnp.log(scale), knots, column), in_axes=1)(flat)
+            return values.reshape(table.shape[1:])
 
-        rms, correlation, factors, simultaneous = self[1:]
-        return interpolate(rms), interpolate(correlation), interpolate(factors), interpolate(simultaneous)
+        rms, correlation, factors, simultaneous = map(interpolate, self[1:])
+        return rms, correlation, factors, simultaneous
 
 
 def uncalibrated(noise: tuple[float, float], parameters: int) -> ErrorTable:

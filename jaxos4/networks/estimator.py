@@ -31,8 +31,7 @@ APPROXIMATORS = ("mlp", "cmac")
 _MOST_FEATURES = 6000
 _MOST_STEPS = 1_000_000
 _WARM_UP_STEPS = 200
-# The learning rate at the end of training, relative to the largest.
-_LAST_RATE = 1e-3
+_LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
 
 
 class NetworkEstimator(eqx.Module):
@@ -133,12 +132,7 @@ class NetworkEstimator(eqx.Module):
 
     @eqx.filter_jit
     def untrained(self, problem: ShootingProblem, bracket: Bracket, key: Key) -> TrainedNetwork:
-        """The network before training: inputs and outputs scaled, its linear map fitted, its intervals uncalibrated.
-
-        **Arguments:**
-
-        - `problem`: has the channels of the settings.
-        """
+        """The network before training, for a problem with its channels: scaled, with its linear map fitted."""
         scales = as_float(np.asarray(self.noise))
         features = FEATURES[self.features].of(problem, Coordinates.of(problem, bracket, scales[1]))
         first_key, sample_key = jax.random.split(key)
@@ -157,6 +151,5 @@ class NetworkEstimator(eqx.Module):
                 raise ValueError(f"`bracket` of {name} must have a positive, finite width, got [{lower}, {upper}].")
         numbers = problem.flight.time.shape[0] * CHANNELS[self.channels]
         if self.features == "raw" and numbers > _MOST_FEATURES:
-            raise ValueError(
-                f'`features` "raw" of this flight are {numbers} numbers, more than {_MOST_FEATURES}: use "score".'
-            )
+            what = f"of this flight are {numbers} numbers, more than {_MOST_FEATURES}"
+            raise ValueError(f'`features` "raw" {what}: use "score".')

@@ -20,11 +20,7 @@ from ..shooting import FASTEST, ShootingProblem
 
 
 class FlightFeatures(NamedTuple):
-    """The features of a measured flight.
-
-    - `values`: the network's input.
-    - `inflation`: for each parameter, the factor by which missing samples enlarge its standard deviation.
-    """
+    """The features of a flight, and the factor by which missing samples enlarge each standard deviation."""
 
     values: Float[Array, " features"]
     inflation: Parameters
@@ -32,8 +28,6 @@ class FlightFeatures(NamedTuple):
 
 class Coordinates(eqx.Module):
     """Bracket coordinates of the unknowns of a problem.
-
-    **Arguments:**
 
     - `center`, `width`: in the unknowns' units; parameters first, then the initial state if it is free.
     - `first_state`: the initial state at the center, free or known, in cascade order.
@@ -45,12 +39,7 @@ class Coordinates(eqx.Module):
 
     @classmethod
     def of(cls, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> "Coordinates":
-        """Coordinates of a problem's unknowns in a bracket.
-
-        **Arguments:**
-
-        - `noise`: the largest noise scale. It widens the bracket of a free initial state, whose center is measured.
-        """
+        """Coordinates of a problem's unknowns. The largest `noise` scale widens the bracket of a free initial state."""
         first_state, off = problem.first_state()
         free = problem.windows * problem.free_size
         sigma = jnp.tile(problem.sigma[CASCADE_ORDER[: problem.size]], problem.windows)
@@ -69,11 +58,9 @@ class Coordinates(eqx.Module):
 
 
 class AbstractFeatures(eqx.Module):
-    """Features prepared for one input, start, sampling and bracket.
+    """Features prepared for one input, start, sampling and bracket; `reference` is the trajectory at its center.
 
-    - `problem`: the problem of training. Of its states only the first counts, and which samples were measured.
-    - `coordinates`: bracket coordinates of the unknowns.
-    - `reference`: the trajectory at the bracket's center.
+    Only the first state of `problem` is used, and which samples were measured.
     """
 
     problem: eqx.AbstractVar[ShootingProblem]
@@ -106,9 +93,7 @@ class AbstractFeatures(eqx.Module):
         mismatch = self._weighted(problem, problem.measured())
         return jnp.where(_measured(self.problem), mismatch, 0.0)
 
-    def _weighted(
-        self, problem: ShootingProblem, trajectory: Float[Array, "samples size"]
-    ) -> Float[Array, "samples size"]:
+    def _weighted(self, problem: ShootingProblem, trajectory: Array) -> Float[Array, "samples size"]:
         weight = 1 / self.problem.sigma[self.problem.columns]
         return jnp.where(_measured(problem), weight * (trajectory - self.reference), 0.0)
 
@@ -129,13 +114,11 @@ class Score(AbstractFeatures):
 
     @classmethod
     def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Score":
-        """Prepares the features for a problem's inputs, start and missing samples."""
+        """Prepares the features."""
         reference, size = _reference(problem, coordinates), coordinates.center.shape[0]
         bare = cls(problem, coordinates, reference, jnp.zeros((*reference.shape, size)), jnp.eye(size))
         jacobian = jax.jacfwd(bare._deviation)(jnp.zeros(size))
-        return eqx.tree_at(
-            lambda f: (f.jacobian, f.noise_factor), bare, (jacobian, invert_factor(cholesky(_squares(jacobian))).T)
-        )
+        return cls(problem, coordinates, reference, jacobian, _noise_factor(jacobian))
 
     @property
     def size(self) -> int:
@@ -145,7 +128,7 @@ class Score(AbstractFeatures):
     def __call__(self, problem: ShootingProblem) -> FlightFeatures:
         """See `AbstractFeatures`. Samples that were measured in training may be missing: they only cost precision."""
         jacobian = jnp.where(_measured(problem)[:, :, None], self.jacobian, 0.0)
-        noise_factor = invert_factor(cholesky(_squares(jacobian))).T
+        noise_factor = _noise_factor(jacobian)
         step = noise_factor @ (noise_factor.T @ jnp.einsum("tcu,tc->u", jacobian, self._mismatch(problem)))
         inflation = jnp.linalg.norm(noise_factor, axis=1) / jnp.linalg.norm(self.noise_factor, axis=1)
         return FlightFeatures(step, inflation[: len(self.problem.model.parameter_names)])
@@ -165,7 +148,7 @@ class Raw(AbstractFeatures):
 
     @classmethod
     def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Raw":
-        """Prepares the features for a problem's inputs, start and missing samples."""
+        """Prepares the features."""
         return cls(problem, coordinates, _reference(problem, coordinates))
 
     @property
@@ -198,5 +181,6 @@ def _measured(problem: ShootingProblem) -> Bool[Array, "samples size"]:
     return ~jnp.isnan(problem.measured())
 
 
-def _squares(jacobian: Float[Array, "samples size unknowns"]) -> Float[Array, "unknowns unknowns"]:
-    return jnp.einsum("tcu,tcv->uv", jacobian, jacobian)
+def _noise_factor(jacobian: Float[Array, "samples size unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    """A factor of F^-1, the covariance of the score."""
+    return invert_factor(cholesky(jnp.einsum("tcu,tcv->uv", jacobian, jacobian))).T

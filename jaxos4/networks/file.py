@@ -48,12 +48,8 @@ def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
     }
     airframe = problem.model.airframe
     arrays = {f"airframe.{f.name}": getattr(airframe, f.name) for f in dataclasses.fields(airframe)}
-    arrays |= {
-        "time": problem.flight.time,
-        "omega": problem.flight.omega,
-        "states": problem.flight.states,
-        "sigma": problem.sigma,
-    }
+    arrays |= {name: getattr(problem.flight, name) for name in ("time", "omega", "states")}
+    arrays["sigma"] = problem.sigma
     if problem.initial_state is not None:
         arrays["initial_state"] = problem.initial_state
     without_problem = eqx.tree_at(lambda n: n.features.problem, network, None)
@@ -103,9 +99,8 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
         windows=header["windows"],
     )
     blank = eqx.filter_eval_shape(settings.untrained, problem, Bracket.default(problem.model), jax.random.key(0))
-    blank = eqx.tree_at(lambda n: n.features.problem, blank, problem)
     history = jax.ShapeDtypeStruct((header["checks"], 2), float)
-    blank = eqx.tree_at(lambda n: n.history, blank, history)
+    blank = eqx.tree_at(lambda n: (n.features.problem, n.history), blank, (problem, history))
 
     def fill(path: tuple, leaf: Any) -> Any:
         if not isinstance(leaf, jax.ShapeDtypeStruct):
@@ -120,9 +115,9 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
 
     network = jax.tree_util.tree_map_with_path(fill, blank)
     scaling, coordinates = network.scaling, network.features.coordinates
-    for positive in (*jax.tree.leaves(scaling), coordinates.width, airframe.mass, airframe.inertia):
-        if not (np.asarray(positive) > 0).all():
-            raise ValueError("a scale is not positive")
+    scales = (*jax.tree.leaves(scaling), coordinates.width, airframe.mass, airframe.inertia)
+    if not all((np.asarray(scale) > 0).all() for scale in scales):
+        raise ValueError("a scale is not positive")
     return network
 
 

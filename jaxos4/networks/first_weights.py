@@ -1,5 +1,6 @@
 """A network before training: measured scales, the best linear map, random first weights for the rest."""
 
+import functools
 import math
 
 import equinox as eqx
@@ -16,21 +17,14 @@ from .features import AbstractFeatures
 from .training import draw_many
 
 # Flights for each feature, and the ridge, of the fit of the linear map.
-_PER_FEATURE = 4
-_RIDGE = 1e-6
-# Random numbers that are drawn at once.
-_DRAWN = 1024
+_PER_FEATURE, _RIDGE = 4, 1e-6
+_DRAWN = 1024  # random numbers at once
 
 
 def scaling_and_linear_map(
     features: AbstractFeatures, scales: Float[Array, "2"], key: Key
 ) -> tuple[Scaling, Float[Array, "unknowns features"]]:
-    """Measures the size of the features on simulated flights, and fits the best linear map from them to the unknowns.
-
-    **Arguments:**
-
-    - `scales`: the lowest and highest noise scale.
-    """
+    """Measures the features' sizes on simulated flights, and fits the best linear map from features to unknowns."""
     problem, coordinates = features.problem, features.coordinates
     count = len(problem.model.parameter_names)
     start = coordinates.split(jnp.zeros_like(coordinates.center), count)
@@ -67,14 +61,12 @@ def first_regressor(
     def arrays(regressor: Regressor) -> list:
         return [array for layer in layers(regressor) for array in (layer.weight, layer.bias)]
 
-    def make(key: Key) -> Regressor:
-        return Regressor(linear_map, approximator, width=width, depth=depth, key=key)
+    def zero(leaf):
+        return jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
 
     # All arrays outside the layers begin at 0, except the linear map.
-    blank = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf,
-        eqx.filter_eval_shape(make, key),
-    )
+    make = functools.partial(Regressor, linear_map, approximator, width=width, depth=depth)
+    blank = jax.tree.map(zero, eqx.filter_eval_shape(make, key=key))
     limits = [1 / math.sqrt(layer.weight.shape[1]) for layer in layers(blank) for _ in ("weight", "bias")]
     shapes = [array.shape for array in arrays(blank)]
     ends = np.cumsum([math.prod(shape) for shape in shapes])

@@ -12,14 +12,11 @@ from .training import Progress
 @contextlib.contextmanager
 def training_bar(steps: int) -> Iterator[Progress]:
     """Shows a bar on the error output while the block runs; shows nothing unless that is a terminal."""
-    columns = (
-        TextColumn("training the network"),
-        BarColumn(),
-        TextColumn("loss {task.fields[loss]}"),
-        TimeRemainingColumn(),
-    )
+    name, loss = TextColumn("training the network"), TextColumn("loss {task.fields[loss]}")
     console = Console(stderr=True)
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Bar(
+        name, BarColumn(), loss, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
         task = bar.add_task("", total=steps, loss="-")
 
         def update(done: int, steps: int, loss: float) -> None:

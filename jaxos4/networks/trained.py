@@ -23,10 +23,8 @@ from .features import AbstractFeatures
 if TYPE_CHECKING:
     from .estimator import NetworkEstimator
 
-# If missing samples enlarge any standard deviation by more than this factor, the problem is another one.
-_LARGEST_INFLATION = 2.0
-# Numbers within this relative tolerance are equal: files round them.
-_SAME = 1e-6
+_LARGEST_INFLATION = 2.0  # if missing samples enlarge a standard deviation by more, the problem is another one
+_SAME = 1e-6  # relative tolerance of equal numbers: files round them
 
 
 class TrainedNetwork(AbstractEstimator):
@@ -58,7 +56,7 @@ class TrainedNetwork(AbstractEstimator):
 
     @property
     def problem(self) -> ShootingProblem:
-        """The problem of training: model, inputs, sampling, sigma, and which samples were measured."""
+        """The problem of training."""
         return self.features.problem
 
     @property
@@ -70,11 +68,9 @@ class TrainedNetwork(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight. The network looks in its own bracket; `bracket` must only be valid.
 
-        **Returns:** an estimate whose result is
-
-        - `at_bound` if the answer lies outside the bracket of training by more than its interval;
-        - `unidentifiable` if the interval of a parameter is hardly narrower than the bracket;
-        - `network_mismatch` if the flight has more noise than in training, or too many missing samples.
+        **Returns:** an estimate, whose result is `at_bound` if the answer lies outside the bracket of training by more
+        than its interval, `unidentifiable` if the interval of a parameter is hardly narrower than the bracket, and
+        `network_mismatch` if the flight has more noise than in training, or too many missing samples.
 
         **Raises:** `ValueError` if the network was trained for another problem, with what differs. Inside `jit` or
         `vmap`, numbers that differ give the result `network_mismatch` instead.

@@ -24,12 +24,9 @@ CHECK = 250
 Progress = Callable[[int, int, float], None]
 """Called at every check with the steps done, the number of steps, and the validation loss."""
 
-# A loss is an improvement if it is lower by this share.
-_IMPROVEMENT = 1e-4
-# The loss is in units of the noise: the worst answer inside a bracket is far below this.
-_DIVERGED = 1e15
-# The smallest share of simulated flights that must not diverge.
-_FLYABLE = 0.01
+_IMPROVEMENT = 1e-4  # a loss is an improvement if it is lower by this share
+_DIVERGED = 1e15  # in units of the noise; the worst answer inside a bracket has a far lower loss
+_FLYABLE = 0.01  # the smallest share of simulated flights that must not diverge
 
 Network = TypeVar("Network", bound=eqx.Module)
 
@@ -77,17 +74,10 @@ def train(
     key: Key,
     progress: Progress | None = None,
 ) -> tuple[Network, Float[np.ndarray, "checks 2"]]:
-    """Trains a network, and returns it as it was at the check with the best validation loss.
+    """Trains a network on the `loss` of one flight; flights that diverge do not count.
 
-    **Arguments:**
-
-    - `loss`: the loss of one flight. Flights that diverge do not count.
-    - `scales`: the lowest and highest noise scale.
-    - `batch`, `steps`: simulated flights in a step, and the number of steps.
-    - `validation`: number of flights for validation.
-    - `patience`: training stops after this number of checks without an improvement.
-
-    **Returns:** the network, and the losses of training and validation at every check.
+    **Returns:** the network as it was at the check with the best validation loss, and the losses of training and
+    validation at every check.
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
@@ -137,10 +127,8 @@ def train(
 def _check_trainable(held_out: Pair, weights: PyTree) -> None:
     flyable = np.isfinite(np.asarray(held_out.features)).all(axis=1).mean()
     if not flyable > _FLYABLE:
-        raise TrainingError(
-            f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end: narrow the "
-            "bracket, or shorten the flight."
-        )
+        what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
+        raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(weights)):
         raise TrainingError(
             "the network's first weights are not finite, because the flight at the bracket's center diverges or too "

@@ -7,6 +7,7 @@ The paper names the method but does not give its steps; the steps here are our c
 - `view`: what a sweep sees when it looks around; `directions`: where it can go.
 - `brackets`: how wide it searches along each direction.
 - `bisection`: how it halves a bracket, and moves along all directions in turn.
+- `progress`: what it remembers from sweep to sweep and from stage to stage.
 """
 
 from .estimator import DIRECTIONS as DIRECTIONS, IBSS as IBSS

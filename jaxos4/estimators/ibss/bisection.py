@@ -14,7 +14,7 @@ from .view import View
 
 
 class Moves(NamedTuple):
-    """Where a sweep has come to, and for each direction: its step, the prediction's error, and whether to grow.
+    """Where a sweep has come to, and for each direction its step, the prediction's error, and whether to grow.
 
     `at_end`: the search ended at an end of its bracket that was not a limit of the unknowns.
     """
@@ -32,10 +32,10 @@ def move_along_all(
     nothing = jnp.zeros_like(view.unknowns)
     moves = Moves(view.unknowns, nothing, nothing, nothing.astype(bool))
     forcing_parameters = len(stage.problem.model.forcing_parameters)
-    # Whitened directions change the forcing only at the end of the list; recomputing it for the others would be waste.
-    first = stage.size - forcing_parameters if whitened or not forcing_parameters else 0
+    # Whitened directions change the forcing only at the end of the list: it is recomputed only for those.
+    unchanged = stage.size - forcing_parameters if whitened or not forcing_parameters else 0
     fixed = view.rows._replace(forcing_tangents=None)
-    for begin, end, rows_at in ((0, first, lambda _: fixed), (first, stage.size, stage.with_forcing)):
+    for begin, end, rows_at in ((0, unchanged, lambda _: fixed), (unchanged, stage.size, stage.with_forcing)):
         if begin < end:
             along = functools.partial(_move_along, stage, view, brackets, rows_at, halvings)
             moves = jax.lax.fori_loop(begin, jnp.where(stay, begin, end), along, moves)

@@ -9,13 +9,10 @@ from ..._custom_types import Scalar
 from .stage import Limits
 
 # The first sweep goes at most this many of the start's standard deviations, in brackets of this share of them.
-_OPENING = 4.0
-_FIRST = 0.05
-# A later bracket is this many times as wide as the last predictions were off; the least error is this share of the way.
-_SAFETY = 2.0
-_LEAST = 0.01
-# A bracket whose search ended at one of its ends grows by this factor.
-_GROWTH = 4.0
+_OPENING, _FIRST = 4.0, 0.05
+# A later bracket is the last relative error of the predictions, at least the second number, times the first.
+_SAFETY, _LEAST = 2.0, 0.01
+GROWTH = 4.0  # of a bracket whose search ended at one of its ends
 
 
 class Brackets(NamedTuple):
@@ -37,14 +34,11 @@ def open_brackets(
     return Brackets(jnp.where(first, _FIRST * opening, later), jnp.where(first, opening, jnp.inf))
 
 
-def grow(growth: Float[Array, "windows n"], at_end: Bool[Array, "windows n"]) -> Float[Array, "windows n"]:
-    """The factor by which the next brackets are wider than the predictions' errors ask for."""
-    return jnp.where(at_end, _GROWTH * growth, 1.0)
-
-
-def relative_error(errors: Float[Array, "windows n"], steps: Float[Array, "windows n"], finest: Scalar) -> Scalar:
+def relative_error(
+    errors: Float[Array, "windows n"], steps: Float[Array, "windows n"], smallest_step: Scalar
+) -> Scalar:
     """How far the predicted steps were off, as a share of the longest step, with a margin for the next sweep."""
-    share = _SAFETY * jnp.abs(errors).max() / jnp.maximum(jnp.abs(steps).max(), finest)
+    share = _SAFETY * jnp.abs(errors).max() / jnp.maximum(jnp.abs(steps).max(), smallest_step)
     return jnp.clip(share, _LEAST, 1.0)
 
 

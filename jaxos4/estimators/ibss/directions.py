@@ -13,13 +13,9 @@ def whitened_directions(
 ) -> tuple[Float[Array, "windows n n"], Float[Array, "windows n n"]]:
     """A factor A of the information A A^T, and the directions: the columns of A^-T, along which the cost is separable.
 
-    The columns of the initial state come first, so that a step along a parameter carries the initial states to where
-    they fit best. The columns of `forcing_parameters`, the parameters that the forcing depends on, come last: all
-    directions before them leave the forcing unchanged.
-
-    **Arguments:**
-
-    - `count`: the first `count` unknowns are the parameters, which all windows share.
+    The first `count` unknowns are the parameters, which all windows share. The columns of the initial state come first,
+    so that a step along a parameter carries the initial states to where they fit best. The columns of
+    `forcing_parameters`, the parameters that the forcing depends on, come last: no other direction changes the forcing.
     """
     if not forcing_parameters:
         factor = joint_factor(information, count)

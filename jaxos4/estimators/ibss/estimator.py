@@ -24,10 +24,10 @@ from ...linalg import covariance_of_shared, covariances
 from ...models.state import CHANNELS
 from ...shooting import Curvature, ShootingProblem, Shot
 from .bisection import move_along_all
-from .brackets import grow, open_brackets, relative_error
+from .brackets import GROWTH, open_brackets, relative_error
 from .progress import Progress, Search, record_brackets
 from .stage import Limits, Stage, join, keep_first, make_stage, misfit, prior_std
-from .view import View, look_around
+from .view import look_around
 
 DIRECTIONS = ("whitened", "coordinate")
 
@@ -121,31 +121,31 @@ class IBSS(AbstractEstimator):
         - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
         """
         check_bracket(problem, bracket)
-        names = problem.model.parameter_names
-        if start is not None and jnp.shape(start) != (len(names),):
-            raise ValueError(f"`start` must hold {len(names)} parameters, got shape {jnp.shape(start)}.")
+        count = len(problem.model.parameter_names)
+        if start is not None and jnp.shape(start) != (count,):
+            raise ValueError(f"`start` must hold {count} parameters, got shape {jnp.shape(start)}.")
         usable = bracket.usable
         start = usable.center if start is None else as_float(start)
         skip = jnp.zeros((), dtype=bool) if skip is None else skip
         progress = self._begin(problem, usable, start, spread, skip=skip)
 
-        def fit(channels: str, progress: Progress, share: Scalar) -> tuple[Progress, Curvature]:
+        def fit_part(channels: str, progress: Progress, share: Scalar) -> tuple[Progress, Curvature]:
             part = problem.restrict(channels)
             stage = make_stage(part, keep_first(share, part.rows()), usable, self._limits(part, usable))
             last = (channels == problem.channels) & (share == 1)
-            return self._fit(stage, progress._replace(done=skip), last=last)
+            return self._fit_stage(stage, progress._replace(done=skip), last=last)
 
         everything = as_float(1.0)
         if self.directions == "coordinate" or not cascade:
-            return self._finish(problem, bracket, *fit(problem.channels, progress, everything))
+            return self._finish(problem, bracket, *fit_part(problem.channels, progress, everything))
         # A window is short enough as it is.
         shares = jnp.asarray((*_HORIZONS, 1.0) if problem.windows == 1 else (1.0,), dtype=float)
         # One scan, so that the search against the rates is compiled once.
-        progress, curvatures = jax.lax.scan(lambda p, share: fit("rates", p, share), progress, shares)
+        progress, curvatures = jax.lax.scan(lambda p, share: fit_part("rates", p, share), progress, shares)
         curvature = jax.tree.map(lambda c: c[-1], curvatures)
         for channels, size in CHANNELS.items():
             if CHANNELS["rates"] < size <= problem.size:
-                progress, curvature = fit(channels, progress, everything)
+                progress, curvature = fit_part(channels, progress, everything)
         return self._finish(problem, bracket, progress, curvature)
 
     def _begin(
@@ -172,8 +172,8 @@ class IBSS(AbstractEstimator):
         reach, far = self.reach * bracket.half_width, jnp.full(problem.free_size, jnp.inf)
         return jnp.concatenate([bracket.center - reach, -far]), jnp.concatenate([bracket.center + reach, far])
 
-    def _fit(self, stage: Stage, progress: Progress, *, last: Bool[Array, ""]) -> tuple[Progress, Curvature]:
-        """One stage: sweeps until little is left to go; the last stage down to `tolerance`, the others coarsely."""
+    def _fit_stage(self, stage: Stage, progress: Progress, *, last: Bool[Array, ""]) -> tuple[Progress, Curvature]:
+        """Sweeps until little is left to go; the last stage down to `tolerance`, the others coarsely."""
         size, windows = stage.size, stage.problem.windows
         zero, square = jnp.zeros((windows,), dtype=float), jnp.zeros((windows, size, size), dtype=float)
         unknowns, spread = progress.unknowns[:, :size], progress.spread[:, :size, :size]
@@ -181,7 +181,7 @@ class IBSS(AbstractEstimator):
             unknowns=unknowns,
             curvature=Curvature(Shot(zero, zero > 0), jnp.zeros_like(unknowns), square),
             basis=square,
-            off=jnp.ones((), dtype=float),
+            relative_error=jnp.ones((), dtype=float),
             growth=jnp.ones_like(unknowns),
             sweeps=jnp.zeros((), dtype=int),
             done=progress.done,
@@ -217,11 +217,13 @@ class IBSS(AbstractEstimator):
         """Looks around, and unless the search ends here moves along each direction. `before`: sweeps so far."""
         whitened, first = self.directions == "whitened", search.sweeps == 0
         view = look_around(stage, search.unknowns, whitened=whitened)
-        done = ~first & (view.ahead <= self._close_enough(stage, view, last=last))
+        fine = jnp.maximum(self.tolerance * view.misfit, stage.smallest_step)
+        close_enough = jnp.where(last, fine, _COARSE * jnp.maximum(view.misfit, 1.0))
+        done = ~first & (view.longest_step <= close_enough)
         finite = jnp.isfinite(view.curvature.shot.cost).all()
         stay = done | ~finite | (search.sweeps >= self.max_sweeps)
 
-        later = jnp.maximum(search.off * view.ahead, stage.finest) * search.growth
+        later = jnp.maximum(search.relative_error * view.longest_step, stage.smallest_step) * search.growth
         brackets = open_brackets(view.factor, spread, later=later, first=first)
         moves = move_along_all(stage, view, brackets, whitened=whitened, halvings=self.halvings, stay=stay)
 
@@ -231,21 +233,15 @@ class IBSS(AbstractEstimator):
             unknowns=jnp.where(sound, moves.unknowns, search.unknowns),
             curvature=view.curvature._replace(shot=Shot(cost, trusted & sound)),
             basis=view.basis,
-            off=relative_error(moves.errors, moves.steps, stage.finest),
-            growth=grow(search.growth, moves.at_end),
+            relative_error=relative_error(moves.errors, moves.steps, stage.smallest_step),
+            growth=jnp.where(moves.at_end, GROWTH * search.growth, 1.0),
             sweeps=search.sweeps + jnp.where(stay, 0, 1),
             done=done | ~sound,
             ended=stay | ~sound,
             brackets=record_brackets(search.brackets, before + search.sweeps, view, brackets.half_width, skip=stay),
         )
 
-    def _close_enough(self, stage: Stage, view: View, *, last: Bool[Array, ""]) -> Scalar:
-        """The longest predicted step with which a stage ends [standard deviations]."""
-        coarse = _COARSE * jnp.maximum(view.misfit, 1.0)
-        return jnp.where(last, jnp.maximum(self.tolerance * view.misfit, stage.finest), coarse)
-
     def _finish(self, problem: ShootingProblem, bracket: Bracket, progress: Progress, curvature: Curvature) -> Estimate:
-        """The estimate, and how it ended."""
         count = bracket.lower.shape[0]
         initial_state = progress.unknowns[:, count:].ravel() if problem.free_size else problem.first_state()[0]
         estimate = conclude(

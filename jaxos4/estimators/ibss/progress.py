@@ -24,15 +24,15 @@ class Progress(NamedTuple):
 class Search(NamedTuple):
     """One stage between two sweeps; `curvature` and `basis` are those of the last look around.
 
-    - `off`: how far off the last sweep's predictions were, as a share of its longest step.
-    - `growth`: by how much the brackets of each direction are wider than `off` asks for.
+    - `relative_error`: of the last sweep's predicted steps, see `brackets.relative_error`.
+    - `growth`: by how much the brackets of each direction are wider than `relative_error` asks for.
     - `done`: the search ended by itself. `ended`: it ended, for whatever reason.
     """
 
     unknowns: Float[Array, "windows unknowns"]
     curvature: Curvature
     basis: Float[Array, "windows unknowns unknowns"]
-    off: Scalar
+    relative_error: Scalar
     growth: Float[Array, "windows unknowns"]
     sweeps: Int[Array, ""]
     done: Bool[Array, ""]

@@ -20,8 +20,7 @@ class Stage(NamedTuple):
     """What does not change while one stage is searched.
 
     The *unknowns* have one row for each window: the parameters, the same in all rows, then the window's own initial
-    state if it is free. Directions are numbered in the opposite order: the `own` directions of the initial states come
-    first, then those of the parameters.
+    state if it is free. Directions are numbered in the opposite order: those of the initial states come first.
 
     - `rows`: the part of the flight that is fitted.
     - `starts`: initial states, used where these are known.
@@ -29,7 +28,7 @@ class Stage(NamedTuple):
     - `prior`: information about the unknowns without the flight: a bracket's half-width is two standard deviations.
       The windows share the information about a parameter, so that it counts once.
     - `limits`: the least and the greatest value of each unknown.
-    - `finest`: the step, in standard deviations, below which rounding decides the sign of a slope.
+    - `smallest_step`: the step, in standard deviations, below which rounding decides the sign of a slope.
     """
 
     problem: ShootingProblem
@@ -38,7 +37,7 @@ class Stage(NamedTuple):
     inputs: Inputs
     prior: Float[Array, "windows unknowns unknowns"]
     limits: Limits
-    finest: Scalar
+    smallest_step: Scalar
 
     @property
     def parameter_count(self) -> int:
@@ -46,14 +45,9 @@ class Stage(NamedTuple):
         return len(self.problem.model.parameter_names)
 
     @property
-    def own(self) -> int:
-        """Number of unknowns of a window's own: its initial state, if that is free."""
-        return self.problem.free_size
-
-    @property
     def size(self) -> int:
         """Number of unknowns of one window."""
-        return self.parameter_count + self.own
+        return self.parameter_count + self.problem.free_size
 
     def with_forcing(self, unknowns: Float[Array, "windows unknowns"], *, tangents: bool = False) -> Rows:
         """The rows with the forcing of these parameters, and its derivatives if wanted."""
@@ -63,12 +57,12 @@ class Stage(NamedTuple):
 
     def fly(self, function: Callable, rows: Rows, unknowns: Float[Array, "windows unknowns"]):
         """`function` (`problem.shot` or `problem.curvature`) of every window."""
-        starts = unknowns[:, self.parameter_count :] if self.own else self.starts
+        starts = unknowns[:, self.parameter_count :] if self.problem.free_size else self.starts
         return jax.vmap(function)(rows, unknowns[:, : self.parameter_count], starts)
 
     def summed(self, number: Int[Array, ""], slopes: Float[Array, " windows"]) -> Float[Array, " windows"]:
         """Slopes along direction `number`: summed over the windows, if the direction belongs to all of them."""
-        return jnp.where(number >= self.own, slopes.sum(), slopes)
+        return jnp.where(number >= self.problem.free_size, slopes.sum(), slopes)
 
     def slope(
         self,
@@ -79,8 +73,7 @@ class Stage(NamedTuple):
     ) -> Callable[[Float[Array, " windows"]], Float[Array, " windows"]]:
         """The slope of the cost as a function of the step from `unknowns` along direction `number`.
 
-        Each call is one shot: a simulation with one forward-mode derivative. A failed shot returns the step itself as
-        the slope, which points back to where the step began.
+        Each call is one shot. A failed shot returns the step itself as the slope, which points back to the beginning.
         """
 
         def at(step: Float[Array, " windows"]) -> Float[Array, " windows"]:
@@ -100,7 +93,7 @@ def make_stage(problem: ShootingProblem, rows: Rows, bracket: Bracket, limits: L
     starts, inputs = problem.split(problem.first_state()[0]), problem.flight.inputs
     prior = 1 / jnp.square(prior_std(problem, bracket))
     prior = jax.vmap(jnp.diag)(prior.at[:, :count].divide(problem.windows))
-    return Stage(problem, rows, starts, inputs, prior, limits, _finest(problem, rows))
+    return Stage(problem, rows, starts, inputs, prior, limits, _smallest_step(problem, rows))
 
 
 def join(
@@ -129,7 +122,7 @@ def misfit(cost: Scalar, rows: Rows) -> Scalar:
     return jnp.sqrt(2 * cost / jnp.maximum(measured.size - jnp.isnan(measured).sum(), 1))
 
 
-def _finest(problem: ShootingProblem, rows: Rows) -> Scalar:
+def _smallest_step(problem: ShootingProblem, rows: Rows) -> Scalar:
     eps = jnp.finfo(problem.sigma.dtype).eps
     squares = [jnp.nanmean(jnp.square(y)) for y in rows.measured]
     weighted = jnp.sqrt(jnp.nan_to_num(jnp.stack(squares))) / problem.sigma[problem.columns]

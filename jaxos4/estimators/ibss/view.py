@@ -19,8 +19,7 @@ class View(NamedTuple):
     - `rows`: the flight's rows with the forcing of these parameters, and its derivatives.
     - `information`: of the flight and the prior together.
     - `factor`, `basis`: A with A A^T = information, and A^-T, whose columns are the directions.
-    - `ahead`: the longest step that the cost's quadratic model predicts along any direction within the limits, in
-      standard deviations.
+    - `longest_step`: that the cost's quadratic model predicts within the limits [standard deviations].
     - `misfit`: root mean square of the weighted residuals.
     """
 
@@ -30,7 +29,7 @@ class View(NamedTuple):
     information: Float[Array, "windows unknowns unknowns"]
     factor: Float[Array, "windows unknowns unknowns"]
     basis: Float[Array, "windows unknowns unknowns"]
-    ahead: Scalar
+    longest_step: Scalar
     misfit: Scalar
 
 
@@ -44,9 +43,8 @@ def look_around(stage: Stage, unknowns: Float[Array, "windows unknowns"], *, whi
     else:
         factor, basis = coordinate_directions(information, stage.parameter_count)
     slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
-    slopes = slopes.at[:, stage.own :].set(slopes[:, stage.own :].sum(axis=0))
+    slopes = slopes.at[:, stage.problem.free_size :].set(slopes[:, stage.problem.free_size :].sum(axis=0))
     rooms = jax.vmap(lambda direction: room(unknowns, direction, stage.limits), -1, -1)(basis)
-    ahead = jnp.abs(jnp.clip(-slopes, -rooms[0], rooms[1])).max()
-    return View(
-        unknowns, rows, curvature, information, factor, basis, ahead, misfit(curvature.shot.cost.sum(), stage.rows)
-    )
+    longest_step = jnp.abs(jnp.clip(-slopes, -rooms[0], rooms[1])).max()
+    noise = misfit(curvature.shot.cost.sum(), stage.rows)
+    return View(unknowns, rows, curvature, information, factor, basis, longest_step, noise)
