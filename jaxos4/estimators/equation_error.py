@@ -26,16 +26,17 @@ from ._regression import (
 class EquationError(AbstractEstimator):
     """Least squares of differentiated body rates on the regressors of the rate equations, in one step.
 
-    The regressors are the derivatives of the rate equations with respect to the parameters, at the measured rates. Any
-    model with rate equations linear in its parameters will do. Only the body rates are used, but the estimate's cost
+    The regressors are the derivatives of the rate equations with respect to the parameters, at the measured rates. The
+    rate equations of the model must be linear in its parameters. Only the body rates are used, but the estimate's cost
     counts all of the problem's channels. There is no iteration; one simulated flight gives the cost, and a free initial
     state is then fitted to the parameters.
 
     **Arguments:**
 
-    - `memory`: how the rates are differentiated, from 0 to 1. The mean of the earlier samples is subtracted, in which
-      each sample weighs `memory` times its successor. 0 gives plain forward differences (ordinary least squares); 1
-      gives the integrated regression, generalised least squares for white noise of the rates. The default of 1 has the
+    - `memory`: how the rates are differentiated, from 0 to 1. A weighted mean of the earlier samples is
+      subtracted. In this mean, each sample has `memory` times the weight of the next one. 0 gives plain forward
+      differences (ordinary least squares). 1 gives the integrated regression, which is generalised least squares for
+      white noise of the rates. The default of 1 has the
       smallest errors of all values on the standard flight.
     - `bridge`: a gap of up to this many samples in a rate is bridged by a straight line in the regressors. A longer gap
       splits the integration in two.

@@ -28,7 +28,7 @@ class Hybrid(AbstractEstimator):
 
     The network's answer, the *seed*, and its covariance open the first brackets, against all of the problem's channels
     at once. If the search shows that the seed was wrong, or if the network had no answer, IBSS searches the whole
-    bracket as it would alone, and the better answer is returned.
+    bracket, as without a network. The better answer is returned.
 
     The estimate's `seed` is the bracket that the network's intervals make (99.9 % for all parameters at once), so that
     hits can be counted. `rollouts` are those of network and search together.
@@ -36,7 +36,7 @@ class Hybrid(AbstractEstimator):
     **Arguments:**
 
     - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
-    - `ibss`: how to search. Near a seed one halving less is enough than in a wide bracket.
+    - `ibss`: how to search. Near a seed, one halving fewer is enough.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -58,7 +58,7 @@ def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, see
 
     **Arguments:**
 
-    - `seed`: an estimate of the same flight, of whatever quality.
+    - `seed`: an estimate of the same flight. It may be wrong.
     """
     answered = jnp.isfinite(seed.covariance).all()
     near = ibss.search(problem, bracket, start=seed.parameters, spread=seed.covariance, cascade=False, skip=~answered)

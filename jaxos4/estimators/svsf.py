@@ -8,7 +8,7 @@ the prediction right. The filter corrects rates and parameters element by elemen
 
 where e_before is the residual after the last correction. This is Habibi's filter for fewer measurements than states:
 Phi12 is the derivative of the rates with respect to the parameters, and Phi22 = 1, because parameters are constant.
-Habibi divides by e and multiplies by it again; both are left out here, so that e = 0 is no special case.
+Habibi divides by e and multiplies by it again; this code does neither, so that e = 0 is no special case.
 """
 
 from typing import ClassVar, NamedTuple
@@ -71,7 +71,8 @@ class SVSF(AbstractEstimator):
       with less influence than the greatest. With 1, the gyroscopic terms hardly move.
     - `passes`: number of passes over the flight. Each begins with the parameters of the pass before (iterative SVSF).
     - `memory`: whether Phi12 is the derivative of a prediction through all corrections before it (`True`), or of one
-      step alone, as in Habibi's paper. One step's errors are small against the noise; their sum is not.
+      step alone, as in Habibi's paper. The errors of one step are small compared with the noise; their sum
+      is not.
 
     The defaults were tuned at a tenth, one and ten times the sensors' noise; `docs/measured.md` has the errors.
 
@@ -80,8 +81,8 @@ class SVSF(AbstractEstimator):
     measurements, and the returned state is fitted to the parameters at the end.
 
     The method itself gives no covariance. Ours follows the errors through the slope of each correction, from the
-    bracket's half-widths on (in the manner of Gadsden and Habibi 2010). It contains the noise and what remains of the
-    initial error, but not that all passes see the same noise. It has the right size, and no more.
+    bracket's half-widths on (in the manner of Gadsden and Habibi 2010). It contains the noise and the remaining
+    initial error. It does not allow for the fact that all passes see the same noise. Only its size is right.
 
     A pass counts as one rollout for each rate and parameter, and one for the state.
 

@@ -44,7 +44,7 @@ def identify_flight(
     validate: Recording | None,
     progress: Callable[[str], None],
 ) -> FlightIdentification:
-    """What `jaxos4.identify` does with a model in alpha_1..8; all arguments are its."""
+    """What `jaxos4.identify` does with a model in alpha_1..8. The arguments are the same."""
     name = estimator_name(estimator)
     kind = ESTIMATORS[estimator] if isinstance(estimator, str) else type(estimator)
     _check_options(name, kind, bracket, channels, window, network)

@@ -15,8 +15,8 @@ from .results import has_answer
 # Noise levels have settled if none changes by more than this share. Weights this close to the right ones cost less
 # than 1 % of the efficiency.
 SETTLED = 0.2
-# With outliers, no parameter may move by more than this many of its standard deviations either, coloured noise allowed
-# for.
+# With outliers, no parameter may move by more than this many of its standard deviations either. The standard deviations
+# allow for coloured noise.
 _SETTLED_PARAMETERS = 0.2
 # Beyond this correlation of neighbouring residuals, the number of independent ones cannot be estimated.
 _MOST_CORRELATION = 0.98
@@ -95,7 +95,7 @@ def colour_factor(residuals: np.ndarray) -> float:
 
     **Arguments:**
 
-    - `residuals`: a row a sample, a column a channel; 0: not measured.
+    - `residuals`: one row for each sample, one column for each channel; 0: not measured.
     """
     products = residuals[1:] * residuals[:-1]
     pairs = products != 0

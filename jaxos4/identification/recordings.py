@@ -51,7 +51,7 @@ def identify_vehicle(
     seed: int,
     progress: Callable[[str], None],
 ) -> VehicleIdentification:
-    """What `jaxos4.identify` does with an airframe; all arguments are its."""
+    """What `jaxos4.identify` does with an airframe. The arguments are the same."""
     name, loss = estimator_name(estimator), "huber" if loss is None else loss
     if loss not in LOSSES:
         raise InputError(f"`loss`: must be huber or squares, got {loss!r}.")

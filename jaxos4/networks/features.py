@@ -71,7 +71,8 @@ class Coordinates(eqx.Module):
 class AbstractFeatures(eqx.Module):
     """Features prepared for one input, start, sampling and bracket.
 
-    - `problem`: the problem of training. Of its states only the first counts, and which samples were measured.
+    - `problem`: the problem of training. It gives the first state, and which samples were measured. Its other states do
+      not matter.
     - `coordinates`: bracket coordinates of the unknowns.
     - `reference`: the trajectory at the bracket's center.
     """

@@ -11,7 +11,7 @@ from .view import View
 
 
 class Progress(NamedTuple):
-    """What one stage hands to the next: where the search is, and the covariance `spread` of that."""
+    """What one stage gives to the next: where the search is, and the covariance `spread` of this point."""
 
     unknowns: Float[Array, "windows unknowns"]
     spread: Float[Array, "windows unknowns unknowns"]
@@ -26,7 +26,7 @@ class Search(NamedTuple):
 
     - `off`: how far off the last sweep's predictions were, as a share of its longest step.
     - `growth`: by how much the brackets of each direction are wider than `off` asks for.
-    - `done`: the search ended by itself. `ended`: it ended, for whatever reason.
+    - `done`: the search ended by itself. `ended`: it ended, for any reason.
     """
 
     unknowns: Float[Array, "windows unknowns"]
