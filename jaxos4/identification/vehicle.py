@@ -1,6 +1,7 @@
 """The staged fit of a real vehicle: identifiable parameters are estimated, the others are held and named.
 
-If the flights hardly excite a parameter, a search for it is unreliable and makes the other estimates uncertain. Therefore:
+If the flights hardly excite a parameter, a search for it is unreliable and makes the other estimates uncertain.
+Therefore:
 
 1. The parameters that every flight excites are fitted; the secondary ones are held at what the airframe implies.
 2. The noise levels of this fit decide which of all parameters are identifiable.
