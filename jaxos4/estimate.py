@@ -26,7 +26,7 @@ _START_STEPS = 4
 
 
 class Calibration(eqx.Module):
-    """How wide an interval must be to hold the truth as often as its level says.
+    """How wide an interval must be to contain the truth in the share of flights that its level gives.
 
     - `levels`: between 0 and 1, rising.
     - `factors`: half-width of the interval in standard deviations, for each level and parameter.
@@ -48,7 +48,7 @@ class Estimate(eqx.Module):
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
     - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own); infinite without
       an estimate.
-    - `rollouts`: number of simulated flights, on whatever channels: one for a shot with its slope, one for each
+    - `rollouts`: number of simulated flights, on any channels: one for a shot with its slope, one for each
       unknown of a Fisher information.
     - `sweeps`: number of iterations, summed over the stages.
     - `result`: how the search ended.
@@ -120,7 +120,7 @@ def conclude(
     prior: float = NO_PRIOR,
     history: Float[Array, "samples parameters"] | None = None,
 ) -> Estimate:
-    """The `Estimate` of what an algorithm found, with its result code; it never holds a parameter that is not finite.
+    """Make an `Estimate` with its result code from the answer of an algorithm. All its parameters are finite.
 
     **Arguments:**
 

@@ -16,7 +16,7 @@ class RESULTS(eqx.Enumeration):
     successful = ""
     at_bound = "a parameter reached the limit of the search around its bracket: widen the bracket or correct the model"
     unidentifiable = (
-        "a parameter is no better known after the flight than from its bracket: fly with more excitation, or hold it"
+        "the flight contains less information about a parameter than its bracket: fly with more excitation, or hold it"
     )
     nonfinite_trajectory = "the simulated trajectory or its input is not finite: check the input and the bracket"
     attitude_singularity = "the pitch angle passed +-90 degrees, where Euler angles are singular: fly no loops"

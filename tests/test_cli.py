@@ -108,13 +108,13 @@ def test_identifiability_names_the_parameters_that_are_not_excited(run, tmp_path
     known = json.loads((tmp_path / "known.json").read_text())
     assert known["fitted"]
     assert known["sigma"]["p"] == pytest.approx(0.01, rel=0.2)
-    assert known["parameters"]["alpha1"]["note"] == "not told: not excited"
+    assert known["parameters"]["alpha1"]["note"] == "not identifiable: not excited"
     assert known["parameters"]["alpha3"]["note"] == ""
     assert known["parameters"]["alpha3"]["bound"] < known["parameters"]["alpha3"]["half_width"]
     assert len(known["directions"]) == len(known["eigenvalues"]) == 8
     for name in ("alpha1", "alpha4", "alpha7"):  # a doublet moves one axis at a time: products of rates are 0
-        assert f"{name}: not told: not excited" in out
-    assert "alpha2: below the noise floor at this noise; identifiable below" in out
+        assert f"{name}: not identifiable: not excited" in out
+    assert "alpha2: below the noise floor: identifiable below" in out
     assert "alpha3:" not in out
     refused(run("identifiability", "missing.csv"), "missing.csv")
 

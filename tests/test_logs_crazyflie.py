@@ -131,7 +131,7 @@ BAD = {
 }
 
 
-def test_time_that_runs_backward_is_told(save):
+def test_time_that_runs_backward_is_reported(save):
     t = T.copy()
     content = bytearray(crazyflie([("e", GYRO + MOTORS, t, np.column_stack([sensors(t), ratios(t)]))], checksum=False))
     size, begin = 2 + 8 + 4 * 6 + 2 * 4, len(content) - T.size * 42

@@ -203,7 +203,7 @@ BAD = {
 }
 
 
-def test_time_that_runs_backward_is_told(save):
+def test_time_that_runs_backward_is_reported(save):
     content = bytearray(everything(angular=None))
     stamps = [i for i in range(len(content) - 11) if content[i : i + 3] == b"\x22\x00D"][:60]
     assert len(stamps) == 60

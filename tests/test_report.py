@@ -22,7 +22,7 @@ from jaxos4.report.style import drawing, log_axis, styles
 
 OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
 OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
-TOLD = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
+ANSWERED = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
 
 
 def few(study):
@@ -117,9 +117,9 @@ def rms(values):
     return math.sqrt(sum(v * v for v in values) / len(values)) if values else math.nan
 
 
-def told(study, scale, estimator):
+def answered(study, scale, estimator):
     cell = study.isel({name: 0 for name in SCENARIO} | {"scale": scale, "estimator": estimator})
-    return cell, [f for f, code in enumerate(cell["result"].values) if code in TOLD]
+    return cell, [f for f, code in enumerate(cell["result"].values) if code in ANSWERED]
 
 
 def places(study):
@@ -166,7 +166,7 @@ def test_every_error_in_the_table(study, page):
     table, seen = page.tables["error-1"], study["seen"].values[0]
     rows = []
     for group, s, estimator, e in places(study):
-        cell, flights = told(study, s, e)
+        cell, flights = answered(study, s, e)
         truth, bound = cell["truth"].values, cell["bound"].values
         for p, name in enumerate(study["parameter"].values):
             zero = (truth[:, p] == 0).any()
@@ -186,7 +186,7 @@ def test_every_error_in_the_table(study, page):
 def test_every_efficiency_and_coverage_in_the_tables(study, page):
     efficiency, coverage, levels = (page.tables[f"{name}-1"] for name in ("efficiency", "coverage", "levels"))
     for group, s, estimator, e in places(study):
-        cell, flights = told(study, s, e)
+        cell, flights = answered(study, s, e)
         error = abs(cell["estimate"].values - cell["truth"].values)
         shares = np.full((3, 4), np.nan)
         for p, name in enumerate(study["parameter"].values):
@@ -209,7 +209,7 @@ def test_every_efficiency_and_coverage_in_the_tables(study, page):
 def test_every_count_in_the_table_of_results(study, page):
     table = page.tables["results-1"]
     for group, s, estimator, e in places(study):
-        cell, _ = told(study, s, e)
+        cell, _ = answered(study, s, e)
         codes = cell["result"].values.tolist()
         for code, name in enumerate(RESULTS):
             if (study["result"] == code).any():
@@ -244,7 +244,7 @@ def test_the_terminal_has_the_same_errors_in_80_columns():
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(error_table(study))
     text = console.export_text()
-    cell, flights = told(study, 1, 0)
+    cell, flights = answered(study, 1, 0)
     error = 100 * rms([cell["estimate"].values[f, 0] / cell["truth"].values[f, 0] - 1 for f in flights])
     rows = re.split(r"noise x 1 *\n", text)[1].splitlines()
     row = next(line for line in rows if line.startswith("ibss"))

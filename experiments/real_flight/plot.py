@@ -21,7 +21,7 @@ NINETY_FIVE = 1.96
 # Horizons above this [s] have bars, of shooting and of two of the regressions.
 SHORTEST = 0.06
 REGRESSION = "memory 0, alone", "memory 0.9, rotors of shooting, holds what shooting held"
-LABELS = {"equation-error": "equation error alone", "rls": "equation error, told by ibss"}
+LABELS = {"equation-error": "equation error alone", "rls": "equation error, with values of ibss"}
 SHOOTING = ("ibss", "output-error", "hybrid")
 
 

@@ -33,8 +33,8 @@ class Winsorised(NamedTuple):
 def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Winsorised:
     """Move each measurement whose residual exceeds 1.345 standard deviations to 1.345 standard deviations.
 
-    Repeat this and a least-squares fit until the parameters stand still: the result is Huber's estimate by the method
-    of modified residuals (Huber, Robust Statistics, section 7.8).
+    Repeat this and a least-squares fit until the parameters no longer change. The result is Huber's estimate by the
+    method of modified residuals (Huber, Robust Statistics, section 7.8).
 
     **Arguments:** `parameters` and `initial_state` of a fit. The standard deviation of each channel is estimated from
     the median of its residuals, which outliers change little. A channel without measurements keeps its sigma.

@@ -38,7 +38,7 @@ class Predictions(NamedTuple):
 
 
 class Skill(NamedTuple):
-    """The skill of predictions, compared with persistence: "the rates stay as they are".
+    """The skill of predictions, compared with persistence: "the rates stay constant".
 
     - `rmse`: root mean square error of the predictions [rad/s].
     - `persistence`: root mean square error of persistence [rad/s].

@@ -22,8 +22,8 @@ def robust_covariance(
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
-    too. The residuals are taken as the noise: noise that is so slow that the fit explained it as motion is missing, so
-    flights must be many times longer than the correlation time of the noise.
+    too. The residuals are taken as the noise. They lack slow noise that the fit explained as motion. A flight must
+    therefore be many times longer than the correlation time of the noise.
 
     **Arguments:** as for `cramer_rao_bound`, at the answer of a fit.
 

@@ -69,17 +69,18 @@ def _print_information(console: Console, found: FlightInformation) -> None:
     if not found.fitted:
         console.print("note: no fit; all numbers below hold at the bracket's centre", highlight=False)
     table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("parameter", "unit", "bound", "others known", "of bracket", "shows below"):
+    for heading in ("parameter", "unit", "bound", "others known", "of bracket", "noise limit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
     for name, row in found.parameters.items():
         bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
-        shows = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
-        table.add_row(name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", shows)
+        limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
+        table.add_row(name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit)
     console.print(table, markup=False)
     console.print(
-        "bound: the least standard deviation at the noise levels found; others known: the same if all other parameters "
-        "were known; of bracket: bound over half-width, above 1 the parameter is not identifiable; shows below: the "
-        "largest noise, in multiples of the noise found, at which the airframe's value differs from 0 visibly.",
+        "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
+        "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
+        "identifiable; noise limit: the largest noise, in multiples of the noise that was found, at which the "
+        "airframe's value can be distinguished from 0.",
         highlight=False,
     )
     for name, row in found.parameters.items():

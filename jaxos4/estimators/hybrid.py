@@ -27,7 +27,7 @@ class Hybrid(AbstractEstimator):
 
     The network's answer, the *seed*, and its covariance open the first brackets, against all of the problem's channels
     at once. If the search shows that the seed was wrong, or if the network had no answer, IBSS searches the whole
-    bracket as it would alone, and the better answer is returned.
+    bracket, as without a network. The better answer is returned.
 
     The estimate's `seed` is the bracket of the network's 99.9 % intervals for all parameters at once. `rollouts` are
     those of network and search together.
@@ -35,7 +35,7 @@ class Hybrid(AbstractEstimator):
     **Arguments:**
 
     - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
-    - `ibss`: how to search. Near a seed one halving less is enough than in a wide bracket.
+    - `ibss`: how to search. Near a seed, one halving fewer is enough.
     """
 
     looks_at: ClassVar[str] = "all"

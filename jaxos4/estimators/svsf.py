@@ -8,7 +8,7 @@ the prediction right. The filter corrects rates and parameters element by elemen
 
 where e_before is the residual after the last correction. This is Habibi's filter for fewer measurements than states:
 Phi12 is the derivative of the rates with respect to the parameters, and Phi22 = 1, because parameters are constant.
-Habibi divides by e and multiplies by it again; both are left out here, so that e = 0 is no special case.
+Habibi divides by e and multiplies by it again; this code does neither, so that e = 0 is no special case.
 """
 
 from typing import ClassVar, NamedTuple
@@ -62,7 +62,8 @@ class SVSF(AbstractEstimator):
       with less influence than the greatest. With 1, the gyroscopic terms hardly move.
     - `passes`: number of passes over the flight. Each begins with the parameters of the pass before (iterative SVSF).
     - `memory`: whether Phi12 is the derivative of a prediction through all corrections before it (`True`), or of one
-      step alone, as in Habibi's paper. One step's errors are small against the noise; their sum is not.
+      step alone, as in Habibi's paper. The errors of one step are small compared with the noise; their sum
+      is not.
 
     The defaults were tuned on simulated flights; `docs/measured.md` has the errors.
 

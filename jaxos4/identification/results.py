@@ -64,8 +64,8 @@ class Constant(msgspec.Struct, frozen=True):
 class RigidBody(msgspec.Struct, frozen=True):
     """The moments of inertia that explain alpha_1..8 best.
 
-    - `constants`: of Ix, Iy, Iz and J_R those that are identifiable.
-    - `consistency_p`: how often the alphas of a rigid body would disagree this much or more; `None`: not tested.
+    - `constants`: those of Ix, Iy, Iz and J_R that are identifiable.
+    - `consistency_p`: the probability that the alphas of a rigid body disagree this much or more; `None`: not tested.
     - `is_rigid_body`: whether no moment of inertia exceeds the sum of the other two; `None`: not tested.
     """
 
@@ -200,7 +200,7 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False)
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):
-    """What a flight can say about one parameter.
+    """The information of a flight about one parameter.
 
     - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation; `None`: infinite.
     - `others_known`: the same if all other parameters were known.

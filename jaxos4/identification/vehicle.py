@@ -1,10 +1,11 @@
 """The staged fit of a real vehicle: identifiable parameters are estimated, the others are held and named.
 
-Parameters that the flights hardly excite make a search wander and the other estimates uncertain. Therefore:
+If the flights hardly excite a parameter, a search for it is unreliable and makes the other estimates uncertain.
+Therefore:
 
 1. The parameters that every flight excites are fitted; the secondary ones are held at what the airframe implies.
 2. The noise levels of this fit decide which of all parameters are identifiable.
-3. These are fitted together, with outliers cut and standard errors that allow for coloured residuals.
+3. The identifiable parameters are fitted together. Outliers are cut. Standard errors allow for coloured residuals.
 """
 
 from collections.abc import Callable
@@ -86,7 +87,7 @@ def fit_vehicle(
     **Arguments:**
 
     - `problem`: its sigma is the first guess of the noise levels.
-    - `bracket`: of all parameters of the model. A parameter that is held, is held at the bracket's centre.
+    - `bracket`: of all parameters of the model. Held parameters have the value at the bracket's centre.
     - `estimator`: of the last stage, one that shoots; IBSS by default. All other searches are by IBSS.
     - `huber`: whether outliers are cut.
     - `progress`: called with the name of each stage.

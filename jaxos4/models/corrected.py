@@ -13,7 +13,7 @@ class CorrectedOS4(AbstractOS4):
     """The published model with the equations of a rigid body: x forward, y left, z up.
 
     alpha2 = J_R / Ix and alpha5 = J_R / Iy have no unit. They multiply Omega_r q and Omega_r p, so a flight excites
-    them. The model leaves out the reaction of accelerating rotors, -J_R Omega_r' / Iz in yaw.
+    them. The model does not include the reaction of accelerating rotors, -J_R Omega_r' / Iz in yaw.
     """
 
     airframe: Airframe = OS4

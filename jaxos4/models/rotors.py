@@ -63,7 +63,9 @@ def squared(speeds: Speeds) -> SquaredSpeeds:
 
 
 def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:
-    """Commands that act `delay` [s] later. Before its first command a stretch has the first, after its last the last.
+    """Commands that act `delay` [s] later.
+
+    Before its first command, a stretch has its first command. After its last command, it has its last command.
 
     Cubics interpolate between samples and join smoothly (Catmull and Rom 1974). So a delay of whole samples is exact,
     and the derivative in the delay has no jumps at which a search could end.
@@ -95,7 +97,7 @@ def lagged(omega: RotorSpeeds, lag: Scalar, grid: Grid) -> Speeds:
     """Speeds of rotors that follow their commands as first-order systems with the time constant `lag` [s].
 
     In each stretch the rotors begin at their first command. The recursion w_{k+1} = a w_k + (1 - a) u_k runs in all
-    blocks of samples in parallel, each from rest; then each block adds what earlier blocks left. This takes as many
+    blocks of samples in parallel, each from rest; then each block adds the effect of earlier blocks. This takes as many
     steps as the square root of the number of samples.
     """
     lag = jnp.maximum(lag, _SHORTEST_LAG * grid.dt)

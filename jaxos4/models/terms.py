@@ -1,4 +1,4 @@
-"""The terms of the vehicle model: one object for each effect that real vehicles show beyond the corrected OS4.
+"""The terms of the vehicle model: one object for each effect of real vehicles that the corrected OS4 lacks.
 
 A new term is one more `Term` in `TERMS`: `FlightModel` and the identification find everything else in that object.
 """
@@ -58,13 +58,13 @@ class Term:
 
     - `description`: the effect, its parameters and their units.
     - `parameters`: the table of its parameters.
-    - `needs`: the constants above without which the term cannot be estimated.
-    - `by_default`: whether an estimate uses the term if the user names none, given what is available.
+    - `needs`: what the log or the airframe must have, by the constants at the top of this file.
+    - `by_default`: takes what is available; returns whether an estimate uses the term if the user names none.
     - `force_axes`: the axes along which the term makes the specific force predictable: 0, 1, 2 for x, y, z.
 
-    The other fields are the contributions, at least one. Each is a function that takes the quantity without the term
-    as its first argument and the values of the term's parameters by name as its second, and returns the quantity with
-    the term. They act in this order:
+    The other fields are the contributions, at least one. Each is a function. Its first argument is the quantity
+    without the term. Its second argument holds the values of the term's parameters by name. It returns the quantity
+    with the term. The contributions act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s].
     - `speed(speeds, values, grid)`: the rotor speeds that follow from the commands.
@@ -188,14 +188,14 @@ TERMS: dict[str, Term] = {
         angular_acceleration=_add_damping,
     ),
     "velocity": Term(
-        "a moment with the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
+        "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
         tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(_AXES[:2])),
         needs=frozenset({BODY_VELOCITY}),
         by_default=lambda available: True,
         angular_acceleration=_add_velocity,
     ),
     "flapping": Term(
-        "a moment with the measured lateral specific force: roll_flapping, pitch_flapping [rad/m]",
+        "a moment proportional to the measured lateral specific force: roll_flapping, pitch_flapping [rad/m]",
         tuple(TermParameter(f"{x}_flapping", "rad/m", _authority(i)) for i, x in enumerate(_AXES[:2])),
         needs=frozenset({LATERAL_FORCE}),
         # The drag of the rotors is proportional to the body velocity: the force replaces a missing velocity.
@@ -215,7 +215,7 @@ TERMS: dict[str, Term] = {
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
     ),
     "reaction": Term(
-        "the body's answer to rotors that accelerate: rotor_reaction = J_R / Iz",
+        "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
         (TermParameter("rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction),),
         by_default=lambda available: True,
         angular_acceleration=_add_reaction,

@@ -30,10 +30,10 @@ _SAME = 1e-6  # relative tolerance of equal numbers: files round them
 class TrainedNetwork(AbstractEstimator):
     """A network that identifies flights of the inputs that it was trained for. Made by `NetworkEstimator.fit`.
 
-    Its intervals hold the truth as often as they say, however good or bad the network is: they are calibrated on
-    simulated flights that training did not use (split-conformal prediction). This is an average over flights that do
-    not diverge, with parameters and initial states uniform in the bracket of training. It is exact at nine noise
-    scales and interpolated between them.
+    Its intervals contain the truth in the share of flights that their level gives, even if the network is bad. They
+    are calibrated on simulated flights that training did not use (split-conformal prediction). The share is an average
+    over flights that do not diverge, with parameters and initial states uniform in the bracket of training. It is exact
+    at nine noise scales and interpolated between them.
     """
 
     looks_at: ClassVar[str] = "rates"

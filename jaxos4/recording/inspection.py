@@ -74,7 +74,7 @@ class Inspection(msgspec.Struct, frozen=True):
 
     - `log`, `format`: the file, and "CSV", "ULog", "blackbox" or "Crazyflie".
     - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
-    - `measured`: by channel; `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
+    - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
     - `notes`: remarks of the reader.
     - `parts`: the stretches in order of time.
     - `identifiable`: `None` without an airframe, without p, q and r, or without a usable stretch.

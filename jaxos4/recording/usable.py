@@ -34,7 +34,10 @@ _USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # t
 
 
 class Stretch(NamedTuple):
-    """A part of a flight, from the sample at `begin` to that at `end` [s]; `reason`: why it is not usable, or empty."""
+    """A part of a flight, from the sample at `begin` to the sample at `end` [s].
+
+    `reason`: why the part is not usable; empty if it is.
+    """
 
     begin: float
     end: float

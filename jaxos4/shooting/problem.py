@@ -39,8 +39,8 @@ class ShootingProblem(eqx.Module):
     - `method`: the stepper, `"euler"` or `"rk4"`.
     - `windows`: number of windows for multiple shooting. The flight is cut into windows of equal length, and each is
       simulated from its own free initial state, so that errors of the model add up over one window only. Windows are
-      not tied together, which loses the information in a long drift. Each channel should be measured in some windows:
-      nothing else identifies the initial states.
+      independent, so the information in a long drift is lost. Measure each channel in at least some windows: nothing
+      else identifies the initial states.
 
     An *initial state* below is the part of X that the channels need, in cascade order: p, q, r, then phi, theta, psi,
     then x, vx, y, vy, z, vz. The initial states of several windows follow each other in one array.

@@ -27,7 +27,7 @@ _LARGEST_OFFSET = 0.8
 
 
 class Fleet(NamedTuple):
-    """What the flights of a scenario share, whatever their noise."""
+    """What the flights of a scenario have in common at all noises."""
 
     model: AbstractModel
     bracket: Bracket

@@ -2,7 +2,7 @@
 
 A *shot* simulates the flight at trial unknowns and returns the slope of the cost along one direction. The sign of the
 slope says which half of a bracket holds the minimum. A *sweep* bisects along every direction once, each time around the
-step that the cost's quadratic model predicts. A *stage* repeats sweeps on some channels until little is left to go.
+step that the cost's quadratic model predicts. A *stage* repeats sweeps on some channels until the minimum is near.
 
 If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
 windows' slopes; initial states are bisected in all windows in parallel.
@@ -49,9 +49,10 @@ class IBSS(AbstractEstimator):
       paper; good on the rates, slow on more channels.
     - `halvings`: how often each bracket is halved in a sweep.
     - `max_sweeps`: the most sweeps of each stage.
-    - `tolerance`: the search ends once no direction has more than this share of its standard deviation to go. The
-      standard deviation follows from the actual residuals, so that noise-free data are fitted to rounding.
-    - `reach`: the parameters stay within this many half-widths of the bracket's center.
+    - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
+      direction. The standard deviation follows from the actual residuals, so the fit of noise-free data ends at
+      rounding errors.
+    - `reach`: the search does not go further than this many half-widths from the bracket's center.
     - `record`: how many sweeps' brackets the estimate keeps, to show how the search went.
 
     A free initial state is searched like the parameters, from the first measurement of each channel.

@@ -11,7 +11,7 @@ from .view import View
 
 
 class Progress(NamedTuple):
-    """What one stage hands to the next: where the search is, and the covariance `spread` of that."""
+    """What one stage gives to the next: where the search is, and the covariance `spread` of this point."""
 
     unknowns: Float[Array, "windows unknowns"]
     spread: Float[Array, "windows unknowns unknowns"]
