@@ -21,10 +21,8 @@ def is_identifiable(
 ) -> Bool[Array, "*parameters"]:
     """The rule: a parameter is identifiable if its standard deviation is at most `prior` half-widths of its bracket.
 
-    **Arguments:**
-
-    - `std`, `half_width`: in the unit of each parameter. A standard deviation that is not finite is too large.
-    - `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
+    A standard deviation that is not finite is too large. `prior` says how the estimator used the bracket: `NO_PRIOR`,
+    `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
     """
     return as_float(std) <= prior * as_float(half_width)
 
@@ -50,7 +48,7 @@ class Bracket(eqx.Module):
 
     @classmethod
     def default(cls, model: AbstractModel) -> "Bracket":
-        """The bracket around the parameters that the model's airframe implies, with the model's half-widths."""
+        """The bracket around `model.alpha`, with the model's half-widths."""
         return _default(model)
 
     @property
@@ -70,7 +68,7 @@ class Bracket(eqx.Module):
         return ((width > 0) & (width < float("inf"))).all()
 
     def identifies(self, std: Float[ArrayLike, " parameters"], prior: float = NO_PRIOR) -> Bool[Array, " parameters"]:
-        """Whether each parameter is identifiable. The rule and the arguments are those of `is_identifiable`."""
+        """See `is_identifiable`."""
         return is_identifiable(std, self.half_width, prior)
 
     @property

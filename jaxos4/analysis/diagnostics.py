@@ -28,8 +28,8 @@ class Diagnostics(eqx.Module):
     - `rms`: of the residuals, in the channel's unit.
     - `percent`: 100 (1 - |y - x| / |y - mean y|). 100 is a perfect prediction, 0 is as good as the mean, or the channel
       does not move.
-    - `level`: mean square of the weighted residuals. 1: they are as large as the problem's sigma. For a model without
-      process noise this is the *normalised innovation level*.
+    - `level`: mean square of the weighted residuals (the *normalised innovation level*). 1: as large as the problem's
+      sigma.
     - `level_p`: p-value of a level of 1, two-sided (chi-squared).
     - `autocorrelation`: of residuals 1, 2, ... samples apart.
     - `colour`: the autocorrelation at the first lag that has pairs of measured samples.
@@ -69,8 +69,7 @@ def residual_diagnostics(
     - `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom.
     - `lags`: the largest lag of the correlations, in samples.
 
-    **Raises:** `ValueError` if the flight has too few samples for `lags`, or if the problem has another number of
-    parameters or initial states.
+    **Raises:** `ValueError` for wrong shapes, or a flight with too few samples for `lags`.
     """
     parameters = as_float(parameters)
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)

@@ -14,9 +14,8 @@ def fisher_information(
 ) -> Float[Array, "parameters parameters"]:
     """J^T W^2 J in the parameters, with the Jacobian J at `parameters` and the weights W = 1 / sigma.
 
-    A free initial state is unknown too and is eliminated (Schur complement): the result is the information about the
-    parameters if the initial state is estimated with them. `initial_state` is where J is computed, by default the
-    measured one.
+    A free initial state is unknown too and is eliminated (Schur complement). `initial_state` is where J is computed, by
+    default the measured one.
     """
     count = parameters.shape[0]
     factor = joint_factor(_information(problem, parameters, initial_state), count)[0, :count, -count:]

@@ -96,7 +96,7 @@ def identifiability(
     **Returns:** an `Identifiability`. Its standard deviations are infinite if the trajectory diverges at `parameters`
     or the bracket is not valid.
 
-    **Raises:** `ValueError` if the model has another number of parameters than `parameters` or `bracket`.
+    **Raises:** `ValueError` for a wrong number of parameters.
     """
     parameters, names = as_float(parameters), problem.model.parameter_names
     for name, shape in (("parameters", parameters.shape), ("bracket", bracket.lower.shape)):

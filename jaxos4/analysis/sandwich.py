@@ -22,15 +22,13 @@ def robust_covariance(
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
-    too. The residuals are taken as the noise: noise that is so slow that the fit explained it as motion is missing, so
-    flights must be many times longer than the correlation time of the noise.
+    too. R is estimated from the windows of a flight that has 20 or more; any other flight takes the noise as
+    stationary. Noise so slow that the fit explained it as motion is missing: flights must be many times longer than the
+    correlation time of the noise.
 
     **Arguments:** as for `cramer_rao_bound`, at the answer of a fit.
 
     **Returns:** the covariance; infinite if the trajectory diverges or nothing was measured.
-
-    A flight with 20 windows or more estimates R from its windows, see `_window_by_window`. Any other flight takes the
-    noise as stationary, see `_stationary`.
 
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """
@@ -79,8 +77,7 @@ def _stationary(
 ) -> Float[Array, "parameters parameters"]:
     """The covariance for stationary noise: R(t, s) depends on t - s only.
 
-    R is summed over lags up to a tenth of the flight, with Bartlett's weights, which make the sum positive. Sums over
-    lags are products of spectra.
+    Bartlett's weights make the sum over lags positive. Sums over lags are products of spectra.
     """
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
@@ -106,9 +103,8 @@ def _window_by_window(
 ) -> Float[Array, "parameters parameters"]:
     """The covariance for many windows: the residuals of the windows are draws of one random vector.
 
-    The initial state of a window absorbs some slow noise, more at the ends of the window than in its middle, so
-    residuals are not stationary. The covariance of the vector, and of the vector with its successor, is the mean over
-    the windows. The noise that the initial states absorb moves no parameter.
+    The initial state of a window absorbs some slow noise, more at its ends than in its middle, so residuals are not
+    stationary. The covariance of the vector, and of the vector with its successor, is the mean over the windows.
     """
     windows, parameters = moves.shape[0], moves.shape[-1]
     errors, measured = errors.reshape(windows, -1), measured.reshape(windows, -1)

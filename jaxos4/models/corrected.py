@@ -12,8 +12,8 @@ from .state import Attitude, Forcing, Rates
 class CorrectedOS4(AbstractOS4):
     """The published model with the equations of a rigid body: x forward, y left, z up.
 
-    alpha2 = J_R / Ix and alpha5 = J_R / Iy have no unit. They multiply Omega_r q and Omega_r p, so a flight excites
-    them. The model leaves out the reaction of accelerating rotors, -J_R Omega_r' / Iz in yaw.
+    alpha2 = J_R / Ix and alpha5 = J_R / Iy have no unit. The model leaves out the reaction of accelerating rotors,
+    -J_R Omega_r' / Iz in yaw.
     """
 
     airframe: Airframe = OS4

@@ -49,14 +49,12 @@ class FlightModel(AbstractModel):
 
     **Arguments:**
 
-    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`.
+    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity` and `drag` need
+      `Flight.body_velocity`. `flapping` needs `Flight.specific_force`, and replaces `velocity` if there is none.
+      `gyro_bias` and `offset` can be distinguished only if the attitude is compared too. Leave out `lag` and `delay` if
+      rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
       own offsets and gyro biases. All other parameters are the vehicle's.
-
-    `velocity` and `drag` need `Flight.body_velocity`, `flapping` needs `Flight.specific_force`. The drag of the rotors
-    is proportional to the body velocity, and so is its moment: `flapping` uses the measured force if velocity was not
-    measured. `gyro_bias` and `offset` can be distinguished only if the attitude is compared too. Leave out `lag` and
-    `delay` if rotor speeds were measured. `jaxos4.hold` holds parameters at known values.
 
     **Raises:** `ValueError` for a term that does not exist or is given twice, recordings that are not counted from 0,
     or a term that needs `airframe.max_rotor_speed` if that is not known.
@@ -95,12 +93,12 @@ class FlightModel(AbstractModel):
 
     @property
     def half_width(self) -> Parameters:
-        """Half the width of a bracket for each parameter: our choice, wide enough for small and large quadrotors."""
+        """Half the width of a bracket for each parameter: our choice, for small and large quadrotors."""
         return jnp.concatenate([self._rigid_body.half_width, self._of_terms(lambda parameter: parameter.half_width)])
 
     @property
     def gyroscopic_factor(self) -> Scalar:
-        """1: alpha2 = J_R / Ix."""
+        """See `AbstractModel`."""
         return self._rigid_body.gyroscopic_factor
 
     @property
@@ -114,10 +112,7 @@ class FlightModel(AbstractModel):
         return not any(term.gyro or term.accelerometer for term in self._terms)
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The chain from commands to torque and thrust: each term acts at its place.
-
-        The speeds of rotors with a lag change linearly over a sample: their mean square makes the mean torque.
-        """
+        """The chain from commands to torque and thrust: each term acts at its place."""
         airframe, grid, omega = self.airframe, Grid.of(inputs), inputs.omega
         for change, values in self._contributions("command", parameters):
             omega = change(omega, values, grid)
@@ -159,10 +154,7 @@ class FlightModel(AbstractModel):
         return force
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
-        """The time derivative of the part of the cascade that `state` holds.
-
-        Terms that need the body velocity use the measured one, or else that of the state.
-        """
+        """See `AbstractModel`. Terms use the measured body velocity, or else that of the state."""
         t, attitude = state.translation, state.attitude
         forcing = self._with_velocity(forcing, state)
         rates = self.angular_acceleration(state.rates, forcing, parameters)
@@ -208,7 +200,7 @@ class FlightModel(AbstractModel):
     def _contributions(
         self, quantity: str, parameters, forcing: Forcing | None = None
     ) -> list[tuple[Callable, Values]]:
-        """The contributions of the terms to a quantity, a field of `Term`, each with the values of its parameters."""
+        """The contributions of the terms to a field of `Term`, each with the values of its parameters."""
         acting = [(term, getattr(term, quantity)) for term in self._terms]
         return [(change, self._values(term, parameters, forcing)) for term, change in acting if change]
 

@@ -1,4 +1,4 @@
-"""A shooting problem: a model, a flight and weights. The cost says how badly parameters explain the flight."""
+"""A shooting problem: how badly parameters of a model explain a flight."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
-from .rows import Rows, cut, windowed
+from .rows import Rows, windowed
 from .scans import Curvature, Shot, predict_window, shoot, shoot_with_derivatives
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
@@ -37,10 +37,9 @@ class ShootingProblem(eqx.Module):
     - `initial_state`: X at the first sample. `None`: free, and estimated with the parameters.
     - `channels`: what is compared and simulated: `"rates"`, `"attitude"` (with the rates), or `"all"`.
     - `method`: the stepper, `"euler"` or `"rk4"`.
-    - `windows`: number of windows for multiple shooting. The flight is cut into windows of equal length, and each is
-      simulated from its own free initial state, so that errors of the model add up over one window only. Windows are
-      not tied together, which loses the information in a long drift. Each channel should be measured in some windows:
-      nothing else identifies the initial states.
+    - `windows`: number of windows of equal length for multiple shooting. Each has its own free initial state, so that
+      errors of the model add up over one window only. Windows are not tied together, which loses the information in a
+      long drift. Each channel should be measured in some windows: nothing else identifies the initial states.
 
     An *initial state* below is the part of X that the channels need, in cascade order: p, q, r, then phi, theta, psi,
     then x, vx, y, vy, z, vz. The initial states of several windows follow each other in one array.
@@ -98,7 +97,7 @@ class ShootingProblem(eqx.Module):
 
     @property
     def free_size(self) -> int:
-        """The number of unknowns in the initial state of one window: `size`, or 0 if the initial state is known."""
+        """The number of unknowns in the initial state of one window: `size`, or 0 if it is known."""
         return 0 if self.initial_state is not None else self.size
 
     @property
@@ -112,15 +111,12 @@ class ShootingProblem(eqx.Module):
         return dataclasses.replace(self, channels=channels)
 
     def measured(self) -> Float[Array, "samples columns"]:
-        """The measurements that are compared, in the order of `columns`. A known first sample is NaN: it is no data."""
+        """The measurements in the order of `columns`. A known first sample is NaN: it is no data."""
         measured = (self.flight.channels if self.model.force_axes else self.flight.states)[:, self.columns]
         return measured if self.initial_state is None else measured.at[0].set(jnp.nan)
 
     def rows(self, parameters: Parameters | None = None) -> Rows:
-        """The data of all windows for a scan. A shorter window ends with a missing measurement.
-
-        `parameters`: for a forcing that depends on them; `model.alpha` by default.
-        """
+        """The data of all windows for a scan, with the forcing at `parameters`, by default `model.alpha`."""
         index, within = self.cut()
         forcing = windowed(self.forcing(self.model.alpha if parameters is None else parameters), index)
         return Rows(forcing, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
@@ -215,7 +211,7 @@ class ShootingProblem(eqx.Module):
         return jax.vmap(self.curvature, in_axes=(0, None, 0))(rows, parameters, self.split(initial_state))
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
-        """The cost of one window. A shooting method calls this in its inner loop with `rows` prepared once."""
+        """The cost of one window, from `rows` that an inner loop prepares once."""
         return shoot(self._advance, rows, self._weights(), parameters, initial_state)
 
     def curvature(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Curvature:
@@ -235,11 +231,10 @@ class ShootingProblem(eqx.Module):
         """The problem with each channel's sigma estimated from the weighted `residuals` of a fit.
 
         Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
-        freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. Residuals can be rounding
-        errors alone: no sigma falls below the rounding that adds up over a flight.
+        freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. No sigma falls below the
+        rounding errors that add up over a flight.
         """
-        columns = self.columns
-        measured = self.measured()
+        columns, measured = self.columns, self.measured()
         count = (~jnp.isnan(measured)).sum(axis=0)
         unknowns = len(self.model.parameter_names) + self.windows * self.free_size
         freedom = jnp.maximum(1 - unknowns / jnp.maximum(count.sum(), 1), 1e-3)
@@ -259,8 +254,11 @@ class ShootingProblem(eqx.Module):
         return np.nonzero(self.cut()[1])[0]
 
     def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-        """The samples of each window, and which of them belong to it: some windows are one sample shorter."""
-        return cut(self.flight.states.shape[-2], self.windows)
+        """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
+        ends = np.arange(self.windows + 1) * self.flight.states.shape[-2] // self.windows
+        index = ends[:-1, None] + np.arange(np.diff(ends).max())
+        within = index < ends[1:, None]
+        return np.where(within, index, ends[1:, None] - 1), within
 
     def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
         return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..models.state import Forcing
 
@@ -20,17 +20,6 @@ class Rows(NamedTuple):
     forcing: Forcing
     measured: tuple[Float[Array, "*windows rows"], ...]
     forcing_tangents: Forcing | None = None
-
-
-def cut(samples: int, windows: int) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-    """The samples of each window, and which of them belong to it.
-
-    Some windows are one sample shorter than others. They repeat their last sample, which then does not belong.
-    """
-    ends = np.arange(windows + 1) * samples // windows
-    index = ends[:-1, None] + np.arange(np.diff(ends).max())
-    within = index < ends[1:, None]
-    return np.where(within, index, ends[1:, None] - 1), within
 
 
 def windowed(forcing: Forcing, index: Int[np.ndarray, "windows length"]) -> Forcing:
