@@ -1,6 +1,7 @@
 """The physical constants of a quadrotor: presets, TOML files, and the conversion between inertia and alpha."""
 
 import math
+from dataclasses import fields
 from os import PathLike
 from typing import Any
 
@@ -201,19 +202,10 @@ def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> Non
         )
 
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "mass": (),
-    "inertia": (3,),
-    "rotor_positions": (4, 2),
-    "rotor_spins": (4,),
-    "thrust_coefficient": (),
-    "drag_coefficient": (),
-    "rotor_inertia": (),
-    "gravity": (),
-    "max_rotor_speed": (),
-}
+_VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
+_SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
 _OPTIONAL = {"gravity", "max_rotor_speed"}
-_POSITIVE = set(_SHAPES) - {"rotor_positions", "rotor_spins", "rotor_inertia"}
+_POSITIVE = _SHAPES.keys() - {"rotor_positions", "rotor_spins", "rotor_inertia"}
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:

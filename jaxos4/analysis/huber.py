@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import InitialStates, Parameters, Scalar
 from ..flight import STATE_NAMES
 from ..shooting import ShootingProblem
 
@@ -30,7 +30,7 @@ class Winsorised(NamedTuple):
 
 
 @eqx.filter_jit
-def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Winsorised:
+def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates) -> Winsorised:
     """Move each measurement whose residual exceeds 1.345 standard deviations to 1.345 standard deviations.
 
     Repeat this and a least-squares fit until the parameters stand still: the result is Huber's estimate by the method

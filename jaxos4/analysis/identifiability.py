@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import InitialStates, Parameters, as_float
 from ..bracket import Bracket, is_identifiable
 from ..results import NINETY_FIVE
 from ..shooting import ShootingProblem
@@ -81,10 +81,7 @@ class Identifiability(eqx.Module):
 
 
 def identifiability(
-    problem: ShootingProblem,
-    bracket: Bracket,
-    parameters: Parameters,
-    initial_state: Float[Array, " starts"] | None = None,
+    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Identifiability:
     """Analyse which parameters of the problem's model its flight can identify, at the problem's sigma.
 
@@ -107,7 +104,7 @@ def identifiability(
 
 @eqx.filter_jit
 def _identifiability(
-    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: Float[Array, " starts"] | None
+    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: InitialStates | None
 ) -> Identifiability:
     sound = bracket.valid & jnp.isfinite(problem.cost(parameters, initial_state))
     parameters, half_width = jnp.where(sound, parameters, problem.model.alpha), bracket.usable.half_width

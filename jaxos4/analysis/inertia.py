@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, Scalar, as_float
+from .._custom_types import Covariance, Parameters, Scalar, as_float
 from ..airframe import inertia_from_alpha
 from ..linalg import cholesky, invert, invert_factor
 from ..models.abstract import AbstractModel
@@ -48,9 +48,7 @@ class InertiaFit(eqx.Module):
 
 
 @eqx.filter_jit
-def fit_inertia(
-    model: AbstractModel, alpha: Parameters, covariance: Float[Array, "parameters parameters"]
-) -> InertiaFit:
+def fit_inertia(model: AbstractModel, alpha: Parameters, covariance: Covariance) -> InertiaFit:
     """Fit four constants to eight alphas by weighted least squares (Gauss-Newton).
 
     **Arguments:**

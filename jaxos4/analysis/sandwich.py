@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import Covariance, InitialStates, Parameters, as_float
 from ..linalg import covariances
 from ..shooting import ShootingProblem
 
@@ -17,8 +17,8 @@ _MANY_WINDOWS, _LARGEST_WINDOW = 20, 4000
 
 @eqx.filter_jit
 def robust_covariance(
-    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
-) -> Float[Array, "parameters parameters"]:
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
+) -> Covariance:
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
@@ -50,7 +50,7 @@ def robust_covariance(
 
 
 def _linearised(
-    problem: ShootingProblem, parameters: Parameters, start: Float[Array, " starts"]
+    problem: ShootingProblem, parameters: Parameters, start: InitialStates
 ) -> tuple[Float[Array, "windows length columns"], Float[Array, "unknowns windows length columns"]]:
     """The weighted residuals, window by window, and their derivatives in the parameters and the initial states.
 
@@ -74,7 +74,7 @@ def _stationary(
     errors: Float[Array, "samples columns"],
     measured: Float[Array, "samples columns"],
     moves: Float[Array, "samples columns parameters"],
-) -> Float[Array, "parameters parameters"]:
+) -> Covariance:
     """The covariance for stationary noise: R(t, s) depends on t - s only.
 
     Bartlett's weights make the sum over lags positive. Sums over lags are products of spectra.
@@ -100,7 +100,7 @@ def _window_by_window(
     errors: Float[Array, "windows length columns"],
     measured: Float[Array, "windows length columns"],
     moves: Float[Array, "windows length columns parameters"],
-) -> Float[Array, "parameters parameters"]:
+) -> Covariance:
     """The covariance for many windows: the residuals of the windows are draws of one random vector.
 
     The initial state of a window absorbs some slow noise, more at its ends than in its middle, so residuals are not
@@ -110,7 +110,7 @@ def _window_by_window(
     errors, measured = errors.reshape(windows, -1), measured.reshape(windows, -1)
     moves = moves.reshape(windows, -1, parameters)
 
-    def contribution(apart: int) -> Float[Array, "parameters parameters"]:
+    def contribution(apart: int) -> Covariance:
         """The contribution of all pairs of windows that are `apart` windows apart."""
         count = windows - apart
         pairs = measured[:count].T @ measured[apart:]

@@ -13,7 +13,7 @@ from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from .corrected import CorrectedOS4
-from .rotation import attitude_rates, to_earth, with_simulated_velocity
+from .rotation import attitude_rates, to_body, to_earth
 from .rotors import Grid, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector
 from .terms import (
@@ -104,7 +104,9 @@ class FlightModel(AbstractModel):
     @property
     def force_axes(self) -> tuple[int, ...]:
         """The axes that the terms predict, if one of the terms is an accelerometer."""
-        return _force_axes(self._terms)
+        if not any(term.accelerometer for term in self._terms):
+            return ()
+        return tuple(sorted({axis for term in self._terms for axis in term.force_axes}))
 
     @property
     def observes_states(self) -> bool:
@@ -189,7 +191,7 @@ class FlightModel(AbstractModel):
 
     @property
     def _table(self) -> "tuple[_Row, ...]":
-        return _table(self._terms, max(self.recordings) + 1)
+        return _table(self._terms, self.force_axes, max(self.recordings) + 1)
 
     def _of_terms(self, constant: Callable[[TermParameter], Constant]) -> Parameters:
         """A constant of each row of the table, for this airframe."""
@@ -223,7 +225,11 @@ class FlightModel(AbstractModel):
         return any(need in term.needs for term in self._terms)
 
     def _with_velocity(self, forcing: Forcing, state: State) -> Forcing:
-        return with_simulated_velocity(forcing, state) if self._needs(BODY_VELOCITY) else forcing
+        """Take the body velocity from `state` if a term needs it and it was not measured."""
+        t, attitude = state.translation, state.attitude
+        if not self._needs(BODY_VELOCITY) or forcing.velocity is not None or attitude is None or t is None:
+            return forcing
+        return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
 
 
 class _Row(NamedTuple):
@@ -240,17 +246,12 @@ class _Row(NamedTuple):
         return Parameter(name, self.source.unit, in_forcing=self.term.in_forcing)
 
 
-def _force_axes(terms: tuple[Term, ...]) -> tuple[int, ...]:
-    measured = any(term.accelerometer for term in terms)
-    return tuple(sorted({axis for term in terms for axis in term.force_axes})) if measured else ()
-
-
 @functools.cache
-def _table(terms: tuple[Term, ...], recordings: int) -> tuple[_Row, ...]:
+def _table(terms: tuple[Term, ...], force_axes: tuple[int, ...], recordings: int) -> tuple[_Row, ...]:
     """The parameters term by term, and within a term recording by recording."""
-    axes, rows, numbers = (None, *_force_axes(terms)), [], (None,) if recordings == 1 else range(recordings)
+    rows, numbers = [], (None,) if recordings == 1 else range(recordings)
     for term in terms:
-        sources = [source for source in term.parameters if source.force_axis in axes]
+        sources = [source for source in term.parameters if source.force_axis in (None, *force_axes)]
         rows += [_Row(term, source, None) for source in sources if not source.each_recording]
         rows += [_Row(term, source, number) for number in numbers for source in sources if source.each_recording]
     return tuple(rows)

@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, Scalar, StateVector, as_float
+from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
@@ -153,11 +153,11 @@ class ShootingProblem(eqx.Module):
         zeros = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), rows.forcing)
         return rows._replace(forcing=completed(new, rows.forcing), forcing_tangents=completed(slopes, zeros))
 
-    def split(self, initial_state: Float[Array, " starts"]) -> Float[Array, "windows size"]:
+    def split(self, initial_state: InitialStates) -> Float[Array, "windows size"]:
         """The initial state of each window."""
         return initial_state.reshape(self.windows, self.size)
 
-    def first_state(self) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
+    def first_state(self) -> tuple[InitialStates, InitialStates]:
         """The initial state at which a search starts, and how far off it may be.
 
         It is the known state, or the first measurement of each channel in each window, or 0 if there is none.
@@ -172,7 +172,7 @@ class ShootingProblem(eqx.Module):
         return jnp.where(jnp.isnan(value), 0.0, value).ravel(), off.ravel()
 
     @eqx.filter_jit
-    def cost(self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None) -> Scalar:
+    def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
 
         Infinite, with an undefined derivative, if the trajectory diverges or reaches theta = +-90 degrees.
@@ -184,7 +184,7 @@ class ShootingProblem(eqx.Module):
 
     @eqx.filter_jit
     def residuals(
-        self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
+        self, parameters: Parameters, initial_state: InitialStates | None = None
     ) -> Float[Array, " residuals"]:
         """W (y - x), sample by sample with the channels in the order of `columns`; 0 for a missing measurement."""
         start = self.first_state()[0] if initial_state is None else initial_state
@@ -192,29 +192,27 @@ class ShootingProblem(eqx.Module):
         return jnp.where(jnp.isnan(measured), 0.0, (measured - predicted) / self.sigma[self.columns]).ravel()
 
     @eqx.filter_jit
-    def predict(
-        self, parameters: Parameters, initial_state: Float[Array, " starts"]
-    ) -> Float[Array, "samples columns"]:
+    def predict(self, parameters: Parameters, initial_state: InitialStates) -> Float[Array, "samples columns"]:
         """The output of noise-free sensors, in the order of `columns`."""
         _, within = self.cut()
         predict = jax.vmap(lambda forcing, start: predict_window(self._advance, forcing, parameters, start))
         return predict(self.rows(parameters).forcing, self.split(initial_state))[within]
 
-    def shots(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Shot:
+    def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
         """The cost of all windows together."""
         each = jax.vmap(self.shot, in_axes=(0, None, 0))(self.rows(parameters), parameters, self.split(initial_state))
         return Shot(each.cost.sum(), each.sound.all())
 
-    def curvatures(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Curvature:
+    def curvatures(self, parameters: Parameters, initial_state: InitialStates) -> Curvature:
         """The curvature of each window, in the parameters and the window's own initial state."""
         rows = self.with_forcing(self.rows(), parameters, tangents=True)
         return jax.vmap(self.curvature, in_axes=(0, None, 0))(rows, parameters, self.split(initial_state))
 
-    def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
+    def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""
         return shoot(self._advance, rows, self._weights(), parameters, initial_state)
 
-    def curvature(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Curvature:
+    def curvature(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Curvature:
         """Cost, gradient and Fisher information of one window, in the parameters and a free initial state."""
         return shoot_with_derivatives(
             self._advance,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import InitialState, Parameters, Scalar
 from ..models.state import Forcing, State, unstack
 from .rows import Rows
 
@@ -45,7 +45,7 @@ class Curvature(NamedTuple):
 
 
 def predict_window(
-    advance: Advance, forcing: Forcing, parameters: Parameters, initial_state: Float[Array, " size"]
+    advance: Advance, forcing: Forcing, parameters: Parameters, initial_state: InitialState
 ) -> Float[Array, "length columns"]:
     """The output of noise-free sensors in one window."""
     scalars = tuple(parameters)
@@ -57,11 +57,7 @@ def predict_window(
 
 
 def shoot(
-    advance: Advance,
-    rows: Rows,
-    weights: tuple[Scalar, ...],
-    parameters: Parameters,
-    initial_state: Float[Array, " size"],
+    advance: Advance, rows: Rows, weights: tuple[Scalar, ...], parameters: Parameters, initial_state: InitialState
 ) -> Shot:
     """Simulate one window and compare it with the measurements. `weights`: 1 / sigma of each channel."""
     scalars = tuple(parameters)
@@ -81,7 +77,7 @@ def shoot_with_derivatives(
     rows: Rows,
     weights: tuple[Scalar, ...],
     parameters: Parameters,
-    initial_state: Float[Array, " size"],
+    initial_state: InitialState,
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
