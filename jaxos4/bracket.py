@@ -7,13 +7,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ._custom_types import Parameters, as_float
 from .models.abstract import AbstractModel
 
-# The largest standard deviation of an identifiable parameter, in half-widths of its bracket. It depends on how the
-# estimator uses the bracket. As a region to search: the flight must contain more information than the bracket.
-NO_PRIOR = 1.0
-# As a Gaussian prior with a standard deviation of one half-width: the flight must contain no less than the prior.
-GAUSSIAN_PRIOR = 0.5**0.5
-# As a uniform prior, whose standard deviation is 0.577 half-widths.
-UNIFORM_PRIOR = 0.5
+# The largest standard deviation of an identifiable parameter, in half-widths of a bracket that is used as ...
+NO_PRIOR = 1.0  # a region to search: the flight must contain more information than the bracket
+GAUSSIAN_PRIOR = 0.5**0.5  # a prior with a standard deviation of 1: the flight must contain no less than the prior
+UNIFORM_PRIOR = 0.5  # a prior with a standard deviation of 0.577
 
 
 def is_identifiable(

@@ -85,10 +85,10 @@ def _scale(diagonal: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
 def _eliminate(
     matrix: Float[Array, "n n"], columns: int, *, floor: int | None = None
 ) -> tuple[Float[Array, "n n"], Float[Array, "n columns"]]:
-    """Some steps of a Cholesky factorisation of a matrix with a unit diagonal.
+    """The first `columns` steps of a Cholesky factorisation of a matrix with a unit diagonal.
 
-    Returns the Schur complement that remains, and the first `columns` columns of the factor. `floor`: the smallest
-    squared pivot, in rounding errors; the size of the matrix by default.
+    Returns the Schur complement and the columns of the factor. `floor`: the smallest squared pivot, in rounding errors;
+    the size of the matrix by default.
     """
     size = matrix.shape[0]
     least = jnp.finfo(matrix.dtype).eps * (floor or size)

@@ -14,8 +14,7 @@ Series = Float[Array, " samples"]
 Measured = Bool[Array, " samples"]
 Correlation = Float[Array, " both"]
 
-# Residuals below this share of a channel's largest value are rounding errors. In single precision the limit is higher:
-# the rounding errors that add up over a flight.
+# Residuals below this share of a channel's largest value are rounding errors, in double precision.
 _ROUNDING = 1e-9
 # A channel with fewer measurements than this has no diagnostics.
 _FEWEST = 3

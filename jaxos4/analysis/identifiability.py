@@ -18,8 +18,7 @@ _PARTNER = 0.2
 class Identifiability(eqx.Module):
     """The information that a flight contains about each parameter, compared with its bracket.
 
-    - `nominal`: the expected value of each parameter: what the airframe implies.
-    - `half_width`: of the bracket.
+    - `nominal`: the value that the airframe implies. `half_width`: of the bracket.
     - `std`: the Cramer-Rao bound, as standard deviations in the units of the parameters.
     - `std_alone`: the Cramer-Rao bound if all other parameters were known.
     - `eigenvalues`: of the information in units of half-widths, in increasing order. Below 1 the flight contains less

@@ -51,15 +51,12 @@ class InertiaFit(eqx.Module):
 def fit_inertia(model: AbstractModel, alpha: Parameters, covariance: Covariance) -> InertiaFit:
     """Fit four constants to eight alphas by weighted least squares (Gauss-Newton).
 
-    **Arguments:**
-
-    - `model`: its `gyroscopic_factor` times J_R is the numerator of alpha2 and alpha5.
-    - `alpha`, `covariance`: of an estimate.
+    **Arguments:** a `model` with the parameters alpha_1..8, and `alpha`, `covariance` of an estimate.
 
     **Returns:** the fit. If the inputs are not finite, or no positive inertias fit them: the constants of the airframe,
     with an infinite covariance and mismatch and a `p_value` of 0.
 
-    **Raises:** `ValueError` for other shapes, or a model whose parameters are not alpha_1..8.
+    **Raises:** `ValueError` for other shapes or another model.
     """
     inertial, alpha, covariance = InertialOS4(model), as_float(alpha), as_float(covariance)
     if alpha.shape != (8,) or covariance.shape != (8, 8):

@@ -24,9 +24,8 @@ _PARTS = 10
 class Predictions(NamedTuple):
     """Predictions of the body rates p, q, r [rad/s] from many starts.
 
-    - `start`: the sample at which each prediction starts.
+    - `start`: the sample at which each prediction starts. `initial`: the measured rates there.
     - `horizons`: time from the start to the prediction [s].
-    - `initial`: the measured rates at the start.
     - `predicted`, `measured`: the rates at each horizon. NaN: not measured.
     """
 
@@ -62,10 +61,8 @@ def predictions(
     Starts are 0.05 s apart. The initial rates are the mean of the rates measured within 0.01 s of the start. A start is
     omitted if one of these rates is missing, or if the longest horizon reaches beyond the stretch.
 
-    **Arguments:**
-
-    - `problem`: gives model, flight and method. Its windows and channels have no effect.
-    - `horizons`: [s], positive.
+    **Arguments:** `problem` gives model, flight and method; its windows and channels have no effect. `horizons` [s] are
+    positive.
 
     **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """

@@ -1,8 +1,8 @@
 """The state of a quadrotor as a cascade, and the forcing: rotors -> torque -> rates -> attitude -> translation.
 
-The parameters enter only the forcing and the rate equations. Attitude follows from the rates, translation from the
-attitude, and neither feeds back. So a `State` may stop at any level of the cascade: a level that is `None` is not
-simulated. States are separate scalars because a batch of scalars vectorises and a batch of 12-vectors does not.
+The parameters enter only the forcing and the rate equations, and no level feeds back. So a `State` may stop at any
+level: a level that is `None` is not simulated. States are separate scalars because a batch of scalars vectorises and a
+batch of 12-vectors does not.
 """
 
 from typing import NamedTuple

@@ -38,7 +38,6 @@ Constant = float | Callable[[Airframe], Scalar]
 class TermParameter(NamedTuple):
     """One parameter of a term.
 
-    - `name`, `unit`.
     - `half_width`, `center`: of the default bracket: a number, or a function of the airframe.
     - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.

@@ -12,9 +12,8 @@ from ..models.state import Forcing
 class Rows(NamedTuple):
     """One window, or a batch of windows: one leaf for each channel, one row for each sample.
 
-    - `forcing`: acts from each sample to the next.
-    - `measured`: the measurements of each channel; NaN if missing.
-    - `forcing_tangents`: the derivative of the forcing in the parameters on which it depends, along the last axis.
+    `forcing` acts from each sample to the next. A missing measurement is NaN. `forcing_tangents` is the derivative of
+    the forcing in the parameters on which it depends, along the last axis.
     """
 
     forcing: Forcing
