@@ -9,6 +9,9 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 Scalar = Float[Array, ""]
 Parameters = Float[Array, " parameters"]
+Covariance = Float[Array, "parameters parameters"]
+InitialStates = Float[Array, " starts"]
+InitialState = Float[Array, " size"]
 StateVector = Float[Array, "12"]
 States = Float[Array, "samples 12"]
 RotorSpeeds = Float[Array, "samples 4"]

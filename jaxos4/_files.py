@@ -35,14 +35,11 @@ BROKEN = (
 def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yields a temporary path in the folder of `path`, and renames it to `path` when the block ends.
 
-    If the block raises, the temporary file is removed and an older `path` does not change. The temporary name keeps
-    the suffix. Links are followed, and the mode of an older file is kept. A pipe or a device cannot be replaced by a
-    rename, so `path` itself is yielded.
+    If the block raises, the temporary file is removed and an older `path` does not change. The temporary name keeps the
+    suffix. Links are followed, and the mode of an older file is kept. A pipe or a device cannot be replaced by a
+    rename: `path` itself is yielded.
 
-        with write_atomically("flight.csv") as temporary:
-            temporary.write_text(text)
-
-    **Raises:** `OSError` that names `path` if its folder does not exist or `path` is a folder.
+    **Raises:** `OSError` that names `path` if it is a folder, or its own folder does not exist.
     """
     target = check_writable(path)
     if target.exists() and not target.is_file():
@@ -66,7 +63,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> Path:
-    """Checks before a long computation that `path` can be written, and returns it with links resolved.
+    """`path` with links resolved, checked before a long computation.
 
     **Raises:** `OSError` that names `path` if its folder does not exist or is not writable, or if `path` is a folder.
     """
@@ -81,10 +78,7 @@ def check_writable(path: str | os.PathLike[str]) -> Path:
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The table in a TOML file.
-
-    **Raises:** `InputError` if the file is not TOML; `OSError` if it cannot be read.
-    """
+    """The table in a TOML file. Raises `InputError` if the file is not TOML, `OSError` if it cannot be read."""
     try:
         with open(path, "rb") as file:
             return tomllib.load(file)

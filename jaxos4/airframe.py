@@ -1,6 +1,7 @@
 """The physical constants of a quadrotor: presets, TOML files, and the conversion between inertia and alpha."""
 
 import math
+from dataclasses import fields
 from os import PathLike
 from typing import Any
 
@@ -17,21 +18,17 @@ ALTERNATING_SPINS = (1.0, -1.0, 1.0, -1.0)
 
 
 class Airframe(eqx.Module):
-    """A rigid quadrotor, in a frame with x forward, y left and z up.
-
-    **Arguments:**
+    """A rigid quadrotor with any layout of four rotors, in a frame with x forward, y left and z up.
 
     - `mass`: [kg].
     - `inertia`: principal moments Ix, Iy, Iz [kg m^2].
-    - `rotor_positions`: x and y of each rotor [m].
+    - `rotor_positions`: x and y of each rotor [m]. `plus_layout` makes those of the paper.
     - `rotor_spins`: +1 for counter-clockwise seen from above, -1 for clockwise.
     - `thrust_coefficient`: b, thrust = b omega^2 [N s^2/rad^2].
     - `drag_coefficient`: d, yaw torque = -spin d omega^2 [N m s^2/rad^2].
     - `rotor_inertia`: J_R [kg m^2].
     - `gravity`: g [m/s^2].
     - `max_rotor_speed`: full-scale rotor speed [rad/s]; infinite if unknown.
-
-    Any layout of four rotors is possible: plus, X, or asymmetric. `plus_layout` makes the layout of the paper.
     """
 
     mass: Float[Numeric, ""] = eqx.field(converter=as_constant)
@@ -99,14 +96,9 @@ PRESETS = {"os4": OS4, "os4-simulator": OS4_SIMULATOR, "voos": VOOS}
 
 
 def alpha_from_inertia(inertia: Float[ArrayLike, "3"], gyroscopic: Float[ArrayLike, ""]) -> Float[Array, "8"]:
-    """alpha_1..8 of a rigid body.
+    """alpha_1..8 of a rigid body with the moments Ix, Iy, Iz [kg m^2], by the definitions below Eq. (13).
 
-    **Arguments:**
-
-    - `inertia`: Ix, Iy, Iz [kg m^2].
-    - `gyroscopic`: the numerator of alpha2 and alpha5: J_R d in the published model, J_R in the corrected model.
-
-    Reference: the definitions below Eq. (13).
+    `gyroscopic`: the numerator of alpha2 and alpha5: J_R d in the published model, J_R in the corrected model.
     """
     ix, iy, iz = jnp.asarray(inertia)
     return jnp.stack(alpha_scalars(ix, iy, iz, jnp.asarray(gyroscopic)))
@@ -130,8 +122,7 @@ def inertia_from_alpha(alpha: Float[ArrayLike, "8"]) -> tuple[Float[Array, "3"],
     """Ix, Iy, Iz [kg m^2] and the gyroscopic constant: the inverse of `alpha_from_inertia`.
 
     The inertias are the reciprocals of alpha3, alpha6 and alpha8, which a flight determines best. The constant is the
-    mean of the two that alpha2 and alpha5 imply. alpha1, alpha4 and alpha7 are not used: if they disagree with the
-    inertias, no rigid body has these alphas. `jaxos4.fit_inertia` uses all eight.
+    mean of the two that alpha2 and alpha5 imply. alpha1, alpha4 and alpha7 are not used; `jaxos4.fit_inertia` uses all.
     """
     a = jnp.asarray(alpha)
     inertia = 1 / a[jnp.array([2, 5, 7])]
@@ -152,9 +143,8 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
     try:
         table = read_toml(source)
     except FileNotFoundError:
-        raise InputError(
-            f"{source}: neither a file nor a preset; give a TOML file or one of {', '.join(PRESETS)}."
-        ) from None
+        presets = ", ".join(PRESETS)
+        raise InputError(f"{source}: neither a file nor a preset; give a TOML file or one of {presets}.") from None
     try:
         return airframe_from_table(table)
     except InputError as error:
@@ -162,7 +152,7 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
 
 def airframe_from_table(table: dict[str, Any]) -> Airframe:
-    """The airframe of a TOML table with the keys of `load_airframe`. Raises `InputError` that names the wrong key."""
+    """The airframe of a table with the keys of `load_airframe`. Raises `InputError` that names the wrong key."""
     table = dict(table)
     if "arm" in table:
         if "rotor_positions" in table:
@@ -172,10 +162,10 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
             raise InputError(f"`arm` must be positive, got {arm}.")
         table["rotor_positions"] = plus_layout(arm)
     table.setdefault("rotor_spins", ALTERNATING_SPINS)
-    missing = [name for name in _SHAPES if name not in table and name not in _OPTIONAL]
+    required = [name for name in _SHAPES if name not in _OPTIONAL]
+    missing = [name for name in required if name not in table]
     if missing:
-        required = ", ".join(name for name in _SHAPES if name not in _OPTIONAL)
-        raise InputError(f"`{missing[0]}` is missing; an airframe needs {required}.")
+        raise InputError(f"`{missing[0]}` is missing; an airframe needs {', '.join(required)}.")
     unknown = [name for name in table if name not in _SHAPES]
     if unknown:
         raise InputError(f"`{unknown[0]}` is not a known key; the keys are arm, {', '.join(_SHAPES)}.")
@@ -212,19 +202,10 @@ def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> Non
         )
 
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "mass": (),
-    "inertia": (3,),
-    "rotor_positions": (4, 2),
-    "rotor_spins": (4,),
-    "thrust_coefficient": (),
-    "drag_coefficient": (),
-    "rotor_inertia": (),
-    "gravity": (),
-    "max_rotor_speed": (),
-}
+_VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
+_SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
 _OPTIONAL = {"gravity", "max_rotor_speed"}
-_POSITIVE = set(_SHAPES) - {"rotor_positions", "rotor_spins", "rotor_inertia"}
+_POSITIVE = _SHAPES.keys() - {"rotor_positions", "rotor_spins", "rotor_inertia"}
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:

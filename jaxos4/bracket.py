@@ -7,13 +7,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from ._custom_types import Parameters, as_float
 from .models.abstract import AbstractModel
 
-# The largest standard deviation of an identifiable parameter, in half-widths of its bracket. It depends on how the
-# estimator uses the bracket. As a region to search: the flight must contain more information than the bracket.
-NO_PRIOR = 1.0
-# As a Gaussian prior with a standard deviation of one half-width: the flight must contain no less than the prior.
-GAUSSIAN_PRIOR = 0.5**0.5
-# As a uniform prior, whose standard deviation is 0.577 half-widths.
-UNIFORM_PRIOR = 0.5
+# The largest standard deviation of an identifiable parameter, in half-widths of a bracket that is used as ...
+NO_PRIOR = 1.0  # a region to search: the flight must contain more information than the bracket
+GAUSSIAN_PRIOR = 0.5**0.5  # a prior with a standard deviation of 1: the flight must contain no less than the prior
+UNIFORM_PRIOR = 0.5  # a prior with a standard deviation of 0.577
 
 
 def is_identifiable(
@@ -21,10 +18,8 @@ def is_identifiable(
 ) -> Bool[Array, "*parameters"]:
     """The rule: a parameter is identifiable if its standard deviation is at most `prior` half-widths of its bracket.
 
-    **Arguments:**
-
-    - `std`, `half_width`: in the unit of each parameter. A standard deviation that is not finite is too large.
-    - `prior`: how the estimator used the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
+    A standard deviation that is not finite is too large. `prior` says how the estimator used the bracket: `NO_PRIOR`,
+    `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
     """
     return as_float(std) <= prior * as_float(half_width)
 
@@ -50,7 +45,7 @@ class Bracket(eqx.Module):
 
     @classmethod
     def default(cls, model: AbstractModel) -> "Bracket":
-        """The bracket around the parameters that the model's airframe implies, with the model's half-widths."""
+        """The bracket around `model.alpha`, with the model's half-widths."""
         return _default(model)
 
     @property
@@ -70,7 +65,7 @@ class Bracket(eqx.Module):
         return ((width > 0) & (width < float("inf"))).all()
 
     def identifies(self, std: Float[ArrayLike, " parameters"], prior: float = NO_PRIOR) -> Bool[Array, " parameters"]:
-        """Whether each parameter is identifiable. The rule and the arguments are those of `is_identifiable`."""
+        """See `is_identifiable`."""
         return is_identifiable(std, self.half_width, prior)
 
     @property

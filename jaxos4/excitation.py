@@ -1,9 +1,9 @@
 """Inputs that excite the parameters: rotor speeds that turn a hovering quadrotor about its axes.
 
 Each function designs angular accelerations about roll, pitch and yaw. The torque is inertia x acceleration, the thrust
-is the weight, and Eqs. (10)-(13) are solved for the rotor speeds. An input that the airframe cannot fly is refused. The
-inputs are open loop: the rates follow the design except for the gyroscopic coupling. The functions compute in NumPy's
-double precision and cannot be traced by JAX. The paper does not state its inputs; these are our choice.
+is the weight, and Eqs. (10)-(13) are solved for the rotor speeds. The inputs are open loop: the rates follow the design
+except for the gyroscopic coupling. The functions compute in NumPy's double precision and cannot be traced by JAX. The
+paper does not state its inputs; these are our choice.
 """
 
 import math
@@ -40,12 +40,11 @@ def multisine(
 
     **Arguments:**
 
-    - `airframe`: the vehicle.
-    - `duration`, `dt`: length and sample time [s]. The result has round(duration / dt) + 1 rows.
+    - `duration`, `dt`: length and sample time [s].
     - `amplitude`: limit of the designed rates [rad/s]: one number, or three for roll, pitch and yaw. 0: no motion.
     - `tones`: frequencies [Hz] of roll, pitch and yaw, below half the sample rate. An empty list: no motion.
 
-    **Returns:** rotor speeds [rad/s].
+    **Returns:** rotor speeds [rad/s] in round(duration / dt) + 1 rows.
 
     **Raises:** `ValueError` for arguments out of range, or if the airframe cannot fly the input.
     """
@@ -73,22 +72,17 @@ def doublet(
 ) -> RotorSpeeds:
     """A doublet of torque about one axis after another.
 
-    From torque to angle a quadrotor is a double integrator. After the pulses + - the rate is zero, but the angle is
-    amplitude x width. The mirror image - + brings the angle back, and a rest of one width follows: five widths for an
-    axis. The sequence repeats as often as it fits, then the quadrotor hovers. Only one axis turns at a time, so the
-    products of rates in Eqs. (1)-(3) are zero, and alpha1, alpha4 and alpha7 are not excited.
+    From torque to angle a quadrotor is a double integrator: the pulses + - end at rate zero and an angle of
+    amplitude x width. The mirror image - + brings the angle back, and a rest follows: five widths for an axis. The
+    sequence repeats as often as it fits, then the quadrotor hovers. Only one axis turns at a time, so the products of
+    rates in Eqs. (1)-(3) are zero, and alpha1, alpha4 and alpha7 are not excited.
 
-    **Arguments:**
+    **Arguments:** those of `multisine`, and:
 
-    - `airframe`, `duration`, `dt`: as in `multisine`.
-    - `amplitude`: the largest rate [rad/s]: one number, or three for roll, pitch and yaw.
     - `width`: length of one pulse [s], rounded to samples.
     - `axes`: some of `"roll"`, `"pitch"`, `"yaw"`, in the order in which they are excited.
 
-    **Returns:** rotor speeds [rad/s].
-
-    **Raises:** `ValueError` for arguments out of range, if the duration is too short, or if the airframe cannot fly
-    the input.
+    **Raises:** as `multisine`, and if the duration is too short.
     """
     return _pulses(airframe, DOUBLET, duration, dt, amplitude, width, axes)
 
@@ -102,11 +96,10 @@ def step3211(
     width: float = 0.1,
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
-    """Pulses of 3, 2, 1 and 1 widths and alternating sign about one axis after another.
+    """Pulses of 3, 2, 1 and 1 widths and alternating sign about one axis after another; otherwise as `doublet`.
 
-    Pulses of equal height would not end at rest. Heights of 0.8, 1.2, 1.1 and 1.1 do: 3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 =
-    0. The angle is then 2.96 amplitude x width, and the mirror image brings it back. With a rest of one width an axis
-    takes 15 widths. Arguments, repetition, errors, and the parameters that are not excited are those of `doublet`.
+    Heights of 0.8, 1.2, 1.1 and 1.1 end at rest: 3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 = 0. The angle is then 2.96
+    amplitude x width. With its mirror image and a rest an axis takes 15 widths.
     """
     return _pulses(airframe, STEP_3211, duration, dt, amplitude, width, axes)
 
@@ -122,21 +115,15 @@ def chirp(
 ) -> RotorSpeeds:
     """A linear frequency sweep about one axis after another. The axes share the duration equally.
 
-    The angle is sin(phase) / (2 pi f). It is faded in over the first fifth of the sweep and out over the last, so that
-    rate and angle return to zero. It stays within about amplitude / (2 pi x the lowest frequency). As with `doublet`,
-    alpha1, alpha4 and alpha7 are not excited.
+    The angle is sin(phase) / (2 pi f), faded in over the first fifth of the sweep and out over the last, so that rate
+    and angle return to zero. As with `doublet`, alpha1, alpha4 and alpha7 are not excited.
 
-    **Arguments:**
+    **Arguments:** those of `multisine` and the `axes` of `doublet`, and:
 
-    - `airframe`, `duration`, `dt`, `axes`: as in `doublet`.
-    - `amplitude`: the largest rate [rad/s]: one number, or three for roll, pitch and yaw. The default yaw rate is half
-      the others, because the yaw torque of rotors is small.
+    - `amplitude`: the default yaw rate is half the others, because the yaw torque of rotors is small.
     - `frequencies`: first and last [Hz], below half the sample rate.
 
-    **Returns:** rotor speeds [rad/s].
-
-    **Raises:** `ValueError` for arguments out of range, if an axis gets less than one cycle, or if the airframe cannot
-    fly the input.
+    **Raises:** as `multisine`, and if an axis gets less than one cycle.
     """
     intervals, order = _intervals(duration, dt), _axis_indices(axes)
     for frequency in frequencies:
@@ -145,10 +132,8 @@ def chirp(
     samples = intervals // len(order)
     span = (samples - 1) * dt
     if span * (first + last) / 2 < 1:
-        shortest = len(order) * (2 / (first + last) + 2 * dt)
-        raise ValueError(
-            f"`duration` must be at least {shortest:.3g} s for one cycle on each axis, got {duration:g} s."
-        )
+        least = len(order) * (2 / (first + last) + 2 * dt)
+        raise ValueError(f"`duration` must be at least {least:.3g} s for one cycle on each axis, got {duration:g} s.")
     share = np.linspace(0, 1, samples)
     phase = 2 * math.pi * span * (first * share + (last - first) * share**2 / 2)
     fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / TAPER, 0, 1)) ** 2
@@ -178,13 +163,13 @@ def _pulses(
     intervals, order = _intervals(duration, dt), _axis_indices(axes)
     if not math.isfinite(width) or round(width / dt) < 1:
         raise ValueError(f"`width` must be at least one sample of {dt:g} s, got {width}.")
-    samples = round(width / dt)
-    once = np.repeat(heights, samples)
-    shape = np.concatenate([once, -once, np.zeros(samples)])
+    once = np.repeat(heights, round(width / dt))
+    shape = np.concatenate([once, -once, np.zeros(round(width / dt))])
     shape = shape / (np.abs(np.cumsum(shape)).max() * dt)
-    if len(order) * len(shape) > intervals:
+    sequence = len(order) * len(shape)
+    if sequence > intervals:
         raise ValueError(
-            f"`duration` must be at least {len(order) * len(shape) * dt:.6g} s for pulses of `width` {width:g} s on "
+            f"`duration` must be at least {sequence * dt:.6g} s for pulses of `width` {width:g} s on "
             f"{len(order)} axes, got {duration:g} s."
         )
     return _rotor_speeds(airframe, _in_turn(shape, intervals, order, _peak_rates(amplitude)), dt)
@@ -271,7 +256,6 @@ def _axis_indices(axes: Sequence[str]) -> list[int]:
 
 
 def _check_frequency(name: str, frequency: float, dt: float) -> None:
-    if not 0 < frequency < 0.5 / dt:
-        raise ValueError(
-            f"`{name}` must lie between 0 and half the sample rate, {0.5 / dt:g} Hz, got {frequency:g} Hz."
-        )
+    limit = 0.5 / dt
+    if not 0 < frequency < limit:
+        raise ValueError(f"`{name}` must lie between 0 and half the sample rate, {limit:g} Hz, got {frequency:g} Hz.")

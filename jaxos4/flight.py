@@ -21,16 +21,8 @@ def _optional_float(x: ArrayLike | None) -> Array | None:
     return None if x is None else as_float(x)
 
 
-def _success() -> RESULTS:
-    return RESULTS.successful
-
-
 class Stretches(NamedTuple):
-    """The uninterrupted stretch to which each sample of joined flights belongs.
-
-    - `number`: of the stretch, counted from 0 in order.
-    - `first`, `last`: the first and the last sample of that stretch.
-    """
+    """The number of the uninterrupted stretch of each sample, and the first and the last sample of that stretch."""
 
     number: Int[Array, " samples"]
     first: Int[Array, " samples"]
@@ -38,18 +30,16 @@ class Stretches(NamedTuple):
 
     @classmethod
     def of(cls, number: Int[Array, " samples"]) -> "Stretches":
-        """The stretches with these numbers."""
+        """The stretches with these numbers, which are counted from 0 in order."""
         return cls(number, jnp.searchsorted(number, number), jnp.searchsorted(number, number, side="right") - 1)
 
 
 class Inputs(NamedTuple):
-    """What drives a vehicle, on the time grid of its flight.
+    """What drives a vehicle, on the time grid of its flight: rotor speeds [rad/s], and the sample time [s].
 
-    - `omega`: rotor speeds, measured or commanded [rad/s].
-    - `dt`: the sample time [s].
     - `velocity`: along the body's axes [m/s]. `None`: unknown.
     - `force`: the measured specific force along the body's axes [m/s^2], an input of some models. `None`: not measured.
-    - `stretches`: the uninterrupted stretch of each sample. `None`: the flight is one stretch.
+    - `stretches`: `None`: the flight is one stretch.
     """
 
     omega: RotorSpeeds
@@ -61,8 +51,6 @@ class Inputs(NamedTuple):
 
 class Flight(eqx.Module):
     """A recorded or simulated flight on a uniform time grid.
-
-    **Arguments:**
 
     - `time`: sample times [s], uniform.
     - `omega`: rotor speeds [rad/s]; row k is held from `time[k]` to `time[k+1]`, the last row drives nothing.
@@ -81,7 +69,7 @@ class Flight(eqx.Module):
     omega: RotorSpeeds = eqx.field(converter=as_float)
     states: States = eqx.field(converter=as_float)
     specific_force: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
-    result: RESULTS = eqx.field(default_factory=_success)
+    result: RESULTS = eqx.field(default_factory=lambda: RESULTS.successful)
     body_velocity: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
     stretch: Int[Array, " samples"] | None = None
     commanded: bool = eqx.field(static=True, default=False)
@@ -93,11 +81,8 @@ class Flight(eqx.Module):
                 "`time`, `omega` and `states` must have shapes (samples,), (samples, 4) and (samples, 12), got "
                 f"{samples}, {self.omega.shape} and {self.states.shape}; a batch of flights is made by `vmap`."
             )
-        for name, shape in (
-            ("specific_force", (*samples, 3)),
-            ("body_velocity", (*samples, 3)),
-            ("stretch", samples),
-        ):
+        vectors = (*samples, 3)
+        for name, shape in (("specific_force", vectors), ("body_velocity", vectors), ("stretch", samples)):
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"`{name}` must have shape {shape}, got {value.shape}.")

@@ -1,13 +1,11 @@
 """Factors and inverses of small symmetric positive semidefinite matrices: information and covariance matrices.
 
-All functions use plain operations in loops, for two reasons. They vectorise over a batch of small matrices, and
-LAPACK's batched kernels inside a loop can deadlock on a CPU (seen with jaxlib 0.10 and 512 lanes).
-
-A direction without information gets a variance that is huge, but neither infinite nor negative.
+All functions use plain operations in loops. They vectorise over a batch of small matrices, while LAPACK's batched
+kernels inside a loop can deadlock on a CPU (seen with jaxlib 0.10 and 512 lanes). A direction without information gets
+a variance that is huge, but neither infinite nor negative.
 
 **Windows.** Each window of a flight has an information matrix (n, n). Its first `count` unknowns are the parameters,
-which all windows share. Its other unknowns are the initial state of that window. Elimination works on
-one window after another, so its time is linear in the number of windows.
+which all windows share; the others are the initial state of that window. The time is linear in the number of windows.
 """
 
 import jax
@@ -18,14 +16,11 @@ from jaxtyping import Array, Float
 def joint_factor(information: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
     """A factor A of the joint information of each window: A A^T is the inverse of its covariance.
 
-    The covariance is that of the window's unknowns when the unknowns of all windows are estimated together. The last
-    `count` columns of A hold the factor for the shared unknowns.
-
-    Block elimination by Cholesky factors: each window's own unknowns are eliminated first, and the remaining
-    Schur complements are summed. No subtraction loses digits in single precision.
+    The covariance is that of the window's unknowns when those of all windows are estimated together. The last `count`
+    columns of A hold the factor for the shared unknowns. Each window's own unknowns are eliminated first, and the
+    remaining Schur complements are summed: no subtraction loses digits in single precision.
     """
-    size = information.shape[-1]
-    own = size - count
+    size, own = information.shape[-1], information.shape[-1] - count
     own_first, shared_first = _orders(size, count)
     shared = information[:, :count, :count].sum(axis=0)
     diagonal = jax.vmap(jnp.diagonal)(information).at[:, :count].set(jnp.diagonal(shared))
@@ -90,10 +85,10 @@ def _scale(diagonal: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
 def _eliminate(
     matrix: Float[Array, "n n"], columns: int, *, floor: int | None = None
 ) -> tuple[Float[Array, "n n"], Float[Array, "n columns"]]:
-    """Some steps of a Cholesky factorisation of a matrix with a unit diagonal.
+    """The first `columns` steps of a Cholesky factorisation of a matrix with a unit diagonal.
 
-    Returns the Schur complement that remains, and the first `columns` columns of the factor. `floor`: the smallest
-    squared pivot, in rounding errors; the size of the matrix by default.
+    Returns the Schur complement and the columns of the factor. `floor`: the smallest squared pivot, in rounding errors;
+    the size of the matrix by default.
     """
     size = matrix.shape[0]
     least = jnp.finfo(matrix.dtype).eps * (floor or size)

@@ -55,22 +55,11 @@ class AbstractNoise(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
-        """Returns the flight with noisy states.
-
-        **Arguments:**
-
-        - `flight`: the true flight, or the result of another noise.
-        - `key`: for the random numbers. The same key gives the same flight.
-        """
+        """The flight with noisy states. The same random `key` gives the same flight."""
 
 
 class WhiteNoise(AbstractNoise):
-    """Independent Gaussian errors of every sample.
-
-    **Arguments:**
-
-    - `sigma`: standard deviation for each state, in the units of `STATE_UNITS`. 0: exact.
-    """
+    """Independent Gaussian errors of every sample, with `sigma` for each state in `STATE_UNITS`. 0: exact."""
 
     sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
 
@@ -82,10 +71,7 @@ class WhiteNoise(AbstractNoise):
 class ConstantBias(AbstractNoise):
     """A Gaussian offset of each state that is constant during the flight.
 
-    **Arguments:**
-
-    - `sigma`: standard deviation of the offset for each state, in the units of `STATE_UNITS`.
-    - `mean`: mean of the offset. `ConstantBias(0, mean=offset)` is a known offset.
+    - `sigma`, `mean`: of the offset, for each state in `STATE_UNITS`. `ConstantBias(0, mean=offset)` is a known offset.
     """
 
     sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
@@ -99,12 +85,9 @@ class ConstantBias(AbstractNoise):
 class GaussMarkov(AbstractNoise):
     """Coloured errors: a stationary first-order process with autocorrelation sigma^2 exp(-|tau| / T).
 
-    The samples are exact: e_{k+1} = a e_k + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T) and w_k standard normal. e_0
-    has the variance sigma^2.
+    The samples are exact: e_{k+1} = a e_k + sigma sqrt(1 - a^2) w_k with a = exp(-dt / T) and w_k standard normal.
 
-    **Arguments:**
-
-    - `sigma`: standard deviation for each state, in the units of `STATE_UNITS`.
+    - `sigma`: standard deviation for each state, in `STATE_UNITS`.
     - `correlation_time`: T [s] for each state, positive. Infinite: a constant bias.
     """
 
@@ -121,17 +104,12 @@ class GaussMarkov(AbstractNoise):
             error = decay * error + fresh * draw
             return error, error
 
-        _, later = jax.lax.scan(step, normal[0], normal[1:])
+        later = jax.lax.scan(step, normal[0], normal[1:])[1]
         return _with_states(flight, flight.states + self.sigma * jnp.concatenate([normal[:1], later]))
 
 
 class Quantisation(AbstractNoise):
-    """Rounding to the nearest multiple of a step. The result does not depend on the key.
-
-    **Arguments:**
-
-    - `step`: for each state, in the units of `STATE_UNITS`. 0: not rounded.
-    """
+    """Rounding to the nearest multiple of `step`, for each state in `STATE_UNITS`. 0: not rounded."""
 
     step: PerChannel = eqx.field(converter=_per_channel("step", 0.0))
 
@@ -142,12 +120,7 @@ class Quantisation(AbstractNoise):
 
 
 class Dropouts(AbstractNoise):
-    """Lost samples: each sample of each state becomes NaN (not measured), independently of the others.
-
-    **Arguments:**
-
-    - `probability`: that a sample is lost, for each state.
-    """
+    """Lost samples: each sample of each state becomes NaN with `probability`, independently of the others."""
 
     probability: PerChannel = eqx.field(converter=_per_channel("probability", 0.0, 1.0))
 
@@ -158,12 +131,7 @@ class Dropouts(AbstractNoise):
 
 
 class Chain(AbstractNoise):
-    """Several noises, applied in order. Noise i draws from `fold_in(key, i)`.
-
-    **Arguments:**
-
-    - `noises`: for example `(WhiteNoise(sigma), Quantisation(step), Dropouts(0.01))`.
-    """
+    """Several noises, applied in order. Noise i draws from `fold_in(key, i)`."""
 
     noises: tuple[AbstractNoise, ...] = eqx.field(converter=tuple)
 
@@ -178,10 +146,6 @@ def _normal(key: Key, like: Float[Array, " *shape"]) -> Float[Array, " *shape"]:
     return jax.random.normal(key, like.shape, like.dtype)
 
 
-# Correlation time [s] of coloured noise, offset and step in multiples of the white noise, share of lost samples.
-_MEMORY, _OFFSET, _STEP, _LOST = 0.05, 0.5, 2.0, 0.1
-
-
 def measure(flight: Flight, noise: AbstractNoise, *, seed: int) -> Flight:
     """The flight as noisy sensors record it, with random numbers from `seed`."""
     return noise(flight, key=jax.random.key(seed))
@@ -189,16 +153,13 @@ def measure(flight: Flight, noise: AbstractNoise, *, seed: int) -> Flight:
 
 NOISES: dict[str, Callable[[ArrayLike], AbstractNoise]] = {
     "white": WhiteNoise,
-    "coloured": lambda sigma: GaussMarkov(sigma, _MEMORY),
-    "biased": lambda sigma: Chain((WhiteNoise(sigma), ConstantBias(_OFFSET * as_float(sigma)))),
-    "quantised": lambda sigma: Chain((WhiteNoise(sigma), Quantisation(_STEP * as_float(sigma)))),
-    "lossy": lambda sigma: Chain((WhiteNoise(sigma), Dropouts(_LOST))),
+    "coloured": lambda sigma: GaussMarkov(sigma, 0.05),
+    "biased": lambda sigma: Chain((WhiteNoise(sigma), ConstantBias(0.5 * as_float(sigma)))),
+    "quantised": lambda sigma: Chain((WhiteNoise(sigma), Quantisation(2.0 * as_float(sigma)))),
+    "lossy": lambda sigma: Chain((WhiteNoise(sigma), Dropouts(0.1))),
 }
 """The kinds of noise that studies name, each made from a standard deviation sigma.
 
-- `white`: white noise.
-- `coloured`: Gauss-Markov noise with a correlation time of 0.05 s.
-- `biased`: white noise and a constant offset with a standard deviation of sigma / 2.
-- `quantised`: white noise, then rounding to multiples of 2 sigma.
-- `lossy`: white noise, then 10 % of the samples are lost.
+`white`; `coloured` with a correlation time of 0.05 s; `biased`: white with a constant offset of standard deviation
+sigma / 2; `quantised`: white, rounded to multiples of 2 sigma; `lossy`: white, 10 % of the samples lost.
 """

@@ -84,7 +84,7 @@ def simulate(
     **Returns:** a `Flight`. Its `result` is `successful`, `attitude_singularity` if the pitch angle reached +-90
     degrees, or `nonfinite_trajectory` if a number overflowed. The states are NaN from the failure on.
 
-    **Raises:** `ValueError` for a method that does not exist, a wrong shape, or a `dt` that is not positive.
+    **Raises:** `ValueError` that names the argument.
     """
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, got {method!r}.")
@@ -114,7 +114,7 @@ def _simulate(
 
     first = unstack(start[CASCADE_ORDER])
     forcing = jax.tree.map(lambda leaf: leaf[:-1], model.forcing(Inputs(omega, dt), parameters))
-    _, rest = jax.lax.scan(step, first, forcing)
+    rest = jax.lax.scan(step, first, forcing)[1]
     trajectory = jnp.concatenate([stack(first)[None], stack(rest)])
     states, result = _until_failure(trajectory[:, CASCADE_ORDER.argsort()])
     return Flight(time=dt * jnp.arange(omega.shape[0]), omega=omega, states=states, result=result)

@@ -1,7 +1,6 @@
 """Sine and cosine in one polynomial evaluation that vectorises over a batch of lanes.
 
-On a CPU, calls of the library's sine and cosine would take most of the time of a simulation step
-(see docs/measured.md).
+On a CPU the library's functions would take most of the time of a simulation step (see docs/measured.md).
 """
 
 import math
@@ -20,10 +19,7 @@ _COS = tuple((-1) ** i / math.factorial(2 * i) for i in range(9))
 
 @jax.custom_jvp
 def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """`(sin(x), cos(x))` to about one ulp, for angles x [rad] of less than a million turns.
-
-    NaN and infinity give NaN, as in the library's functions.
-    """
+    """`(sin(x), cos(x))` to about one ulp, for angles x [rad] of less than a million turns; NaN if x is not finite."""
     quarter = jnp.round(x * (2 / math.pi))
     r = x
     for part in _HALF_PI_SINGLE if x.dtype == jnp.float32 else _HALF_PI_DOUBLE:

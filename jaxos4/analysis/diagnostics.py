@@ -7,11 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, Scalar, as_float
+from .._custom_types import InitialStates, Parameters, Scalar, as_float
 from ..shooting import ROUNDING, ShootingProblem
 
-# Residuals below this share of a channel's largest value are rounding errors. In single precision the limit is higher:
-# the rounding errors that add up over a flight.
+Series = Float[Array, " samples"]
+Measured = Bool[Array, " samples"]
+Correlation = Float[Array, " both"]
+
+# Residuals below this share of a channel's largest value are rounding errors, in double precision.
 _ROUNDING = 1e-9
 # A channel with fewer measurements than this has no diagnostics.
 _FEWEST = 3
@@ -28,8 +31,8 @@ class Diagnostics(eqx.Module):
     - `rms`: of the residuals, in the channel's unit.
     - `percent`: 100 (1 - |y - x| / |y - mean y|). 100 is a perfect prediction, 0 is as good as the mean, or the channel
       does not move.
-    - `level`: mean square of the weighted residuals. 1: they are as large as the problem's sigma. For a model without
-      process noise this is the *normalised innovation level*.
+    - `level`: mean square of the weighted residuals (the *normalised innovation level*). 1: as large as the problem's
+      sigma.
     - `level_p`: p-value of a level of 1, two-sided (chi-squared).
     - `autocorrelation`: of residuals 1, 2, ... samples apart.
     - `colour`: the autocorrelation at the first lag that has pairs of measured samples.
@@ -56,7 +59,7 @@ class Diagnostics(eqx.Module):
 def residual_diagnostics(
     problem: ShootingProblem,
     parameters: Parameters,
-    initial_state: Float[Array, " starts"] | None = None,
+    initial_state: InitialStates | None = None,
     *,
     fitted: bool = True,
     lags: int = 25,
@@ -69,8 +72,7 @@ def residual_diagnostics(
     - `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom.
     - `lags`: the largest lag of the correlations, in samples.
 
-    **Raises:** `ValueError` if the flight has too few samples for `lags`, or if the problem has another number of
-    parameters or initial states.
+    **Raises:** `ValueError` for wrong shapes, or a flight with too few samples for `lags`.
     """
     parameters = as_float(parameters)
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
@@ -88,11 +90,7 @@ def residual_diagnostics(
 
 @eqx.filter_jit
 def _diagnostics(
-    problem: ShootingProblem,
-    parameters: Parameters,
-    initial_state: Float[Array, " starts"],
-    fitted: bool,
-    lags: int,
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates, fitted: bool, lags: int
 ) -> Diagnostics:
     sigma = problem.sigma[problem.columns]
     residuals = _residuals(problem, parameters, initial_state)
@@ -102,7 +100,10 @@ def _diagnostics(
     trivial = ~known | (sigma * jnp.abs(errors).max(axis=0) <= rounding * size)
 
     unknowns = problem.windows * problem.free_size + (parameters.shape[0] if fitted else 0)
-    level, level_p = _level(residuals, unknowns)
+    freedom = jnp.maximum(count * (1 - unknowns / jnp.maximum(count.sum(), 1)), 1.0)
+    below, above = (
+        tail(freedom / 2, squares / 2) for tail in (jax.scipy.special.gammainc, jax.scipy.special.gammaincc)
+    )
     motion = jnp.where(measured, values - values.sum(axis=0) / most, 0.0)
     spread = jnp.sqrt(jnp.square(motion).sum(axis=0))
     moved = known & (spread > rounding * size * jnp.sqrt(most))
@@ -113,8 +114,8 @@ def _diagnostics(
         count=count,
         rms=jnp.where(known, sigma * jnp.sqrt(squares / most), 0.0),
         percent=jnp.where(moved, 100 * (1 - sigma * jnp.sqrt(squares) / jnp.where(moved, spread, 1.0)), 0.0),
-        level=jnp.where(known, level, 1.0),
-        level_p=jnp.where(known, level_p, 1.0),
+        level=jnp.where(known, squares / freedom, 1.0),
+        level_p=jnp.where(known, 2 * jnp.minimum(below, above), 1.0),
         autocorrelation=jnp.where(trivial[:, None], 0.0, autocorrelation),
         colour=jnp.where(trivial, 0.0, colour),
         white_p=jnp.where(trivial | (problem.windows > 1), 1.0, white_p),
@@ -135,7 +136,7 @@ class _Residuals(NamedTuple):
     squares: Float[Array, " size"]
 
 
-def _residuals(problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"]) -> _Residuals:
+def _residuals(problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates) -> _Residuals:
     observed = problem.measured()
     errors = problem.residuals(parameters, initial_state).reshape(observed.shape)
     # A diverged trajectory counts as nothing measured.
@@ -144,16 +145,6 @@ def _residuals(problem: ShootingProblem, parameters: Parameters, initial_state: 
     errors, count = jnp.where(measured, errors, 0.0), measured.sum(axis=0)
     values = jnp.where(measured, observed, 0.0)
     return _Residuals(sound, errors, measured, values, count, jnp.maximum(count, 1), jnp.square(errors).sum(axis=0))
-
-
-def _level(residuals: _Residuals, unknowns: int) -> tuple[Float[Array, " size"], Float[Array, " size"]]:
-    """Mean square of the residuals by degree of freedom, and its p-value."""
-    count, squares = residuals.total, residuals.squares
-    freedom = jnp.maximum(count * (1 - unknowns / jnp.maximum(count.sum(), 1)), 1.0)
-    below, above = (
-        tail(freedom / 2, squares / 2) for tail in (jax.scipy.special.gammainc, jax.scipy.special.gammaincc)
-    )
-    return squares / freedom, 2 * jnp.minimum(below, above)
 
 
 def _whiteness(
@@ -192,20 +183,14 @@ def _dependence(
     return correlation, jnp.minimum(3 * p.min(axis=1), 1.0)
 
 
-def _correlations(
-    a: Float[Array, " samples"],
-    b: Float[Array, " samples"],
-    of_a: Bool[Array, " samples"],
-    of_b: Bool[Array, " samples"],
-    lags: int,
-) -> tuple[Float[Array, " both"], Float[Array, " both"]]:
+def _correlations(a: Series, b: Series, of_a: Measured, of_b: Measured, lags: int) -> tuple[Correlation, Correlation]:
     """Correlation of a(t + lag) with b(t) for lags from -`lags` to `lags`, and the number of pairs at each lag.
 
     `of_a`, `of_b`: which samples were measured; the others are 0.
     """
     samples = a.shape[0]
 
-    def sums(x: Float[Array, " samples"], y: Float[Array, " samples"]) -> Float[Array, " both"]:
+    def sums(x: Series, y: Series) -> Correlation:
         spectrum = jnp.fft.rfft(x, 2 * samples) * jnp.conj(jnp.fft.rfft(y, 2 * samples))
         return jnp.fft.irfft(spectrum, 2 * samples)[jnp.arange(-lags, lags + 1)]
 
@@ -216,12 +201,7 @@ def _correlations(
 
 
 def _with_input(
-    errors: Float[Array, " samples"],
-    measured: Bool[Array, " samples"],
-    colour: Float[Array, " lags"],
-    torque: Float[Array, " samples"],
-    driving: Bool[Array, " samples"],
-    lags: int,
+    errors: Series, measured: Measured, colour: Float[Array, " lags"], torque: Series, driving: Measured, lags: int
 ) -> tuple[Scalar, Scalar]:
     """The largest correlation of residuals with one input over all lags, and the p-value of no correlation."""
     correlation, pairs = _correlations(errors, torque, measured, driving, lags)

@@ -3,20 +3,19 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import Covariance, InitialStates, Parameters, as_float
 from ..linalg import covariance_of_shared, joint_factor
 from ..shooting import ShootingProblem
 
 
 @eqx.filter_jit
 def fisher_information(
-    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
-) -> Float[Array, "parameters parameters"]:
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
+) -> Covariance:
     """J^T W^2 J in the parameters, with the Jacobian J at `parameters` and the weights W = 1 / sigma.
 
-    A free initial state is unknown too and is eliminated (Schur complement): the result is the information about the
-    parameters if the initial state is estimated with them. `initial_state` is where J is computed, by default the
-    measured one.
+    A free initial state is unknown too and is eliminated (Schur complement). `initial_state` is where J is computed, by
+    default the measured one.
     """
     count = parameters.shape[0]
     factor = joint_factor(_information(problem, parameters, initial_state), count)[0, :count, -count:]
@@ -25,8 +24,8 @@ def fisher_information(
 
 @eqx.filter_jit
 def cramer_rao_bound(
-    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
-) -> Float[Array, "parameters parameters"]:
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
+) -> Covariance:
     """The smallest covariance that an unbiased estimate can have: the inverse of `fisher_information`.
 
     A parameter that is not excited has a huge variance, but not an infinite one.

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import InitialStates, Parameters, Scalar
 from ..flight import STATE_NAMES
 from ..shooting import ShootingProblem
 
@@ -30,14 +30,13 @@ class Winsorised(NamedTuple):
 
 
 @eqx.filter_jit
-def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Winsorised:
+def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates) -> Winsorised:
     """Move each measurement whose residual exceeds 1.345 standard deviations to 1.345 standard deviations.
 
     Repeat this and a least-squares fit until the parameters no longer change. The result is Huber's estimate by the
     method of modified residuals (Huber, Robust Statistics, section 7.8).
 
-    **Arguments:** `parameters` and `initial_state` of a fit. The standard deviation of each channel is estimated from
-    the median of its residuals, which outliers change little. A channel without measurements keeps its sigma.
+    **Arguments:** `parameters` and `initial_state` of a fit.
     """
     observed, sigma = problem.measured(), problem.sigma[problem.columns]
     errors = problem.residuals(parameters, initial_state).reshape(observed.shape) * sigma
@@ -49,13 +48,8 @@ def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: 
     share = (measured & (cut == errors)).sum() / jnp.maximum(measured.sum(), 1)
     channels = problem.flight.channels.at[:, problem.columns].add(cut - errors)
     states, force = channels[:, : len(STATE_NAMES)], channels[:, len(STATE_NAMES) :]
-    has_force = problem.flight.specific_force is not None
-    return Winsorised(
-        eqx.tree_at(
-            lambda p: (p.flight.states, p.sigma) + ((p.flight.specific_force,) if has_force else ()),
-            problem,
-            (states, problem.sigma.at[problem.columns].set(scale)) + ((force,) if has_force else ()),
-        ),
-        share,
-        jnp.where(measured, cut / scale, 0.0),
-    )
+    moved = problem.sigma.at[problem.columns].set(scale), states
+    moved = eqx.tree_at(lambda p: (p.sigma, p.flight.states), problem, moved)
+    if problem.flight.specific_force is not None:
+        moved = eqx.tree_at(lambda p: p.flight.specific_force, moved, force)
+    return Winsorised(moved, share, jnp.where(measured, cut / scale, 0.0))

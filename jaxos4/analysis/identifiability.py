@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import InitialStates, Parameters, as_float
 from ..bracket import Bracket, is_identifiable
 from ..results import NINETY_FIVE
 from ..shooting import ShootingProblem
@@ -81,10 +81,7 @@ class Identifiability(eqx.Module):
 
 
 def identifiability(
-    problem: ShootingProblem,
-    bracket: Bracket,
-    parameters: Parameters,
-    initial_state: Float[Array, " starts"] | None = None,
+    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Identifiability:
     """Analyse which parameters of the problem's model its flight can identify, at the problem's sigma.
 
@@ -96,7 +93,7 @@ def identifiability(
     **Returns:** an `Identifiability`. Its standard deviations are infinite if the trajectory diverges at `parameters`
     or the bracket is not valid.
 
-    **Raises:** `ValueError` if the model has another number of parameters than `parameters` or `bracket`.
+    **Raises:** `ValueError` for a wrong number of parameters.
     """
     parameters, names = as_float(parameters), problem.model.parameter_names
     for name, shape in (("parameters", parameters.shape), ("bracket", bracket.lower.shape)):
@@ -107,7 +104,7 @@ def identifiability(
 
 @eqx.filter_jit
 def _identifiability(
-    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: Float[Array, " starts"] | None
+    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: InitialStates | None
 ) -> Identifiability:
     sound = bracket.valid & jnp.isfinite(problem.cost(parameters, initial_state))
     parameters, half_width = jnp.where(sound, parameters, problem.model.alpha), bracket.usable.half_width

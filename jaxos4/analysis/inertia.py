@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, Scalar, as_float
+from .._custom_types import Covariance, Parameters, Scalar, as_float
 from ..airframe import inertia_from_alpha
 from ..linalg import cholesky, invert, invert_factor
 from ..models.abstract import AbstractModel
@@ -48,20 +48,15 @@ class InertiaFit(eqx.Module):
 
 
 @eqx.filter_jit
-def fit_inertia(
-    model: AbstractModel, alpha: Parameters, covariance: Float[Array, "parameters parameters"]
-) -> InertiaFit:
+def fit_inertia(model: AbstractModel, alpha: Parameters, covariance: Covariance) -> InertiaFit:
     """Fit four constants to eight alphas by weighted least squares (Gauss-Newton).
 
-    **Arguments:**
-
-    - `model`: its `gyroscopic_factor` times J_R is the numerator of alpha2 and alpha5.
-    - `alpha`, `covariance`: of an estimate.
+    **Arguments:** a `model` with the parameters alpha_1..8, and `alpha`, `covariance` of an estimate.
 
     **Returns:** the fit. If the inputs are not finite, or no positive inertias fit them: the constants of the airframe,
     with an infinite covariance and mismatch and a `p_value` of 0.
 
-    **Raises:** `ValueError` for other shapes, or a model whose parameters are not alpha_1..8.
+    **Raises:** `ValueError` for other shapes or another model.
     """
     inertial, alpha, covariance = InertialOS4(model), as_float(alpha), as_float(covariance)
     if alpha.shape != (8,) or covariance.shape != (8, 8):

@@ -24,9 +24,8 @@ _PARTS = 10
 class Predictions(NamedTuple):
     """Predictions of the body rates p, q, r [rad/s] from many starts.
 
-    - `start`: the sample at which each prediction starts.
+    - `start`: the sample at which each prediction starts. `initial`: the measured rates there.
     - `horizons`: time from the start to the prediction [s].
-    - `initial`: the measured rates at the start.
     - `predicted`, `measured`: the rates at each horizon. NaN: not measured.
     """
 
@@ -40,12 +39,10 @@ class Predictions(NamedTuple):
 class Skill(NamedTuple):
     """The skill of predictions, compared with persistence: "the rates stay constant".
 
-    - `rmse`: root mean square error of the predictions [rad/s].
-    - `persistence`: root mean square error of persistence [rad/s].
+    - `rmse`, `persistence`: root mean square errors of the predictions and of persistence [rad/s].
     - `skill`: 1 - (rmse / persistence)^2. 1 is perfect, 0 is as good as persistence, negative is worse. NaN: nothing
       was measured, or both errors are 0.
-    - `std`: standard error of the skill, from a jackknife over ten parts of the flight. Neighbouring predictions may be
-      correlated.
+    - `std`: standard error of the skill, from a jackknife over ten parts of the flight.
     - `starts`: number of starts.
     """
 
@@ -64,10 +61,8 @@ def predictions(
     Starts are 0.05 s apart. The initial rates are the mean of the rates measured within 0.01 s of the start. A start is
     omitted if one of these rates is missing, or if the longest horizon reaches beyond the stretch.
 
-    **Arguments:**
-
-    - `problem`: gives model, flight and method. Its windows and channels have no effect.
-    - `horizons`: [s], positive.
+    **Arguments:** `problem` gives model, flight and method; its windows and channels have no effect. `horizons` [s] are
+    positive.
 
     **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """
@@ -84,10 +79,7 @@ def predictions(
 def starts(
     flight: Flight, horizons: tuple[float, ...] = HORIZONS
 ) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 3"]]:
-    """The samples at which `predictions` starts, and the measured rates there [rad/s].
-
-    **Raises:** the errors of `predictions`.
-    """
+    """The samples at which `predictions` starts, and the measured rates there [rad/s]. Raises the same errors."""
     dt, samples, ahead = float(flight.dt), flight.time.shape[0], _ahead(flight, horizons)
     around = int(_AROUND / 2 / dt)
     stretch = np.zeros(samples, dtype=int) if flight.stretch is None else np.asarray(flight.stretch)
@@ -96,10 +88,10 @@ def starts(
     start = start[stretch[start - around] == stretch[np.minimum(start + ahead.max(), samples - 1)]]
     near = start[:, None] + np.arange(-around, around + 1)
     initial = rates[near].mean(axis=1)
-    start, initial = start[np.isfinite(initial).all(axis=1)], initial[np.isfinite(initial).all(axis=1)]
-    if not start.size:
+    known = np.isfinite(initial).all(axis=1)
+    if not known.any():
         raise ValueError(f"`flight` has no stretch with measured rates that is longer than {max(horizons)} s.")
-    return start, initial
+    return start[known], initial[known]
 
 
 def _ahead(flight: Flight, horizons: tuple[float, ...]) -> Int[np.ndarray, " horizons"]:

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import Covariance, InitialStates, Parameters, as_float
 from ..linalg import covariances
 from ..shooting import ShootingProblem
 
@@ -17,8 +17,8 @@ _MANY_WINDOWS, _LARGEST_WINDOW = 20, 4000
 
 @eqx.filter_jit
 def robust_covariance(
-    problem: ShootingProblem, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
-) -> Float[Array, "parameters parameters"]:
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
+) -> Covariance:
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
@@ -28,9 +28,6 @@ def robust_covariance(
     **Arguments:** as for `cramer_rao_bound`, at the answer of a fit.
 
     **Returns:** the covariance; infinite if the trajectory diverges or nothing was measured.
-
-    A flight with 20 windows or more estimates R from its windows, see `_window_by_window`. Any other flight takes the
-    noise as stationary, see `_stationary`.
 
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """
@@ -52,7 +49,7 @@ def robust_covariance(
 
 
 def _linearised(
-    problem: ShootingProblem, parameters: Parameters, start: Float[Array, " starts"]
+    problem: ShootingProblem, parameters: Parameters, start: InitialStates
 ) -> tuple[Float[Array, "windows length columns"], Float[Array, "unknowns windows length columns"]]:
     """The weighted residuals, window by window, and their derivatives in the parameters and the initial states.
 
@@ -76,11 +73,10 @@ def _stationary(
     errors: Float[Array, "samples columns"],
     measured: Float[Array, "samples columns"],
     moves: Float[Array, "samples columns parameters"],
-) -> Float[Array, "parameters parameters"]:
+) -> Covariance:
     """The covariance for stationary noise: R(t, s) depends on t - s only.
 
-    R is summed over lags up to a tenth of the flight, with Bartlett's weights, which make the sum positive. Sums over
-    lags are products of spectra.
+    Bartlett's weights make the sum over lags positive. Sums over lags are products of spectra.
     """
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
@@ -103,18 +99,17 @@ def _window_by_window(
     errors: Float[Array, "windows length columns"],
     measured: Float[Array, "windows length columns"],
     moves: Float[Array, "windows length columns parameters"],
-) -> Float[Array, "parameters parameters"]:
+) -> Covariance:
     """The covariance for many windows: the residuals of the windows are draws of one random vector.
 
-    The initial state of a window absorbs some slow noise, more at the ends of the window than in its middle, so
-    residuals are not stationary. The covariance of the vector, and of the vector with its successor, is the mean over
-    the windows. The noise that the initial states absorb moves no parameter.
+    The initial state of a window absorbs some slow noise, more at its ends than in its middle, so residuals are not
+    stationary. The covariance of the vector, and of the vector with its successor, is the mean over the windows.
     """
     windows, parameters = moves.shape[0], moves.shape[-1]
     errors, measured = errors.reshape(windows, -1), measured.reshape(windows, -1)
     moves = moves.reshape(windows, -1, parameters)
 
-    def contribution(apart: int) -> Float[Array, "parameters parameters"]:
+    def contribution(apart: int) -> Covariance:
         """The contribution of all pairs of windows that are `apart` windows apart."""
         count = windows - apart
         pairs = measured[:count].T @ measured[apart:]

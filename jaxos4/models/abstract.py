@@ -24,7 +24,6 @@ DEFAULT_HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
 class Parameter(NamedTuple):
     """One unknown of a model.
 
-    - `name`, `unit`.
     - `in_forcing`: whether the forcing depends on the parameter.
     - `linear`: whether the rate equations are linear in the parameter if the forcing does not depend on it.
     """
@@ -46,12 +45,12 @@ class AbstractModel(eqx.Module):
     @property
     @abc.abstractmethod
     def parameters(self) -> tuple[Parameter, ...]:
-        """The table of the unknown parameters. The order of the table is the order of all arrays of parameters."""
+        """The table of the unknown parameters, in the order of all arrays of parameters."""
 
     @property
     @abc.abstractmethod
     def alpha(self) -> Parameters:
-        """The value of each parameter that follows from the airframe's constants: the centre of the default bracket."""
+        """The parameters that follow from the airframe's constants: the centre of the default bracket."""
 
     @property
     @abc.abstractmethod
@@ -110,13 +109,9 @@ class AbstractModel(eqx.Module):
         return all(parameter.linear and not parameter.in_forcing for parameter in self.parameters)
 
     def derivative(self, state: StateVector, omega: Float[Array, "4"], parameters: Parameters) -> StateVector:
-        """dX/dt of the whole state in the paper's order, Eq. (14).
+        """dX/dt in the paper's order, Eq. (14), in SI units.
 
-        **Arguments:**
-
-        - `state`: X in the order of `jaxos4.STATE_NAMES`, SI units.
-        - `omega`: rotor speeds [rad/s].
-        - `parameters`: in the order of `parameter_names`.
+        **Arguments:** `state` X, `omega` [rad/s], and `parameters` in the order of `parameter_names`.
         """
         rows = self.forcing(Inputs(omega[None], jnp.ones(())), parameters)
         forcing = jax.tree.map(lambda leaf: leaf[0], rows)
@@ -125,7 +120,7 @@ class AbstractModel(eqx.Module):
 
 
 class AbstractOS4(AbstractModel):
-    """The part that the two OS4 models share. Their parameters are alpha_1..8, and their sensors show the states."""
+    """The common part of the two OS4 models: their parameters are alpha_1..8, and their sensors show the states."""
 
     @property
     @abc.abstractmethod
@@ -150,12 +145,10 @@ class AbstractOS4(AbstractModel):
 
     @property
     def half_width(self) -> Float[Array, "8"]:
-        """`DEFAULT_HALF_WIDTH`. The widths of alpha3, alpha6 and alpha8 are scaled to the airframe's inertia."""
+        """`DEFAULT_HALF_WIDTH`, with the widths of alpha3, alpha6 and alpha8 scaled to the airframe's inertia."""
         os4, own = (alpha_from_inertia(airframe.inertia, jnp.zeros(())) for airframe in (OS4, self.airframe))
-        inverse_inertia = jnp.zeros(8, dtype=bool).at[jnp.array([2, 5, 7])].set(True)
-        return jnp.asarray(DEFAULT_HALF_WIDTH) * jnp.where(
-            inverse_inertia, own / jnp.where(inverse_inertia, os4, 1.0), 1.0
-        )
+        scaled = jnp.zeros(8, dtype=bool).at[jnp.array([2, 5, 7])].set(True)
+        return jnp.asarray(DEFAULT_HALF_WIDTH) * jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0)
 
     @property
     def force_axes(self) -> tuple[int, ...]:
@@ -175,16 +168,15 @@ class AbstractOS4(AbstractModel):
         return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
-        """The time derivative of the part of the cascade that `state` holds."""
+        """See `AbstractModel`."""
         rates = self.angular_acceleration(state.rates, forcing, parameters)
-        attitude = translation = None
-        if state.attitude is not None:
-            attitude = attitude_rates(state.rates, state.attitude)
-        if state.attitude is not None and state.translation is not None:
-            ax, ay, az = self.acceleration(state.attitude, forcing)
-            t = state.translation
-            translation = Translation(t.vx, ax, t.vy, ay, t.vz, az)
-        return State(rates, attitude, translation)
+        if state.attitude is None:
+            return State(rates)
+        attitude, t = attitude_rates(state.rates, state.attitude), state.translation
+        if t is None:
+            return State(rates, attitude)
+        ax, ay, az = self.acceleration(state.attitude, forcing)
+        return State(rates, attitude, Translation(t.vx, ax, t.vy, ay, t.vz, az))
 
     def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
         """The states in cascade order."""

@@ -15,11 +15,8 @@ from .reparametrised import AbstractReparametrised
 class HeldParameters(AbstractReparametrised):
     """A model with some of its parameters held at known values. `hold` makes one.
 
-    **Arguments:**
-
     - `model`: the inner model.
-    - `held`: the positions of the held parameters in `model.parameter_names`.
-    - `values`: their values.
+    - `held`, `values`: the positions of the held parameters in `model.parameter_names`, and their values.
     """
 
     model: AbstractModel
@@ -35,15 +32,15 @@ class HeldParameters(AbstractReparametrised):
         return np.delete(np.arange(len(self.model.parameters)), list(self.held))
 
     def without(self, values: Float[Array, " all"]) -> Float[Array, " free"]:
-        """The values of the remaining parameters, from one value for each parameter of the inner model."""
+        """The values of the remaining parameters, from one value for each inner parameter."""
         return values[self.free]
 
     def complete(self, parameters: Float[Array, " free"]) -> Float[Array, " all"]:
-        """The parameters of the inner model, from those of this model and the held values."""
+        """The inner parameters, from the remaining ones and the held values."""
         return jnp.stack(self.inner(tuple(parameters)))
 
     def inner(self, parameters) -> tuple[Scalar, ...]:
-        """The parameters of the inner model: the given ones and the held ones, in the inner model's order."""
+        """See `AbstractReparametrised`."""
         values = dict(zip(self.free.tolist(), parameters, strict=True))
         values.update(zip(self.held, self.values, strict=True))
         return tuple(values[i] for i in range(len(values)))
@@ -56,19 +53,17 @@ class HeldParameters(AbstractReparametrised):
 
     @property
     def alpha(self) -> Parameters:
-        """The inner model's values of the remaining parameters."""
+        """The values of the remaining parameters in the inner model."""
         return self.without(self.model.alpha)
 
     @property
     def half_width(self) -> Parameters:
-        """The inner model's widths of the remaining parameters."""
+        """The widths of the remaining parameters in the inner model."""
         return self.without(self.model.half_width)
 
 
 def hold(model: AbstractModel, values: Mapping[str, Float[Array, ""] | float]) -> HeldParameters:
-    """Hold the parameters named in `values`: `hold(FlightModel(airframe), {"rotor_lag": 0.06})`.
-
-    **Returns:** a model whose parameters are the remaining ones.
+    """The model without the parameters named in `values`: `hold(FlightModel(airframe), {"rotor_lag": 0.06})`.
 
     **Raises:** `ValueError` for a name that the model does not have, or if no parameter remains.
     """

@@ -10,13 +10,10 @@ from .reparametrised import AbstractReparametrised
 
 
 class InertialOS4(AbstractReparametrised):
-    """An OS4 model with the parameters Ix, Iy, Iz and J_R instead of the eight alphas.
+    """`PublishedOS4` or `CorrectedOS4` with the parameters Ix, Iy, Iz and J_R instead of the eight alphas.
 
-    The eight alphas of a rigid body follow from these four constants, so an estimate of the four is more precise.
-
-    **Arguments:**
-
-    - `model`: `PublishedOS4` or `CorrectedOS4`. Its alphas follow from the constants by the definitions below Eq. (13).
+    The eight alphas of a rigid body follow from these four constants (the definitions below Eq. (13)), so an estimate
+    of the four is more precise.
 
     **Raises:** `ValueError` for another model.
     """
@@ -42,10 +39,8 @@ class InertialOS4(AbstractReparametrised):
     @property
     def half_width(self) -> Float[Array, "4"]:
         """30 % of each inertia, and for J_R the width that the inner bracket has for alpha2. It may exceed J_R."""
-        ix = jnp.asarray(self.airframe.inertia)[0]
-        return jnp.append(
-            0.3 * jnp.asarray(self.airframe.inertia), self.model.half_width[1] * ix / self.model.gyroscopic_factor
-        )
+        inertia = jnp.asarray(self.airframe.inertia)
+        return jnp.append(0.3 * inertia, self.model.half_width[1] * inertia[0] / self.model.gyroscopic_factor)
 
     def inner(self, parameters) -> tuple[Scalar, ...]:
         """alpha_1..8 of these constants."""

@@ -1,4 +1,12 @@
-"""The model as the paper prints it."""
+"""The model as the paper prints it.
+
+Its equations are here:
+
+- Eqs. (1)-(3), (7)-(9): `PublishedOS4`, rates and translation.
+- Eqs. (4)-(6): attitude, `rotation.attitude_rates`.
+- Eqs. (10)-(13): torques and thrust, `Airframe.mixer`; the definitions of alpha below them, `alpha_from_inertia`.
+- Eq. (14): the order of the state, `STATE_NAMES`.
+"""
 
 import jax.numpy as jnp
 
@@ -10,15 +18,13 @@ from .state import Attitude, Forcing, Rates
 
 
 class PublishedOS4(AbstractOS4):
-    """The model exactly as the paper prints it: Eqs. (1)-(13).
+    """The model exactly as the paper prints it: Eqs. (1)-(13), kept as a benchmark.
 
-    The printed model departs from rigid-body physics in three places, and is kept as a benchmark:
+    It departs from the physics of a rigid body, which is `CorrectedOS4`, in three places:
 
     - The gyroscopic terms lack the rotor speed: alpha2 = J_R d / Ix multiplies q alone, in 1/s.
     - Eq. (2) has alpha5 r; physics has alpha5 p.
     - Eqs. (7)-(9) mix two earth frames.
-
-    `CorrectedOS4` has the equations of a rigid body.
     """
 
     airframe: Airframe = OS4
@@ -34,7 +40,7 @@ class PublishedOS4(AbstractOS4):
         return "1/s"
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
-        """Eqs. (1)-(3)."""
+        """p', q', r' [rad/s^2]: Eqs. (1)-(3)."""
         p, q, r = rates
         a1, a2, a3, a4, a5, a6, a7, a8 = parameters
         return Rates(
@@ -44,7 +50,7 @@ class PublishedOS4(AbstractOS4):
         )
 
     def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """Eqs. (7)-(9)."""
+        """x'', y'', z'' [m/s^2]: Eqs. (7)-(9)."""
         sin_phi, cos_phi = sincos(attitude.phi)
         sin_theta, cos_theta = sincos(attitude.theta)
         sin_psi, cos_psi = sincos(attitude.psi)

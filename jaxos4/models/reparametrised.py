@@ -23,36 +23,36 @@ class AbstractReparametrised(AbstractModel):
 
     @property
     def airframe(self) -> Airframe:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The airframe of the inner model."""
+        """See `AbstractModel`."""
         return self.model.airframe
 
     @property
     def gyroscopic_factor(self) -> Scalar:
-        """The factor of the inner model."""
+        """See `AbstractModel`."""
         return self.model.gyroscopic_factor
 
     @property
     def force_axes(self) -> tuple[int, ...]:
-        """The axes of the inner model."""
+        """See `AbstractModel`."""
         return self.model.force_axes
 
     @property
     def observes_states(self) -> bool:
-        """As in the inner model."""
+        """See `AbstractModel`."""
         return self.model.observes_states
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The forcing of the inner model."""
+        """See `AbstractModel`."""
         return self.model.forcing(inputs, jnp.stack(self.inner(tuple(parameters))))
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
-        """The rate equations of the inner model."""
+        """See `AbstractModel`."""
         return self.model.angular_acceleration(rates, forcing, self.inner(parameters))
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
-        """The time derivative by the inner model."""
+        """See `AbstractModel`."""
         return self.model.cascade(state, forcing, self.inner(parameters))
 
     def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
-        """The sensors of the inner model."""
+        """See `AbstractModel`."""
         return self.model.observe(state, forcing, self.inner(parameters))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from ..flight import STATE_NAMES, Flight, fill_gaps
 from ..trigonometry import sincos
-from .state import Attitude, Forcing, Rates, Samples, State, Vector
+from .state import Attitude, Rates, Samples, Vector
 
 
 def attitude_rates(rates: Rates, attitude: Attitude) -> Attitude:
@@ -35,24 +35,13 @@ def to_body(attitude: Attitude, earth: Vector) -> Vector:
 
 
 def with_body_velocity(flight: Flight) -> Flight:
-    """Add `body_velocity` to a flight that measured velocity and attitude. Other flights are returned unchanged.
-
-    A missing measurement is replaced by the previous one.
-    """
+    """Add `body_velocity` to a flight that measured velocity and attitude. Other flights are returned unchanged."""
     columns = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "vx", "vy", "vz")]
     if bool(jnp.isnan(flight.states[:, columns]).all(axis=0).any()):
         return flight
     *angles, vx, vy, vz = fill_gaps(flight.states[:, columns]).T
     velocity = to_body(Attitude(*angles), (vx, vy, vz))
     return eqx.tree_at(lambda f: f.body_velocity, flight, jnp.stack(velocity, axis=1), is_leaf=lambda x: x is None)
-
-
-def with_simulated_velocity(forcing: Forcing, state: State) -> Forcing:
-    """Take the body velocity from `state` if it was not measured and `state` holds a velocity and an attitude."""
-    t, attitude = state.translation, state.attitude
-    if forcing.velocity is not None or attitude is None or t is None:
-        return forcing
-    return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
 
 
 def _sines_and_cosines(attitude: Attitude) -> tuple[Samples, ...]:

@@ -15,10 +15,7 @@ _SHORTEST_LAG = 0.05
 
 
 class Grid(NamedTuple):
-    """The time grid of a flight: the sample time [s], and the stretch, first and last sample of each sample's stretch.
-
-    A stretch is a part of the flight without a break.
-    """
+    """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that."""
 
     dt: Scalar
     stretch: Int[Array, " samples"]
@@ -67,8 +64,8 @@ def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:
 
     Before its first command, a stretch has its first command. After its last command, it has its last command.
 
-    Cubics interpolate between samples and join smoothly (Catmull and Rom 1974). So a delay of whole samples is exact,
-    and the derivative in the delay has no jumps at which a search could end.
+    Cubics interpolate between samples (Catmull and Rom 1974): a delay of whole samples is exact, and the derivative in
+    the delay has no jumps at which a search could end.
     """
     count, samples = omega.shape[0], delay / grid.dt
     floor = jnp.floor(jax.lax.stop_gradient(samples))

@@ -1,8 +1,8 @@
 """The state of a quadrotor as a cascade, and the forcing: rotors -> torque -> rates -> attitude -> translation.
 
-The parameters enter only the forcing and the rate equations. Attitude follows from the rates, translation from the
-attitude, and neither feeds back. So a `State` may stop at any level of the cascade: a level that is `None` is not
-simulated. States are separate scalars because a batch of scalars vectorises and a batch of 12-vectors does not.
+The parameters enter only the forcing and the rate equations, and no level feeds back. So a `State` may stop at any
+level: a level that is `None` is not simulated. States are separate scalars because a batch of scalars vectorises and a
+batch of 12-vectors does not.
 """
 
 from typing import NamedTuple
@@ -60,10 +60,10 @@ class Forcing(NamedTuple):
     Only a `FlightModel` has the other fields:
 
     - `spin_up`: Omega_r' [rad/s^2].
-    - `specific_thrust`: U_c / m at the sample itself [m/s^2], as an accelerometer measures it.
+    - `specific_thrust`: U_c/m at the sample itself [m/s^2], as an accelerometer measures it.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
-    - `velocity`: the measured velocity along the body's axes [m/s], if a log has it.
-    - `lateral`: the measured specific force along x and y [m/s^2], if a log has it and a term needs it.
+    - `velocity`: measured, along the body's axes [m/s].
+    - `lateral`: the measured specific force along x and y [m/s^2], if a term needs it.
     """
 
     roll: Samples
@@ -88,9 +88,8 @@ CHANNELS = {"rates": 3, "attitude": 6, "all": 12}
 def unstack(values: Float[Array, " states"]) -> State:
     """A `State` from its first 3, 6 or 12 leaves in cascade order."""
     v = tuple(values)
-    return State(
-        Rates(*v[:3]), Attitude(*v[3:6]) if len(v) > 3 else None, Translation(*v[6:12]) if len(v) > 6 else None
-    )
+    attitude, translation = Attitude(*v[3:6]) if len(v) > 3 else None, Translation(*v[6:]) if len(v) > 6 else None
+    return State(Rates(*v[:3]), attitude, translation)
 
 
 def stack(state: State) -> Float[Array, "*batch states"]:

@@ -1,6 +1,6 @@
 """The terms of the vehicle model: one object for each effect of real vehicles that the corrected OS4 lacks.
 
-A new term is one more `Term` in `TERMS`: `FlightModel` and the identification find everything else in that object.
+A new term is one more `Term` in `TERMS`; everything else is found in that object.
 """
 
 from collections.abc import Callable, Mapping
@@ -38,7 +38,6 @@ Constant = float | Callable[[Airframe], Scalar]
 class TermParameter(NamedTuple):
     """One parameter of a term.
 
-    - `name`, `unit`.
     - `half_width`, `center`: of the default bracket: a number, or a function of the airframe.
     - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
@@ -74,10 +73,8 @@ class Term:
     - `gyro(rates, values)`: the measured body rates [rad/s].
     - `accelerometer(force, values)`: the measured specific force [m/s^2]. It makes specific force a measurement.
 
-    If each recording has its own value of a parameter, `values` holds that of the sample's recording. The first three
-    contributions act on a whole flight at once: their parameters cannot differ between recordings.
-
-    **Raises:** `ValueError` for such parameters of such a contribution.
+    If each recording has its own value of a parameter, `values` holds that of the sample's recording. This is not
+    possible in the first three contributions, which act on a whole flight at once: `ValueError`.
     """
 
     description: str
@@ -133,12 +130,12 @@ def _add_damping(total: Rates, values: Values, rates: Rates, forcing: Forcing) -
 
 
 def _add_velocity(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-    vx, vy, _ = body_velocity(forcing)
+    vx, vy, _ = required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
     return Rates(total.p + values["roll_velocity"] * vy, total.q + values["pitch_velocity"] * vx, total.r)
 
 
 def _add_flapping(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-    ax, ay = lateral_force(forcing)
+    ax, ay = required(forcing.lateral, _missing(LATERAL_FORCE, "specific_force"))
     return Rates(total.p + values["roll_flapping"] * ay, total.q + values["pitch_flapping"] * ax, total.r)
 
 
@@ -159,7 +156,7 @@ def _scale_thrust(force: Vector, values: Values, forcing: Forcing) -> Vector:
 
 
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    vx, vy, _ = body_velocity(forcing)
+    vx, vy, _ = required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
     x, y, z = force
     return x - values["x_drag"] * vx, y - values["y_drag"] * vy, z
 
@@ -264,16 +261,6 @@ def default_terms(available: frozenset[str]) -> tuple[str, ...]:
 def has_full_scale(airframe: Airframe) -> bool:
     """Whether `max_rotor_speed` is known. A traced value counts as known."""
     return isinstance(airframe.max_rotor_speed, Tracer) or bool(np.isfinite(airframe.max_rotor_speed))
-
-
-def body_velocity(forcing: Forcing) -> Vector:
-    """The body velocity [m/s]. Raises `ValueError` if it is neither measured nor simulated."""
-    return required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
-
-
-def lateral_force(forcing: Forcing) -> tuple[Samples, Samples]:
-    """The measured specific force along x and y [m/s^2]. Raises `ValueError` if it was not measured."""
-    return required(forcing.lateral, _missing(LATERAL_FORCE, "specific_force"))
 
 
 def required(value: T | None, message: str) -> T:

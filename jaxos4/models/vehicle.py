@@ -13,7 +13,7 @@ from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from .corrected import CorrectedOS4
-from .rotation import attitude_rates, to_earth, with_simulated_velocity
+from .rotation import attitude_rates, to_body, to_earth
 from .rotors import Grid, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector
 from .terms import (
@@ -49,14 +49,12 @@ class FlightModel(AbstractModel):
 
     **Arguments:**
 
-    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`.
+    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity` and `drag` need
+      `Flight.body_velocity`. `flapping` needs `Flight.specific_force`, and replaces `velocity` if there is none.
+      `gyro_bias` and `offset` can be distinguished only if the attitude is compared too. Leave out `lag` and `delay` if
+      rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
       own offsets and gyro biases. All other parameters are the vehicle's.
-
-    `velocity` and `drag` need `Flight.body_velocity`, `flapping` needs `Flight.specific_force`. The drag of the rotors
-    is proportional to the body velocity, and so is its moment: `flapping` uses the measured force if velocity was not
-    measured. `gyro_bias` and `offset` can be distinguished only if the attitude is compared too. Leave out `lag` and
-    `delay` if rotor speeds were measured. `jaxos4.hold` holds parameters at known values.
 
     **Raises:** `ValueError` for a term that does not exist or is given twice, recordings that are not counted from 0,
     or a term that needs `airframe.max_rotor_speed` if that is not known.
@@ -95,18 +93,20 @@ class FlightModel(AbstractModel):
 
     @property
     def half_width(self) -> Parameters:
-        """Half the width of a bracket for each parameter: our choice, wide enough for small and large quadrotors."""
+        """Half the width of a bracket for each parameter: our choice, for small and large quadrotors."""
         return jnp.concatenate([self._rigid_body.half_width, self._of_terms(lambda parameter: parameter.half_width)])
 
     @property
     def gyroscopic_factor(self) -> Scalar:
-        """1: alpha2 = J_R / Ix."""
+        """See `AbstractModel`."""
         return self._rigid_body.gyroscopic_factor
 
     @property
     def force_axes(self) -> tuple[int, ...]:
         """The axes that the terms predict, if one of the terms is an accelerometer."""
-        return _force_axes(self._terms)
+        if not any(term.accelerometer for term in self._terms):
+            return ()
+        return tuple(sorted({axis for term in self._terms for axis in term.force_axes}))
 
     @property
     def observes_states(self) -> bool:
@@ -114,10 +114,7 @@ class FlightModel(AbstractModel):
         return not any(term.gyro or term.accelerometer for term in self._terms)
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The chain from commands to torque and thrust: each term acts at its place.
-
-        The speeds of rotors with a lag change linearly over a sample: their mean square makes the mean torque.
-        """
+        """The chain from commands to torque and thrust: each term acts at its place."""
         airframe, grid, omega = self.airframe, Grid.of(inputs), inputs.omega
         for change, values in self._contributions("command", parameters):
             omega = change(omega, values, grid)
@@ -159,10 +156,7 @@ class FlightModel(AbstractModel):
         return force
 
     def cascade(self, state: State, forcing: Forcing, parameters) -> State:
-        """The time derivative of the part of the cascade that `state` holds.
-
-        Terms that need the body velocity use the measured one, or else that of the state.
-        """
+        """See `AbstractModel`. Terms use the measured body velocity, or else that of the state."""
         t, attitude = state.translation, state.attitude
         forcing = self._with_velocity(forcing, state)
         rates = self.angular_acceleration(state.rates, forcing, parameters)
@@ -197,7 +191,7 @@ class FlightModel(AbstractModel):
 
     @property
     def _table(self) -> "tuple[_Row, ...]":
-        return _table(self._terms, max(self.recordings) + 1)
+        return _table(self._terms, self.force_axes, max(self.recordings) + 1)
 
     def _of_terms(self, constant: Callable[[TermParameter], Constant]) -> Parameters:
         """A constant of each row of the table, for this airframe."""
@@ -208,7 +202,7 @@ class FlightModel(AbstractModel):
     def _contributions(
         self, quantity: str, parameters, forcing: Forcing | None = None
     ) -> list[tuple[Callable, Values]]:
-        """The contributions of the terms to a quantity, a field of `Term`, each with the values of its parameters."""
+        """The contributions of the terms to a field of `Term`, each with the values of its parameters."""
         acting = [(term, getattr(term, quantity)) for term in self._terms]
         return [(change, self._values(term, parameters, forcing)) for term, change in acting if change]
 
@@ -231,7 +225,11 @@ class FlightModel(AbstractModel):
         return any(need in term.needs for term in self._terms)
 
     def _with_velocity(self, forcing: Forcing, state: State) -> Forcing:
-        return with_simulated_velocity(forcing, state) if self._needs(BODY_VELOCITY) else forcing
+        """Take the body velocity from `state` if a term needs it and it was not measured."""
+        t, attitude = state.translation, state.attitude
+        if not self._needs(BODY_VELOCITY) or forcing.velocity is not None or attitude is None or t is None:
+            return forcing
+        return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
 
 
 class _Row(NamedTuple):
@@ -248,17 +246,12 @@ class _Row(NamedTuple):
         return Parameter(name, self.source.unit, in_forcing=self.term.in_forcing)
 
 
-def _force_axes(terms: tuple[Term, ...]) -> tuple[int, ...]:
-    measured = any(term.accelerometer for term in terms)
-    return tuple(sorted({axis for term in terms for axis in term.force_axes})) if measured else ()
-
-
 @functools.cache
-def _table(terms: tuple[Term, ...], recordings: int) -> tuple[_Row, ...]:
+def _table(terms: tuple[Term, ...], force_axes: tuple[int, ...], recordings: int) -> tuple[_Row, ...]:
     """The parameters term by term, and within a term recording by recording."""
-    axes, rows, numbers = (None, *_force_axes(terms)), [], (None,) if recordings == 1 else range(recordings)
+    rows, numbers = [], (None,) if recordings == 1 else range(recordings)
     for term in terms:
-        sources = [source for source in term.parameters if source.force_axis in axes]
+        sources = [source for source in term.parameters if source.force_axis in (None, *force_axes)]
         rows += [_Row(term, source, None) for source in sources if not source.each_recording]
         rows += [_Row(term, source, number) for number in numbers for source in sources if source.each_recording]
     return tuple(rows)

@@ -1,4 +1,4 @@
-"""A shooting problem: a model, a flight and weights. The cost says how badly parameters explain the flight."""
+"""A shooting problem: how badly parameters of a model explain a flight."""
 
 import dataclasses
 
@@ -9,13 +9,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, Scalar, StateVector, as_float
+from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
-from .rows import Rows, cut, windowed
+from .rows import Rows, windowed
 from .scans import Curvature, Shot, predict_window, shoot, shoot_with_derivatives
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
@@ -98,7 +98,7 @@ class ShootingProblem(eqx.Module):
 
     @property
     def free_size(self) -> int:
-        """The number of unknowns in the initial state of one window: `size`, or 0 if the initial state is known."""
+        """The number of unknowns in the initial state of one window: `size`, or 0 if it is known."""
         return 0 if self.initial_state is not None else self.size
 
     @property
@@ -112,15 +112,12 @@ class ShootingProblem(eqx.Module):
         return dataclasses.replace(self, channels=channels)
 
     def measured(self) -> Float[Array, "samples columns"]:
-        """The measurements that are compared, in the order of `columns`. A known first sample is NaN: it is no data."""
+        """The measurements in the order of `columns`. A known first sample is NaN: it is no data."""
         measured = (self.flight.channels if self.model.force_axes else self.flight.states)[:, self.columns]
         return measured if self.initial_state is None else measured.at[0].set(jnp.nan)
 
     def rows(self, parameters: Parameters | None = None) -> Rows:
-        """The data of all windows for a scan. A shorter window ends with a missing measurement.
-
-        `parameters`: for a forcing that depends on them; `model.alpha` by default.
-        """
+        """The data of all windows for a scan, with the forcing at `parameters`, by default `model.alpha`."""
         index, within = self.cut()
         forcing = windowed(self.forcing(self.model.alpha if parameters is None else parameters), index)
         return Rows(forcing, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
@@ -157,11 +154,11 @@ class ShootingProblem(eqx.Module):
         zeros = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), rows.forcing)
         return rows._replace(forcing=completed(new, rows.forcing), forcing_tangents=completed(slopes, zeros))
 
-    def split(self, initial_state: Float[Array, " starts"]) -> Float[Array, "windows size"]:
+    def split(self, initial_state: InitialStates) -> Float[Array, "windows size"]:
         """The initial state of each window."""
         return initial_state.reshape(self.windows, self.size)
 
-    def first_state(self) -> tuple[Float[Array, " starts"], Float[Array, " starts"]]:
+    def first_state(self) -> tuple[InitialStates, InitialStates]:
         """The initial state at which a search starts, and how far off it may be.
 
         It is the known state, or the first measurement of each channel in each window, or 0 if there is none.
@@ -176,7 +173,7 @@ class ShootingProblem(eqx.Module):
         return jnp.where(jnp.isnan(value), 0.0, value).ravel(), off.ravel()
 
     @eqx.filter_jit
-    def cost(self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None) -> Scalar:
+    def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
 
         Infinite, with an undefined derivative, if the trajectory diverges or reaches theta = +-90 degrees.
@@ -188,7 +185,7 @@ class ShootingProblem(eqx.Module):
 
     @eqx.filter_jit
     def residuals(
-        self, parameters: Parameters, initial_state: Float[Array, " starts"] | None = None
+        self, parameters: Parameters, initial_state: InitialStates | None = None
     ) -> Float[Array, " residuals"]:
         """W (y - x), sample by sample with the channels in the order of `columns`; 0 for a missing measurement."""
         start = self.first_state()[0] if initial_state is None else initial_state
@@ -196,29 +193,27 @@ class ShootingProblem(eqx.Module):
         return jnp.where(jnp.isnan(measured), 0.0, (measured - predicted) / self.sigma[self.columns]).ravel()
 
     @eqx.filter_jit
-    def predict(
-        self, parameters: Parameters, initial_state: Float[Array, " starts"]
-    ) -> Float[Array, "samples columns"]:
+    def predict(self, parameters: Parameters, initial_state: InitialStates) -> Float[Array, "samples columns"]:
         """The output of noise-free sensors, in the order of `columns`."""
         _, within = self.cut()
         predict = jax.vmap(lambda forcing, start: predict_window(self._advance, forcing, parameters, start))
         return predict(self.rows(parameters).forcing, self.split(initial_state))[within]
 
-    def shots(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Shot:
+    def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
         """The cost of all windows together."""
         each = jax.vmap(self.shot, in_axes=(0, None, 0))(self.rows(parameters), parameters, self.split(initial_state))
         return Shot(each.cost.sum(), each.sound.all())
 
-    def curvatures(self, parameters: Parameters, initial_state: Float[Array, " starts"]) -> Curvature:
+    def curvatures(self, parameters: Parameters, initial_state: InitialStates) -> Curvature:
         """The curvature of each window, in the parameters and the window's own initial state."""
         rows = self.with_forcing(self.rows(), parameters, tangents=True)
         return jax.vmap(self.curvature, in_axes=(0, None, 0))(rows, parameters, self.split(initial_state))
 
-    def shot(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Shot:
-        """The cost of one window. A shooting method calls this in its inner loop with `rows` prepared once."""
+    def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
+        """The cost of one window, from `rows` that an inner loop prepares once."""
         return shoot(self._advance, rows, self._weights(), parameters, initial_state)
 
-    def curvature(self, rows: Rows, parameters: Parameters, initial_state: Float[Array, " size"]) -> Curvature:
+    def curvature(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Curvature:
         """Cost, gradient and Fisher information of one window, in the parameters and a free initial state."""
         return shoot_with_derivatives(
             self._advance,
@@ -235,11 +230,10 @@ class ShootingProblem(eqx.Module):
         """The problem with each channel's sigma estimated from the weighted `residuals` of a fit.
 
         Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
-        freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. Residuals can be rounding
-        errors alone: no sigma falls below the rounding that adds up over a flight.
+        freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. No sigma falls below the
+        rounding errors that add up over a flight.
         """
-        columns = self.columns
-        measured = self.measured()
+        columns, measured = self.columns, self.measured()
         count = (~jnp.isnan(measured)).sum(axis=0)
         unknowns = len(self.model.parameter_names) + self.windows * self.free_size
         freedom = jnp.maximum(1 - unknowns / jnp.maximum(count.sum(), 1), 1e-3)
@@ -259,8 +253,11 @@ class ShootingProblem(eqx.Module):
         return np.nonzero(self.cut()[1])[0]
 
     def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-        """The samples of each window, and which of them belong to it: some windows are one sample shorter."""
-        return cut(self.flight.states.shape[-2], self.windows)
+        """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""
+        ends = np.arange(self.windows + 1) * self.flight.states.shape[-2] // self.windows
+        index = ends[:-1, None] + np.arange(np.diff(ends).max())
+        within = index < ends[1:, None]
+        return np.where(within, index, ends[1:, None] - 1), within
 
     def _advance(self, state: State, forcing: Forcing, parameters) -> tuple[State, tuple[Scalar, ...]]:
         return self.step(state, forcing, parameters), self.model.observe(state, forcing, parameters)

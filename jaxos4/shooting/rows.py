@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..models.state import Forcing
 
@@ -12,25 +12,13 @@ from ..models.state import Forcing
 class Rows(NamedTuple):
     """One window, or a batch of windows: one leaf for each channel, one row for each sample.
 
-    - `forcing`: acts from each sample to the next.
-    - `measured`: the measurements of each channel; NaN if missing.
-    - `forcing_tangents`: the derivative of the forcing in the parameters on which it depends, along the last axis.
+    `forcing` acts from each sample to the next. A missing measurement is NaN. `forcing_tangents` is the derivative of
+    the forcing in the parameters on which it depends, along the last axis.
     """
 
     forcing: Forcing
     measured: tuple[Float[Array, "*windows rows"], ...]
     forcing_tangents: Forcing | None = None
-
-
-def cut(samples: int, windows: int) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
-    """The samples of each window, and which of them belong to it.
-
-    Some windows are one sample shorter than others. They repeat their last sample, which then does not belong.
-    """
-    ends = np.arange(windows + 1) * samples // windows
-    index = ends[:-1, None] + np.arange(np.diff(ends).max())
-    within = index < ends[1:, None]
-    return np.where(within, index, ends[1:, None] - 1), within
 
 
 def windowed(forcing: Forcing, index: Int[np.ndarray, "windows length"]) -> Forcing:

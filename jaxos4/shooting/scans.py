@@ -1,6 +1,6 @@
 """The inner loops: one scan over a window simulates it and sums its cost, gradient and information.
 
-The sums travel with the state, so that memory does not grow with the flight. Derivatives are forward-mode. All values
+The sums travel with the state, so that memory does not grow with the flight. Derivatives are forward-mode. Values
 inside a scan are scalars of a lane, because stacking them in every step is slow.
 """
 
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import InitialState, Parameters, Scalar
 from ..models.state import Forcing, State, unstack
 from .rows import Rows
 
@@ -28,9 +28,8 @@ class Shot(NamedTuple):
     """One simulated window.
 
     - `cost`: of the samples before the trajectory fails.
-    - `sound`: whether no sample fails: a pitch angle beyond +-90 degrees or a body rate above `FASTEST` fails.
-
-    The cost of a failed shot means nothing, but its derivative still points back to valid trajectories.
+    - `sound`: whether no sample fails, by a pitch angle beyond +-90 degrees or a body rate above `FASTEST`. The cost of
+      a failed shot means nothing, but its derivative still points back to valid trajectories.
     """
 
     cost: Scalar
@@ -38,10 +37,7 @@ class Shot(NamedTuple):
 
 
 class Curvature(NamedTuple):
-    """A shot with its gradient and Fisher information in (parameters, initial state).
-
-    The information J^T W^2 J is the second derivative in the Gauss-Newton approximation.
-    """
+    """A shot with its gradient and its Fisher information J^T W^2 J in (parameters, initial state)."""
 
     shot: Shot
     gradient: Float[Array, " unknowns"]
@@ -49,7 +45,7 @@ class Curvature(NamedTuple):
 
 
 def predict_window(
-    advance: Advance, forcing: Forcing, parameters: Parameters, initial_state: Float[Array, " size"]
+    advance: Advance, forcing: Forcing, parameters: Parameters, initial_state: InitialState
 ) -> Float[Array, "length columns"]:
     """The output of noise-free sensors in one window."""
     scalars = tuple(parameters)
@@ -61,11 +57,7 @@ def predict_window(
 
 
 def shoot(
-    advance: Advance,
-    rows: Rows,
-    weights: tuple[Scalar, ...],
-    parameters: Parameters,
-    initial_state: Float[Array, " size"],
+    advance: Advance, rows: Rows, weights: tuple[Scalar, ...], parameters: Parameters, initial_state: InitialState
 ) -> Shot:
     """Simulate one window and compare it with the measurements. `weights`: 1 / sigma of each channel."""
     scalars = tuple(parameters)
@@ -85,14 +77,14 @@ def shoot_with_derivatives(
     rows: Rows,
     weights: tuple[Scalar, ...],
     parameters: Parameters,
-    initial_state: Float[Array, " size"],
+    initial_state: InitialState,
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
 ) -> Curvature:
     """`shoot` with the gradient and the information in the parameters and, if it is free, the initial state.
 
-    One tangent for each unknown travels with the state, and the products of the tangents are summed at each sample.
+    One tangent for each unknown travels with the state.
     """
     count, size = parameters.shape[0], initial_state.shape[0]
     free = size if initial_state_is_free else 0
