@@ -172,11 +172,7 @@ def test_an_airframe_that_cannot_hover():
 @every_excitation
 @pytest.mark.parametrize(
     ("name", "values"),
-    [
-        ("duration", (0.0, -1.0, np.nan, np.inf, 0.001)),
-        ("dt", (0.0, np.nan)),
-        ("amplitude", (np.nan, (1.0, 1.0))),
-    ],
+    [("duration", (0.0, -1.0, np.nan, np.inf, 0.001)), ("dt", (0.0, np.nan)), ("amplitude", (np.nan, (1.0, 1.0)))],
 )
 def test_arguments_out_of_range_are_named(excite, name, values):
     for value in values:

@@ -338,10 +338,7 @@ BAD = {
     "no state": (csv("t,omega1,omega2,omega3,omega4,P,b,c"), ["no state was measured", "'P' be p"]),
     "nothing in the states": (csv(rows=[row.rsplit(",", 3)[0] + ",,," for row in ROWS]), ["no state was measured"]),
     "twice the same": (csv(HEADER.replace("q", " p ")), ["row 1, column p", "occurs 2 times"]),
-    "a cell short": (
-        csv(rows=[*ROWS[:2], ROWS[2].rsplit(",", 1)[0], *ROWS[3:]]),
-        ["row 4", "7 cells", "header has 8"],
-    ),
+    "a cell short": (csv(rows=[*ROWS[:2], ROWS[2].rsplit(",", 1)[0], *ROWS[3:]]), ["row 4", "7 cells", "header has 8"]),
     "a cell long": (csv(rows=[*ROWS[:2], ROWS[2] + ",0", *ROWS[3:]]), ["row 4", "9 cells", "the header has 8"]),
     "a cut line": (csv(rows=[*ROWS, "0.0"]), ["row 8", "has 1 cell,"]),
     "a blank row": (csv(rows=[*ROWS[:2], "", *ROWS[2:]]), ["row 4", "is blank"]),
@@ -613,10 +610,7 @@ def test_turns_are_taken_out_before_interpolation(save):
     assert notes[0] == "psi: 4 jumps of 2 pi removed"
 
 
-@given(
-    turns=hnp.arrays(int, st.integers(2, 30), elements=st.integers(-3, 3)),
-    seed=st.integers(0, 99),
-)
+@given(turns=hnp.arrays(int, st.integers(2, 30), elements=st.integers(-3, 3)), seed=st.integers(0, 99))
 @settings(max_examples=50)
 def test_unwrapping_changes_by_whole_turns_and_leaves_the_smooth(turns, seed):
     rng = np.random.default_rng(seed)

@@ -247,11 +247,7 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
 
 
 @settings(max_examples=50)
-@given(
-    st.lists(st.integers(1, 3), min_size=6, max_size=6),
-    st.integers(1, 40),
-    st.integers(1, 12),
-)
+@given(st.lists(st.integers(1, 3), min_size=6, max_size=6), st.integers(1, 40), st.integers(1, 12))
 def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
     few = iter(lengths)
     study = Study(
