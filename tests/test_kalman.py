@@ -8,8 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, REFERENCES, noisy_states, random_starts, standard_flight, standard_problem
-from lanes import HALF, identify, lanes as standard_lanes, names
+from helpers import DT, REFERENCES, noisy_states, random_starts, standard_problem
+from lanes import (
+    HALF,
+    assert_chi_square,
+    assert_covered,
+    bound,
+    errors,
+    identify,
+    information,
+    lanes as standard_lanes,
+    names,
+)
 
 import jaxos4
 from jaxos4.estimators.kalman import JointEKF
@@ -37,23 +47,6 @@ def lanes(case, states):
 
 
 @functools.cache
-def information(case):
-    model_class, channels, free = CASES[case]
-    problem = standard_problem(model_class, channels, free=free)
-    start = standard_flight(model_class).states[0][ORDER[: problem.size]]
-    return np.asarray(jaxos4.fisher_information(problem, model_class().alpha, start))
-
-
-def bound(case):
-    """Standard deviations at the Cramer-Rao bound."""
-    return np.sqrt(np.diagonal(np.linalg.inv(information(case))))
-
-
-def errors(case, estimates):
-    return np.asarray(estimates.parameters - CASES[case][0]().alpha)
-
-
-@functools.cache
 def noisy(case):
     model_class = CASES[case][0]
     return identify(JointEKF(), *lanes(case, noisy_states(LANES, model_class)))
@@ -68,20 +61,18 @@ def test_errors_are_near_the_cramer_rao_bound(case):
     assert names(estimates).tolist() == ["successful"] * LANES
     unknowns = 8 + 3 * CASES[case][2]
     np.testing.assert_array_equal(estimates.rollouts, (unknowns + 1) * estimates.sweeps + 1)
-    error = errors(case, estimates) / bound(case)
+    error = errors(estimates, CASES[case][0])
+    assert_chi_square(error, information(*CASES[case]))
+    error = error / bound(*CASES[case])
     assert np.sqrt(np.mean(error**2, axis=0)).max() < 1.2 + 3 / np.sqrt(2 * LANES)
     assert np.abs(error.mean(axis=0)).max() < 4 / np.sqrt(LANES)
-    square = np.einsum("ni,ij,nj->n", errors(case, estimates), information(case), errors(case, estimates)) / 8
-    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
 
 
 @every_case
 def test_estimates_know_their_errors(case):
     estimates = noisy(case)
-    np.testing.assert_allclose(np.median(estimates.std / bound(case), axis=0), 1, atol=0.05)
-    inside = np.mean(np.abs(errors(case, estimates)) < 1.96 * np.asarray(estimates.std))
-    # Errors of one flight are correlated: count flights, not parameters, for the standard error.
-    assert abs(inside - 0.95) < 4 * np.sqrt(0.95 * 0.05 / LANES)
+    np.testing.assert_allclose(np.median(estimates.std / bound(*CASES[case]), axis=0), 1, atol=0.05)
+    assert_covered(errors(estimates, CASES[case][0]), estimates.std)
 
 
 def test_one_pass_is_not_enough_beyond_the_rates():
@@ -89,14 +80,14 @@ def test_one_pass_is_not_enough_beyond_the_rates():
     case = "corrected-all"
     plain = identify(JointEKF(passes=1), *lanes(case, noisy_states(LANES, CORRECTED)))
     assert set(names(plain)) == {"successful"}
-    off = np.sqrt(np.mean((errors(case, plain) / bound(case)) ** 2, axis=0))
+    off = np.sqrt(np.mean((errors(plain, CORRECTED) / bound(*CASES[case])) ** 2, axis=0))
     assert (off > 1.5).all(), off
     assert (np.asarray(plain.sweeps) == 1).all()
     assert (np.asarray(noisy(case).sweeps) > 2).all()
     # Too few passes are reported.
     few = identify(JointEKF(passes=2), *lanes(case, noisy_states(LANES, CORRECTED)))
     assert "max_sweeps" in names(few)
-    close = np.abs(errors(case, few) / bound(case)).max(axis=1) < 6
+    close = np.abs(errors(few, CORRECTED) / bound(*CASES[case])).max(axis=1) < 6
     assert close[names(few) == "successful"].all()
 
 
@@ -126,7 +117,7 @@ def test_tiny_noise_gives_the_truth():
     problem = eqx.tree_at(lambda p: p.sigma, problem, 1e-5 * problem.sigma)
     estimates = identify(JointEKF(), problem, *rest)
     assert set(names(estimates)) == {"successful"}
-    assert np.abs(errors(case, estimates) / HALF).max() < 1e-5
+    assert np.abs(errors(estimates) / HALF).max() < 1e-5
 
 
 # Against other ways to the same numbers.

@@ -31,7 +31,7 @@ def angular_velocity(t):
     return "vehicle_angular_velocity", fields, "QQfff", rows, t + 5e-4
 
 
-def combined(t, gyro=True):
+def combined(t):
     rows = np.column_stack([rates(t) @ FRD, force(t) @ FRD]).tolist()
     fields = "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;"
     return "sensor_combined", fields, "Qffffff", rows, t
