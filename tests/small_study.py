@@ -8,7 +8,7 @@ import sys
 import jax
 import xarray as xr
 
-from jaxos4.study import load_study
+from jaxos4.study import carry_out, load_study
 
 SPECIFICATION = """
 title = "A small study"
@@ -47,11 +47,8 @@ def specification(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Pa
 
 def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
     """Runs a study in this process."""
-    study, out = load_study(specification(folder, text)), folder / "whole"
-    with open_store(out, study, "these tests") as store:
-        for _ in run_here(store):
-            pass
-        save_dataset(assemble(store), out)
+    out = folder / "whole"
+    carry_out(load_study(specification(folder, text)), out, "these tests")
     return out
 
 

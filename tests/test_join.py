@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
-from jaxos4.flight import Stretches, held_values
+from jaxos4.flight import Stretches, fill_gaps
 from jaxos4.recording.averaging import average
 
 
@@ -188,6 +188,6 @@ def test_gaps_are_filled_from_their_own_stretch():
     nan = np.nan
     values = jnp.array([[nan, 1.0, nan, 2.0, nan, nan, nan, nan, 5.0, nan]]).T
     number = jnp.array([0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
-    found = held_values(values, Stretches.of(number))[:, 0]
+    found = fill_gaps(values, Stretches.of(number))[:, 0]
     np.testing.assert_array_equal(found, [1, 1, 1, 2, 0, 0, 5, 5, 5, 5])
-    np.testing.assert_array_equal(held_values(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])
+    np.testing.assert_array_equal(fill_gaps(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])

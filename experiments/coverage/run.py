@@ -20,6 +20,7 @@ from rich.console import Console
 import jaxos4
 from jaxos4.models import MODELS
 from jaxos4.report.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
+from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)
 

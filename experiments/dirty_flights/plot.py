@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import typer
-from jaxos4.cli.experiment import write_figure
 from matplotlib.figure import Figure
 
+from jaxos4.report.experiment import write_figure
 from jaxos4.report.style import INK, grid, styles
 
 

@@ -18,6 +18,7 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.report.experiment import PARAMETERS, count_results, in_words, table_of
+from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)
 

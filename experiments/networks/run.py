@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from jaxos4.cli.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
 from rich.console import Console
 
 import jaxos4
+from jaxos4.report.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
 from jaxos4.study import metrics
 
 jax.config.update("jax_enable_x64", True)

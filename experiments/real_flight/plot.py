@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import typer
-from jaxos4.cli.experiment import write_figure
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
 
+from jaxos4.report.experiment import write_figure
 from jaxos4.report.style import BOUND_DASHES, INK, styles
 
 RATES = "pqr"
