@@ -22,9 +22,7 @@ CASES = {
     "corrected-rates": (CORRECTED, "rates", False),
     "corrected-all": (CORRECTED, "all", False),
 }
-every_case = pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.xdist_group(case)) for case in CASES]
-)
+every_case = pytest.mark.parametrize("case", CASES)
 SEEDS = {case: seed for seed, case in enumerate(CASES)}
 
 

@@ -35,9 +35,7 @@ CASES = {
     "published-rates-free": (PUBLISHED, "rates", True),
     "corrected-all": (CORRECTED, "all", False),
 }
-every_case = pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.xdist_group(f"kalman-{case}")) for case in CASES]
-)
+every_case = pytest.mark.parametrize("case", CASES)
 
 
 def lanes(case, states):
