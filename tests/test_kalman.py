@@ -9,17 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import DT, REFERENCES, noisy_states, random_starts, standard_problem
-from lanes import (
-    HALF,
-    assert_chi_square,
-    assert_covered,
-    bound,
-    errors,
-    identify,
-    information,
-    lanes as standard_lanes,
-    names,
-)
+from lanes import HALF, assert_chi_square, assert_covered, bound, errors, identify, information, lanes, names
 
 import jaxos4
 from jaxos4.estimators.kalman import JointEKF
@@ -38,16 +28,16 @@ CASES = {
 every_case = pytest.mark.parametrize("case", CASES)
 
 
-def lanes(case, states):
+def data(case, states):
     """Arguments of `identify`."""
     model_class, channels, free = CASES[case]
-    return standard_lanes(states, model_class, channels, free=free, seed=100)
+    return lanes(states, model_class, channels, free=free, seed=100)
 
 
 @functools.cache
 def noisy(case):
     model_class = CASES[case][0]
-    return identify(JointEKF(), *lanes(case, noisy_states(LANES, model_class)))
+    return identify(JointEKF(), *data(case, noisy_states(LANES, model_class)))
 
 
 # With the noise of the sensors.
@@ -76,14 +66,14 @@ def test_estimates_know_their_errors(case):
 def test_one_pass_is_not_enough_beyond_the_rates():
     """Why there are passes: the plain filter keeps the errors of its first linearisations, and does not know it."""
     case = "corrected-all"
-    plain = identify(JointEKF(passes=1), *lanes(case, noisy_states(LANES, CORRECTED)))
+    plain = identify(JointEKF(passes=1), *data(case, noisy_states(LANES, CORRECTED)))
     assert set(names(plain)) == {"successful"}
     off = np.sqrt(np.mean((errors(plain, CORRECTED) / bound(*CASES[case])) ** 2, axis=0))
     assert (off > 1.5).all(), off
     assert (np.asarray(plain.sweeps) == 1).all()
     assert (np.asarray(noisy(case).sweeps) > 2).all()
     # Too few passes are reported.
-    few = identify(JointEKF(passes=2), *lanes(case, noisy_states(LANES, CORRECTED)))
+    few = identify(JointEKF(passes=2), *data(case, noisy_states(LANES, CORRECTED)))
     assert "max_sweeps" in names(few)
     close = np.abs(errors(few, CORRECTED) / bound(*CASES[case])).max(axis=1) < 6
     assert close[names(few) == "successful"].all()
@@ -111,7 +101,7 @@ def test_a_free_initial_state_is_estimated():
 
 def test_tiny_noise_gives_the_truth():
     case = "published-rates"
-    problem, *rest = lanes(case, noisy_states(8, scale=1e-5))
+    problem, *rest = data(case, noisy_states(8, scale=1e-5))
     problem = eqx.tree_at(lambda p: p.sigma, problem, 1e-5 * problem.sigma)
     estimates = identify(JointEKF(), problem, *rest)
     assert set(names(estimates)) == {"successful"}
@@ -210,7 +200,7 @@ def test_a_linear_model_with_a_wide_prior_is_least_squares():
 def test_agrees_with_shooting():
     """The prior aside, which a wide bracket makes weak, both have the same optimum."""
     case = "published-rates"
-    problem, states, omega, lower, upper = lanes(case, noisy_states(8))
+    problem, states, omega, lower, upper = data(case, noisy_states(8))
     middle = (lower + upper) / 2
     wide = identify(JointEKF(), problem, states, omega, middle - 5 * HALF, middle + 5 * HALF)
     shot = identify(jaxos4.IBSS(tolerance=1e-4), problem, states, omega, lower, upper)
@@ -230,7 +220,7 @@ def test_what_was_not_measured_stays_as_uncertain_as_the_bracket_with_a_free_sta
 def test_single_precision_is_enough():
     """Everything in float32 from the data on; the bracket's errors are a thousand times the rounding's."""
     case = "published-rates"
-    problem, states, _, lower, upper = lanes(case, noisy_states(1))
+    problem, states, _, lower, upper = data(case, noisy_states(1))
     double = JointEKF()(eqx.tree_at(lambda p: p.flight.states, problem, states[0]), jaxos4.Bracket(lower[0], upper[0]))
     with jax.enable_x64(False):
         model = PUBLISHED(jaxos4.OS4)
