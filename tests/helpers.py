@@ -1,6 +1,10 @@
 """The standard flight, and an independent copy of the equations of motion in NumPy, from the printed equations."""
 
 import functools
+import json
+import os
+import subprocess
+import sys
 
 import equinox as eqx
 import jax
@@ -124,3 +128,11 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
     assert err.count("\n") == 1, err
     for fragment in fragments:
         assert fragment in err
+
+
+def single_precision(script):
+    """What a script writes as JSON in a process of its own, with JAX as it comes."""
+    environment = {**os.environ, "JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)

@@ -14,15 +14,15 @@ LANES = 64
 
 
 @eqx.filter_jit
-def identify(estimator, problem, states, omega, lower, upper):
-    """One estimate for each lane of the last four arguments."""
+def identify(estimator, problem, *arguments):
+    """One estimate for each lane of `arguments`: states, rotor speeds, the bracket's two ends and, if given, starts."""
 
     @eqx.filter_vmap
-    def lane(states, omega, lower, upper):
+    def lane(states, omega, lower, upper, *start):
         data = eqx.tree_at(lambda p: (p.flight.states, p.flight.omega), problem, (states, omega))
-        return estimator(data, jaxos4.Bracket(lower, upper))
+        return estimator(data, jaxos4.Bracket(lower, upper), **dict(zip(("start",), start, strict=False)))
 
-    return lane(states, omega, lower, upper)
+    return lane(*arguments)
 
 
 def lanes(states, model_class=jaxos4.PublishedOS4, channels="rates", *, free=False, scale=1.0, seed=150):
@@ -39,6 +39,30 @@ def bound(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
     """Standard deviations at the Cramer-Rao bound."""
     problem = standard_problem(model_class, channels, free=free)
     return np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model_class().alpha)))
+
+
+@functools.cache
+def information(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
+    """The information about the parameters at the truth."""
+    problem = standard_problem(model_class, channels, free=free)
+    return np.asarray(jaxos4.fisher_information(problem, model_class().alpha))
+
+
+def errors(estimates, model_class=jaxos4.PublishedOS4):
+    """Estimates less the truth, lane by lane."""
+    return np.asarray(estimates.parameters - model_class().alpha)
+
+
+def assert_chi_square(error, information):
+    """error^T F error of each lane is chi-square with 8 degrees of freedom: its mean within four standard errors."""
+    square = np.einsum("ni,nij,nj->n", error, np.broadcast_to(information, (len(error), 8, 8)), error) / 8
+    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * len(error))), square.mean()
+
+
+def assert_covered(error, std):
+    """95 % intervals hold the truth as often as they say. The errors of a flight are correlated: flights count."""
+    inside = np.mean(np.abs(error) < 1.96 * np.asarray(std))
+    assert abs(inside - 0.95) < 4 * np.sqrt(0.95 * 0.05 / len(error)), inside
 
 
 def names(estimates):

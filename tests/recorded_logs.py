@@ -131,9 +131,6 @@ def message(kind, body):
     return struct.pack("<HB", len(body), ord(kind)) + body
 
 
-CODES = {"uint64_t": "Q", "float": "f", "int32_t": "i", "uint8_t": "B", "bool": "?", "uint16_t": "H"}
-
-
 def ulog(topics, *, extra=b"", before=b""):
     """A ULog file.
 

@@ -24,10 +24,7 @@ SMALL = ParameterEstimate(0.0011, 0.001, 0.001, (-0.0009, 0.0031), "1/s", "below
 WHITE = ChannelFit(0.01, "rad/s", 97.53, 1.0, 0.5, 0.02, 0.4, {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}, 0.3)
 COLOURED = msgspec.structs.replace(WHITE, percent=81.26, level=4.0, correlation=0.8, white_p=1e-9, input_p=1e-5)
 BODY = RigidBody(
-    {
-        "Ix": Constant(1.733e-5, 1.5e-7, "kg m^2", "if arms and mass are right"),
-        "J_R": Constant(1e-8, 1e-7, "kg m^2"),
-    },
+    {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2", "if arms and mass are right"), "J_R": Constant(1e-8, 1e-7, "kg m^2")},
     0.21,
     True,
 )

@@ -149,16 +149,10 @@ def test_a_flight_without_excitation_fails_with_a_message(run, tmp_path):
     assert json.loads((tmp_path / "e.json").read_text())["result"] in err
 
 
+# `test_flight_csv.py` has all kinds of bad files.
 BAD_FILES = {
     "empty": ("", ["empty"]),
-    "header only": ("t,omega1,omega2,omega3,omega4,p\n", ["row"]),
-    "one row": ("t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n", ["row"]),
     "text": ("t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n0.1,1,abc,1,1,0\n", ["row 3", "omega2"]),
-    "duplicate": ("t,omega1,omega1,omega3,omega4,p\n0,1,1,1,1,0\n0.1,1,1,1,1,0\n", ["omega1"]),
-    "missing": ("t,omega1,omega3,omega4,p\n0,1,1,1,0\n0.1,1,1,1,0\n", ["omega2"]),
-    "backward": ("t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n-1,1,1,1,1,0\n", ["row 3", "t"]),
-    "negative": ("t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n1,1,1,1,-1,0\n", ["row 3", "omega4"]),
-    "nan": ("t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n1,1,1,1,1,nan\n", ["row 3", "p"]),
     "degrees": ("t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n1,1,1,1,1,90\n", ["row 3", "p", "57.3"]),
 }
 
@@ -283,7 +277,7 @@ def test_a_real_flight_is_read_and_fitted(run, tmp_path, shared_flights):
     assert code == (report["result"] != "successful")
     assert np.all([row["estimate"] is None or np.isfinite(row["estimate"]) for row in report["parameters"].values()])
     # The model lacks this vehicle's offsets and lag: the page or the result says so.
-    assert "are not noise" in out or "No estimate" in out
+    assert "are not white noise" in " ".join(out.split()) or "No estimate" in out
 
 
 # Networks.

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import refused
 
 import jaxos4
 from jaxos4.cli._choices import VehicleModel
@@ -56,6 +57,11 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def command(vehicle, *flights):
+    """`jaxos4 estimate` of logs of the folder, or elsewhere if their paths are absolute."""
+    return "estimate", *(str(vehicle / flight) for flight in flights), "--airframe", str(vehicle / "airframe.toml")
+
+
 def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
     out = tmp_path / "found.json"
     code, page_text, err = run(
@@ -99,17 +105,11 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
     ],
 )
 def test_wrong_requests_are_one_line(run, vehicle, options, said):
-    code, _, err = run("estimate", str(vehicle / "flight1.csv"), "--airframe", str(vehicle / "airframe.toml"), *options)
-    assert code == 2
-    assert said in err
-    assert len(err.strip().splitlines()) == 1
+    refused(run(*command(vehicle, "flight1.csv"), *options), said)
 
 
 def test_only_the_flight_model_takes_several_flights(run, vehicle):
-    flights = (str(vehicle / f"flight{number}.csv") for number in (1, 2))
-    code, _, err = run("estimate", *flights, "--airframe", str(vehicle / "airframe.toml"))
-    assert code == 2
-    assert "--model flight for several" in err
+    refused(run(*command(vehicle, "flight1.csv", "flight2.csv")), "--model flight for several")
 
 
 def test_each_measurement_is_either_fitted_or_held_out(vehicle):
@@ -156,14 +156,9 @@ def test_no_window_reaches_from_one_stretch_into_the_next(vehicle, tmp_path, ste
 
 
 def test_a_log_counts_once(run, vehicle):
-    flight, airframe = str(vehicle / "flight1.csv"), ("--airframe", str(vehicle / "airframe.toml"))
-    code, _, err = run("estimate", flight, flight, "--model", "flight", *airframe)
-    assert code == 2
-    assert "given twice" in err
-    code, _, err = run("estimate", flight, "--model", "flight", *airframe, "--validate", flight)
-    assert code == 2
-    assert "--validate" in err
-    assert "is fitted" in err
+    refused(run(*command(vehicle, "flight1.csv", "flight1.csv"), "--model", "flight"), "given twice")
+    again = ("--model", "flight", "--validate", str(vehicle / "flight1.csv"))
+    refused(run(*command(vehicle, "flight1.csv"), *again), "--validate", "is fitted")
 
 
 def test_commands_and_speeds_do_not_mix(run, vehicle, tmp_path):
@@ -173,10 +168,8 @@ def test_commands_and_speeds_do_not_mix(run, vehicle, tmp_path):
         ]
 
     speeds = rewritten(vehicle / "flight2.csv", tmp_path / "speeds.csv", as_speeds)
-    files = str(vehicle / "flight1.csv"), str(speeds)
-    code, _, err = run("estimate", *files, "--model", "flight", "--airframe", str(vehicle / "airframe.toml"))
-    assert code == 2
-    assert "some of these logs hold commands" in err
+    mixed = run(*command(vehicle, "flight1.csv", speeds), "--model", "flight")
+    refused(mixed, "some of these logs hold commands")
 
 
 def test_an_unpredictable_flight_is_refused_before_the_fit(run, vehicle, tmp_path):
@@ -185,11 +178,7 @@ def test_an_unpredictable_flight_is_refused_before_the_fit(run, vehicle, tmp_pat
         return header, [row if k % 10 == 0 else [*row[:at], "", *row[at + 1 :]] for k, row in enumerate(rows)]
 
     rare = rewritten(vehicle / "flight2.csv", tmp_path / "rare.csv", rarely)
-    out = tmp_path / "out.json"
-    code, _, err = run(
-        *("estimate", str(vehicle / "flight1.csv"), "--model", "flight", "--validate", str(rare)),
-        *("--airframe", str(vehicle / "airframe.toml"), "--out", str(out)),
-    )
-    assert code == 2
-    assert "nothing is long enough to be predicted 0.5 s ahead" in err
-    assert not out.exists()
+    options = ("--model", "flight", "--validate", str(rare), "--out", str(tmp_path / "out.json"))
+    result = run(*command(vehicle, "flight1.csv"), *options)
+    refused(result, "nothing is long enough to be predicted 0.5 s ahead")
+    assert not (tmp_path / "out.json").exists()

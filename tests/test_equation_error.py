@@ -1,18 +1,14 @@
 """Equation error, in batch and recursive: against plain NumPy, with noise, with gaps, and when things go wrong."""
 
 import functools
-import json
-import os
-import subprocess
-import sys
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, OS4, noisy_states, standard_flight, standard_problem
-from lanes import HALF, LANES, bound, names
+from helpers import DT, OS4, noisy_states, single_precision, standard_flight, standard_problem
+from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors, names
 
 import jaxos4
 from jaxos4.estimators.equation_error import EquationError
@@ -113,10 +109,8 @@ def test_the_reference_fails_on_inputs_that_are_a_sample_late():
     problem = standard_problem(channels="rates", free=True)
     late = jnp.concatenate([problem.flight.omega[:1], problem.flight.omega[:-1]])
     shifted = eqx.tree_at(lambda p: p.flight.omega, problem, late)
-    error = (EquationError()(shifted, bracket_of(PUBLISHED)).parameters - PUBLISHED().alpha) / bound(
-        PUBLISHED, "rates", True
-    )
-    assert np.abs(error).max() > 10
+    error = errors(EquationError()(shifted, bracket_of(PUBLISHED)))
+    assert np.abs(error / bound(PUBLISHED, free=True)).max() > 10
 
 
 # Without noise.
@@ -154,9 +148,7 @@ def test_the_trapezoidal_rule_is_for_flights_that_were_not_flown_by_eulers():
         problem = jaxos4.ShootingProblem(
             model, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0], channels="rates", method=method
         )
-        off[method] = np.abs(
-            (EquationError()(problem, bracket_of(PUBLISHED)).parameters - model.alpha) / bound(PUBLISHED)
-        ).max()
+        off[method] = np.abs(errors(EquationError()(problem, bracket_of(PUBLISHED))) / bound()).max()
     assert off["rk4"] < 0.2 < 0.4 < off["euler"]
 
 
@@ -184,35 +176,28 @@ def noisy(model_class, free, memory, scale=1.0):
 def test_estimates_know_their_errors(model_class, free, memory, scale):
     """Normalised squared error and coverage within four standard errors of what the covariance claims."""
     estimates = noisy(model_class, free, memory, scale)
-    error = np.asarray(estimates.parameters - model_class().alpha)
     assert set(names(estimates)) == {"successful"}
-    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimates.covariance), error) / 8
-    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
-    inside = np.mean(np.abs(error) < 1.96 * np.asarray(estimates.std))
-    assert abs(inside - 0.95) < 4 * np.sqrt(0.95 * 0.05 / LANES)
+    assert_chi_square(errors(estimates, model_class), np.linalg.inv(estimates.covariance))
+    assert_covered(errors(estimates, model_class), estimates.std)
 
 
 def test_least_squares_without_regard_to_the_noise_would_be_overconfident():
     """The inverse normal matrix of plain differences is not their covariance: the check above can fail."""
-    estimates = noisy(PUBLISHED, True, 0.0)
-    error = np.asarray(estimates.parameters - PUBLISHED().alpha)
     rates = np.asarray(standard_flight().states)[:, RATES]
     naive = np.zeros((8, 8))
     for regressors, columns in equations(rates, standard_flight().omega):
         matrix = DT * regressors[:-1] / (np.sqrt(2) * jaxos4.SENSOR_SIGMA[RATES[0]])
         naive[columns, columns] = matrix.T @ matrix
-    square = np.einsum("ni,ij,nj->n", error, naive, error) / 8
-    assert abs(square.mean() - 1) > 4 * np.sqrt(2 / (8 * LANES))
+    with pytest.raises(AssertionError):
+        assert_chi_square(errors(noisy(PUBLISHED, True, 0.0)), naive)
 
 
 def test_the_integrated_form_is_nearly_efficient_and_plain_differences_are_not():
-    error = np.asarray(noisy(PUBLISHED, True, 1.0).parameters - PUBLISHED().alpha) / bound(PUBLISHED, free=True)
+    error = errors(noisy(PUBLISHED, True, 1.0)) / bound(PUBLISHED, free=True)
     efficiency = np.sqrt(np.mean(error**2, axis=0))
     assert efficiency.max() < 1.11 * (1 + 3.5 / np.sqrt(2 * LANES)), efficiency
     assert np.abs(error.mean(axis=0) * np.sqrt(LANES)).max() < 4 * 1.11
-    differences = np.asarray(noisy(PUBLISHED, True, 0.0).parameters - PUBLISHED().alpha) / bound(
-        PUBLISHED, "rates", True
-    )
+    differences = errors(noisy(PUBLISHED, True, 0.0)) / bound(PUBLISHED, free=True)
     assert np.sqrt(np.mean(differences**2, axis=0)).min() > 1.4
 
 
@@ -265,9 +250,7 @@ def test_forgetting_knows_its_errors():
     problem = standard_problem(channels="rates", free=True)
     estimator = RecursiveLeastSquares(forgetting=0.98)
     estimates = identify(estimator, problem, noisy_states(LANES, seed=5), bracket_of(PUBLISHED))
-    error = np.asarray(estimates.parameters - PUBLISHED().alpha)
-    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimates.covariance), error) / 8
-    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
+    assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))
     assert (np.median(estimates.std, axis=0) > 2 * bound(PUBLISHED, free=True)).all()
 
 
@@ -361,12 +344,9 @@ json.dump(found, sys.stdout)
 
 
 def test_single_precision_is_enough():
-    """In a process of its own, with JAX as it comes; an exact flight, to a hundredth of what noise would do."""
-    environment = {**os.environ, "JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
-    run = subprocess.run([sys.executable, "-c", SINGLE], env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
+    """An exact flight, to a hundredth of what noise would do."""
     sigma = bound(PUBLISHED)
-    for result, parameters, std in json.loads(run.stdout):
+    for result, parameters, std in single_precision(SINGLE):
         assert result == "successful"
         assert np.abs((np.array(parameters) - PUBLISHED().alpha) / sigma).max() < 0.01
         assert (np.array(std) > 0.99 * sigma).all()

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import noisy_states, standard_flight, standard_problem
-from lanes import HALF, LANES, bound, identify, lanes, names
+from lanes import HALF, LANES, assert_chi_square, bound, errors, identify, lanes, names
 
 import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
@@ -93,9 +93,7 @@ def test_missing_samples_only_cost_precision(name):
     estimates = identify(make_estimator(name), *lanes(jnp.where(lost, jnp.nan, states)))
     assert set(names(estimates)) == {"successful"}
     assert (np.median(estimates.std, axis=0) > 1.05 * bound()).all()
-    error = np.asarray(estimates.parameters - MODEL.alpha)
-    square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimates.covariance), error) / 8
-    assert abs(square.mean() - 1) < 4 * np.sqrt(2 / (8 * LANES))
+    assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))
 
 
 @every_estimator

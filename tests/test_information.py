@@ -9,7 +9,6 @@ from jaxos4.linalg import covariance_of_shared, covariances, inverse_transpose, 
 from jaxos4.models.state import CHANNELS
 
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
-known_or_free = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
 
 # Standard flight, known initial state: standard deviations in % of alpha (alpha2, 5 and 7: absolute x 100).
 PRINTED = {

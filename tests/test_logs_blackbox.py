@@ -2,18 +2,7 @@
 
 import numpy as np
 import pytest
-from recorded_logs import (
-    GRAVITY,
-    RPM,
-    attitude,
-    blackbox_csv,
-    check,
-    force,
-    position,
-    rates,
-    speeds,
-    velocity,
-)
+from recorded_logs import GRAVITY, RPM, attitude, blackbox_csv, check, force, position, rates, speeds, velocity
 from test_flight_csv import CRAZYFLIE
 
 from jaxos4.errors import InputError

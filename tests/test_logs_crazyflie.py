@@ -6,19 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from recorded_logs import (
-    GRAVITY,
-    RPM,
-    attitude,
-    check,
-    crazyflie,
-    force,
-    outcome,
-    position,
-    rates,
-    speeds,
-    velocity,
-)
+from recorded_logs import GRAVITY, RPM, attitude, check, crazyflie, force, outcome, position, rates, speeds, velocity
 from scipy.spatial.transform import Rotation
 from test_flight_csv import CRAZYFLIE
 
@@ -120,10 +108,7 @@ BAD = {
     "nothing": (crazyflie([("e", GYRO, np.zeros(0), np.zeros((0, 6)))]), "holds no events"),
     "no gyro": (crazyflie([("e", MOTORS, T, ratios(T))]), "holds no body rates"),
     "no motors": (crazyflie([("e", GYRO, T, sensors(T))]), "holds no rotor speeds or commands"),
-    "apart": (
-        crazyflie([("e", GYRO, T, sensors(T)), ("m", MOTORS, T + 60, ratios(T))]),
-        "not logged at the same time",
-    ),
+    "apart": (crazyflie([("e", GYRO, T, sensors(T)), ("m", MOTORS, T + 60, ratios(T))]), "not logged at the same time"),
     "too fast": (
         crazyflie([("e", GYRO + MOTORS, T, np.column_stack([99 * sensors(T), ratios(T)]))]),
         "rad/s, beyond 60 rad/s; the log is corrupt there",

@@ -8,20 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from recorded_logs import (
-    FRD,
-    RPM,
-    attitude,
-    check,
-    force,
-    message,
-    outcome,
-    position,
-    rates,
-    speeds,
-    ulog,
-    velocity,
-)
+from recorded_logs import FRD, RPM, attitude, check, force, message, outcome, position, rates, speeds, ulog, velocity
 from scipy.spatial.transform import Rotation
 from test_flight_csv import CRAZYFLIE
 
@@ -44,7 +31,7 @@ def angular_velocity(t):
     return "vehicle_angular_velocity", fields, "QQfff", rows, t + 5e-4
 
 
-def combined(t, gyro=True):
+def combined(t):
     rows = np.column_stack([rates(t) @ FRD, force(t) @ FRD]).tolist()
     fields = "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;"
     return "sensor_combined", fields, "Qffffff", rows, t
@@ -188,15 +175,9 @@ BAD = {
     "nothing": (ulog([]), "no body rates"),
     "no motors": (everything(esc=None), "no rotor speeds or commands"),
     "no gyro": (everything(angular=None, combined=None), "no body rates"),
-    "six motors": (
-        everything(esc=None, motors=motors(grid(0.01), [[0.5] * 4] * 300, more=2)),
-        "drives 6 motors",
-    ),
+    "six motors": (everything(esc=None, motors=motors(grid(0.01), [[0.5] * 4] * 300, more=2)), "drives 6 motors"),
     "apart": (everything(esc=escs(grid(0.01, 1.0, offset=50.0))), "not logged at the same time"),
-    "newer": (
-        b"ULog\x01\x12\x35\x01" + bytes(8) + message("B", bytes(8) + b"\x02" + bytes(31)),
-        "newer ULog format",
-    ),
+    "newer": (b"ULog\x01\x12\x35\x01" + bytes(8) + message("B", bytes(8) + b"\x02" + bytes(31)), "newer ULog format"),
     "no such message": (ulog([combined(grid(0.005))], extra=b"\x05\x00\x07hello"), "is corrupt at byte"),
     "unannounced": (ulog([combined(grid(0.005))], extra=message("D", b"\x63\0" + bytes(9))), "never announced"),
     "no format": (ulog([], before=message("A", b"\0\0\0sensor_combined")), "has no format"),

@@ -104,8 +104,6 @@ def test_the_whole_standard_flight_agrees(model_class):
 def test_the_standard_flight_is_the_one_described():
     flight = standard_flight()
     states = dict(zip(jaxos4.STATE_NAMES, np.abs(flight.states).max(axis=0), strict=True))
-    assert int(flight.omega.min()) == 134
-    assert int(flight.omega.max()) == 289
     assert max(states[name] for name in "pqr") < 1.1
     assert max(states[name] for name in ("phi", "theta", "psi")) < 0.7
     assert not flight.states[0].any()

@@ -329,9 +329,7 @@ def test_a_flight_without_excitation_is_unidentifiable():
     hover = jnp.full_like(OMEGA, jaxos4.OS4.hover_speed)
     flight = jaxos4.simulate(PUBLISHED(), PUBLISHED().alpha, hover, dt=DT)
     still = problem_of(flight.states, omega=hover)
-    network = jaxos4.NetworkEstimator(**(SMALL | {"steps": 5, "held_out": 1000})).fit(
-        still, BRACKET, key=jax.random.key(0)
-    )
+    network = jaxos4.NetworkEstimator(**SHORT).fit(still, BRACKET, key=jax.random.key(0))
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(1))
     assert names(network(problem_of(noisy.states, omega=hover), BRACKET)) == "unidentifiable"
 

@@ -66,6 +66,7 @@ COMMANDS = """study study.toml --out study --dry-run
 study study.toml --out study
 report study
 simulate --duration 1 --out flight.csv
+study study.toml --out study --dry-run
 estimate flight.csv --estimator toy --channels rates --initial-state known --out toy.json
 """
 
@@ -75,14 +76,19 @@ def test_a_new_estimator_is_offered_everywhere(tmp_path, monkeypatch):
     (tmp_path / "study.toml").write_text(STUDY)
     (tmp_path / "commands").write_text(COMMANDS)
     said = finish(start("commands", code=TOY))
-    assert said.count("toy") >= 2  # in the plan and in the table of the study
+    assert said.count("toy") >= 3  # in both plans and in the table of the study
+    assert "4 estimates: 4 successful" in said
+    assert ["toy", "0", "0", "0", "0", "0.0"] in [line.split() for line in said.splitlines()]  # nothing remains
     found = json.loads((tmp_path / "toy.json").read_text())
     assert (found["estimator"], found["result"]) == ("toy", "successful")
     assert "toy" in (tmp_path / "study/report.html").read_text()
 
 
-def test_every_estimator_has_a_style_of_its_own():
+def test_every_estimator_has_a_style_of_its_own_and_the_known_ones_keep_theirs():
     known = styles(list(ESTIMATORS))
-    extended = styles([*ESTIMATORS, *(f"toy {i}" for i in range(12))])
-    assert {name: extended[name] for name in known} == known
-    assert len(set(extended.values())) == len(extended)
+    assert styles(["svsf"])["svsf"] == known["svsf"]
+    toys = [f"toy {i}" for i in range(12)]
+    for names in (["new", "newest"], ["new", "newer", "newest"], [*ESTIMATORS, "newest"], [*ESTIMATORS, *toys]):
+        found = styles(names)
+        assert len(set(found.values())) == len(found)
+        assert all(found[name] == known[name] for name in names if name in known)

@@ -96,10 +96,7 @@ def test_a_checkbox_hides_an_estimator_everywhere(opened):
 
 @pytest.mark.parametrize(
     ("name", "figure", "first", "then"),
-    [
-        ("study", "distribution", "noise x 1", "noise x 0.1"),
-        ("flight", "predictions", "0.248 s ahead", "0.5 s ahead"),
-    ],
+    [("study", "distribution", "noise x 1", "noise x 0.1"), ("flight", "predictions", "0.248 s ahead", "0.5 s ahead")],
 )
 def test_a_list_chooses_what_a_figure_shows(opened, name, figure, first, then):
     page = opened(name)

@@ -11,7 +11,6 @@ from scipy.integrate import solve_ivp
 import jaxos4
 from jaxos4.simulation import METHODS
 
-every_model = pytest.mark.parametrize("model_class", REFERENCES)
 every_method = pytest.mark.parametrize("method", METHODS)
 THETA, Q = jaxos4.STATE_NAMES.index("theta"), jaxos4.STATE_NAMES.index("q")
 SUCCESS, SINGULAR, NONFINITE = "successful", "attitude_singularity", "nonfinite_trajectory"

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ from hypothesis import given, settings, strategies as st
 from small_study import COMMAND, environment, run_study, specification
 
 import jaxos4
-from jaxos4.estimators import ESTIMATORS
 from jaxos4.flight import STATE_NAMES
 from jaxos4.study import (
     OUTCOMES,
@@ -168,36 +166,6 @@ def test_any_specification_is_a_study_or_an_input_error_of_one_line(table):
         assert "\n" not in line
 
 
-class Center(jaxos4.AbstractEstimator):
-    """Returns the center of the bracket."""
-
-    looks_at: ClassVar[str] = "rates"
-    shoots: ClassVar[bool] = False
-    prior: ClassVar[float] = 1.0
-    needs_network: ClassVar[bool] = False
-
-    def __call__(self, problem, bracket):
-        return jaxos4.Estimate(
-            parameters=bracket.center,
-            covariance=jnp.diag(bracket.half_width**2),
-            initial_state=jnp.zeros(3),
-            cost=problem.cost(bracket.center),
-            rollouts=jnp.ones((), dtype=int),
-            sweeps=jnp.zeros((), dtype=int),
-            result=jaxos4.RESULTS.successful,
-        )
-
-
-def test_an_estimator_needs_only_its_line_in_the_registry(run, tmp_path, monkeypatch):
-    monkeypatch.setitem(ESTIMATORS, "center", Center)
-    specification(tmp_path, SPECIFICATION.replace('["ibss", "equation-error"]', '["center"]'))
-    code, out, err = run("study", "spec.toml", "--out", "out")
-    assert (code, err) == (0, "")
-    assert "20 estimates: 20 successful" in out
-    out = run("study", "spec.toml", "--out", "out", "--dry-run")[1]
-    assert ["center", "0", "0", "0", "0", "0.0"] in [line.split() for line in out.splitlines()]
-
-
 def test_another_specification_or_version_is_refused_with_what_changed(run, tmp_path):
     (tmp_path / "other.toml").write_text(SPECIFICATION.replace("seed = 5", "seed = 6\ndt = 0.02"))
     study = load_study(specification(tmp_path, SPECIFICATION))
@@ -247,11 +215,7 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
 
 
 @settings(max_examples=50)
-@given(
-    st.lists(st.integers(1, 3), min_size=6, max_size=6),
-    st.integers(1, 40),
-    st.integers(1, 12),
-)
+@given(st.lists(st.integers(1, 3), min_size=6, max_size=6), st.integers(1, 40), st.integers(1, 12))
 def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
     few = iter(lengths)
     study = Study(

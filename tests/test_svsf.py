@@ -7,17 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import DT, noisy_states, published_derivative, random_starts, standard_problem
-from lanes import HALF, LANES, bound, identify, lanes, names
+from lanes import HALF, LANES, bound, errors, identify, lanes, names
 
 import jaxos4
 from jaxos4.estimators.svsf import SVSF
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 RATES = [7, 9, 11]
-
-
-def errors(estimates, model_class=PUBLISHED):
-    return np.asarray(estimates.parameters - model_class().alpha)
 
 
 @functools.cache

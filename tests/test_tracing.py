@@ -100,18 +100,6 @@ def test_the_estimator_itself_traces_once(counted):
     assert counts[0] == counts[-1]
 
 
-def test_noise_with_another_sigma_is_traced_once():
-    flight = standard_flight(duration=DURATION)
-
-    @eqx.filter_jit
-    @once
-    def measure(noise, flight, key):
-        return noise(flight, key=key)
-
-    for sigma in (0.01, 2, jaxos4.SENSOR_SIGMA, jnp.ones(12)):
-        measure(jaxos4.WhiteNoise(sigma), flight, jax.random.key(0))
-
-
 def test_the_count_would_see_a_second_trace(counted):
     """A sample more is another program."""
     model_class, count = counted

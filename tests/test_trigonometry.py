@@ -9,10 +9,7 @@ from jaxos4.trigonometry import sincos
 SINGLE, DOUBLE = np.float32, np.float64
 
 
-@pytest.mark.parametrize(
-    ("dtype", "turns"),
-    [(DOUBLE, 1), (DOUBLE, 1e3), (DOUBLE, 1e5), (SINGLE, 1), (SINGLE, 1e3)],
-)
+@pytest.mark.parametrize(("dtype", "turns"), [(DOUBLE, 1), (DOUBLE, 1e3), (DOUBLE, 1e5), (SINGLE, 1), (SINGLE, 1e3)])
 def test_agrees_with_the_library_to_about_one_ulp(dtype, turns):
     rng = np.random.default_rng(0)
     anywhere = rng.uniform(-turns, turns, 20_000)
