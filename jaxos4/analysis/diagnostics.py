@@ -104,6 +104,7 @@ def _diagnostics(
     below, above = (
         tail(freedom / 2, squares / 2) for tail in (jax.scipy.special.gammainc, jax.scipy.special.gammaincc)
     )
+    level, level_p = squares / freedom, 2 * jnp.minimum(below, above)
     motion = jnp.where(measured, values - values.sum(axis=0) / most, 0.0)
     spread = jnp.sqrt(jnp.square(motion).sum(axis=0))
     moved = known & (spread > rounding * size * jnp.sqrt(most))
@@ -114,8 +115,8 @@ def _diagnostics(
         count=count,
         rms=jnp.where(known, sigma * jnp.sqrt(squares / most), 0.0),
         percent=jnp.where(moved, 100 * (1 - sigma * jnp.sqrt(squares) / jnp.where(moved, spread, 1.0)), 0.0),
-        level=jnp.where(known, squares / freedom, 1.0),
-        level_p=jnp.where(known, 2 * jnp.minimum(below, above), 1.0),
+        level=jnp.where(known, level, 1.0),
+        level_p=jnp.where(known, level_p, 1.0),
         autocorrelation=jnp.where(trivial[:, None], 0.0, autocorrelation),
         colour=jnp.where(trivial, 0.0, colour),
         white_p=jnp.where(trivial | (problem.windows > 1), 1.0, white_p),
