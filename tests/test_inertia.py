@@ -138,5 +138,5 @@ def test_alphas_far_from_the_airframe_or_without_an_error_give_a_fit_or_say_that
 
 
 def test_constants_stand_above_a_model_in_alphas_alone():
-    with pytest.raises(ValueError, match="must be one in alpha_1..8"):
+    with pytest.raises(ValueError, match="must have the parameters alpha_1..8"):
         jaxos4.InertialOS4(jaxos4.InertialOS4(jaxos4.CorrectedOS4()))

@@ -157,14 +157,14 @@ def test_first_weights_are_uniform_as_those_of_equinox():
 
 
 def test_training_learns_and_comes_near_the_bound():
-    network = trained()
-    assert network.history.shape == (2, 2)
+    network = trained(steps=1000)
+    assert network.history.shape == (4, 2)
     alpha, states = flights(MANY, seed=11)
     estimates = identify(network, states)
     bound = jax.vmap(lambda a: jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(problem_of(), a))))(alpha)
     assert set(names(estimates)) <= {"successful", "at_bound", "unidentifiable"}
     efficiency = np.sqrt(np.mean(np.square((estimates.parameters - alpha) / bound), axis=0))
-    assert (efficiency < 2.2).all(), efficiency  # a short training: 2.08 in one parameter
+    assert (efficiency < 2).all(), efficiency
     assert (efficiency > 0.8).all()
 
 

@@ -20,8 +20,7 @@ from ..errors import InputError
 from ..flight import Flight
 from ..models import MODELS
 from ..shooting import ShootingProblem
-from .estimator import NetworkEstimator
-from .trained import TrainedNetwork
+from .estimator import NetworkEstimator, TrainedNetwork
 
 _FORMAT = 2
 _LARGEST = 2**30
