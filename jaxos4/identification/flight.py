@@ -40,7 +40,7 @@ def identify_flight(
     validate: Recording | None,
     progress: Callable[[str], None],
 ) -> FlightIdentification:
-    """What `jaxos4.identify` does with a model in alpha_1..8; all arguments are its."""
+    """What `jaxos4.identify` does with a model in alpha_1..8. The arguments are the same."""
     name, kind = name_and_class(estimator)
     _check_options(name, kind, channels, window, network)
     if network is not None and not isinstance(estimator, str):

@@ -49,7 +49,7 @@ def identify_vehicle(
     seed: int,
     progress: Callable[[str], None],
 ) -> VehicleIdentification:
-    """What `jaxos4.identify` does with an airframe; all arguments are its."""
+    """What `jaxos4.identify` does with an airframe. The arguments are the same."""
     (name, kind), loss = name_and_class(estimator), "huber" if loss is None else loss
     if loss not in ("huber", "squares"):
         raise InputError(f"`loss`: must be huber or squares, got {loss!r}.")
