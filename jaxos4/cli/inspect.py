@@ -9,12 +9,11 @@ from rich.console import Console
 from rich.table import Table
 
 from ..airframe import load_airframe
-from ..logs import FORMATS
+from ..logs import log_format
 from ..recording.inspection import RATES, IdentifiableParameters, Inspection, inspect_log
 from ._choices import OutOption
 from ._output import check_output, write_json
 
-LABELS = {each.name: each.label for each in FORMATS}
 # At most so many parts are printed, the longest ones.
 MOST_PARTS = 14
 CHANNELS = (
@@ -42,7 +41,7 @@ def inspect(
     found = inspect_log(log, vehicle)
     if out is not None:
         write_json(found.to_dict(), out)
-    _print_contents(console, found)
+    _print_contents(console, found, log_format(log).label)
     _print_parts(console, found)
     if found.identifiable is not None:
         _print_identifiable(console, found.identifiable)
@@ -54,9 +53,9 @@ def inspect(
         console.print("identifiable parameters are computed only if p, q and r were measured.")
 
 
-def _print_contents(console: Console, found: Inspection) -> None:
+def _print_contents(console: Console, found: Inspection, label: str) -> None:
     console.print(
-        f"{found.log}: {LABELS[found.format]}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
+        f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
         f"one every {1e3 * found.sample_time:.4g} ms",
         soft_wrap=True,
     )
