@@ -86,7 +86,7 @@ def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_re
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, f"jaxos4: {out}: interrupted; the same command goes on where it was.\n")
+    assert (process.returncode, err) == (130, f"jaxos4: {out}: interrupted; run the same command again to continue.\n")
     finished = cells(out)
     assert finished.items() <= cells(whole).items()
     assert len(read_store(out).missing()) == 96 - len(finished)

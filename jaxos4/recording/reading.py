@@ -29,9 +29,11 @@ class Recording(NamedTuple):
         return tuple(f"{self.name}: {note}" for note in self.notes)
 
     def same_data(self, other: "Recording") -> bool:
-        """Whether both hold the same rotor speeds and states."""
-        pairs = ((self.flight.omega, other.flight.omega), (self.flight.states, other.flight.states))
-        return all(np.array_equal(np.asarray(a), np.asarray(b), equal_nan=True) for a, b in pairs)
+        """Whether both hold the same samples: times, rotor speeds and states."""
+        mine, others = ((each.flight.time, each.flight.omega, each.flight.states) for each in (self, other))
+        return all(
+            np.array_equal(np.asarray(a), np.asarray(b), equal_nan=True) for a, b in zip(mine, others, strict=True)
+        )
 
 
 def read_recording(path: str | os.PathLike[str], airframe: Airframe | None = None) -> Recording:
