@@ -12,7 +12,7 @@ from rich.console import Console
 from .._files import read_toml
 from ..airframe import load_airframe
 from ..errors import InputError
-from ..identification import VehicleIdentification, identify
+from ..identification import Identification, VehicleIdentification, identify
 from ..models import MODELS
 from ..recording import read_recording
 from ..report.flight_page import write_flight_page
@@ -103,19 +103,29 @@ def estimate(
         other = None if validate is None else read_recording(validate, vehicle)
         subject = vehicle if is_vehicle else MODELS[model](vehicle)
         found = identify(recordings, subject, validate=other, progress=progress, **options)
+    _publish(_with_command(found, airframe), out, report, title=", ".join(path.name for path in flights))
+
+
+def _with_command(found: Identification, airframe: str) -> Identification:
+    """The identification with the command in its provenance, and its notes in the words of the command line."""
     asked = {
         "airframe": airframe,
         "notes": [in_options(note) for note in found.provenance["notes"]],
         "command": shlex.join(["jaxos4", *sys.argv[1:]]),
     }
-    found, console = msgspec.structs.replace(found, provenance=found.provenance | asked), Console()
+    return msgspec.structs.replace(found, provenance=found.provenance | asked)
+
+
+def _publish(found: Identification, out: Path | None, report: Path | None, *, title: str) -> None:
+    """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
+    console = Console()
     if out is not None:
         write_json(found.to_dict(), out)
     for note in found.provenance["notes"]:
         console.print(f"note: {note}", markup=False, highlight=False)
     print_identification(console, found)
     if report is not None and isinstance(found, VehicleIdentification):
-        write_flight_page(report, found, title=", ".join(path.name for path in flights))
+        write_flight_page(report, found, title=title)
         console.print(f"report: {report}", markup=False, highlight=False)
     if not found.successful:
         typer.echo(f"jaxos4: {found.result}: {RESULTS[getattr(RESULTS, found.result)]}", err=True)

@@ -51,8 +51,7 @@ def identify(
     **Arguments:**
 
     - `flights`: a `Flight`, a `Recording` (a flight with a name), or several for a vehicle.
-    - `subject`: a model in alpha_1..8, such as `PublishedOS4()`; or the `Airframe` of a real vehicle, whose model is
-      a `FlightModel`.
+    - `subject`: a model in alpha_1..8, such as `PublishedOS4()`, or the `Airframe` of a real vehicle.
     - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. A vehicle needs one that shoots.
     - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
     - `window`: length of the windows for multiple shooting [s]; by default none for a model, 0.25 s for a vehicle.
@@ -76,8 +75,7 @@ def identify(
 
     **Returns:** a `FlightIdentification` for a model, a `VehicleIdentification` for an airframe. Check `result`.
 
-    **Raises:** `InputError`, one line, for arguments and flights that cannot be used; `TrainingError` if a network
-    cannot be trained.
+    **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
     """
     recordings = as_recordings(flights)
     if not recordings:
@@ -92,16 +90,19 @@ def identify(
         if initial_state != "free":
             raise InputError(f"`initial_state` {initial_state}: each window has its own initial state; leave it out.")
         return identify_vehicle(recordings, subject, validate=other, **of_vehicle, **common)
+    _check_model(subject, recordings, of_vehicle)
+    return identify_flight(recordings[0], subject, initial_state=initial_state, validate=other, **of_model, **common)
+
+
+def _check_model(subject: AbstractModel, recordings: Sequence[Recording], of_vehicle: dict[str, Any]) -> None:
     if getattr(subject, "parameter_names", None) != PARAMETER_NAMES:
         raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(subject).__name__}.")
     name = class_name(subject, MODELS)
     _refuse(of_vehicle, f"is for an `Airframe` as `subject`, not for the {name} model")
-    recording, *others = recordings
-    if others:
+    if len(recordings) > 1:
         raise InputError(
-            f"{others[0].name}: `subject` {name} explains one flight; use an `Airframe` as `subject` for several."
+            f"{recordings[1].name}: `subject` {name} explains one flight; use an `Airframe` as `subject` for several."
         )
-    return identify_flight(recording, subject, initial_state=initial_state, validate=other, **of_model, **common)
 
 
 def _refuse(options: dict[str, Any], why: str) -> None:

@@ -16,6 +16,7 @@ from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..recording.reading import Recording
 from ..results import result_names
+from ..shooting import ShootingProblem
 from .constants import flight_constants
 from .flight_fit import FlightFit, fit_flight
 from .network import GivenNetwork, loaded, network_for, network_provenance
@@ -54,32 +55,20 @@ def identify_flight(
     other = None if validate is None else flight_problem(validate, model, **shooting)
     begin = time.perf_counter()
     if _has_own_channels(kind):
-        problem = problem.restrict(kind.looks_at)
-        if np.isnan(np.asarray(problem.flight.states)[:, CASCADE_ORDER[: problem.size]]).all(axis=0).any():
-            raise InputError(f"{recording.name}: {name} needs p, q and r; use `estimator` output-error.")
+        problem = _restricted(problem, kind.looks_at, name, recording)
     if kind.needs_network and trained is None:
         progress("training a network for this flight")
         trained = network_for(problem, where, recording.name, shoots=kind.shoots, seed=seed)
     method = make_estimator(estimator, trained) if isinstance(estimator, str) else estimator
     if trained is not None:
-        mismatch = trained.mismatch(problem)
-        if mismatch is not None:
-            raise InputError(
-                f"`network`: cannot be used on {recording.name}: {mismatch}; train one with `jaxos4 train`."
-            )
+        _check_match(trained, problem, recording)
         if not kind.shoots:
             problem, where = problem.restrict(trained.channels), trained.bracket
     if validate is not None and other is not None:
-        other = other.restrict(problem.channels) if other.size > problem.size else other
-        if np.isnan(np.asarray(other.measured())).all():
-            raise InputError(
-                f"{validate.name}: nothing was measured among the {problem.channels} channels; give another flight."
-            )
+        other = _comparable(other, problem, validate)
     fit = fit_flight(method, problem, where, progress=progress)
     seconds, problem, estimate = time.perf_counter() - begin, fit.problem, fit.estimate
-    body, validation, notes = RigidBody(), None, list(recording.notes)
-    if has_answer(estimate):
-        body = flight_constants(model, estimate)
+    validation, notes = None, list(recording.notes)
     if validate is not None and other is not None:
         notes += validate.named_notes
         validation = validate_on(problem, estimate, other, validate.name) if has_answer(estimate) else None
@@ -91,7 +80,7 @@ def identify_flight(
         cost=finite_or_none(estimate.cost),
         seconds=seconds,
         parameters=_parameters(fit, where, kind.prior),
-        rigid_body=body,
+        rigid_body=flight_constants(model, estimate) if has_answer(estimate) else RigidBody(),
         fit={} if fit.diagnostics is None else channel_fits(problem, fit.diagnostics),
         validation=validation,
         provenance={
@@ -109,6 +98,30 @@ def identify_flight(
         estimate=estimate,
         problem=problem,
     )
+
+
+def _restricted(problem: ShootingProblem, channels: str, name: str, recording: Recording) -> ShootingProblem:
+    """The problem on the channels that an estimator looks at."""
+    problem = problem.restrict(channels)
+    if np.isnan(np.asarray(problem.flight.states)[:, CASCADE_ORDER[: problem.size]]).all(axis=0).any():
+        raise InputError(f"{recording.name}: {name} needs p, q and r; use `estimator` output-error.")
+    return problem
+
+
+def _check_match(network: TrainedNetwork, problem: ShootingProblem, recording: Recording) -> None:
+    mismatch = network.mismatch(problem)
+    if mismatch is not None:
+        raise InputError(f"`network`: cannot be used on {recording.name}: {mismatch}; train one with `jaxos4 train`.")
+
+
+def _comparable(other: ShootingProblem, problem: ShootingProblem, validate: Recording) -> ShootingProblem:
+    """The other flight's problem on the same channels."""
+    other = other.restrict(problem.channels) if other.size > problem.size else other
+    if np.isnan(np.asarray(other.measured())).all():
+        raise InputError(
+            f"{validate.name}: nothing was measured among the {problem.channels} channels; give another flight."
+        )
+    return other
 
 
 def _check_options(

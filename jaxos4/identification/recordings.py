@@ -24,7 +24,7 @@ from .parameters import parameter_table
 from .problem import Intervals, bracket_of
 from .provenance import airframe_name, name_and_class, shooting_names, versions
 from .results import HeldParameter, RigidBody, VehicleIdentification, finite_or_none
-from .vehicle import Search, fit_vehicle, free_bracket
+from .vehicle import Search, VehicleFit, fit_vehicle, free_bracket
 
 # The first guess of the noise levels [rad/s]: errors of the model rather than of the sensor.
 _FIRST_SIGMA = 0.5
@@ -50,8 +50,8 @@ def identify_vehicle(
     progress: Callable[[str], None],
 ) -> VehicleIdentification:
     """What `jaxos4.identify` does with an airframe. The arguments are the same."""
-    (name, kind), loss = name_and_class(estimator), "huber" if loss is None else loss
-    if loss not in ("huber", "squares"):
+    name, kind = name_and_class(estimator)
+    if loss not in (None, "huber", "squares"):
         raise InputError(f"`loss`: must be huber or squares, got {loss!r}.")
     if not kind.shoots:
         raise InputError(f"`estimator` {name}: does not shoot, which a vehicle needs; use one of {shooting_names()}.")
@@ -61,31 +61,18 @@ def identify_vehicle(
     prepared = prepare(recordings, airframe, **part)
     chosen = default_terms(prepared.available) if terms is None else _checked_terms(terms, prepared.available)
     model = FlightModel(airframe, terms=chosen, recordings=prepared.recordings)
-    where, notes, held_out = bracket_of(bracket, model), prepared.notes, None
-    if validate is not None:
-        other = _prepare_other(recordings, validate, prepared, model, window)
-        held_out, notes = HeldOut(other.fitted, other.seconds[0], validate.name, False), notes + other.notes
-    elif prepared.tested is not None:
-        held_out = HeldOut(prepared.tested, prepared.seconds[1], recordings[0].name, True)
-    if held_out is not None:
-        check_starts(held_out)
+    where = bracket_of(bracket, model)
+    held_out, notes = _held_out(recordings, validate, prepared, model, window)
     problem = _problem(prepared, model, recordings[0].name, window)
-    gibibytes = problem.flight.time.shape[0] * problem.columns.size * _unknowns(problem) * 8 / 2**30
-    if kind is OutputError and gibibytes > _LARGEST_JACOBIAN:
-        raise InputError(
-            f"`estimator` {name}: its Jacobian would take {gibibytes:.0f} GiB in {problem.windows} windows; use ibss, "
-            "or less of the flight by `begin` and `end`."
-        )
-    search = _last_search(estimator, kind, recordings[0].name, seed)
-    fit = fit_vehicle(problem, where, estimator=search, huber=loss == "huber", progress=progress)
+    _check_memory(problem, kind, name)
+    last = _last_search(estimator, kind, recordings[0].name, seed)
+    fit = fit_vehicle(problem, where, estimator=last, huber=loss != "squares", progress=progress)
     estimate, free, noise = fit.estimate, fit.problem.model, np.asarray(fit.problem.sigma)
-    parameters, body, predicted, skill = {}, RigidBody(), None, None
+    predicted = skill = None
     if fit.answered and held_out is not None:
         progress("predicting what was not fitted")
         predicted, skill = predict_held_out(fit, model, held_out)
-    if fit.answered:
-        parameters = parameter_table(free, estimate, fit.bound, free_bracket(where, model, fit.held))
-        body = vehicle_constants(free.parameter_names, estimate, where, airframe)
+    table = parameter_table(free, estimate, fit.bound, free_bracket(where, model, fit.held)) if fit.answered else {}
     return VehicleIdentification(
         estimator=name,
         model="flight",
@@ -93,13 +80,9 @@ def identify_vehicle(
         rollouts=fit.rollouts,
         cost=finite_or_none(estimate.cost),
         seconds=time.perf_counter() - started,
-        parameters=parameters,
-        rigid_body=body,
-        held={
-            name: HeldParameter(fit.held[name][0], unit, fit.held[name][1] or "not asked")
-            for name, unit in zip(model.parameter_names, model.parameter_units, strict=True)
-            if name in fit.held
-        },
+        parameters=table,
+        rigid_body=vehicle_constants(free.parameter_names, estimate, where, airframe) if fit.answered else RigidBody(),
+        held=_held_parameters(fit, model),
         cut=fit.cut,
         noise={CHANNEL_NAMES[i]: float(noise[i]) for i in fit.problem.columns},
         skill=skill,
@@ -113,13 +96,45 @@ def identify_vehicle(
             "sample_time": float(prepared.fitted.dt),
             "fitted_seconds": prepared.seconds[0],
             "tested_seconds": 0.0 if held_out is None else held_out.seconds,
-            "loss": loss,
+            "loss": loss or "huber",
             "notes": list(notes),
             **versions(problem),
         },
         estimate=estimate,
         problem=fit.problem,
     )
+
+
+def _held_out(
+    recordings: Sequence[Recording], validate: Recording | None, prepared: Prepared, model: FlightModel, window: float
+) -> tuple[HeldOut | None, tuple[str, ...]]:
+    """The data that are predicted and not fitted, if there are any; and the notes about all data."""
+    held_out, notes = None, prepared.notes
+    if validate is not None:
+        other = _prepare_other(recordings, validate, prepared, model, window)
+        held_out, notes = HeldOut(other.fitted, other.seconds[0], validate.name, False), notes + other.notes
+    elif prepared.tested is not None:
+        held_out = HeldOut(prepared.tested, prepared.seconds[1], recordings[0].name, True)
+    if held_out is not None:
+        check_starts(held_out)
+    return held_out, notes
+
+
+def _held_parameters(fit: VehicleFit, model: FlightModel) -> dict[str, HeldParameter]:
+    return {
+        name: HeldParameter(fit.held[name][0], unit, fit.held[name][1] or "not asked")
+        for name, unit in zip(model.parameter_names, model.parameter_units, strict=True)
+        if name in fit.held
+    }
+
+
+def _check_memory(problem: ShootingProblem, kind: type[AbstractEstimator], name: str) -> None:
+    gibibytes = problem.flight.time.shape[0] * problem.columns.size * _unknowns(problem) * 8 / 2**30
+    if kind is OutputError and gibibytes > _LARGEST_JACOBIAN:
+        raise InputError(
+            f"`estimator` {name}: its Jacobian would take {gibibytes:.0f} GiB in {problem.windows} windows; use ibss, "
+            "or less of the flight by `begin` and `end`."
+        )
 
 
 def _last_search(
