@@ -26,7 +26,7 @@ from ..models.abstract import AbstractModel
 from ..models.held import HeldParameters, hold
 from ..shooting import ShootingProblem
 from .noise_levels import Refined, refine
-from .results import NO_ANSWER as NO_ANSWER, has_answer
+from .results import has_answer
 
 # Value and reason of each parameter that is held.
 Held = dict[str, tuple[float, str]]

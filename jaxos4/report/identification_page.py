@@ -16,7 +16,6 @@ from ..identification.results import (
     Validation,
     VehicleIdentification,
 )
-from ..identification.vehicle import NO_ANSWER
 from ..results import NINETY_FIVE
 
 # The share of fits of true models that a test of all channels' residuals may reject.
@@ -37,7 +36,7 @@ def _parts(found: Identification) -> Iterator[str | Table]:
             f"the model lacks{' (try --window, or a shorter window)' if shoots else ''}, or the airframe's constants "
             "or the units of the flight are wrong."
         )
-    if found.result in NO_ANSWER:
+    if not found.has_answer:
         return
     if isinstance(found, FlightIdentification):
         yield from _of_flight(found)
