@@ -21,6 +21,8 @@ Numeric = Array | np.ndarray
 
 def as_float(x: ArrayLike) -> Array:
     """Convert to a strongly typed array of the default float type, so that equal shapes share one compiled program."""
+    if isinstance(x, np.ndarray | np.generic | float | int):  # without the program that `jnp.asarray` compiles
+        return jax.device_put(np.asarray(x, dtype=jax.dtypes.canonicalize_dtype(float)))
     return jnp.asarray(x, dtype=float)
 
 

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ._custom_types import Parameters, as_float
+from ._custom_types import Numeric, Parameters, as_float
 from .models.abstract import AbstractModel
 
 # The largest standard deviation of an identifiable parameter, in half-widths of a bracket that is used as ...
@@ -15,13 +15,13 @@ UNIFORM_PRIOR = 0.5  # a prior with a standard deviation of 0.577
 
 def is_identifiable(
     std: Float[ArrayLike, "*parameters"], half_width: Float[ArrayLike, "*parameters"], prior: float = NO_PRIOR
-) -> Bool[Array, "*parameters"]:
+) -> Bool[Numeric, "*parameters"]:
     """The rule: a parameter is identifiable if its standard deviation is at most `prior` half-widths of its bracket.
 
     A standard deviation that is not finite is too large. `prior` says how the estimator used the bracket: `NO_PRIOR`,
     `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR`.
     """
-    return as_float(std) <= prior * as_float(half_width)
+    return std <= prior * half_width  # type: ignore[return-value]
 
 
 class Bracket(eqx.Module):
@@ -64,7 +64,7 @@ class Bracket(eqx.Module):
         width = self.upper - self.lower
         return ((width > 0) & (width < float("inf"))).all()
 
-    def identifies(self, std: Float[ArrayLike, " parameters"], prior: float = NO_PRIOR) -> Bool[Array, " parameters"]:
+    def identifies(self, std: Float[ArrayLike, " parameters"], prior: float = NO_PRIOR) -> Bool[Numeric, " parameters"]:
         """See `is_identifiable`."""
         return is_identifiable(std, self.half_width, prior)
 

@@ -5,6 +5,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._custom_types import RotorSpeeds, Scalar, States, as_float
@@ -92,7 +94,9 @@ class Flight(eqx.Module):
     @property
     def dt(self) -> Scalar:
         """The sample time [s]."""
-        return (self.time[-1] - self.time[0]) / (self.time.shape[0] - 1)
+        # A recorded flight's sample time needs no compiled program.
+        time = self.time if isinstance(self.time, Tracer) else np.asarray(self.time)
+        return as_float((time[-1] - time[0]) / (time.shape[0] - 1))
 
     @property
     def inputs(self) -> Inputs:

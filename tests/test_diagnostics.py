@@ -15,11 +15,20 @@ LAGS = 25
 
 @eqx.filter_jit
 @eqx.filter_vmap
-def judged(states):
-    """The diagnostics of a fit to each flight."""
+def fitted(states):
     problem = standard_problem(states=states, channels="rates")
     found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
-    return jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+    return found.parameters, found.initial_state
+
+
+def judged(states):
+    """The diagnostics of a fit to each flight."""
+    problem = standard_problem(channels="rates")
+    each = [
+        jaxos4.residual_diagnostics(eqx.tree_at(lambda p: p.flight.states, problem, flight), parameters, start)
+        for flight, parameters, start in zip(states, *fitted(states), strict=True)
+    ]
+    return jax.tree.map(lambda *values: np.stack(values), *each)
 
 
 def coloured_states(count, noise):

@@ -214,18 +214,15 @@ def test_both_kinds_of_directions_reach_the_maximum_of_the_likelihood():
 
 
 def test_rollouts_are_counted_right():
-    """Each simulated step calls back: the count of shots is independent of the estimator's own."""
-    calls = [0]
-
-    def note():
-        calls[0] += 1
+    """Each simulated step calls back with its torque; the first torque starts a shot, on however many samples."""
+    torques = []
 
     class Counting(PUBLISHED):
         def angular_acceleration(self, rates, forcing, parameters):
-            jax.debug.callback(note)
+            jax.debug.callback(lambda torque: torques.append(float(torque)), forcing.roll)
             return super().angular_acceleration(rates, forcing, parameters)
 
-    flight, samples = standard_flight(duration=0.5), 51
+    flight = standard_flight(duration=0.5)
     states = noisy_states(1, duration=0.5)[0]
     free, slow = None, {"directions": "coordinate", "halvings": 3, "max_sweeps": 5}
     for start, unknowns, stages, settings in ((flight.states[0], 8, 3, {}), (free, 11, 1, slow)):
@@ -236,14 +233,15 @@ def test_rollouts_are_counted_right():
             channels="rates",
             initial_state=start,
         )
-        calls[0] = 0
+        torques.clear()
         bracket = jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF)
         estimate = jaxos4.IBSS(**settings)(problem, bracket)
         jax.effects_barrier()
         sweeps = int(estimate.sweeps)
         curvatures = sweeps + stages  # each of them carries one tangent for every unknown
-        shots = calls[0] // samples - curvatures
-        assert calls[0] % samples == 0
+        rolls = np.asarray(problem.forcing(problem.model.alpha).roll)
+        assert (rolls == rolls[0]).sum() == 1
+        shots = torques.count(float(rolls[0])) - curvatures
         assert sweeps > 3
         assert shots == unknowns * settings.get("halvings", 4) * sweeps
         assert int(estimate.rollouts) == shots + unknowns * curvatures

@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 from typing import Annotated
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,13 +29,6 @@ CONSTANTS = ("Ix", "Iy", "Iz", "J_R")
 CHUNK = 250
 
 
-@eqx.filter_jit
-@eqx.filter_vmap(in_axes=(None, 0, 0))
-def constants(model: jaxos4.AbstractModel, parameters: jax.Array, covariance: jax.Array) -> jaxos4.InertiaFit:
-    """The rigid body of each flight."""
-    return jaxos4.fit_inertia(model, parameters, covariance)
-
-
 def cover(
     estimator: jaxos4.AbstractEstimator, problem: jaxos4.ShootingProblem, scale: float, flights: int, seed: int
 ) -> dict:
@@ -52,7 +44,7 @@ def cover(
 
     found = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(part, range(0, flights, CHUNK)))
     seconds = time.perf_counter() - begin
-    rigid = constants(model, found.parameters, found.covariance)
+    rigid = jaxos4.fit_inertia(model, found.parameters, found.covariance)
     results = count_results(jaxos4.result_names(found.result))
     # A flight without an estimate has an infinite interval, and counts as not covered.
     errors, half_width = np.abs(found.parameters - model.alpha), np.asarray(found.half_width(0.95))

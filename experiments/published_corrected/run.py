@@ -32,12 +32,12 @@ class Fits(NamedTuple):
     noise. Each is the smallest of all channels, times the number of channels (Bonferroni).
     """
 
-    estimate: jax.Array
-    half_width: jax.Array
-    result: jaxos4.RESULTS
-    white_p: jax.Array
-    input_p: jax.Array
-    level_p: jax.Array
+    estimate: np.ndarray
+    half_width: np.ndarray
+    result: np.ndarray
+    white_p: np.ndarray
+    input_p: np.ndarray
+    level_p: np.ndarray
 
 
 def model_of(study: Study, name: str) -> jaxos4.AbstractModel:
@@ -46,17 +46,21 @@ def model_of(study: Study, name: str) -> jaxos4.AbstractModel:
 
 
 @eqx.filter_jit
-def identify(exact: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, states: jax.Array) -> Fits:
+@eqx.filter_vmap(in_axes=(None, None, 0))
+def identify(exact: jaxos4.ShootingProblem, bracket: jaxos4.Bracket, states: jax.Array) -> jaxos4.Estimate:
     """Fit noisy flights. They differ from the flight of `exact` in their measured states."""
+    return jaxos4.IBSS()(eqx.tree_at(lambda p: p.flight.states, exact, states), bracket)
 
-    def one(states: jax.Array) -> Fits:
-        problem = eqx.tree_at(lambda p: p.flight.states, exact, states)
-        found = jaxos4.IBSS()(problem, bracket)
-        tests = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
-        least = [jnp.minimum(p.size * p.min(), 1.0) for p in (tests.white_p, tests.input_p, tests.level_p)]
-        return Fits(found.parameters, found.half_width(0.95), found.result, *least)
 
-    return jax.vmap(one)(states)
+def judge(exact: jaxos4.ShootingProblem, found: jaxos4.Estimate, states: jax.Array) -> Fits:
+    """The fits with their diagnostics."""
+    least = []
+    for flight, parameters, start in zip(states, found.parameters, found.initial_state, strict=True):
+        problem = eqx.tree_at(lambda p: p.flight.states, exact, flight)
+        tests = jaxos4.residual_diagnostics(problem, parameters, start)
+        least.append([min(p.size * p.min(), 1.0) for p in (tests.white_p, tests.input_p, tests.level_p)])
+    names, half_width = jaxos4.result_names(found.result), np.asarray(found.half_width(0.95))
+    return Fits(np.asarray(found.parameters), half_width, names, *np.array(least).T)
 
 
 def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
@@ -71,17 +75,18 @@ def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
     flight, noise = jaxos4.simulate(truth, truth.alpha, omega, dt=study.dt), jaxos4.WhiteNoise(sigma)
     keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(study.seed), i))(jnp.arange(study.flights))
     bracket = jaxos4.Bracket.around(model.alpha + 0.3 * model.half_width, model.half_width)
-    found = identify(exact, bracket, jax.vmap(lambda key: noise(flight, key=key).states)(keys))
-    answered = np.isin(jaxos4.result_names(found.result), ["successful", "unidentifiable"])
-    error = np.asarray(found.estimate - model.alpha)
+    states = jax.vmap(lambda key: noise(flight, key=key).states)(keys)
+    found = judge(exact, identify(exact, bracket, states), states)
+    answered = np.isin(found.result, ["successful", "unidentifiable"])
+    error = found.estimate - np.asarray(model.alpha)
     return xr.Dataset(
         {
             "error": (("flight", "parameter"), error / bound, {"units": "bounds of the fitted model's own flight"}),
             "covered": (("flight", "parameter"), np.abs(error) < found.half_width),
             "answered": ("flight", answered),
-            "white_p": ("flight", np.asarray(found.white_p)),
-            "input_p": ("flight", np.asarray(found.input_p)),
-            "level_p": ("flight", np.asarray(found.level_p)),
+            "white_p": ("flight", found.white_p),
+            "input_p": ("flight", found.input_p),
+            "level_p": ("flight", found.level_p),
             "truth": ("parameter", np.asarray(model.alpha)),
             "bound": ("parameter", bound),
         },

@@ -1,18 +1,12 @@
 """Diagnostics of the residuals of a fit: their size, whether they are white, and whether they depend on the inputs."""
 
-from typing import NamedTuple
-
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Bool, Float, Int
 
-from .._custom_types import InitialStates, Parameters, Scalar, as_float
+from .._custom_types import InitialStates, Parameters
 from ..shooting import ROUNDING, ShootingProblem
-
-Series = Float[Array, " samples"]
-Measured = Bool[Array, " samples"]
-Correlation = Float[Array, " both"]
+from .evaluation import Evaluation, evaluate
 
 # Residuals below this share of a channel's largest value are rounding errors, in double precision.
 _ROUNDING = 1e-9
@@ -43,17 +37,17 @@ class Diagnostics(eqx.Module):
       System Identification, chapter 16) and is conservative (Bonferroni).
     """
 
-    sound: Bool[Array, ""]
-    count: Int[Array, " size"]
-    rms: Float[Array, " size"]
-    percent: Float[Array, " size"]
-    level: Float[Array, " size"]
-    level_p: Float[Array, " size"]
-    autocorrelation: Float[Array, "size lags"]
-    colour: Float[Array, " size"]
-    white_p: Float[Array, " size"]
-    input_correlation: Float[Array, "size 3"]
-    input_p: Float[Array, " size"]
+    sound: bool
+    count: Int[np.ndarray, " size"]
+    rms: Float[np.ndarray, " size"]
+    percent: Float[np.ndarray, " size"]
+    level: Float[np.ndarray, " size"]
+    level_p: Float[np.ndarray, " size"]
+    autocorrelation: Float[np.ndarray, "size lags"]
+    colour: Float[np.ndarray, " size"]
+    white_p: Float[np.ndarray, " size"]
+    input_correlation: Float[np.ndarray, "size 3"]
+    input_p: Float[np.ndarray, " size"]
 
 
 def residual_diagnostics(
@@ -64,7 +58,7 @@ def residual_diagnostics(
     fitted: bool = True,
     lags: int = 25,
 ) -> Diagnostics:
-    """Diagnostics of the residuals at `parameters`.
+    """Diagnostics of the residuals at `parameters`, computed by NumPy for one flight.
 
     **Arguments:**
 
@@ -74,143 +68,108 @@ def residual_diagnostics(
 
     **Raises:** `ValueError` for wrong shapes, or a flight with too few samples for `lags`.
     """
-    parameters = as_float(parameters)
-    start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     for name, value, length in (
         ("parameters", parameters, len(problem.model.parameter_names)),
-        ("initial_state", start, problem.windows * problem.size),
+        ("initial_state", initial_state, problem.windows * problem.size),
     ):
-        if value.shape != (length,):
-            raise ValueError(f"`{name}` must be of shape ({length},), got {value.shape}.")
+        if value is not None and np.shape(value) != (length,):
+            raise ValueError(f"`{name}` must be of shape ({length},), got {np.shape(value)}.")
     samples = problem.flight.states.shape[-2]
     if not 1 <= lags < samples:
         raise ValueError(f"`lags` must lie in 1 to {samples - 1} for {samples} samples, got {lags}.")
-    return _diagnostics(problem, parameters, start, fitted, lags)
+    return diagnostics_of(evaluate(problem, parameters, initial_state), fitted=fitted, lags=lags)
 
 
-@eqx.filter_jit
-def _diagnostics(
-    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates, fitted: bool, lags: int
-) -> Diagnostics:
-    sigma = problem.sigma[problem.columns]
-    residuals = _residuals(problem, parameters, initial_state)
-    _, errors, measured, values, count, most, squares = residuals
-    known, size = count >= _FEWEST, jnp.abs(values).max(axis=0)
-    rounding = max(_ROUNDING, ROUNDING * float(jnp.finfo(sigma.dtype).eps))
-    trivial = ~known | (sigma * jnp.abs(errors).max(axis=0) <= rounding * size)
+def diagnostics_of(evaluation: Evaluation, *, fitted: bool, lags: int) -> Diagnostics:
+    """`residual_diagnostics` of a flight that was simulated already."""
+    from scipy.special import gammainc, gammaincc  # slow to import, and few need it
 
-    unknowns = problem.windows * problem.free_size + (parameters.shape[0] if fitted else 0)
-    freedom = jnp.maximum(count * (1 - unknowns / jnp.maximum(count.sum(), 1)), 1.0)
-    below, above = (
-        tail(freedom / 2, squares / 2) for tail in (jax.scipy.special.gammainc, jax.scipy.special.gammaincc)
-    )
-    level, level_p = squares / freedom, 2 * jnp.minimum(below, above)
-    motion = jnp.where(measured, values - values.sum(axis=0) / most, 0.0)
-    spread = jnp.sqrt(jnp.square(motion).sum(axis=0))
-    moved = known & (spread > rounding * size * jnp.sqrt(most))
-    autocorrelation, colour, white_p = _whiteness(residuals, lags)
-    input_correlation, input_p = _dependence(problem, parameters, residuals, autocorrelation, rounding, lags)
-    return Diagnostics(
-        sound=residuals.sound,
-        count=count,
-        rms=jnp.where(known, sigma * jnp.sqrt(squares / most), 0.0),
-        percent=jnp.where(moved, 100 * (1 - sigma * jnp.sqrt(squares) / jnp.where(moved, spread, 1.0)), 0.0),
-        level=jnp.where(known, level, 1.0),
-        level_p=jnp.where(known, level_p, 1.0),
-        autocorrelation=jnp.where(trivial[:, None], 0.0, autocorrelation),
-        colour=jnp.where(trivial, 0.0, colour),
-        white_p=jnp.where(trivial | (problem.windows > 1), 1.0, white_p),
-        input_correlation=jnp.where(trivial[:, None], 0.0, input_correlation),
-        input_p=jnp.where(trivial, 1.0, input_p),
-    )
-
-
-class _Residuals(NamedTuple):
-    """Weighted residuals `errors` and measured `values`, 0 for missing samples; `most`: `total`, or 1 if it is 0."""
-
-    sound: Bool[Array, ""]
-    errors: Float[Array, "samples size"]
-    measured: Bool[Array, "samples size"]
-    values: Float[Array, "samples size"]
-    total: Int[Array, " size"]
-    most: Int[Array, " size"]
-    squares: Float[Array, " size"]
-
-
-def _residuals(problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates) -> _Residuals:
-    observed = problem.measured()
-    errors = problem.residuals(parameters, initial_state).reshape(observed.shape)
+    problem, sound = evaluation.problem, evaluation.sound
     # A diverged trajectory counts as nothing measured.
-    sound = jnp.isfinite(problem.cost(parameters, initial_state)) & jnp.isfinite(errors).all()
-    measured = ~jnp.isnan(observed) & sound
-    errors, count = jnp.where(measured, errors, 0.0), measured.sum(axis=0)
-    values = jnp.where(measured, observed, 0.0)
-    return _Residuals(sound, errors, measured, values, count, jnp.maximum(count, 1), jnp.square(errors).sum(axis=0))
+    measured = ~np.isnan(evaluation.measured) & sound
+    errors, values = (np.where(measured, x, 0.0) for x in (evaluation.errors, evaluation.measured))
+    sigma, count, squares = evaluation.sigma, measured.sum(axis=0), np.square(errors).sum(axis=0)
+    most, known, largest = np.maximum(count, 1), count >= _FEWEST, np.abs(values).max(axis=0)
+    rounding = max(_ROUNDING, ROUNDING * float(np.finfo(np.asarray(problem.sigma).dtype).eps))
+    trivial = ~known | (sigma * np.abs(errors).max(axis=0) <= rounding * largest)
 
-
-def _whiteness(
-    residuals: _Residuals, lags: int
-) -> tuple[Float[Array, "size lags"], Float[Array, " size"], Float[Array, " size"]]:
-    """Autocorrelation at positive lags, its value at the first lag with pairs, and the p-value of white residuals."""
-    errors, measured, most = residuals.errors, residuals.measured, residuals.most
-    correlation, pairs = jax.vmap(lambda e, m: _correlations(e, e, m, m, lags), in_axes=1)(errors, measured)
-    after, pairs = correlation[:, lags + 1 :], pairs[:, lags + 1 :]
-    box = ((most + 2) / most) * (pairs * jnp.square(after)).sum(axis=1)
-    has_pairs = pairs > 0
-    colour = jnp.take_along_axis(after, jnp.argmax(has_pairs, axis=1)[:, None], axis=1)[:, 0]
+    unknowns = problem.windows * problem.free_size + (evaluation.parameters.size if fitted else 0)
+    freedom = np.maximum(count * (1 - unknowns / max(count.sum(), 1)), 1.0)
+    level, tails = squares / freedom, [tail(freedom / 2, squares / 2) for tail in (gammainc, gammaincc)]
+    motion = np.where(measured, values - values.sum(axis=0) / most, 0.0)
+    spread = np.sqrt(np.square(motion).sum(axis=0))
+    moved = known & (spread > rounding * largest * np.sqrt(most))
+    autocorrelation, pairs = _correlations(errors, errors, measured, measured, lags)
+    autocorrelation, pairs = autocorrelation[:, lags + 1 :], pairs[:, lags + 1 :]
     # Without any pairs the statistic is 0 and the p-value 1.
-    return after, colour, jax.scipy.special.gammaincc(jnp.maximum(has_pairs.sum(axis=1), 1) / 2, box / 2)
+    box = ((most + 2) / most) * (pairs * np.square(autocorrelation)).sum(axis=1)
+    white_p = gammaincc(np.maximum((pairs > 0).sum(axis=1), 1) / 2, box / 2)
+    colour = autocorrelation[np.arange(count.size), np.argmax(pairs > 0, axis=1)]
+    input_correlation, input_p = _dependence(errors, measured, autocorrelation, evaluation.torques, rounding, lags)
+    return Diagnostics(
+        sound=sound,
+        count=count,
+        rms=np.where(known, sigma * np.sqrt(squares / most), 0.0),
+        percent=np.where(moved, 100 * (1 - sigma * np.sqrt(squares) / np.where(moved, spread, 1.0)), 0.0),
+        level=np.where(known, level, 1.0),
+        level_p=np.where(known, 2 * np.minimum(*tails), 1.0),
+        autocorrelation=np.where(trivial[:, None], 0.0, autocorrelation),
+        colour=np.where(trivial, 0.0, colour),
+        white_p=np.where(trivial | (problem.windows > 1), 1.0, white_p),
+        input_correlation=np.where(trivial[:, None], 0.0, input_correlation),
+        input_p=np.where(trivial, 1.0, input_p),
+    )
 
 
 def _dependence(
-    problem: ShootingProblem,
-    parameters: Parameters,
-    residuals: _Residuals,
-    autocorrelation: Float[Array, "size lags"],
+    errors: Float[np.ndarray, "samples size"],
+    measured: Bool[np.ndarray, "samples size"],
+    autocorrelation: Float[np.ndarray, "size lags"],
+    torques: Float[np.ndarray, "samples 3"],
     rounding: float,
     lags: int,
-) -> tuple[Float[Array, "size 3"], Float[Array, " size"]]:
+) -> tuple[Float[np.ndarray, "size 3"], Float[np.ndarray, " size"]]:
     """The largest correlation with each torque, and the p-value of residuals that depend on no torque."""
-    torques = jnp.stack(problem.forcing(parameters)[:3], axis=1)
+    from scipy.special import ndtr
+
     # The last row of rotor speeds drives nothing.
-    driving = jnp.arange(torques.shape[0]) < torques.shape[0] - 1
-    moves = jnp.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
-    moving = jnp.abs(moves).max(axis=0) > rounding * jnp.abs(torques[:-1]).max(axis=0)
-    torques = jnp.where(moving, moves, 0.0)
-    correlation, p = jax.vmap(
-        lambda e, m, own: jax.vmap(lambda u: _with_input(e, m, own, u, driving, lags), in_axes=1)(torques),
-        in_axes=(1, 1, 0),
-    )(residuals.errors, residuals.measured, autocorrelation)
-    return correlation, jnp.minimum(3 * p.min(axis=1), 1.0)
+    driving = np.arange(torques.shape[0]) < torques.shape[0] - 1
+    moves = np.where(driving[:, None], torques - torques[:-1].mean(axis=0), 0.0)
+    torques = np.where(np.abs(moves).max(axis=0) > rounding * np.abs(torques[:-1]).max(axis=0), moves, 0.0)
+    taper, found, worst = 1 - np.arange(1, lags + 1) / (lags + 1), [], []
+    for torque in torques.T:
+        column, drives = torque[:, None], driving[:, None]
+        correlation, pairs = _correlations(errors, column, measured, drives, lags)
+        own = _correlations(column, column, drives, drives, lags)[0][0, lags + 1 :]
+        # Variance of the correlation of two coloured series, relative to white ones; at least 1.
+        inflation = np.maximum(1 + 2 * (autocorrelation * (taper * own)).sum(axis=1), 1.0)
+        deviations = np.abs(correlation) * np.sqrt(pairs / inflation[:, None])
+        at = np.argmax(deviations, axis=1)[:, None]
+        found.append(np.take_along_axis(correlation, at, axis=1)[:, 0])
+        worst.append(2 * ndtr(-np.take_along_axis(deviations, at, axis=1)[:, 0]))
+    p = np.minimum((2 * lags + 1) * np.min(worst, axis=0), 1.0)
+    return np.stack(found, axis=1), np.minimum(3 * p, 1.0)
 
 
-def _correlations(a: Series, b: Series, of_a: Measured, of_b: Measured, lags: int) -> tuple[Correlation, Correlation]:
+def _correlations(
+    a: Float[np.ndarray, "samples size"],
+    b: Float[np.ndarray, "samples size_or_one"],
+    of_a: Bool[np.ndarray, "samples size"],
+    of_b: Bool[np.ndarray, "samples size_or_one"],
+    lags: int,
+) -> tuple[Float[np.ndarray, "size both"], Float[np.ndarray, "size both"]]:
     """Correlation of a(t + lag) with b(t) for lags from -`lags` to `lags`, and the number of pairs at each lag.
 
-    `of_a`, `of_b`: which samples were measured; the others are 0.
+    `of_a`, `of_b`: which samples were measured; the others are 0. Columns of `a` and `b` are paired.
     """
-    samples = a.shape[0]
+    length = 2 * a.shape[0]
 
-    def sums(x: Series, y: Series) -> Correlation:
-        spectrum = jnp.fft.rfft(x, 2 * samples) * jnp.conj(jnp.fft.rfft(y, 2 * samples))
-        return jnp.fft.irfft(spectrum, 2 * samples)[jnp.arange(-lags, lags + 1)]
+    def sums(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        spectrum = np.fft.rfft(x, length, axis=0) * np.conj(np.fft.rfft(y, length, axis=0))
+        return np.fft.irfft(spectrum, length, axis=0)[np.arange(-lags, lags + 1)].T
 
-    pairs = jnp.round(sums(of_a.astype(a.dtype), of_b.astype(a.dtype)))
-    variance = (jnp.square(a).sum() / jnp.maximum(of_a.sum(), 1)) * (jnp.square(b).sum() / jnp.maximum(of_b.sum(), 1))
-    mean = sums(a, b) / jnp.maximum(pairs, 1)
-    return jnp.where((variance > 0) & (pairs > 0), mean / jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0), pairs
-
-
-def _with_input(
-    errors: Series, measured: Measured, colour: Float[Array, " lags"], torque: Series, driving: Measured, lags: int
-) -> tuple[Scalar, Scalar]:
-    """The largest correlation of residuals with one input over all lags, and the p-value of no correlation."""
-    correlation, pairs = _correlations(errors, torque, measured, driving, lags)
-    own, _ = _correlations(torque, torque, driving, driving, lags)
-    taper = 1 - jnp.arange(1, lags + 1) / (lags + 1)
-    # Variance of the correlation of two coloured series, relative to white ones; at least 1.
-    inflation = jnp.maximum(1 + 2 * (taper * colour * own[lags + 1 :]).sum(), 1.0)
-    deviations = jnp.abs(correlation) * jnp.sqrt(pairs / inflation)
-    at = jnp.argmax(deviations)
-    p = 2 * jax.scipy.special.ndtr(-deviations[at])
-    return correlation[at], jnp.minimum((2 * lags + 1) * p, 1.0)
+    pairs = np.round(sums(of_a, of_b))
+    power = [np.square(x).sum(axis=0) / np.maximum(of_x.sum(axis=0), 1) for x, of_x in ((a, of_a), (b, of_b))]
+    variance = (power[0] * power[1])[:, None]
+    mean = sums(a, b) / np.maximum(pairs, 1)
+    return np.where((variance > 0) & (pairs > 0), mean / np.sqrt(np.where(variance > 0, variance, 1.0)), 0.0), pairs

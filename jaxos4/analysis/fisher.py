@@ -18,7 +18,7 @@ def fisher_information(
     default the measured one.
     """
     count = parameters.shape[0]
-    factor = joint_factor(_information(problem, parameters, initial_state), count)[0, :count, -count:]
+    factor = joint_factor(_information(problem, parameters, initial_state), count).factor[0, :count, -count:]
     return (factor[:, None, :] * factor[None, :, :]).sum(axis=-1)
 
 

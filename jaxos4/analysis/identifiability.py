@@ -1,15 +1,16 @@
 """Which parameters a flight can identify, and for each of the others the reason why not."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from .._custom_types import InitialStates, Parameters, as_float
 from ..bracket import Bracket, is_identifiable
 from ..results import NINETY_FIVE
 from ..shooting import ShootingProblem
-from .fisher import cramer_rao_bound, fisher_information
+from .evaluation import Evaluation, evaluate, inverse, shared_information
+
+Values = Float[np.ndarray, " parameters"]
 
 # Smallest share of a weakly determined direction for a parameter to be named as a partner.
 _PARTNER = 0.2
@@ -27,27 +28,27 @@ class Identifiability(eqx.Module):
     - `directions`: the eigenvectors in half-widths, one in each column.
     """
 
-    nominal: Parameters
-    half_width: Parameters
-    std: Parameters
-    std_alone: Parameters
-    eigenvalues: Parameters
-    directions: Float[Array, "parameters parameters"]
+    nominal: Values
+    half_width: Values
+    std: Values
+    std_alone: Values
+    eigenvalues: Values
+    directions: Float[np.ndarray, "parameters parameters"]
 
     @property
-    def identifiable(self) -> Bool[Array, " parameters"]:
+    def identifiable(self) -> Bool[np.ndarray, " parameters"]:
         """Whether each parameter is identifiable, by the rule of `jaxos4.bracket.is_identifiable`."""
-        return is_identifiable(self.std, self.half_width)
+        return np.asarray(is_identifiable(self.std, self.half_width))
 
     @property
-    def excited(self) -> Bool[Array, " parameters"]:
+    def excited(self) -> Bool[np.ndarray, " parameters"]:
         """Whether each parameter would be identifiable if all others were known."""
-        return is_identifiable(self.std_alone, self.half_width)
+        return np.asarray(is_identifiable(self.std_alone, self.half_width))
 
     @property
-    def noise_limit(self) -> Parameters:
+    def noise_limit(self) -> Values:
         """The largest noise, in multiples of sigma, at which the 95 % interval of the nominal value excludes 0."""
-        return jnp.abs(self.nominal) / (NINETY_FIVE * self.std)
+        return np.abs(self.nominal) / (NINETY_FIVE * self.std)
 
     def reasons(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of one flight that is not identifiable, the reason."""
@@ -95,23 +96,26 @@ def identifiability(
 
     **Raises:** `ValueError` for a wrong number of parameters.
     """
-    parameters, names = as_float(parameters), problem.model.parameter_names
-    for name, shape in (("parameters", parameters.shape), ("bracket", bracket.lower.shape)):
+    names = problem.model.parameter_names
+    for name, shape in (("parameters", np.shape(parameters)), ("bracket", bracket.lower.shape)):
         if shape != (len(names),):
             raise ValueError(f"`{name}` must hold {len(names)} parameters, got shape {shape}.")
-    return _identifiability(problem, bracket, parameters, initial_state)
+    return identifiability_of(evaluate(problem, parameters, initial_state), bracket)
 
 
-@eqx.filter_jit
-def _identifiability(
-    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: InitialStates | None
-) -> Identifiability:
-    sound = bracket.valid & jnp.isfinite(problem.cost(parameters, initial_state))
-    parameters, half_width = jnp.where(sound, parameters, problem.model.alpha), bracket.usable.half_width
-    information = fisher_information(problem, parameters, initial_state)
-    eigenvalues, directions = jnp.linalg.eigh(information * half_width[:, None] * half_width[None, :])
-    diagonal = jnp.diagonal(information)
-    alone = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), jnp.inf)
-    bound = cramer_rao_bound(problem, parameters, initial_state)
-    std, alone = (jnp.where(sound, x, jnp.inf) for x in (jnp.sqrt(jnp.diagonal(bound)), alone))
-    return Identifiability(problem.model.alpha, half_width, std, alone, eigenvalues, directions)
+def identifiability_of(evaluation: Evaluation, bracket: Bracket) -> Identifiability:
+    """`identifiability` where a flight was simulated already."""
+    problem, lower, upper = evaluation.problem, np.asarray(bracket.lower), np.asarray(bracket.upper)
+    nominal, valid = evaluation.nominal, bool(((upper > lower) & (upper - lower < np.inf)).all())
+    sound = valid and evaluation.sound
+    if not evaluation.sound:
+        evaluation = evaluate(problem, as_float(nominal))
+    half_width = (upper - lower) / 2 if valid else np.ones_like(nominal)
+    information = shared_information(evaluation.information, nominal.size)
+    eigenvalues, directions = np.linalg.eigh(np.nan_to_num(information * half_width[:, None] * half_width))
+    diagonal = np.diagonal(information)
+    with np.errstate(divide="ignore"):
+        alone = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 0.0)), np.inf)
+    std = np.sqrt(np.diagonal(inverse(information)))
+    std, alone = (x if sound else np.full_like(x, np.inf) for x in (std, alone))
+    return Identifiability(nominal, half_width, std, alone, eigenvalues, directions)

@@ -1,24 +1,31 @@
-"""The constants Ix, Iy, Iz, J_R of a rigid body, fitted to alpha_1..8 and their covariance."""
+"""The constants Ix, Iy, Iz, J_R of a rigid body, fitted to alpha_1..8 and their covariance.
+
+The fit is a few small matrix products, computed by NumPy: a compiled program would cost seconds and save nothing.
+"""
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import ArrayLike, Bool, Float
 
-from .._custom_types import Covariance, Parameters, Scalar, as_float
-from ..airframe import inertia_from_alpha
-from ..linalg import cholesky, invert, invert_factor
-from ..models.abstract import AbstractModel
-from ..models.inertial import InertialOS4
+from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from .evaluation import inverse, unit_eigen
 
 # Gauss-Newton steps. They converge fast, because the alphas are nearly linear in the constants over their errors.
 _STEPS = 20
 # The fit starts at the reciprocals of alpha3, 6, 8 if they are within this factor of the airframe's inertia.
 _FAR = 100.0
+# The definitions below Eq. (13): alpha_i = (_OFFSET + _NUMERATOR @ constants)_i / constants[_DENOMINATOR_i], with
+# J_R in multiples of the model's gyroscopic factor.
+_DENOMINATOR = np.array([0, 0, 0, 1, 1, 1, 2, 2])
+_OFFSET = np.array([0, 0, 1.0, 0, 0, 1.0, 0, 1.0])
+_NUMERATOR = np.zeros((8, 4))
+_NUMERATOR[0, [1, 2]] = _NUMERATOR[3, [2, 0]] = _NUMERATOR[6, [0, 1]] = 1.0, -1.0
+_NUMERATOR[[1, 4], 3] = 1.0
+_TRIANGLE = np.ones((3, 3)) - 2 * np.eye(3)
 
 
 class InertiaFit(eqx.Module):
-    """The rigid body that explains eight alphas best.
+    """The rigid body that explains eight alphas best; or one for each row of a batch.
 
     - `constants`: Ix, Iy, Iz, J_R [kg m^2].
     - `covariance`: of the constants.
@@ -29,68 +36,98 @@ class InertiaFit(eqx.Module):
     - `triangle_std`: the standard deviations of `triangle`.
     """
 
-    constants: Float[Array, "4"]
-    covariance: Float[Array, "4 4"]
-    mismatch: Scalar
-    p_value: Scalar
-    triangle: Float[Array, "3"]
-    triangle_std: Float[Array, "3"]
+    constants: Float[np.ndarray, "*batch 4"]
+    covariance: Float[np.ndarray, "*batch 4 4"]
+    mismatch: Float[np.ndarray, "*batch"]
+    p_value: Float[np.ndarray, "*batch"]
+    triangle: Float[np.ndarray, "*batch 3"]
+    triangle_std: Float[np.ndarray, "*batch 3"]
 
     @property
-    def std(self) -> Float[Array, "*batch 4"]:
+    def std(self) -> Float[np.ndarray, "*batch 4"]:
         """Standard deviation of each constant."""
-        return jnp.sqrt(jnp.diagonal(self.covariance, axis1=-2, axis2=-1))
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     @property
-    def is_rigid_body(self) -> Bool[Array, "*batch"]:
+    def is_rigid_body(self) -> Bool[np.ndarray | np.bool_, "*batch"]:
         """Whether every triangle inequality holds within two standard deviations."""
         return (self.triangle > -2 * self.triangle_std).all(axis=-1)
 
 
-@eqx.filter_jit
-def fit_inertia(model: AbstractModel, alpha: Parameters, covariance: Covariance) -> InertiaFit:
+def fit_inertia(
+    model: AbstractModel, alpha: Float[ArrayLike, "..."], covariance: Float[ArrayLike, "..."]
+) -> InertiaFit:
     """Fit four constants to eight alphas by weighted least squares (Gauss-Newton).
 
-    **Arguments:** a `model` with the parameters alpha_1..8, and `alpha`, `covariance` of an estimate.
+    **Arguments:** a `model` with the parameters alpha_1..8, and `alpha`, `covariance` of an estimate or of a batch.
 
     **Returns:** the fit. If the inputs are not finite, or no positive inertias fit them: the constants of the airframe,
     with an infinite covariance and mismatch and a `p_value` of 0.
 
     **Raises:** `ValueError` for other shapes or another model.
     """
-    inertial, alpha, covariance = InertialOS4(model), as_float(alpha), as_float(covariance)
-    if alpha.shape != (8,) or covariance.shape != (8, 8):
+    if model.parameter_names != PARAMETER_NAMES:
+        raise ValueError("`model` must have the parameters alpha_1..8: give PublishedOS4 or CorrectedOS4.")
+    alpha, covariance = np.asarray(alpha, dtype=float), np.asarray(covariance, dtype=float)
+    if alpha.shape[-1:] != (8,) or covariance.shape[-2:] != (8, 8):
         raise ValueError(
             f"`alpha`, `covariance` must be of shapes (8,), (8, 8), got {alpha.shape}, {covariance.shape}."
         )
-    whiten = invert_factor(cholesky(covariance))
-    nominal = jnp.asarray(model.airframe.inertia)
-    first, gyroscopic = inertia_from_alpha(alpha)
-    first = jnp.where((first > nominal / _FAR) & (first < _FAR * nominal), first, nominal)
-    begin = jnp.append(first, gyroscopic / model.gyroscopic_factor)
-    scale = jnp.append(first, jnp.sqrt(covariance[1, 1]) * first[0] / model.gyroscopic_factor)
-
-    def residuals(u: Float[Array, "4"]) -> Float[Array, "8"]:
-        return whiten @ (alpha - jnp.stack(inertial.inner(tuple(u * scale))))
-
-    def step(u: Float[Array, "4"], _) -> tuple[Float[Array, "4"], None]:
-        jacobian = jax.jacfwd(residuals)(u)
-        return u - invert(jacobian.T @ jacobian) @ (jacobian.T @ residuals(u)), None
-
-    u, _ = jax.lax.scan(step, begin / scale, length=_STEPS)
-    jacobian = jax.jacfwd(residuals)(u)
-    spread = invert(jacobian.T @ jacobian) * scale[:, None] * scale[None, :]
-    mismatch = jnp.square(residuals(u)).sum()
-    constants = u * scale
-    fitted = jnp.isfinite(spread).all() & jnp.isfinite(mismatch) & (constants[:3] > 0).all()
-    constants = jnp.where(fitted, constants, inertial.alpha)
-    spread, mismatch = jnp.where(fitted, spread, jnp.inf), jnp.where(fitted, mismatch, jnp.inf)
-    sums = jnp.ones((3, 3)) - 2 * jnp.eye(3)
+    usable = np.asarray(np.isfinite(alpha).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+    factor, inertia = float(model.gyroscopic_factor), np.asarray(model.airframe.inertia, dtype=float)
+    airframe = np.append(inertia, float(model.airframe.rotor_inertia))
+    alpha = np.where(usable[..., None], alpha, _alphas(airframe * [1, 1, 1, factor]))
+    whiten = _whitening(np.where(usable[..., None, None], covariance, np.eye(8)))
+    with np.errstate(all="ignore"):
+        constants, curvature, residuals = _gauss_newton(alpha, whiten, inertia)
+        spread = inverse(curvature)
+        mismatch = np.square(residuals).sum(axis=-1)
+    fitted = usable & np.isfinite(spread).all(axis=(-2, -1)) & np.isfinite(mismatch) & (constants[..., :3] > 0).all(-1)
+    in_factors = np.array([1, 1, 1, factor])
+    constants = np.where(fitted[..., None], constants / in_factors, airframe)
+    spread = np.where(fitted[..., None, None], spread / (in_factors[:, None] * in_factors), np.inf)
+    mismatch = np.where(fitted, mismatch, np.inf)
+    finite = np.where(fitted[..., None, None], spread, 0.0)[..., :3, :3]
+    variance = np.einsum("ij,...jk,ik->...i", _TRIANGLE, finite, _TRIANGLE)
     return InertiaFit(
         constants=constants,
         covariance=spread,
         mismatch=mismatch,
-        p_value=jnp.where(fitted, jax.scipy.special.gammaincc(2.0, mismatch / 2), 0.0),
-        triangle=sums @ constants[:3],
-        triangle_std=jnp.where(fitted, jnp.sqrt(jnp.diagonal(sums @ spread[:3, :3] @ sums.T)), jnp.inf),
+        # The chi-squared distribution with four degrees of freedom in closed form.
+        p_value=np.where(fitted, np.exp(-mismatch / 2) * (1 + np.where(fitted, mismatch, 0.0) / 2), 0.0),
+        triangle=constants[..., :3] @ _TRIANGLE,
+        triangle_std=np.where(fitted[..., None], np.sqrt(np.maximum(variance, 0.0)), np.inf),
     )
+
+
+def _alphas(constants: np.ndarray) -> np.ndarray:
+    return (constants @ _NUMERATOR.T + _OFFSET) / constants[..., _DENOMINATOR]
+
+
+def _gauss_newton(
+    alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The constants, the curvature of the cost, and the weighted residuals."""
+    first = 1 / alpha[..., [2, 5, 7]]
+    first = np.where((first > inertia / _FAR) & (first < _FAR * inertia), first, inertia)
+    rotor = (alpha[..., 1] * first[..., 0] + alpha[..., 4] * first[..., 1]) / 2
+    constants = np.concatenate([first, rotor[..., None]], axis=-1)
+
+    def linearised(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        predicted = _alphas(constants)
+        slopes = _NUMERATOR - predicted[..., None] * np.eye(4)[_DENOMINATOR]
+        slopes = whiten @ (slopes / constants[..., _DENOMINATOR, None])
+        residuals = (whiten @ (alpha - predicted)[..., None])[..., 0]
+        return slopes, np.swapaxes(slopes, -1, -2) @ slopes, residuals
+
+    for _ in range(_STEPS):
+        slopes, curvature, residuals = linearised(constants)
+        gradient = np.swapaxes(slopes, -1, -2) @ residuals[..., None]
+        constants = constants + (inverse(curvature) @ gradient)[..., 0]
+    return constants, *linearised(constants)[1:]
+
+
+def _whitening(covariance: np.ndarray) -> np.ndarray:
+    """W with W C W^T = 1; directions without variance count as known to rounding errors."""
+    scale, values, vectors = unit_eigen(covariance)
+    return np.swapaxes(vectors, -1, -2) / np.sqrt(values)[..., :, None] / scale[..., None, :]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_bracket, conclude
-from ..linalg import cholesky, covariance_of_shared, invert_factor
+from ..linalg import covariance_of_shared, unit_directions
 from ..models.state import CHANNELS
 from ..shooting import ShootingProblem
 
@@ -110,15 +110,15 @@ class NormalCholesky(lx.AbstractLinearSolver):
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict) -> tuple:
-        """The matrix, and its inverse Cholesky factor."""
+        """The matrix M, and B with B B^T the inverse of M^T M."""
         matrix = operator.as_matrix()
-        return matrix, invert_factor(cholesky(jnp.einsum("ij,ik->jk", matrix, matrix)))
+        return matrix, unit_directions(jnp.einsum("ij,ik->jk", matrix, matrix))
 
     def compute(self, state: tuple, vector, options: dict):
         """Solves for one right-hand side."""
-        matrix, inverse = state
+        matrix, basis = state
         flat = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(vector)])
-        solution = inverse.T @ (inverse @ (matrix.T @ flat))
+        solution = basis @ (basis.T @ (matrix.T @ flat))
         return solution, lx.RESULTS.successful, {}
 
     def transpose(self, state, options):

@@ -1,6 +1,5 @@
 """Moments of inertia from the estimated parameters."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..airframe import Airframe
@@ -59,5 +58,5 @@ def vehicle_constants(names: tuple[str, ...], estimate: Estimate, bracket: Brack
     # Alphas that are held are no evidence for or against a rigid body.
     if not set(PARAMETER_NAMES) <= set(names):
         return RigidBody(constants)
-    rigid = fit_inertia(CorrectedOS4(airframe), jnp.asarray(alpha), jnp.asarray(covariance))
+    rigid = fit_inertia(CorrectedOS4(airframe), alpha, covariance)
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..analysis.identifiability import identifiability
+from ..analysis.identifiability import identifiability_of
 from ..bracket import Bracket
 from ..errors import InputError
 from ..estimate import AbstractEstimator
@@ -117,7 +117,7 @@ def _check_match(network: TrainedNetwork, problem: ShootingProblem, recording: R
 def _comparable(other: ShootingProblem, problem: ShootingProblem, validate: Recording) -> ShootingProblem:
     """The other flight's problem on the same channels."""
     other = other.restrict(problem.channels) if other.size > problem.size else other
-    if np.isnan(np.asarray(other.measured())).all():
+    if np.isnan(other.recorded()).all():
         raise InputError(
             f"{validate.name}: nothing was measured among the {problem.channels} channels; give another flight."
         )
@@ -142,14 +142,14 @@ def _has_own_channels(kind: type[AbstractEstimator]) -> bool:
 
 
 def _parameters(fit: FlightFit, bracket: Bracket, prior: float) -> dict[str, ParameterEstimate]:
-    problem, estimate, names = fit.problem, fit.estimate, fit.problem.model.parameter_names
+    estimate, names = fit.estimate, fit.problem.model.parameter_names
     limit, notes, excited = np.full(len(names), np.nan), {}, np.ones(len(names), dtype=bool)
-    if has_answer(estimate):
-        information = identifiability(problem, bracket, estimate.parameters, estimate.initial_state)
-        limit, notes = np.asarray(information.noise_limit), information.notes(names)
-        excited = np.asarray(information.identifiable & information.excited)
+    if fit.evaluation is not None:
+        information = identifiability_of(fit.evaluation, bracket)
+        limit, notes = information.noise_limit, information.notes(names)
+        excited = information.identifiable & information.excited
     return parameter_table(
-        problem.model,
+        fit.problem.model,
         estimate,
         fit.bound,
         bracket,

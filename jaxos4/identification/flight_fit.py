@@ -5,16 +5,17 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
 
-from .._custom_types import Parameters
+from .._custom_types import as_float
 from ..analysis.diagnostics import Diagnostics
-from ..analysis.fisher import cramer_rao_bound
+from ..analysis.evaluation import Evaluation, evaluate
 from ..analysis.sandwich import robust_covariance
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..results import RESULTS
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, padded
 from .noise_levels import refine
 from .quality import COLOURED, diagnose
 from .results import has_answer
@@ -30,14 +31,15 @@ class FlightFit(NamedTuple):
     - `estimate`: with its cost and covariance at these noise levels.
     - `bound`: standard deviations of the Cramer-Rao bound at these noise levels.
     - `rollouts`: of all searches together.
-    - `diagnostics`: of the residuals; `None` without an answer.
+    - `diagnostics`: of the residuals; `evaluation`: the flight simulated at the estimate. `None` without an answer.
     """
 
     problem: ShootingProblem
     estimate: Estimate
-    bound: Parameters
+    bound: Float[np.ndarray, " parameters"]
     rollouts: int
     diagnostics: Diagnostics | None = None
+    evaluation: Evaluation | None = None
 
 
 def fit_flight(
@@ -59,25 +61,31 @@ def fit_flight(
         del colour
         progress("compiling and fitting" if previous is None else f"fitting with the noise levels of pass {passes}")
         passes += 1
-        return jax.block_until_ready(estimator(weighted, bracket))
+        shared = padded(weighted) if estimator.shoots and not estimator.needs_network else weighted
+        return jax.block_until_ready(estimator(shared, bracket))
+
+    def residuals(weighted: ShootingProblem, estimate: Estimate) -> np.ndarray:
+        return evaluate(weighted, estimate.parameters, estimate.initial_state).errors
 
     def failed(estimate: Estimate) -> bool:
         return estimator.shoots and bool(estimate.result != RESULTS.successful)
 
-    refined = refine(problem, search, passes=_PASSES, stop=failed)
+    refined = refine(problem, search, passes=_PASSES, residuals=residuals, stop=failed)
     problem, estimate, rollouts = refined.problem, refined.estimate, refined.rollouts
     if has_answer(estimate):
         if not refined.settled:
-            problem = problem.reweighted(problem.residuals(estimate.parameters, estimate.initial_state))
+            problem = problem.reweighted(residuals(problem, estimate))
         if not estimator.shoots:
             estimate = search(problem, estimate, refined.colour)
             rollouts += int(estimate.rollouts)
     if not has_answer(estimate):
-        return FlightFit(problem, estimate, estimate.std, rollouts)
+        return FlightFit(problem, estimate, np.full(len(problem.model.parameter_names), np.inf), rollouts)
     at = (estimate.parameters, estimate.initial_state)
-    bound, cost = cramer_rao_bound(problem, *at), problem.cost(*at)
-    covariance, diagnostics = estimate.covariance, diagnose(problem, *at, fitted=True)
+    evaluation = evaluate(problem, *at)
+    bound, covariance = evaluation.covariance, estimate.covariance
+    diagnostics = diagnose(evaluation, fitted=True)
     if estimator.shoots:
-        covariance = robust_covariance(problem, *at) if (diagnostics.colour > COLOURED).any() else bound
-    estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, (covariance, cost))
-    return FlightFit(problem, estimate, jnp.sqrt(jnp.diagonal(bound)), rollouts, diagnostics)
+        coloured = (diagnostics.colour > COLOURED).any()
+        covariance = robust_covariance(problem, *at) if coloured else as_float(bound)
+    estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, (covariance, as_float(evaluation.cost)))
+    return FlightFit(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, diagnostics, evaluation)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from .._custom_types import Parameters
@@ -40,11 +39,16 @@ class Refined(NamedTuple):
     kept: float
 
 
+def _residuals(problem: ShootingProblem, estimate: Estimate) -> np.ndarray:
+    return np.asarray(problem.residuals(estimate.parameters, estimate.initial_state))
+
+
 def refine(
     problem: ShootingProblem,
     search: Callable[[ShootingProblem, Estimate | None, float], Estimate],
     *,
     passes: int,
+    residuals: Callable[[ShootingProblem, Estimate], np.ndarray] = _residuals,
     start: Parameters | None = None,
     huber: bool = False,
     stop: Callable[[Estimate], bool] = lambda estimate: False,
@@ -54,6 +58,7 @@ def refine(
     - `problem`: its `sigma` is the first guess of the noise levels.
     - `search`: makes an estimate of a problem, the previous estimate (`None` at first) and its `_colour_factor`.
     - `passes`: how often noise levels are computed at most.
+    - `residuals`: computes the weighted residuals of an estimate.
     - `start`: where the first search starts; needed with `huber`.
     - `huber`: whether outliers are cut, see `jaxos4.winsorised`.
     - `stop`: whether to stop after an estimate, once its noise levels are computed.
@@ -66,15 +71,16 @@ def refine(
             break
         before = weighted
         if huber:
-            weighted, share, residuals = winsorised(problem, estimate.parameters, estimate.initial_state)
+            weighted, share, errors = winsorised(problem, estimate.parameters, estimate.initial_state)
             kept = float(share)
         else:
-            residuals = before.residuals(estimate.parameters, estimate.initial_state)
-            weighted = before.reweighted(residuals)
-        colour = _colour_factor(np.asarray(residuals).reshape(-1, problem.columns.size))
-        settled = bool((jnp.abs(weighted.sigma / before.sigma - 1) < _SETTLED).all())
+            errors = residuals(before, estimate)
+            weighted = before.reweighted(errors)
+        colour = _colour_factor(np.asarray(errors).reshape(-1, problem.columns.size))
+        settled = bool((np.abs(np.asarray(weighted.sigma) / np.asarray(before.sigma) - 1) < _SETTLED).all())
         if huber and previous is not None:
-            moved = jnp.abs(estimate.parameters - previous) / estimate.std
+            std = np.sqrt(np.diagonal(estimate.covariance))
+            moved = np.abs(np.asarray(estimate.parameters) - np.asarray(previous)) / std
             settled = settled and bool(moved.max() < _SETTLED_PARAMETERS * colour)
         previous = estimate.parameters
         settled = settled or stop(estimate)

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
+import equinox as eqx
 import msgspec
 import numpy as np
+from jaxtyping import Float
 
-from .._custom_types import Parameters
-from ..bracket import NO_PRIOR, Bracket
+from .._custom_types import Numeric, Parameters
+from ..bracket import NO_PRIOR, Bracket, is_identifiable
 from ..estimate import Estimate
 from ..models.abstract import AbstractModel
 from .results import ParameterEstimate, finite_or_none
@@ -15,7 +17,7 @@ from .results import ParameterEstimate, finite_or_none
 def parameter_table(
     model: AbstractModel,
     estimate: Estimate,
-    bound: Parameters,
+    bound: Float[Numeric, " parameters"],
     bracket: Bracket,
     *,
     prior: float = NO_PRIOR,
@@ -28,9 +30,9 @@ def parameter_table(
     - `reason`: why a parameter is not identifiable, by its place.
     - `noise_limit`: by place; see `ParameterEstimate`.
     """
-    identifiable = np.asarray(bracket.identifies(estimate.std, prior))
-    half_width = np.asarray(estimate.half_width(0.95))
-    values, std, bounds = (np.asarray(x) for x in (estimate.parameters, estimate.std, bound))
+    std, half_width = map(np.asarray, _intervals(estimate))
+    values, bounds, lower, upper = map(np.asarray, (estimate.parameters, bound, bracket.lower, bracket.upper))
+    identifiable = is_identifiable(std, (upper - lower) / 2, prior)
     return {
         name: ParameterEstimate(
             estimate=float(values[i]) if identifiable[i] else None,
@@ -45,11 +47,16 @@ def parameter_table(
     }
 
 
+@eqx.filter_jit  # one compiled program instead of one for each operation
+def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
+    return estimate.std, estimate.half_width(0.95)
+
+
 def _note(estimate: Estimate, bracket: Bracket, i: int, half_width: float) -> str:
-    value, seed = float(estimate.parameters[i]), estimate.seed
+    value, seed = float(np.asarray(estimate.parameters)[i]), estimate.seed
     notes = ["below noise"] if abs(value) < half_width else []
-    if not float(bracket.lower[i]) <= value <= float(bracket.upper[i]):
+    if not np.asarray(bracket.lower)[i] <= value <= np.asarray(bracket.upper)[i]:
         notes.append("outside its bracket")
-    if seed is not None and not seed.lower[i] <= value <= seed.upper[i]:
+    if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
         notes.append("outside the network's interval")
     return "; ".join(notes)

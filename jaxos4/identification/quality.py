@@ -1,13 +1,13 @@
 """How well a model explains flights that were fitted, and flights that were not."""
 
 import equinox as eqx
-from jaxtyping import Array
 
-from ..analysis.diagnostics import Diagnostics, residual_diagnostics
+from ..analysis.diagnostics import Diagnostics, diagnostics_of
+from ..analysis.evaluation import Evaluation, evaluate
 from ..estimate import Estimate, fit_start
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.state import CASCADE_ORDER
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, padded
 from .results import ChannelFit, Validation, finite_or_none
 
 # Residuals are coloured if neighbours correlate by more than this: intervals then allow for it.
@@ -17,10 +17,9 @@ _LAGS = 25
 _FEWEST_SAMPLES = 2
 
 
-def diagnose(problem: ShootingProblem, parameters: Array, initial_state: Array, *, fitted: bool) -> Diagnostics:
+def diagnose(evaluation: Evaluation, *, fitted: bool) -> Diagnostics:
     """Diagnostics of the residuals; `fitted`: whether the parameters were fitted to this flight."""
-    lags = min(_LAGS, problem.flight.states.shape[0] // 2)
-    return residual_diagnostics(problem, parameters, initial_state, fitted=fitted, lags=lags)
+    return diagnostics_of(evaluation, fitted=fitted, lags=min(_LAGS, evaluation.measured.shape[0] // 2))
 
 
 def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str, ChannelFit]:
@@ -47,8 +46,8 @@ def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str
 def validate_on(problem: ShootingProblem, estimate: Estimate, other: ShootingProblem, name: str) -> Validation:
     """How well the parameters explain another flight, named `name`; only its initial state is fitted."""
     other = eqx.tree_at(lambda p: p.sigma, other, problem.sigma)
-    start, cost, sound, _ = eqx.filter_jit(fit_start)(other, estimate.parameters)
+    start, cost, sound, _ = eqx.filter_jit(fit_start)(padded(other), estimate.parameters)
     if not bool(sound):
         return Validation(name, None, None)
-    diagnostics = diagnose(other, estimate.parameters, start, fitted=False)
+    diagnostics = diagnose(evaluate(other, estimate.parameters, start), fitted=False)
     return Validation(name, finite_or_none(cost), channel_fits(other, diagnostics))

@@ -191,7 +191,7 @@ def _prepare_other(
 def _problem(prepared: Prepared, model: FlightModel, name: str, window: float) -> ShootingProblem:
     sigma, windows = np.full(12, _FIRST_SIGMA), prepared.windows
     problem = ShootingProblem(model, prepared.fitted, sigma=sigma, channels="rates", method="rk4", windows=windows)
-    measured = np.count_nonzero(~np.isnan(np.asarray(problem.measured())))
+    measured = np.count_nonzero(~np.isnan(problem.recorded()))
     if measured <= _unknowns(problem):
         raise InputError(
             f"{name}: {measured} measurements are too few for windows of {window:g} s; give a longer `window`."

@@ -8,9 +8,7 @@ Its equations are here:
 - Eq. (14): the order of the state, `STATE_NAMES`.
 """
 
-import jax.numpy as jnp
-
-from .._custom_types import Scalar
+from .._custom_types import Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..trigonometry import sincos
 from .abstract import AbstractOS4
@@ -32,7 +30,7 @@ class PublishedOS4(AbstractOS4):
     @property
     def gyroscopic_factor(self) -> Scalar:
         """The drag coefficient d: the paper prints alpha2 = J_R d / Ix."""
-        return jnp.asarray(self.airframe.drag_coefficient)
+        return as_float(self.airframe.drag_coefficient)
 
     @property
     def gyroscopic_unit(self) -> str:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Key, Parameters, Scalar
 from ..bracket import Bracket
-from ..linalg import cholesky, invert_factor
+from ..linalg import unit_directions
 from ..models.state import CASCADE_ORDER
 from ..shooting import FASTEST, ShootingProblem
 
@@ -183,4 +183,4 @@ def _measured(problem: ShootingProblem) -> Bool[Array, "samples size"]:
 
 def _noise_factor(jacobian: Float[Array, "samples size unknowns"]) -> Float[Array, "unknowns unknowns"]:
     """A factor of F^-1, the covariance of the score."""
-    return invert_factor(cholesky(jnp.einsum("tcu,tcv->uv", jacobian, jacobian))).T
+    return unit_directions(jnp.einsum("tcu,tcv->uv", jacobian, jacobian))

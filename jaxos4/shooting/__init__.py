@@ -1,5 +1,6 @@
 """The mismatch between a flight and a simulation of it: cost, residuals, gradient and information."""
 
+from .padding import padded as padded
 from .problem import ROUNDING as ROUNDING, ShootingProblem as ShootingProblem
 from .rows import Rows as Rows
-from .scans import FASTEST as FASTEST, Curvature as Curvature, Shot as Shot
+from .scans import FASTEST as FASTEST, Curvature as Curvature, Length as Length, Shot as Shot

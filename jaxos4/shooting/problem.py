@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
-from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
+from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES, Flight, Inputs
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
 from .rows import Rows, windowed
-from .scans import Curvature, Shot, predict_window, shoot, shoot_with_derivatives
+from .scans import Curvature, Length, Shot, predict_window, shoot, shoot_with_derivatives
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
 ROUNDING = 64.0
@@ -41,6 +41,8 @@ class ShootingProblem(eqx.Module):
       simulated from its own free initial state, so that errors of the model add up over one window only. Windows are
       independent, so the information in a long drift is lost. Measure each channel in at least some windows: nothing
       else identifies the initial states.
+    - `length`: the number of samples that count; the others are padding, in which nothing was measured. `padded` makes
+      it. `None`: all of them.
 
     An *initial state* below is the part of X that the channels need, in cascade order: p, q, r, then phi, theta, psi,
     then x, vx, y, vy, z, vz. The initial states of several windows follow each other in one array.
@@ -55,6 +57,7 @@ class ShootingProblem(eqx.Module):
     channels: str = eqx.field(static=True, default="all")
     method: str = eqx.field(static=True, default="euler")
     windows: int = eqx.field(static=True, default=1)
+    length: Length = None
 
     def __init__(
         self,
@@ -66,6 +69,7 @@ class ShootingProblem(eqx.Module):
         channels: str = "all",
         method: str = "euler",
         windows: int = 1,
+        length: Length = None,
     ):
         if channels not in CHANNELS:
             raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
@@ -85,11 +89,13 @@ class ShootingProblem(eqx.Module):
             raise ValueError(f"`windows` must be an integer from 1 to {most}, two samples each, got {windows!r}.")
         if windows > 1 and initial_state is not None:
             raise ValueError("`initial_state` must be `None` if there are several windows: each has its own.")
+        if windows > 1 and length is not None:
+            raise ValueError("`length` must be `None` if there are several windows: only a whole flight is padded.")
         if model.force_axes and np.shape(sigma) == (len(STATE_NAMES),):
             sigma = jnp.concatenate([as_float(sigma), jnp.full(3, FORCE_SIGMA)])
         self.model, self.flight, self.sigma = model, flight, as_float(sigma)
         self.initial_state = None if initial_state is None else as_float(initial_state)
-        self.channels, self.method, self.windows = channels, method, windows
+        self.channels, self.method, self.windows, self.length = channels, method, windows, length
 
     @property
     def size(self) -> int:
@@ -114,13 +120,25 @@ class ShootingProblem(eqx.Module):
     def measured(self) -> Float[Array, "samples columns"]:
         """The measurements in the order of `columns`. A known first sample is NaN: it is no data."""
         measured = (self.flight.channels if self.model.force_axes else self.flight.states)[:, self.columns]
-        return measured if self.initial_state is None else measured.at[0].set(jnp.nan)
+        if self.initial_state is None:
+            return measured
+        return jnp.where((np.arange(measured.shape[0]) > 0)[:, None], measured, jnp.nan)
+
+    def recorded(self) -> Float[np.ndarray, "samples columns"]:
+        """`measured` as NumPy, without a compiled program."""
+        states, force = np.asarray(self.flight.states), self.flight.specific_force
+        nothing = np.full((*states.shape[:-1], len(FORCE_NAMES)), np.nan, states.dtype)
+        channels = np.concatenate([states, nothing if force is None else np.asarray(force)], axis=-1)[:, self.columns]
+        if self.initial_state is not None:
+            channels[0] = np.nan
+        return channels
 
     def rows(self, parameters: Parameters | None = None) -> Rows:
         """The data of all windows for a scan, with the forcing at `parameters`, by default `model.alpha`."""
         index, within = self.cut()
         forcing = windowed(self.forcing(self.model.alpha if parameters is None else parameters), index)
-        return Rows(forcing, tuple(jnp.where(within, y[index], jnp.nan) for y in self.measured().T))
+        measured = windowed(tuple(self.measured().T), index)
+        return Rows(forcing, tuple(y if within.all() else jnp.where(within, y, jnp.nan) for y in measured))
 
     def forcing(self, parameters: Parameters) -> Forcing:
         """The forcing of the whole flight, one row for each sample."""
@@ -166,7 +184,8 @@ class ShootingProblem(eqx.Module):
         order = CASCADE_ORDER[: self.size]
         if self.initial_state is not None:
             return self.initial_state[order], jnp.zeros(self.size, dtype=float)
-        states, sigma = jnp.stack(self.rows().measured[: self.size], axis=-1), self.sigma[order]
+        (index, within), sigma = self.cut(), self.sigma[order]
+        states = jnp.where(within[:, :, None], self.measured()[index, : self.size], jnp.nan)
         first = jnp.argmin(jnp.isnan(states), axis=1)
         value = jnp.take_along_axis(states, first[:, None], axis=1)[:, 0]
         off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
@@ -196,7 +215,9 @@ class ShootingProblem(eqx.Module):
     def predict(self, parameters: Parameters, initial_state: InitialStates) -> Float[Array, "samples columns"]:
         """The output of noise-free sensors, in the order of `columns`."""
         _, within = self.cut()
-        predict = jax.vmap(lambda forcing, start: predict_window(self._advance, forcing, parameters, start))
+        predict = jax.vmap(
+            lambda forcing, start: predict_window(self._advance, forcing, parameters, start, self.length)
+        )
         return predict(self.rows(parameters).forcing, self.split(initial_state))[within]
 
     def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
@@ -211,7 +232,7 @@ class ShootingProblem(eqx.Module):
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""
-        return shoot(self._advance, rows, self._weights(), parameters, initial_state)
+        return shoot(self._advance, rows, self._weights(), parameters, initial_state, self.length)
 
     def curvature(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Curvature:
         """Cost, gradient and Fisher information of one window, in the parameters and a free initial state."""
@@ -223,26 +244,27 @@ class ShootingProblem(eqx.Module):
             initial_state,
             forcing_parameters=self.model.forcing_parameters,
             initial_state_is_free=self.initial_state is None,
+            length=self.length,
         )
 
-    @eqx.filter_jit
-    def reweighted(self, residuals: Float[Array, " residuals"]) -> "ShootingProblem":
-        """The problem with each channel's sigma estimated from the weighted `residuals` of a fit.
+    def reweighted(self, residuals: Float[ArrayLike, "..."]) -> "ShootingProblem":
+        """The problem with each channel's sigma estimated from the weighted `residuals` of a fit, by NumPy.
 
         Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
         freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. No sigma falls below the
         rounding errors that add up over a flight.
         """
-        columns, measured = self.columns, self.measured()
-        count = (~jnp.isnan(measured)).sum(axis=0)
-        unknowns = len(self.model.parameter_names) + self.windows * self.free_size
-        freedom = jnp.maximum(1 - unknowns / jnp.maximum(count.sum(), 1), 1e-3)
-        squares = jnp.square(residuals.reshape(-1, columns.size)).sum(axis=0)
-        sigma = self.sigma[columns] * jnp.sqrt(squares / jnp.maximum(count * freedom, 1))
-        rounding = ROUNDING * jnp.finfo(sigma.dtype).eps * jnp.nan_to_num(jnp.nanmax(jnp.abs(measured), axis=0))
-        sigma = jnp.where((count > 1) & jnp.isfinite(sigma), jnp.maximum(sigma, rounding), self.sigma[columns])
-        sigma = jnp.where(sigma > 0, sigma, self.sigma[columns])
-        return eqx.tree_at(lambda p: p.sigma, self, self.sigma.at[columns].set(sigma))
+        columns, before = self.columns, np.asarray(self.sigma)
+        measured, squares = self.recorded(), np.square(np.reshape(residuals, (-1, columns.size))).sum(axis=0)
+        known = ~np.isnan(measured)
+        count, unknowns = known.sum(axis=0), len(self.model.parameter_names) + self.windows * self.free_size
+        freedom = max(1 - unknowns / max(count.sum(), 1), 1e-3)
+        sigma = before[columns] * np.sqrt(squares / np.maximum(count * freedom, 1))
+        rounding = ROUNDING * np.finfo(before.dtype).eps * np.where(known, np.abs(measured), 0.0).max(axis=0)
+        sigma = np.where((count > 1) & np.isfinite(sigma), np.maximum(sigma, rounding), before[columns])
+        after = before.copy()
+        after[columns] = np.where(sigma > 0, sigma, before[columns])
+        return eqx.tree_at(lambda p: p.sigma, self, as_float(after))
 
     def step(self, state: State, forcing: Forcing, parameters) -> State:
         """The state one sample later, down to the same level of the cascade."""

@@ -1,6 +1,6 @@
 """The data that a scan over a flight reads, cut into windows."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -21,10 +21,13 @@ class Rows(NamedTuple):
     forcing_tangents: Forcing | None = None
 
 
-def windowed(forcing: Forcing, index: Int[np.ndarray, "windows length"]) -> Forcing:
-    """The forcing of each window, from that of each sample. Windows of equal length need no copy."""
+Series = TypeVar("Series", Forcing, tuple[Array, ...])
+
+
+def windowed(series: Series, index: Int[np.ndarray, "windows length"]) -> Series:
+    """The series of each window, from those of the flight. Windows of equal length need no copy."""
 
     def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:
         return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
 
-    return jax.tree.map(rows, forcing)
+    return jax.tree.map(rows, series)

@@ -6,12 +6,12 @@ inside a scan are scalars of a lane, because stacking them in every step is slow
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import InitialState, Parameters, Scalar
 from ..models.state import Forcing, State, unstack
@@ -22,6 +22,9 @@ FASTEST = 1e3
 
 # From a state, the forcing and the parameters: the state one sample later, and the output of noise-free sensors.
 Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
+
+
+Carry = TypeVar("Carry")
 
 
 class Shot(NamedTuple):
@@ -44,32 +47,58 @@ class Curvature(NamedTuple):
     information: Float[Array, "unknowns unknowns"]
 
 
+# The number of rows that count, if the flight is padded. It is a number and no shape, so that flights of different
+# lengths share one compiled program.
+Length = Int[Array, ""] | None
+
+
 def predict_window(
-    advance: Advance, forcing: Forcing, parameters: Parameters, initial_state: InitialState
+    advance: Advance, forcing: Forcing, parameters: Parameters, initial_state: InitialState, length: Length = None
 ) -> Float[Array, "length columns"]:
-    """The output of noise-free sensors in one window."""
-    scalars = tuple(parameters)
+    """The output of noise-free sensors in one window; 0 in padding."""
+    scalars, first = tuple(parameters), unstack(initial_state)
 
     def step(state: State, forcing: Forcing) -> tuple[State, tuple[Scalar, ...]]:
         return advance(state, forcing, scalars)
 
-    return jnp.stack(jax.lax.scan(step, unstack(initial_state), forcing)[1], axis=-1)
+    if length is None:
+        return jnp.stack(jax.lax.scan(step, first, forcing)[1], axis=-1)
+    samples = forcing.roll.shape[0]
+    columns = len(jax.eval_shape(step, first, jax.tree.map(lambda leaf: leaf[0], forcing))[1])
+
+    def fill(i: Int[Array, ""], carry):
+        state, outputs = carry
+        state, predicted = step(state, jax.tree.map(lambda leaf: leaf[i], forcing))
+        return state, outputs.at[i].set(jnp.stack(predicted))
+
+    return jax.lax.fori_loop(0, length, fill, (first, jnp.zeros((samples, columns), dtype=float)))[1]
+
+
+def _fold(step: Callable, first: Carry, rows: Rows, length: Length) -> Carry:
+    """The last carry of `step` over the rows that count."""
+    if length is None:
+        return jax.lax.scan(lambda carry, row: (step(carry, row), None), first, rows)[0]
+    return jax.lax.fori_loop(0, length, lambda i, carry: step(carry, jax.tree.map(lambda leaf: leaf[i], rows)), first)
 
 
 def shoot(
-    advance: Advance, rows: Rows, weights: tuple[Scalar, ...], parameters: Parameters, initial_state: InitialState
+    advance: Advance,
+    rows: Rows,
+    weights: tuple[Scalar, ...],
+    parameters: Parameters,
+    initial_state: InitialState,
+    length: Length = None,
 ) -> Shot:
     """Simulate one window and compare it with the measurements. `weights`: 1 / sigma of each channel."""
     scalars = tuple(parameters)
 
-    def step(carry: tuple[State, Shot], row: Rows) -> tuple[tuple[State, Shot], None]:
+    def step(carry: tuple[State, Shot], row: Rows) -> tuple[State, Shot]:
         state, shot = carry
         sound = shot.sound & _is_sound(state)
         following, predicted = advance(state, row.forcing, scalars)
-        shot = Shot(shot.cost + _half_square(_errors(row, predicted, weights, sound)), sound)
-        return (following, shot), None
+        return following, Shot(shot.cost + _half_square(_errors(row, predicted, weights, sound)), sound)
 
-    return jax.lax.scan(step, (unstack(initial_state), _no_shot()), rows)[0][1]
+    return _fold(step, (unstack(initial_state), _no_shot()), rows, length)[1]
 
 
 def shoot_with_derivatives(
@@ -81,6 +110,7 @@ def shoot_with_derivatives(
     *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
+    length: Length = None,
 ) -> Curvature:
     """`shoot` with the gradient and the information in the parameters and, if it is free, the initial state.
 
@@ -119,11 +149,11 @@ def shoot_with_derivatives(
             total.gradient + sum(e * s for e, s in zip(errors, slopes, strict=True)),
             total.information + sum(s[:, None] * s[None, :] for s in slopes),
         )
-        return (following, following_tangent, total), None
+        return following, following_tangent, total
 
     zero = Curvature(_no_shot(), jnp.zeros(unknowns, dtype=float), 0 * identity)
     tangents = jax.vmap(unstack)(start_tangents)
-    return jax.lax.scan(step, (unstack(initial_state), tangents, zero), rows)[0][2]
+    return _fold(step, (unstack(initial_state), tangents, zero), rows, length)[2]
 
 
 def _no_shot() -> Shot:

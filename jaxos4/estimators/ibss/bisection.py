@@ -1,6 +1,5 @@
 """Bisect along a direction, and along all directions one after another."""
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -31,14 +30,22 @@ def move_along_all(
     """Bisects along each direction in turn; along none with `stay`."""
     nothing = jnp.zeros_like(view.unknowns)
     moves = Moves(view.unknowns, nothing, nothing, nothing.astype(bool))
+    size, free = nothing.shape[1], stage.problem.free_size
     forcing_parameters = len(stage.problem.model.forcing_parameters)
     # Whitened directions change the forcing only at the end of the list: it is recomputed only for those.
-    unchanged = stage.size - forcing_parameters if whitened or not forcing_parameters else 0
+    unchanged = size - forcing_parameters if whitened or not forcing_parameters else 0
     fixed = view.rows._replace(forcing_tangents=None)
-    for begin, end, rows_at in ((0, unchanged, lambda _: fixed), (unchanged, stage.size, stage.with_forcing)):
+    # The directions of the initial states that this stage does not search, `own` to `free`, are skipped.
+    skipped = free - stage.own
+    for begin, end, rows_at in ((0, unchanged, lambda _: fixed), (unchanged, size, stage.with_forcing)):
         if begin < end:
-            along = functools.partial(_move_along, stage, view, brackets, rows_at, halvings)
-            moves = jax.lax.fori_loop(begin, jnp.where(stay, begin, end), along, moves)
+            first = jnp.where(begin == 0, skipped, begin)
+
+            def along(i: Int[Array, ""], moves: Moves, rows_at: RowsAt = rows_at) -> Moves:
+                number = jnp.where(i < free, i - skipped, i)
+                return _move_along(stage, view, brackets, rows_at, halvings, number, moves)
+
+            moves = jax.lax.fori_loop(first, jnp.where(stay, first, end), along, moves)
     return moves
 
 

@@ -14,6 +14,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
@@ -21,12 +22,11 @@ from ..._custom_types import Parameters, Scalar, as_float
 from ...bracket import NO_PRIOR, Bracket
 from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
 from ...linalg import covariance_of_shared, covariances
-from ...models.state import CHANNELS
 from ...shooting import Curvature, ShootingProblem, Shot
 from .bisection import move_along_all
 from .brackets import GROWTH, open_brackets, relative_error
 from .progress import Progress, Search, record_brackets
-from .stage import Limits, Stage, join, keep_first, make_stage, misfit, prior_std
+from .stage import Limits, Stage, join, misfit, prior_std, stages
 from .view import look_around
 
 DIRECTIONS = ("whitened", "coordinate")
@@ -79,7 +79,7 @@ class IBSS(AbstractEstimator):
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
         for name in ("tolerance", "reach"):
             value = getattr(self, name)
-            if not isinstance(value, Tracer) and not value > 0:
+            if not isinstance(value, Tracer) and not np.asarray(value) > 0:
                 raise ValueError(f"`{name}` must be positive, got {value}.")
 
     @eqx.filter_jit
@@ -111,7 +111,7 @@ class IBSS(AbstractEstimator):
         *,
         start: Parameters | None = None,
         spread: Float[Array, "parameters parameters"] | None = None,
-        cascade: bool = True,
+        cascade: Bool[Array, ""] | bool = True,
         skip: Bool[Array, ""] | None = None,
     ) -> Estimate:
         """Identifies one flight, inside the program of another estimator.
@@ -128,37 +128,40 @@ class IBSS(AbstractEstimator):
         usable = bracket.usable
         start = usable.center if start is None else as_float(start)
         skip = jnp.zeros((), dtype=bool) if skip is None else skip
-        progress = self._begin(problem, usable, start, spread, skip=skip)
+        plan, limits = self._plan(problem), self._limits(problem, usable)
+        stage_of = stages(problem, usable, limits, plan)
 
-        def fit_part(channels: str, progress: Progress, share: Scalar) -> tuple[Progress, Curvature]:
-            part = problem.restrict(channels)
-            stage = make_stage(part, keep_first(share, part.rows()), usable, self._limits(part, usable))
-            last = (channels == problem.channels) & (share == 1)
+        def fit(number: Int[Array, ""], carry: tuple[Progress, Curvature]) -> tuple[Progress, Curvature]:
+            progress, _ = carry
+            stage, last = stage_of(number), number == len(plan) - 1
             return self._fit_stage(stage, progress._replace(done=skip), last=last)
 
-        everything = as_float(1.0)
-        if self.directions == "coordinate" or not cascade:
-            return self._finish(problem, bracket, *fit_part(problem.channels, progress, everything))
-        # A window is short enough as it is.
-        shares = jnp.asarray((*_HORIZONS, 1.0) if problem.windows == 1 else (1.0,), dtype=float)
-        # One scan, so that the search against the rates is compiled once.
-        progress, curvatures = jax.lax.scan(lambda p, share: fit_part("rates", p, share), progress, shares)
-        curvature = jax.tree.map(lambda c: c[-1], curvatures)
-        for channels, size in CHANNELS.items():
-            if CHANNELS["rates"] < size <= problem.size:
-                progress, curvature = fit_part(channels, progress, everything)
+        progress = self._begin(problem, usable, limits, start, spread, skip=skip)
+        # One loop, so that the search is compiled once for all stages.
+        first = jnp.where(cascade, 0, len(plan) - 1)
+        progress, curvature = jax.lax.fori_loop(first, len(plan), fit, (progress, _no_curvature(progress)))
         return self._finish(problem, bracket, progress, curvature)
+
+    def _plan(self, problem: ShootingProblem) -> tuple[tuple[str, float], ...]:
+        """The channels of each stage, and the share of the flight that it fits."""
+        everything = ((problem.channels, 1.0),)
+        if self.directions == "coordinate":
+            return everything
+        # A window is short enough as it is.
+        shares = (*_HORIZONS, 1.0) if problem.windows == 1 else (1.0,)
+        rates = tuple(("rates", share) for share in shares)
+        return rates if problem.channels == "rates" else rates + everything
 
     def _begin(
         self,
         problem: ShootingProblem,
         bracket: Bracket,
+        limits: Limits,
         start: Parameters,
         spread: Float[Array, "parameters parameters"] | None,
         *,
         skip: Bool[Array, ""],
     ) -> Progress:
-        lower, upper = self._limits(problem, bracket)
         unknowns, count = join(problem, start, problem.first_state()[0]), start.shape[0]
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem, bracket)))
         if spread is not None:
@@ -166,7 +169,7 @@ class IBSS(AbstractEstimator):
             covariance = covariance.at[:, :count, :count].set(known)
         none = jnp.zeros((), dtype=int)
         brackets = jnp.full((self.record, 2, count), jnp.nan) if self.record else None
-        return Progress(jnp.clip(unknowns, lower, upper), covariance, none, none, skip, brackets)
+        return Progress(jnp.clip(unknowns, *limits), covariance, none, none, skip, brackets)
 
     def _limits(self, problem: ShootingProblem, bracket: Bracket) -> Limits:
         """The least and the greatest value of each unknown: a free initial state has no limits."""
@@ -175,31 +178,29 @@ class IBSS(AbstractEstimator):
 
     def _fit_stage(self, stage: Stage, progress: Progress, *, last: Bool[Array, ""]) -> tuple[Progress, Curvature]:
         """Sweeps until little is left to go; the last stage down to `tolerance`, the others coarsely."""
-        size, windows = stage.size, stage.problem.windows
-        zero, square = jnp.zeros((windows,), dtype=float), jnp.zeros((windows, size, size), dtype=float)
-        unknowns, spread = progress.unknowns[:, :size], progress.spread[:, :size, :size]
         search = Search(
-            unknowns=unknowns,
-            curvature=Curvature(Shot(zero, zero > 0), jnp.zeros_like(unknowns), square),
-            basis=square,
+            unknowns=progress.unknowns,
+            curvature=_no_curvature(progress),
+            basis=jnp.zeros_like(progress.spread),
             relative_error=jnp.ones((), dtype=float),
-            growth=jnp.ones_like(unknowns),
+            growth=jnp.ones_like(progress.unknowns),
             sweeps=jnp.zeros((), dtype=int),
             done=progress.done,
             ended=progress.done,
             brackets=progress.brackets,
         )
-        sweep = functools.partial(self._sweep, stage, spread=spread, before=progress.sweeps, last=last)
+        sweep = functools.partial(self._sweep, stage, spread=progress.spread, before=progress.sweeps, last=last)
         search = jax.lax.while_loop(lambda search: ~search.ended, sweep, search)
         if self.directions == "coordinate":
             covariance = covariances(search.curvature.information + stage.prior, stage.parameter_count)
         else:
             covariance = (search.basis[:, :, None, :] * search.basis[:, None, :, :]).sum(axis=-1)
-        noise = jnp.maximum(misfit(search.curvature.shot.cost.sum(), stage.rows), 1.0)
+        noise = jnp.maximum(misfit(search.curvature.shot.cost.sum(), stage.measurements), 1.0)
+        searched, size = stage.searched, stage.parameter_count + stage.own
         rollouts = jnp.where(progress.done, 0, size * (1 + search.sweeps * (self.halvings + 1)))
         return Progress(
-            progress.unknowns.at[:, :size].set(search.unknowns),
-            progress.spread.at[:, :size, :size].set(jnp.square(noise) * covariance),
+            search.unknowns,
+            jnp.where(searched & searched[:, None], jnp.square(noise) * covariance, progress.spread),
             progress.sweeps + search.sweeps,
             progress.rollouts + rollouts,
             search.done,
@@ -258,3 +259,8 @@ class IBSS(AbstractEstimator):
             reach=self.reach,
         )
         return eqx.tree_at(lambda e: e.brackets, estimate, progress.brackets, is_leaf=lambda leaf: leaf is None)
+
+
+def _no_curvature(progress: Progress) -> Curvature:
+    zero = jnp.zeros(progress.unknowns.shape[:1], dtype=float)
+    return Curvature(Shot(zero, zero > 0), jnp.zeros_like(progress.unknowns), jnp.zeros_like(progress.spread))

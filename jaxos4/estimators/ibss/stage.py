@@ -1,16 +1,19 @@
 """One stage of the search: a problem on some of its channels, and the slope of its cost along a direction."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from ..._custom_types import Parameters, Scalar
 from ...bracket import Bracket
 from ...flight import Inputs
-from ...shooting import ROUNDING, Rows, ShootingProblem
+from ...shooting import ROUNDING, Curvature, Length, Rows, ShootingProblem
 
 Limits = tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]
 RowsAt = Callable[[Float[Array, "windows unknowns"]], Rows]
@@ -20,23 +23,34 @@ class Stage(NamedTuple):
     """What does not change while one stage is searched.
 
     The *unknowns* have one row for each window: the parameters, the same in all rows, then the window's own initial
-    state if it is free. Directions are numbered in the opposite order: those of the initial states come first.
+    state if it is free. All stages have the same unknowns; a stage on few channels searches the first of the initial
+    state alone. Directions are numbered in the opposite order: those of the initial states come first.
 
-    - `rows`: the part of the flight that is fitted.
+    - `problem`: on all channels. `parts`: the problem on each choice of channels that a stage fits.
+    - `part`: the position in `parts` of what this stage fits.
+    - `own`: how many unknowns of a window's initial state this stage searches.
+    - `length`: how many samples are fitted, from the first on. `None`: all.
+    - `rows`: the flight.
     - `starts`: initial states, used where these are known.
     - `inputs`: what the forcing is computed from.
     - `prior`: information about the unknowns without the flight: a bracket's half-width is two standard deviations.
       The windows share the information about a parameter, so that it counts once.
     - `limits`: the least and the greatest value of each unknown.
+    - `measurements`: how many there are.
     - `smallest_step`: the step, in standard deviations, below which rounding decides the sign of a slope.
     """
 
     problem: ShootingProblem
+    parts: tuple[ShootingProblem, ...]
+    part: Int[Array, ""]
+    own: Int[Array, ""]
+    length: Length
     rows: Rows
     starts: Float[Array, "windows size"]
     inputs: Inputs
     prior: Float[Array, "windows unknowns unknowns"]
     limits: Limits
+    measurements: Scalar
     smallest_step: Scalar
 
     @property
@@ -45,9 +59,10 @@ class Stage(NamedTuple):
         return len(self.problem.model.parameter_names)
 
     @property
-    def size(self) -> int:
-        """Number of unknowns of one window."""
-        return self.parameter_count + self.problem.free_size
+    def searched(self) -> Bool[Array, " unknowns"]:
+        """Which unknowns of a window this stage searches."""
+        places = jnp.arange(self.prior.shape[-1])
+        return places < self.parameter_count + self.own
 
     def with_forcing(self, unknowns: Float[Array, "windows unknowns"], *, tangents: bool = False) -> Rows:
         """The rows with the forcing of these parameters, and its derivatives if wanted."""
@@ -55,10 +70,17 @@ class Stage(NamedTuple):
             self.rows, unknowns[0, : self.parameter_count], inputs=self.inputs, tangents=tangents
         )
 
-    def fly(self, function: Callable, rows: Rows, unknowns: Float[Array, "windows unknowns"]):
-        """`function` (`problem.shot` or `problem.curvature`) of every window."""
-        starts = unknowns[:, self.parameter_count :] if self.problem.free_size else self.starts
-        return jax.vmap(function)(rows, unknowns[:, : self.parameter_count], starts)
+    def curvature(self, rows: Rows, unknowns: Float[Array, "windows unknowns"]) -> Curvature:
+        """The curvature of every window in all unknowns; 0 in those that this stage does not search."""
+        size = unknowns.shape[1]
+
+        def of(part: ShootingProblem) -> Curvature:
+            shot, gradient, information = self._fly("curvature", part, rows, unknowns)
+            more = (0, size - gradient.shape[1])
+            none = (0, 0)
+            return Curvature(shot, jnp.pad(gradient, (none, more)), jnp.pad(information, (none, more, more)))
+
+        return self._on_part(of)
 
     def summed(self, number: Int[Array, ""], slopes: Float[Array, " windows"]) -> Float[Array, " windows"]:
         """Slopes along direction `number`: summed over the windows, if the direction belongs to all of them."""
@@ -77,23 +99,72 @@ class Stage(NamedTuple):
         """
 
         def at(step: Float[Array, " windows"]) -> Float[Array, " windows"]:
-            def cost(s: Float[Array, " windows"]) -> Float[Array, " windows"]:
-                moved = unknowns + s[:, None] * direction
-                return self.fly(self.problem.shot, rows_at(moved), moved).cost
+            def of(part: ShootingProblem) -> Float[Array, " windows"]:
+                def cost(s: Float[Array, " windows"]) -> Float[Array, " windows"]:
+                    moved = unknowns + s[:, None] * direction
+                    return self._fly("shot", part, rows_at(moved), moved).cost
 
-            value = self.summed(number, jax.jvp(cost, (step,), (jnp.ones_like(step),))[1])
+                return jax.jvp(cost, (step,), (jnp.ones_like(step),))[1]
+
+            value = self.summed(number, self._on_part(of))
             return jnp.where(jnp.isfinite(value), value, step)
 
         return at
 
+    def _on_part(self, function: Callable):
+        """`function` of the part that this stage fits. The stage is the same in all lanes of a batch."""
+        if len(self.parts) == 1:
+            return function(self.parts[0])
+        return jax.lax.switch(self.part, [functools.partial(function, part) for part in self.parts])
 
-def make_stage(problem: ShootingProblem, rows: Rows, bracket: Bracket, limits: Limits) -> Stage:
-    """The stage that fits `rows` of a problem."""
-    count = bracket.lower.shape[0]
-    starts, inputs = problem.split(problem.first_state()[0]), problem.flight.inputs
+    def _fly(self, name: str, part: ShootingProblem, rows: Rows, unknowns: Float[Array, "windows unknowns"]):
+        """`"shot"` or `"curvature"` of every window."""
+        function = getattr(eqx.tree_at(lambda p: p.length, part, self.length, is_leaf=lambda leaf: leaf is None), name)
+        count, states = self.parameter_count, self.problem.size
+        fitted = rows.measured[: part.size] + rows.measured[states:]
+        starts = unknowns[:, count : count + part.size] if part.free_size else self.starts[:, : part.size]
+        return jax.vmap(function)(rows._replace(measured=fitted), unknowns[:, :count], starts)
+
+
+def stages(
+    problem: ShootingProblem, bracket: Bracket, limits: Limits, plan: Sequence[tuple[str, float]]
+) -> Callable[[Int[Array, ""]], Stage]:
+    """The stages by number. `plan`: for each stage its channels, and the share of the flight that it fits."""
+    names, count = tuple(dict.fromkeys(channels for channels, _ in plan)), bracket.lower.shape[0]
+    parts = tuple(problem.restrict(channels) for channels in names)
+    place = np.array([names.index(channels) for channels, _ in plan])
+    fitted = np.array([np.isin(problem.columns, part.columns) for part in parts])[place]
+    measured, eps = problem.measured(), jnp.finfo(problem.sigma.dtype).eps
+    samples = measured.shape[0] if problem.length is None else problem.length
+    lengths = jnp.ceil(np.array([share for _, share in plan]) * samples).astype(int)
+    # Number and mean square of the measurements in each stage and column.
+    within = (jnp.arange(measured.shape[0]) < lengths[:, None]).astype(float)
+    known = within @ (~jnp.isnan(measured)).astype(float)
+    squares = (within @ jnp.square(jnp.nan_to_num(measured))) / jnp.maximum(known, 1)
+    largest = jnp.where(fitted, jnp.sqrt(squares) / problem.sigma[problem.columns], 0.0).max(axis=1)
     prior = 1 / jnp.square(prior_std(problem, bracket))
-    prior = jax.vmap(jnp.diag)(prior.at[:, :count].divide(problem.windows))
-    return Stage(problem, rows, starts, inputs, prior, limits, _smallest_step(problem, rows))
+    prior = prior.at[:, :count].divide(problem.windows)[:, :, None] * np.eye(prior.shape[1])
+    everything = Stage(
+        problem=problem,
+        parts=parts,
+        part=jnp.asarray(place),
+        own=jnp.asarray(np.array([part.free_size for part in parts])[place]),
+        length=lengths if problem.windows == 1 else None,
+        rows=problem.rows(),
+        starts=problem.split(problem.first_state()[0]),
+        inputs=problem.flight.inputs,
+        prior=prior,
+        limits=limits,
+        measurements=jnp.where(fitted, known, 0.0).sum(axis=1),
+        smallest_step=jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * largest),
+    )
+    changing = ("part", "own", "length", "measurements", "smallest_step")
+
+    def stage(number: Int[Array, ""]) -> Stage:
+        values = {name: getattr(everything, name) for name in changing}
+        return everything._replace(**{name: None if x is None else x[number] for name, x in values.items()})
+
+    return stage
 
 
 def join(
@@ -109,21 +180,6 @@ def prior_std(problem: ShootingProblem, bracket: Bracket) -> Float[Array, "windo
     return join(problem, bracket.half_width, problem.first_state()[1]) / 2
 
 
-def keep_first(share: Scalar, rows: Rows) -> Rows:
-    """The rows with all measurements after the first `share` of each window removed."""
-    samples = rows.measured[0].shape[-1]
-    within = jnp.arange(samples) < jnp.ceil(share * samples)
-    return rows._replace(measured=tuple(jnp.where(within, y, jnp.nan) for y in rows.measured))
-
-
-def misfit(cost: Scalar, rows: Rows) -> Scalar:
+def misfit(cost: Scalar, measurements: Scalar) -> Scalar:
     """Root mean square of the weighted residuals: 1 if the noise is as large as the problem's sigma."""
-    measured = jnp.stack(rows.measured)
-    return jnp.sqrt(2 * cost / jnp.maximum(measured.size - jnp.isnan(measured).sum(), 1))
-
-
-def _smallest_step(problem: ShootingProblem, rows: Rows) -> Scalar:
-    eps = jnp.finfo(problem.sigma.dtype).eps
-    squares = [jnp.nanmean(jnp.square(y)) for y in rows.measured]
-    weighted = jnp.sqrt(jnp.nan_to_num(jnp.stack(squares))) / problem.sigma[problem.columns]
-    return jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * weighted.max())
+    return jnp.sqrt(2 * cost / jnp.maximum(measurements, 1))

@@ -36,7 +36,7 @@ class View(NamedTuple):
 def look_around(stage: Stage, unknowns: Float[Array, "windows unknowns"], *, whitened: bool) -> View:
     """Simulates the flight with all its first derivatives, and predicts the steps to the minimum."""
     rows = stage.with_forcing(unknowns, tangents=True)
-    curvature = stage.fly(stage.problem.curvature, rows, unknowns)
+    curvature = stage.curvature(rows, unknowns)
     information = curvature.information + stage.prior
     if whitened:
         factor, basis = whitened_directions(information, stage.parameter_count, stage.problem.model.forcing_parameters)
@@ -46,5 +46,5 @@ def look_around(stage: Stage, unknowns: Float[Array, "windows unknowns"], *, whi
     slopes = slopes.at[:, stage.problem.free_size :].set(slopes[:, stage.problem.free_size :].sum(axis=0))
     rooms = jax.vmap(lambda direction: room(unknowns, direction, stage.limits), -1, -1)(basis)
     longest_step = jnp.abs(jnp.clip(-slopes, -rooms[0], rooms[1])).max()
-    noise = misfit(curvature.shot.cost.sum(), stage.rows)
+    noise = misfit(curvature.shot.cost.sum(), stage.measurements)
     return View(unknowns, rows, curvature, information, factor, basis, longest_step, noise)

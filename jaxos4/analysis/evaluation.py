@@ -1,0 +1,150 @@
+"""A flight simulated at the answer of a fit, with all first derivatives: what every check of a fit is computed from.
+
+The simulation is one compiled program. What follows from it is small, and NumPy computes it: bounds, identifiability,
+diagnostics and noise levels need no program of their own.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._custom_types import InitialStates, Parameters, as_float
+from ..models.state import CHANNELS
+from ..shooting import FASTEST, ShootingProblem, padded
+
+_THETA = 4  # the place of the pitch angle in cascade order
+
+
+class Evaluation(NamedTuple):
+    """A flight simulated at `parameters`, on the host.
+
+    - `problem`: its sigma gives the weights.
+    - `measured`, `predicted`: what sensors measured (NaN: missing), and what noise-free sensors measure.
+    - `slopes`: the derivative of `predicted` in the parameters, then in the initial state of the sample's window.
+    - `torques`: roll, pitch and yaw torque [N m].
+    - `nominal`: the parameters that the airframe implies.
+    """
+
+    problem: ShootingProblem
+    parameters: Float[np.ndarray, " parameters"]
+    measured: Float[np.ndarray, "samples columns"]
+    predicted: Float[np.ndarray, "samples columns"]
+    slopes: Float[np.ndarray, "unknowns samples columns"]
+    torques: Float[np.ndarray, "samples 3"]
+    nominal: Float[np.ndarray, " parameters"]
+
+    @property
+    def sound(self) -> bool:
+        """Whether the trajectory is finite to its end, without a pitch angle of 90 degrees."""
+        states = self.predicted[:, : self.problem.size]
+        if not np.isfinite(states).all() or (np.abs(states[:, : CHANNELS["rates"]]) >= FASTEST).any():
+            return False
+        return states.shape[1] <= _THETA or bool((np.abs(states[:, _THETA]) < np.pi / 2).all())
+
+    @property
+    def sigma(self) -> Float[np.ndarray, " columns"]:
+        """The standard deviation of the noise in each column."""
+        return np.asarray(self.problem.sigma)[self.problem.columns]
+
+    @property
+    def errors(self) -> Float[np.ndarray, "samples columns"]:
+        """The weighted residuals; 0 for a missing measurement."""
+        return np.where(np.isnan(self.measured), 0.0, (self.measured - self.predicted) / self.sigma)
+
+    @property
+    def cost(self) -> float:
+        """1/2 |W (y - x)|^2; infinite if the trajectory is not sound."""
+        return float(np.square(self.errors).sum() / 2) if self.sound else float("inf")
+
+    @property
+    def information(self) -> Float[np.ndarray, "windows unknowns unknowns"]:
+        """The Fisher information of each window, in the parameters and the window's own initial state."""
+        weighted = np.where(np.isnan(self.measured), 0.0, self.slopes / self.sigma)
+        ends = np.arange(1, self.problem.windows) * self.measured.shape[0] // self.problem.windows
+        windows = [part.reshape(part.shape[0], -1) for part in np.split(weighted, ends, axis=1)]
+        return np.stack([part @ part.T for part in windows])
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
+        """The Cramer-Rao bound of the parameters."""
+        return inverse(shared_information(self.information, self.parameters.size))
+
+
+def evaluate(
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
+) -> Evaluation:
+    """Simulate a flight with all first derivatives. `initial_state` defaults to the measured one."""
+    parameters, samples = as_float(parameters), problem.flight.time.shape[0]
+    predicted, slopes, torques, nominal = map(np.asarray, _fly(padded(problem), parameters, initial_state))
+    return Evaluation(
+        problem=problem,
+        parameters=np.asarray(parameters),
+        measured=problem.recorded(),
+        predicted=predicted[:samples],
+        slopes=slopes[:, :samples],
+        torques=torques[:samples],
+        nominal=nominal,
+    )
+
+
+@eqx.filter_jit
+def _fly(
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
+) -> tuple[
+    Float[Array, "samples columns"],
+    Float[Array, "unknowns samples columns"],
+    Float[Array, "samples 3"],
+    Parameters,
+]:
+    start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
+    count, free = parameters.shape[0], problem.free_size
+
+    def outputs(step: Float[Array, " unknowns"]) -> Float[Array, "samples columns"]:
+        # All initial states take the same step: a sample depends on the initial state of its own window only.
+        starts = problem.split(start) + (step[count:] if free else 0.0)
+        return problem.predict(parameters + step[:count], starts.ravel())
+
+    here = jnp.zeros(count + free, dtype=parameters.dtype)
+
+    def along(_, direction: Float[Array, " unknowns"]):
+        return jax.jvp(outputs, (here,), (direction,))
+
+    # One unknown after another, with a loop: one simulation is compiled, and the memory holds no copies of the flight.
+    predicted, slopes = jax.lax.scan(along, jnp.zeros_like(problem.measured()), jnp.eye(count + free, dtype=here.dtype))
+    return predicted, slopes, jnp.stack(problem.forcing(parameters)[:3], axis=1), problem.model.alpha
+
+
+def shared_information(
+    information: Float[np.ndarray, "windows unknowns unknowns"], count: int
+) -> Float[np.ndarray, "count count"]:
+    """The information in the first `count` unknowns, which all windows share: the sum of the Schur complements."""
+    shared, cross, own = information[:, :count, :count], information[:, count:, :count], information[:, count:, count:]
+    return (shared - np.swapaxes(cross, 1, 2) @ inverse(own) @ cross).sum(axis=0)
+
+
+def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:
+    """The inverse of symmetric positive semidefinite matrices, whatever the units of their rows.
+
+    A direction without information gets a variance that is huge, but neither infinite nor negative.
+    """
+    scale, values, vectors = unit_eigen(information)
+    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse / scale[..., :, None] / scale[..., None, :]
+
+
+def unit_eigen(
+    matrix: Float[np.ndarray, "*batch n n"],
+) -> tuple[Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n"], Float[np.ndarray, "*batch n n"]]:
+    """The scale that makes the diagonal 1, and the eigenvalues and eigenvectors of the scaled matrix.
+
+    An eigenvalue below the rounding errors counts as large as these.
+    """
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where((diagonal > 0) & np.isfinite(diagonal), diagonal, 1.0))
+    unit = matrix / scale[..., :, None] / scale[..., None, :]
+    values, vectors = np.linalg.eigh(np.where(np.isfinite(unit), unit, 0.0))
+    return scale, np.maximum(values, values.shape[-1] * np.finfo(float).eps), vectors

@@ -1,0 +1,45 @@
+"""Padding: flights of different lengths share one compiled program."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from .problem import ShootingProblem
+
+# A flight is padded to the first of these numbers of samples that is enough. A longer flight is not padded: to compile
+# its program takes less time than to simulate it.
+_CAPACITIES = (4096, 16384, 65536)
+
+
+def padded(problem: ShootingProblem) -> ShootingProblem:
+    """The problem with a padded flight. Padding is not simulated: it costs memory and no time, and changes no result.
+
+    A flight in windows is not padded.
+    """
+    flight, samples = problem.flight, problem.flight.time.shape[0]
+    capacity = next((capacity for capacity in _CAPACITIES if capacity >= samples), None)
+    if capacity is None or problem.windows > 1 or problem.length is not None:
+        return problem
+
+    def pad(values: jax.Array | None, fill: float | None = None) -> jax.Array | None:
+        """With more rows, which repeat the last row or hold `fill`."""
+        if values is None:
+            return None
+        rows = np.asarray(values)
+        more = np.repeat(rows[-1:] if fill is None else np.full_like(rows[-1:], fill), capacity - samples, axis=0)
+        return jax.device_put(np.concatenate([rows, more]))
+
+    time = np.asarray(flight.time)
+    longer = dataclasses.replace(
+        flight,
+        time=time[0] + float(flight.dt) * np.arange(capacity),
+        omega=pad(flight.omega),
+        states=pad(flight.states, np.nan),
+        specific_force=pad(flight.specific_force, np.nan),
+        body_velocity=pad(flight.body_velocity),
+        stretch=pad(flight.stretch),
+    )
+    length = jax.device_put(np.asarray(samples))
+    return eqx.tree_at(lambda p: (p.flight, p.length), problem, (longer, length), is_leaf=lambda leaf: leaf is None)

@@ -1,0 +1,105 @@
+"""How many programs an identification compiles, and that the next flight compiles none."""
+
+import contextlib
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from helpers import noisy_states, standard_flight, standard_problem
+
+import jaxos4
+from jaxos4.analysis.evaluation import evaluate
+from jaxos4.shooting import padded
+
+# The search, the simulation with all derivatives, the default bracket, the intervals, a comparison of result codes.
+BUDGET = 6
+
+
+@contextlib.contextmanager
+def compiled_programs():
+    """The names of the programs that are compiled, or read from the persistent cache, inside the block."""
+    names, inside = [], True
+
+    def record(event, seconds, **details):
+        if inside and event == "/jax/core/compile/backend_compile_duration":
+            names.append(details.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(record)
+    try:
+        yield names
+    finally:
+        inside = False
+
+
+def recorded(samples, model, seed=0):
+    """A noisy flight of this many samples; every third velocity is missing."""
+    flight = standard_flight(type(model))
+    states = np.array(noisy_states(1, type(model), seed=seed)[0][:samples])
+    states[::3, 1] = np.nan
+    return jaxos4.Flight(np.asarray(flight.time)[:samples], np.asarray(flight.omega)[:samples], states)
+
+
+def test_an_identification_is_few_programs_and_the_next_one_none():
+    """The second flight has another length, and another vehicle flew it."""
+    model = jaxos4.PublishedOS4()
+    other = eqx.tree_at(lambda m: m.airframe.inertia, model, 1.1 * np.asarray(model.airframe.inertia))
+    flights = recorded(501, model), recorded(420, other)
+    jax.clear_caches()
+    with compiled_programs() as first:
+        jaxos4.identify(flights[0], model)
+    assert 2 <= len(first) <= BUDGET, first
+    with compiled_programs() as second:
+        jaxos4.identify(flights[1], other)
+    assert second == []
+
+
+def test_the_count_would_see_another_program():
+    with compiled_programs() as programs:
+        jax.jit(lambda x: x + 1)(np.ones(3))
+    assert len(programs) >= 1
+
+
+@pytest.mark.parametrize("channels", ["rates", "all"])
+def test_padding_changes_no_result(channels):
+    problem = standard_problem(states=noisy_states(1)[0], channels=channels, free=True)
+    longer, bracket = padded(problem), jaxos4.Bracket.default(problem.model)
+    assert longer.flight.time.shape[0] > 501
+    found, again = (jaxos4.IBSS()(p, bracket) for p in (problem, longer))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+    at = (found.parameters, found.initial_state)
+    np.testing.assert_allclose(longer.cost(*at), problem.cost(*at), rtol=1e-12)
+    residuals = np.asarray(longer.residuals(*at)).reshape(-1, problem.size)
+    np.testing.assert_allclose(residuals[:501], np.asarray(problem.residuals(*at)).reshape(-1, problem.size), rtol=1e-9)
+    assert not residuals[501:].any()
+
+
+def test_windows_and_very_long_flights_are_not_padded():
+    problem = standard_problem(channels="rates", free=True)
+    windows = jaxos4.ShootingProblem(problem.model, problem.flight, sigma=problem.sigma, channels="rates", windows=5)
+    assert padded(windows) is windows
+    with pytest.raises(ValueError, match="`length` must be `None`"):
+        jaxos4.ShootingProblem(
+            problem.model, problem.flight, sigma=problem.sigma, channels="rates", windows=5, length=jax.device_put(7)
+        )
+
+
+@pytest.mark.parametrize("windows", [1, 5])
+def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
+    problem = standard_problem(states=noisy_states(1)[0], channels="attitude", free=True)
+    problem = jaxos4.ShootingProblem(
+        problem.model, problem.flight, sigma=problem.sigma, channels="attitude", windows=windows
+    )
+    found, start = evaluate(problem, problem.model.alpha), problem.first_state()[0]
+    expected = problem.curvatures(problem.model.alpha, start)
+    assert found.sound
+    np.testing.assert_allclose(found.cost, expected.shot.cost.sum(), rtol=1e-12)
+    scale = np.sqrt(np.abs(np.asarray(expected.information)).max())
+    np.testing.assert_allclose(found.information / scale**2, expected.information / scale**2, atol=1e-12)
+    bound = np.asarray(jaxos4.cramer_rao_bound(problem, problem.model.alpha))
+    unit = np.sqrt(np.diagonal(bound))
+    np.testing.assert_allclose(found.covariance / np.outer(unit, unit), bound / np.outer(unit, unit), atol=1e-9)
+    diverged = evaluate(problem, problem.model.alpha.at[2].set(1e9))
+    assert not diverged.sound
+    assert diverged.cost == float("inf")
