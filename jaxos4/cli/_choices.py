@@ -9,16 +9,17 @@ import typer
 from ..estimators import ESTIMATORS
 
 # The names in the library's tables, written out because an import of these tables takes seconds; a test compares them.
-Model = StrEnum("Model", ["published", "corrected"])
-Excitation = StrEnum("Excitation", ["multisine", "doublet", "3211", "chirp"])
-Method = StrEnum("Method", ["euler", "rk4", "diffrax"])
-Channels = StrEnum("Channels", ["rates", "attitude", "all"])
+# `list(...)`: pyright takes the values of a written list for numbers.
+Model = StrEnum("Model", list(("published", "corrected")))
+Excitation = StrEnum("Excitation", list(("multisine", "doublet", "3211", "chirp")))
+Method = StrEnum("Method", list(("euler", "rk4", "diffrax")))
+Channels = StrEnum("Channels", list(("rates", "attitude", "all")))
 InitialState = StrEnum("InitialState", ["free", "known"])
 Estimator = StrEnum("Estimator", list(ESTIMATORS))
-Features = StrEnum("Features", ["score", "raw"])
-Approximator = StrEnum("Approximator", ["mlp", "cmac"])
+Features = StrEnum("Features", list(("score", "raw")))
+Approximator = StrEnum("Approximator", list(("mlp", "cmac")))
 
-VehicleModel = StrEnum("VehicleModel", [*Model, "flight"])
+VehicleModel = StrEnum("VehicleModel", list((*Model, "flight")))
 Loss = StrEnum("Loss", ["huber", "squares"])
 
 FlightFile = Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
