@@ -1,5 +1,6 @@
-"""What JAX needs before the library computes: double precision, and compiled programs kept for the next command."""
+"""What is set before the library computes: double precision, and compiled programs kept for the next command."""
 
+import gc
 import os
 import shutil
 import tempfile
@@ -15,7 +16,9 @@ _JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in le
 
 
 def prepare() -> None:
-    """Sets JAX's configuration for this process. Choices that the user, or the tests, made already stay."""
+    """Prepares this process for JAX. A cache that the user, or a test, chose already stays."""
+    gc.set_threshold(100_000, 20, 100)  # JAX makes millions of small objects that stay: rarer searches for garbage
+
     import jax
 
     jax.config.update("jax_enable_x64", True)
