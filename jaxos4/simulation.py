@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -39,6 +38,9 @@ def _advance(state: State, derivative: State, dt: Scalar) -> State:
 
 
 def _diffrax_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
+    with jax.ensure_compile_time_eval():  # here, because it is slow to import, and its constants must not be traced
+        import diffrax
+
     # One solve for each sample holds the input exactly: a lookup by time would read the next sample at a step's end.
     eps = float(jnp.finfo(dt.dtype).eps)
     solution = diffrax.diffeqsolve(

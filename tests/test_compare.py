@@ -5,8 +5,7 @@ import pytest
 import xarray as xr
 from helpers import refused
 
-from jaxos4.cli import compare as command
-from jaxos4.study import OUTCOMES
+from jaxos4.study import OUTCOMES, comparison as command
 
 SMALL = {
     "durations": (0.5,),

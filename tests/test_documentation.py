@@ -12,7 +12,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 def test_every_public_name_is_in_the_api_reference():
     pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md"))
     documented = set(re.findall(r"^::: jaxos4\.(\w+)$", pages, flags=re.MULTILINE))
-    public = {name for name, thing in vars(jaxos4).items() if name[0] != "_" and not isinstance(thing, type(jaxos4))}
+    public = {name for name in dir(jaxos4) if name[0] != "_" and not isinstance(getattr(jaxos4, name), type(jaxos4))}
     assert public - documented == set()
 
 

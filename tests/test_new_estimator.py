@@ -42,7 +42,7 @@ class OneStep(AbstractEstimator):
 ESTIMATORS["toy"] = OneStep  # the line in the registry
 
 from jaxos4.cli import main
-from jaxos4.cli.compare import STANDARD
+from jaxos4.study.comparison import STANDARD
 
 assert STANDARD.estimators[-1] == "toy"
 for line in open(sys.argv[1]):

@@ -1,3 +1,6 @@
-"""The command line: parses arguments, calls the library, prints."""
+"""The command line: parses arguments, calls the library, prints.
+
+A command imports the library when it runs, not before: help, wrong arguments and shell completion answer at once.
+"""
 
 from ._app import main as main

@@ -1,13 +1,15 @@
-"""The application: its commands, the precision, and exit codes."""
+"""The application: its commands and exit codes."""
 
+import functools
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated
 
-import jax
 import typer
 
 from ..errors import InputError, TrainingError
+from ._jax import NO_CACHE, prepare
 from .compare import compare
 from .estimate import estimate
 from .identifiability import identifiability
@@ -18,22 +20,35 @@ from .study import study
 from .train import train
 
 _INTERRUPTED = 130
+_EPILOG = f"Compiled programs are kept in your cache folder, at most 1 GB. {NO_CACHE}=1 switches this off."
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False)
+
+def _prepared(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, with JAX prepared first. Its arguments are parsed before that: help and mistakes need no JAX."""
+
+    @functools.wraps(command)
+    def run(*args, **kwargs) -> None:
+        prepare()
+        command(*args, **kwargs)
+
+    return run
+
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 for command in (simulate, estimate, train, inspect, identifiability, compare, study, report):
-    app.command()(command)
+    app.command()(_prepared(command))
 
 
 def _show_version(wanted: bool) -> bool:
     if wanted:
-        from .. import __version__
+        from .._version import __version__
 
         typer.echo(f"jaxos4 {__version__}")
         raise typer.Exit
     return wanted
 
 
-@app.callback()
+@app.callback(epilog=_EPILOG)
 def _jaxos4(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
@@ -47,7 +62,6 @@ def main() -> None:
 
     Exit code 0: done, 1: the computation failed, 2: unusable arguments or input, 130: interrupted.
     """
-    jax.config.update("jax_enable_x64", True)
     try:
         app()
     except SystemExit as stop:

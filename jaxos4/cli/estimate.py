@@ -3,21 +3,12 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import msgspec
 import typer
-from rich.console import Console
 
 from .._files import read_toml
-from ..airframe import load_airframe
 from ..errors import InputError
-from ..identification import Identification, VehicleIdentification, identify
-from ..models import MODELS
-from ..recording import read_recording
-from ..report.flight_page import write_flight_page
-from ..report.identification_page import print_identification
-from ..results import RESULTS
 from ._choices import (
     AirframeOption,
     BracketOption,
@@ -33,6 +24,9 @@ from ._choices import (
 from ._messages import in_options, option_names
 from ._output import check_output, write_json
 from ._progress import stages
+
+if TYPE_CHECKING:
+    from ..identification import Identification
 
 
 def estimate(
@@ -83,7 +77,6 @@ def estimate(
     is_vehicle = model == "flight"
     if report is not None and not is_vehicle:
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
-    vehicle = load_airframe(airframe)
     options: dict[str, Any] = {
         "estimator": estimator.value,
         "bracket": None if bracket is None else read_toml(bracket),
@@ -98,7 +91,14 @@ def estimate(
         "holdout": holdout,
         "loss": None if loss is None else loss.value,
     }
-    with stages("reading") as progress, option_names(bracket=bracket, network=network):
+    with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
+        from ..airframe import load_airframe
+        from ..identification import identify
+        from ..models import MODELS
+        from ..recording import read_recording
+
+        progress("reading")
+        vehicle = load_airframe(airframe)
         recordings = [read_recording(path, vehicle) for path in flights]
         other = None if validate is None else read_recording(validate, vehicle)
         subject = vehicle if is_vehicle else MODELS[model](vehicle)
@@ -106,8 +106,10 @@ def estimate(
     _publish(_with_command(found, airframe), out, report, title=", ".join(path.name for path in flights))
 
 
-def _with_command(found: Identification, airframe: str) -> Identification:
+def _with_command(found: "Identification", airframe: str) -> "Identification":
     """The identification with the command in its provenance, and its notes in the words of the command line."""
+    import msgspec
+
     asked = {
         "airframe": airframe,
         "notes": [in_options(note) for note in found.provenance["notes"]],
@@ -116,8 +118,14 @@ def _with_command(found: Identification, airframe: str) -> Identification:
     return msgspec.structs.replace(found, provenance=found.provenance | asked)
 
 
-def _publish(found: Identification, out: Path | None, report: Path | None, *, title: str) -> None:
+def _publish(found: "Identification", out: Path | None, report: Path | None, *, title: str) -> None:
     """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
+    from rich.console import Console
+
+    from ..identification import VehicleIdentification
+    from ..report import print_identification
+    from ..results import RESULTS
+
     console = Console()
     if out is not None:
         write_json(found.to_dict(), out)
@@ -125,7 +133,10 @@ def _publish(found: Identification, out: Path | None, report: Path | None, *, ti
         console.print(f"note: {note}", markup=False, highlight=False)
     print_identification(console, found)
     if report is not None and isinstance(found, VehicleIdentification):
-        write_flight_page(report, found, title=title)
+        with stages("drawing"):
+            from ..report import write_flight_page
+
+            write_flight_page(report, found, title=title)
         console.print(f"report: {report}", markup=False, highlight=False)
     if not found.successful:
         typer.echo(f"jaxos4: {found.result}: {RESULTS[getattr(RESULTS, found.result)]}", err=True)

@@ -1,16 +1,9 @@
 """`jaxos4 identifiability`: which parameters a flight can identify, and why not the others."""
 
 from pathlib import Path
-
-import rich.box
-from rich.console import Console
-from rich.table import Table
+from typing import TYPE_CHECKING
 
 from .._files import read_toml
-from ..airframe import load_airframe
-from ..identification import FlightInformation, assess
-from ..models import MODELS
-from ..recording import read_recording
 from ._choices import (
     AirframeOption,
     BracketOption,
@@ -26,6 +19,11 @@ from ._choices import (
 from ._messages import option_names
 from ._output import check_output, write_json
 from ._progress import stages
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ..identification import FlightInformation
 
 # Parameters with less than this share of the largest one are not shown in a direction.
 _SMALL = 0.1
@@ -45,8 +43,14 @@ def identifiability(
     """Find which of alpha_1..8 a flight can identify, and why not the others."""
     if out is not None:
         check_output(out, flight, Path(airframe), bracket)
-    subject = MODELS[model](load_airframe(airframe))
-    with stages("reading") as progress, option_names(bracket=bracket):
+    with stages("loading the library") as progress, option_names(bracket=bracket):
+        from ..airframe import load_airframe
+        from ..identification import assess
+        from ..models import MODELS
+        from ..recording import read_recording
+
+        progress("reading")
+        subject = MODELS[model](load_airframe(airframe))
         recording = read_recording(flight, subject.airframe)
         found = assess(
             recording,
@@ -59,13 +63,18 @@ def identifiability(
         )
     if out is not None:
         write_json(found.to_dict(), out)
+    from rich.console import Console
+
     console = Console()
     for note in recording.notes:
         console.print(f"note: {note}", markup=False, highlight=False)
     _print_information(console, found)
 
 
-def _print_information(console: Console, found: FlightInformation) -> None:
+def _print_information(console: "Console", found: "FlightInformation") -> None:
+    import rich.box
+    from rich.table import Table
+
     if not found.fitted:
         console.print("note: no fit; all numbers below hold at the bracket's centre", highlight=False)
     table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
@@ -90,7 +99,7 @@ def _print_information(console: Console, found: FlightInformation) -> None:
         _print_weakest(console, found.eigenvalues[0], dict(zip(found.parameters, found.directions[0], strict=True)))
 
 
-def _print_weakest(console: Console, eigenvalue: float, direction: dict[str, float]) -> None:
+def _print_weakest(console: "Console", eigenvalue: float, direction: dict[str, float]) -> None:
     largest = max(abs(part) for part in direction.values())
     ordered = sorted(direction.items(), key=lambda item: -abs(item[1]))
     parts = " ".join(f"{part:+.2f} {name}" for name, part in ordered if abs(part) > _SMALL * largest)

@@ -1,23 +1,23 @@
 """`jaxos4 inspect`: the contents of a log, its usable parts, and the identifiable parameters."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import rich.box
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from ..airframe import load_airframe
-from ..logs import log_format
-from ..recording.inspection import RATES, IdentifiableParameters, Inspection, inspect_log
 from ._choices import OutOption
 from ._output import check_output, write_json
+from ._progress import stages
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ..recording.inspection import IdentifiableParameters, Inspection
 
 # At most so many parts are printed, the longest ones.
 MOST_PARTS = 14
 CHANNELS = (
-    (RATES, "rad/s"),
+    (("p", "q", "r"), "rad/s"),
     (("phi", "theta", "psi"), "rad"),
     (("x", "y", "z"), "m"),
     (("vx", "vy", "vz"), "m/s"),
@@ -34,11 +34,21 @@ def inspect(
     out: OutOption = None,
 ) -> None:
     """Show what a log contains, which parts of it can be used, and which parameters they identify."""
-    console = Console(highlight=False, markup=False)
-    vehicle = None if airframe is None else load_airframe(airframe)
     if out is not None:
         check_output(out, log, None if airframe is None else Path(airframe))
-    found = inspect_log(log, vehicle)
+    with stages("loading the library") as progress:
+        from rich.console import Console
+
+        from ..airframe import load_airframe
+        from ..logs import log_format
+        from ..recording.inspection import inspect_log
+
+        progress("reading")
+        vehicle = None if airframe is None else load_airframe(airframe)
+        if vehicle is not None:
+            progress("reading, and finding the identifiable parameters")
+        found = inspect_log(log, vehicle)
+    console = Console(highlight=False, markup=False)
     if out is not None:
         write_json(found.to_dict(), out)
     _print_contents(console, found, log_format(log).label)
@@ -53,7 +63,7 @@ def inspect(
         console.print("identifiable parameters are computed only if p, q and r were measured.")
 
 
-def _print_contents(console: Console, found: Inspection, label: str) -> None:
+def _print_contents(console: "Console", found: "Inspection", label: str) -> None:
     console.print(
         f"{found.log}: {label}, {found.begin:.2f} to {found.end:.2f} s, {found.samples} samples, "
         f"one every {1e3 * found.sample_time:.4g} ms",
@@ -74,7 +84,10 @@ def _print_contents(console: Console, found: Inspection, label: str) -> None:
         console.print(f"note: {note}")
 
 
-def _print_parts(console: Console, found: Inspection) -> None:
+def _print_parts(console: "Console", found: "Inspection") -> None:
+    import rich.box
+    from rich.table import Table
+
     table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     for heading in ("from [s]", "to [s]", "use"):
         table.add_column(heading, justify="left" if heading == "use" else "right", no_wrap=heading != "use")
@@ -90,7 +103,7 @@ def _print_parts(console: Console, found: Inspection) -> None:
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
 
 
-def _print_identifiable(console: Console, found: IdentifiableParameters) -> None:
+def _print_identifiable(console: "Console", found: "IdentifiableParameters") -> None:
     noise = ", ".join(f"{name} {sigma:.2g}" for name, sigma in found.sigma.items())
     console.print(
         f"Identifiable from the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model "

@@ -5,16 +5,10 @@ from typing import Annotated
 
 import typer
 
-from ..airframe import load_airframe
 from ..errors import InputError
-from ..excitation import EXCITATIONS
-from ..logs import write_flight
-from ..models import MODELS
-from ..noise import SENSOR_SIGMA, WhiteNoise, measure
-from ..results import RESULTS, result_names
-from ..simulation import simulate as fly
 from ._choices import AirframeOption, Excitation, Method, Model, ModelOption
 from ._output import check_output
+from ._progress import stages
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
 
@@ -32,21 +26,32 @@ def simulate(
 ) -> None:
     """Simulate a flight and write it as CSV."""
     check_output(out, Path(airframe))
-    vehicle = MODELS[model](load_airframe(airframe))
     if not 0 <= noise <= 1e6:
         raise InputError(f"--noise: must lie in 0 to 1e6, got {noise}.")
     if not 0 <= seed < 2**63:
         raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
     if dt > 0 and duration / dt > MOST_SAMPLES:
         raise InputError(f"--duration {duration:g}: more than {MOST_SAMPLES} samples of {dt:g} s; ask for fewer.")
-    try:
-        omega = EXCITATIONS[excitation](vehicle.airframe, duration=duration, dt=dt)
-    except ValueError as error:
-        raise InputError(f"--excitation {excitation.value}: {error}") from None
-    flight = fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)
-    if flight.result != RESULTS.successful:
-        typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
-        raise typer.Exit(1)
-    flight = measure(flight, WhiteNoise(noise * SENSOR_SIGMA), seed=seed)
-    write_flight(flight, out)
+    with stages("loading the library") as progress:
+        from ..airframe import load_airframe
+        from ..excitation import EXCITATIONS
+        from ..logs import write_flight
+        from ..models import MODELS
+        from ..noise import SENSOR_SIGMA, WhiteNoise, measure
+        from ..results import RESULTS, result_names
+        from ..simulation import simulate as fly
+
+        progress("compiling and simulating")
+        vehicle = MODELS[model](load_airframe(airframe))
+        try:
+            omega = EXCITATIONS[excitation](vehicle.airframe, duration=duration, dt=dt)
+        except ValueError as error:
+            raise InputError(f"--excitation {excitation.value}: {error}") from None
+        flight = fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)
+        if flight.result != RESULTS.successful:
+            typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
+            raise typer.Exit(1)
+        flight = measure(flight, WhiteNoise(noise * SENSOR_SIGMA), seed=seed)
+        progress("writing")
+        write_flight(flight, out)
     typer.echo(f"{out}: {omega.shape[0]} samples of {dt:g} s, {model.value} model, {method.value}, noise {noise:g}")

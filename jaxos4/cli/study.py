@@ -3,15 +3,15 @@
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from ..errors import InputError
-from ..study import Study, device_name, load_study, plan, run_on_cluster, use_all_cores
+from ._progress import stages
+
+if TYPE_CHECKING:
+    from ..study import Study
 
 Executor = StrEnum("Executor", ["local", "dask"])
 
@@ -24,14 +24,17 @@ def study(
     scheduler: Annotated[str | None, typer.Option(help="Address of the Dask scheduler, for dask.")] = None,
 ) -> None:
     """Run a noise study, or resume it: finished cells are kept."""
-    use_all_cores()  # before anything is computed
-    wanted = load_study(specification)
     if (executor is Executor["dask"]) != (scheduler is not None):
         raise InputError("--executor dask and --scheduler ADDRESS: give both, or neither.")
+    with stages("loading the library"):
+        from ..study import load_study, run_on_cluster, use_all_cores
+
+        use_all_cores()  # before anything is computed
+        wanted = load_study(specification)
     if dry_run:
         _print_plan(wanted, out)
         return
-    from ..report.progress import count_outcomes, run_with_bar  # here, because matplotlib is slow to import
+    from ..report.progress import count_outcomes, run_with_bar
 
     if scheduler is None:
         dataset = run_with_bar(wanted, out)
@@ -41,7 +44,13 @@ def study(
     typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
 
 
-def _print_plan(wanted: Study, out: Path) -> None:
+def _print_plan(wanted: "Study", out: Path) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..study import device_name, plan
+
     rows = plan(wanted, out)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in ("estimator", "cells", "flights", "programs", "networks", "time [min]"):

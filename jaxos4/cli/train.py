@@ -7,13 +7,7 @@ from typing import Annotated
 import typer
 
 from .._files import read_toml
-from ..airframe import load_airframe
 from ..errors import InputError
-from ..identification.network import train_network
-from ..models import MODELS
-from ..networks import NetworkEstimator
-from ..networks.file import save_network
-from ..recording import read_recording
 from ._choices import (
     AirframeOption,
     Approximator,
@@ -27,6 +21,10 @@ from ._choices import (
 )
 from ._messages import option_names
 from ._output import check_output
+from ._progress import stages
+
+# Of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
+NOISE, STEPS = (0.1, 10.0), 10_000
 
 
 def train(
@@ -41,26 +39,36 @@ def train(
     noise: Annotated[
         tuple[float, float],
         typer.Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
-    ] = NetworkEstimator.noise,
+    ] = NOISE,
     channels: Annotated[
         Channels | None,
         typer.Option(
             help="The channels that the network sees. Default: the rates, and the attitude if a rate was not measured."
         ),
     ] = None,
-    steps: Annotated[int, typer.Option(help="Number of training steps.")] = NetworkEstimator.steps,
+    steps: Annotated[int, typer.Option(help="Number of training steps.")] = STEPS,
     seed: Annotated[int, typer.Option(help="Random seed for training.")] = 0,
 ) -> None:
     """Train a network that identifies any flight with the inputs of this one."""
     if not 0 <= seed < 2**63:
         raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
-    try:
-        settings = NetworkEstimator(features=features.value, approximator=approximator.value, noise=noise, steps=steps)
-    except ValueError as error:
-        raise InputError(f"options: {error}") from None
-    check_output(out, flight, Path(airframe), bracket)
-    subject = MODELS[model](load_airframe(airframe))
-    recording = read_recording(flight, subject.airframe)
+    with stages("loading the library") as progress:
+        from ..airframe import load_airframe
+        from ..identification.network import train_network
+        from ..models import MODELS
+        from ..networks import NetworkEstimator, save_network
+        from ..recording import read_recording
+
+        try:
+            settings = NetworkEstimator(
+                features=features.value, approximator=approximator.value, noise=noise, steps=steps
+            )
+        except ValueError as error:
+            raise InputError(f"options: {error}") from None
+        check_output(out, flight, Path(airframe), bracket)
+        progress("reading")
+        subject = MODELS[model](load_airframe(airframe))
+        recording = read_recording(flight, subject.airframe)
     for note in recording.notes:
         typer.echo(f"note: {note}")
     begin = time.perf_counter()

@@ -9,7 +9,7 @@ from ..airframe import Airframe
 from ..bracket import Bracket
 from ..errors import InputError
 from ..estimate import AbstractEstimator, Estimate
-from ..estimators import IBSS, OutputError, make_estimator
+from ..estimators import IBSS, make_estimator
 from ..flight import CHANNEL_NAMES
 from ..models.terms import FULL_SCALE, TERMS, default_terms
 from ..models.vehicle import FlightModel
@@ -64,7 +64,7 @@ def identify_vehicle(
     where = bracket_of(bracket, model)
     held_out, notes = _held_out(recordings, validate, prepared, model, window)
     problem = _problem(prepared, model, recordings[0].name, window)
-    _check_memory(problem, kind, name)
+    _check_memory(problem, name)
     last = _last_search(estimator, kind, recordings[0].name, seed)
     fit = fit_vehicle(problem, where, estimator=last, huber=loss != "squares", progress=progress)
     estimate, free, noise = fit.estimate, fit.problem.model, np.asarray(fit.problem.sigma)
@@ -128,9 +128,9 @@ def _held_parameters(fit: VehicleFit, model: FlightModel) -> dict[str, HeldParam
     }
 
 
-def _check_memory(problem: ShootingProblem, kind: type[AbstractEstimator], name: str) -> None:
+def _check_memory(problem: ShootingProblem, name: str) -> None:
     gibibytes = problem.flight.time.shape[0] * problem.columns.size * _unknowns(problem) * 8 / 2**30
-    if kind is OutputError and gibibytes > _LARGEST_JACOBIAN:
+    if name == "output-error" and gibibytes > _LARGEST_JACOBIAN:
         raise InputError(
             f"`estimator` {name}: its Jacobian would take {gibibytes:.0f} GiB in {problem.windows} windows; use ibss, "
             "or less of the flight by `begin` and `end`."

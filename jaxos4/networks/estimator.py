@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
@@ -107,6 +106,8 @@ class NetworkEstimator(eqx.Module):
         **Raises:** `ValueError` for a bracket without width or channels that the problem lacks; `TrainingError` if
         training diverges, or if the flights of the bracket diverge.
         """
+        import optax  # here, because it is slow to import
+
         self._check(problem, bracket)
         start_key, train_key, held_out_key = split_key(key, 3)
         blank = self.untrained(problem.restrict(self.channels), bracket, start_key)

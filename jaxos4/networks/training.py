@@ -5,18 +5,20 @@ No flight is stored. Each step simulates its own batch: parameters, initial stat
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, PyTree
 
 from .._custom_types import Key, Scalar
 from ..errors import TrainingError
 from .features import AbstractFeatures
+
+if TYPE_CHECKING:
+    import optax  # `train` imports it, because it is slow to import
 
 CHECK = 250
 """Steps between two evaluations of the validation loss."""
@@ -65,7 +67,7 @@ def train(
     loss: Callable[[Network, Pair], Scalar],
     features: AbstractFeatures,
     scales: Float[Array, "2"],
-    optimiser: optax.GradientTransformation,
+    optimiser: "optax.GradientTransformation",
     *,
     batch: int,
     steps: int,
@@ -81,6 +83,8 @@ def train(
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
+    import optax
+
     train_key, validation_key = split_key(key, 2)
     held_out = eqx.filter_jit(draw_many)(features, scales, validation, key=validation_key)
     weights, structure = eqx.partition(network, eqx.is_inexact_array)

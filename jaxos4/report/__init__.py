@@ -1,7 +1,8 @@
-"""Reports: figures, tables and an HTML page of a study; a page and a text of an identification."""
+"""Reports: figures, tables and an HTML page of a study; a page and a text of an identification.
 
-from .flight_page import write_flight_page as write_flight_page
-from .identification_page import print_identification as print_identification
-from .reading import read_results as read_results
-from .terminal import error_table as error_table
-from .writing import write_report as write_report
+The names are in `__init__.pyi`. Each is imported when it is first used: text needs no Matplotlib.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -6,7 +6,15 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from ..study import OUTCOMES, Step, Store, Study, carry_out, device_name, run_here
 
@@ -17,9 +25,9 @@ def run_with_bar(
     """`jaxos4.study.carry_out` with a progress bar on stderr. `device`: by default the devices of this process."""
     console = Console(stderr=True)
     label = TextColumn("{task.description}")
-    columns = (SpinnerColumn(), label, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (SpinnerColumn(), label, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=study.count)
+        task = bar.add_task("compiling", total=study.count)
 
         def show(step: Step) -> None:
             bar.update(task, completed=step.done, description=step.label)

@@ -1,0 +1,92 @@
+"""The public names. Each is imported when it is first used, see `__init__.py`."""
+
+from . import (
+    airframe as airframe,
+    analysis as analysis,
+    bracket as bracket,
+    errors as errors,
+    estimate as estimate,
+    estimators as estimators,
+    excitation as excitation,
+    flight as flight,
+    identification as identification,
+    linalg as linalg,
+    logs as logs,
+    models as models,
+    networks as networks,
+    noise as noise,
+    recording as recording,
+    report as report,
+    results as results,
+    shooting as shooting,
+    simulation as simulation,
+    study as study,
+    trigonometry as trigonometry,
+)
+from ._version import __version__ as __version__
+from .airframe import (
+    OS4 as OS4,
+    OS4_SIMULATOR as OS4_SIMULATOR,
+    VOOS as VOOS,
+    Airframe as Airframe,
+    alpha_from_inertia as alpha_from_inertia,
+    inertia_from_alpha as inertia_from_alpha,
+    load_airframe as load_airframe,
+    plus_layout as plus_layout,
+)
+from .analysis.diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
+from .analysis.fisher import cramer_rao_bound as cramer_rao_bound, fisher_information as fisher_information
+from .analysis.huber import winsorised as winsorised
+from .analysis.identifiability import Identifiability as Identifiability, identifiability as identifiability
+from .analysis.inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia
+from .analysis.prediction import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
+from .analysis.sandwich import robust_covariance as robust_covariance
+from .bracket import Bracket as Bracket
+from .errors import InputError as InputError, TrainingError as TrainingError
+from .estimate import AbstractEstimator as AbstractEstimator, Estimate as Estimate
+from .estimators import (
+    IBSS as IBSS,
+    SVSF as SVSF,
+    EquationError as EquationError,
+    Hybrid as Hybrid,
+    JointEKF as JointEKF,
+    OutputError as OutputError,
+    Profile as Profile,
+    RecursiveLeastSquares as RecursiveLeastSquares,
+    profile_likelihood as profile_likelihood,
+)
+from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
+from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
+from .identification import (
+    FlightIdentification as FlightIdentification,
+    FlightInformation as FlightInformation,
+    Identification as Identification,
+    VehicleFit as VehicleFit,
+    VehicleIdentification as VehicleIdentification,
+    assess as assess,
+    fit_vehicle as fit_vehicle,
+    identify as identify,
+)
+from .logs import read_flight as read_flight, read_log as read_log, write_flight as write_flight
+from .models.abstract import DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH, AbstractModel as AbstractModel
+from .models.corrected import CorrectedOS4 as CorrectedOS4
+from .models.held import HeldParameters as HeldParameters, hold as hold
+from .models.inertial import InertialOS4 as InertialOS4
+from .models.published import PublishedOS4 as PublishedOS4
+from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
+from .networks import NetworkEstimator as NetworkEstimator, TrainedNetwork as TrainedNetwork
+from .networks.file import load_network as load_network, save_network as save_network
+from .noise import (
+    SENSOR_SIGMA as SENSOR_SIGMA,
+    AbstractNoise as AbstractNoise,
+    Chain as Chain,
+    ConstantBias as ConstantBias,
+    Dropouts as Dropouts,
+    GaussMarkov as GaussMarkov,
+    Quantisation as Quantisation,
+    WhiteNoise as WhiteNoise,
+)
+from .recording import Recording as Recording, join as join
+from .results import RESULTS as RESULTS, result_names as result_names
+from .shooting import ShootingProblem as ShootingProblem
+from .simulation import simulate as simulate

@@ -1,0 +1,65 @@
+"""What is set before the library computes: double precision, and compiled programs kept for the next command."""
+
+import gc
+import os
+import shutil
+import tempfile
+import warnings
+from pathlib import Path
+
+NO_CACHE = "JAXOS4_NO_CACHE"
+"""The environment variable that switches off the cache of compiled programs."""
+
+_MOST_BYTES = 1 << 30
+_LEAST_FREE_BYTES = 200 << 20  # with less space on the disk, programs might be cut off while they are written
+_JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in less than this [s]
+
+
+def prepare() -> None:
+    """Prepares this process for JAX. A cache that the user, or a test, chose already stays."""
+    gc.set_threshold(100_000, 20, 100)  # JAX makes millions of small objects that stay: rarer searches for garbage
+
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if os.environ.get(NO_CACHE):
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        folder = _usable_folder()
+        if folder is None:
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    if jax.config.values["jax_persistent_cache_min_compile_time_secs"] == _JAX_SHORTEST:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
+    # Another process may be writing the same program, or remove it: it is then compiled again.
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+
+
+def _usable_folder() -> Path | None:
+    """The folder of compiled programs, not larger than its limit; `None` if it cannot be written."""
+    import platformdirs
+
+    folder = platformdirs.user_cache_path("jaxos4", appauthor=False) / "programs"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        _remove_oldest(folder, _MOST_BYTES)
+        return folder if shutil.disk_usage(folder).free > _LEAST_FREE_BYTES else None
+    except OSError:
+        return None
+
+
+def _remove_oldest(folder: Path, most_bytes: int) -> None:
+    """Removes the programs that were not used for the longest time, until the others take half of `most_bytes`."""
+    with os.scandir(folder) as entries:
+        files = [(entry.stat(), entry.path) for entry in entries if entry.is_file()]
+    size = sum(status.st_size for status, _ in files)
+    if size <= most_bytes:
+        return
+    for status, path in sorted(files, key=lambda file: max(file[0].st_atime, file[0].st_mtime)):
+        if size <= most_bytes / 2:
+            return
+        Path(path).unlink(missing_ok=True)  # another process may remove the same one
+        size -= status.st_size

@@ -1,0 +1,237 @@
+"""What a start costs: what each entry imports, and compiled programs that the next command finds again."""
+
+import importlib
+import inspect
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import jax
+import pytest
+
+import jaxos4
+from jaxos4.cli import _choices, _jax, train
+from jaxos4.estimators import ESTIMATORS
+from jaxos4.excitation import EXCITATIONS
+from jaxos4.models import MODELS
+from jaxos4.models.state import CHANNELS
+from jaxos4.networks import APPROXIMATORS, FEATURES, NetworkEstimator
+from jaxos4.simulation import METHODS
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+# Libraries that only some commands need, and that are slow to import.
+HEAVY = {
+    "diffrax",
+    "lineax",
+    "optax",
+    "optimistix",
+    "xarray",
+    "h5netcdf",
+    "h5py",
+    "matplotlib",
+    "jinja2",
+    "pandas",
+    "dask",
+}
+COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
+# Prints the loaded packages when the process ends, however it ends.
+LIST = "import atexit, sys; atexit.register(lambda: print('\\nloaded', *{name.split('.')[0] for name in sys.modules}));"
+# Counts the programs that the cache of compiled programs gave, and those that it did not have.
+COUNT = """
+import atexit, collections, jax
+seen = collections.Counter()
+jax.monitoring.register_event_listener(lambda event, **_: seen.update([event.rsplit('/', 1)[-1]]))
+atexit.register(lambda: print('\\ncounted', seen['cache_hits'], seen['cache_misses']))
+"""
+
+
+def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Runs Python code in another process, without the tests' cache of compiled programs."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "JAXOS4_"))}
+    variables = inherited | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]]), "JAX_PLATFORMS": "cpu"}
+    process = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(process, env=variables | environment, cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+def loaded(
+    *arguments: str, code: str = COMMAND, **environment: str
+) -> tuple[subprocess.CompletedProcess[str], set[str]]:
+    """The process, and the names of the packages that it imported."""
+    process = start(*arguments, code=LIST + code, **environment)
+    return process, set(process.stdout.splitlines()[-1].split()[1:])
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "said"),
+    [
+        ("--help", 0, "identifiability"),
+        ("--version", 0, jaxos4.__version__),
+        ("estimate --help", 0, "--estimator"),
+        ("train --help", 0, "--steps"),
+        ("compare --help", 0, "--quick"),
+        ("none", 2, "none"),
+        ("simulate", 2, "--out"),
+        ("estimate flight.csv --estimator none", 2, "output-error"),
+        ("estimate flight.csv --model none", 2, "corrected"),
+        ("simulate --out flight.csv --excitation none", 2, "multisine"),
+    ],
+)
+def test_help_and_mistakes_import_no_library(line, code, said):
+    process, packages = loaded(*line.split())
+    assert process.returncode == code, process.stderr
+    assert said in process.stdout + process.stderr
+    assert not packages & (HEAVY | {"jax", "equinox", "jaxtyping", "numpy", "msgspec"})
+
+
+def test_shell_completion_offers_estimators_and_imports_no_library():
+    line = {"COMP_WORDS": "jaxos4 estimate flight.csv --estimator ", "COMP_CWORD": "4"}
+    process, packages = loaded(_JAXOS4_COMPLETE="complete_bash", **line)
+    assert process.stdout.split()[: len(ESTIMATORS)] == list(ESTIMATORS)
+    assert not packages & (HEAVY | {"jax", "equinox", "jaxtyping", "numpy", "msgspec"})
+
+
+def test_the_package_imports_what_is_used():
+    _, packages = loaded(code="import jaxos4")
+    assert not packages & (HEAVY | {"jax", "numpy"})
+    _, packages = loaded(code="import jaxos4; jaxos4.IBSS; jaxos4.identify; jaxos4.simulate; jaxos4.read_flight")
+    assert "equinox" in packages
+    assert not packages & HEAVY
+
+
+def test_all_public_names_are_there():
+    for name in dir(jaxos4):
+        assert getattr(jaxos4, name) is not None
+    assert callable(jaxos4.identify)
+    assert callable(jaxos4.simulate)
+    assert callable(jaxos4.identifiability)
+    with pytest.raises(AttributeError):
+        jaxos4.nothing  # noqa: B018
+    for package in ("jaxos4.estimators", "jaxos4.report"):
+        module = importlib.import_module(package)
+        assert all(getattr(module, name) is not None for name in dir(module))
+
+
+def test_a_first_import_inside_a_traced_function_leaks_no_tracer():
+    code = """
+import jax, jaxos4
+with jax.checking_leaks():
+    jax.jit(lambda x: [getattr(jaxos4, name) for name in dir(jaxos4)] and x)(1.0)
+simulate = jax.jit(lambda x: jaxos4.simulate(model, x, omega, dt=0.01, method="diffrax").states)
+model = jaxos4.PublishedOS4(jaxos4.OS4)
+omega = jaxos4.multisine(jaxos4.OS4, duration=0.05)
+assert (simulate(model.alpha) == simulate(model.alpha)).all()
+import diffrax
+"""
+    process = start(code=code)
+    assert process.returncode == 0, process.stderr
+
+
+def test_the_choices_of_the_command_line_are_the_names_in_the_tables():
+    assert list(_choices.Estimator) == list(ESTIMATORS)
+    assert list(_choices.Model) == list(MODELS)
+    assert list(_choices.Excitation) == list(EXCITATIONS)
+    assert list(_choices.Method) == list(METHODS)
+    assert list(_choices.Channels) == list(CHANNELS)
+    assert list(_choices.Features) == list(FEATURES)
+    assert list(_choices.Approximator) == list(APPROXIMATORS)
+    defaults = {name: argument.default for name, argument in inspect.signature(train.train).parameters.items()}
+    assert (defaults["noise"], defaults["steps"]) == (NetworkEstimator.noise, NetworkEstimator.steps)
+    assert (defaults["features"], defaults["approximator"]) == (
+        NetworkEstimator.features,
+        NetworkEstimator.approximator,
+    )
+
+
+# The cache of compiled programs.
+
+SIMULATE = ("simulate", "--duration", "0.1", "--out", "flight.csv")
+
+
+def programs(*arguments: str, cwd: pathlib.Path, **environment: str) -> tuple[int, int]:
+    """How many programs of a command came from the cache, and how many did not; it must succeed and stay silent."""
+    process = start(*arguments, code=COUNT + COMMAND, cwd=cwd, **environment)
+    assert (process.returncode, process.stderr) == (0, ""), process.stderr
+    hits, misses = process.stdout.splitlines()[-1].split()[1:]
+    return int(hits), int(misses)
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory):
+    """The environment of a home whose cache a first command has filled, and the number of its programs."""
+    folder = tmp_path_factory.mktemp("home")
+    home = {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
+    hits, misses = programs(*SIMULATE, cwd=folder, **home)
+    assert (hits, misses > 1) == (0, True)
+    return home, misses
+
+
+def test_the_second_command_finds_the_programs_of_the_first(filled, tmp_path):
+    home, count = filled
+    assert programs(*SIMULATE, cwd=tmp_path, **home) == (count, 0)
+
+
+def test_the_cache_can_be_switched_off_or_put_elsewhere(filled, tmp_path):
+    home, count = filled
+    assert programs(*SIMULATE, cwd=tmp_path, JAXOS4_NO_CACHE="1", **home) == (0, 0)
+    chosen = tmp_path / "chosen"
+    assert programs(*SIMULATE, cwd=tmp_path, JAX_COMPILATION_CACHE_DIR=str(chosen), **home) == (0, count)
+    assert len(list(chosen.iterdir())) >= count
+
+
+def test_a_program_that_was_cut_off_is_compiled_again_in_silence(filled, tmp_path):
+    shutil.copytree(filled[0]["XDG_CACHE_HOME"], tmp_path / "cache")
+    for path in (tmp_path / "cache").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[:100])
+    home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    assert programs(*SIMULATE, cwd=tmp_path, **home)[0] == 0
+
+
+def test_a_cache_folder_that_cannot_be_used_is_no_error(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    process = start(*SIMULATE, cwd=tmp_path, HOME=str(tmp_path / "file"), XDG_CACHE_HOME=str(tmp_path / "file"))
+    assert (process.returncode, process.stderr) == (0, "")
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="needs a user who may not write everywhere")
+def test_a_read_only_cache_folder_is_not_used(tmp_path, monkeypatch):
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    folder = _jax._usable_folder()
+    assert folder is not None
+    folder.chmod(0o500)
+    assert _jax._usable_folder() is None
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc").is_dir(), reason="/proc is read-only for everybody")
+def test_a_cache_on_a_read_only_disk_is_not_used(monkeypatch):
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, "/proc/none")
+    assert _jax._usable_folder() is None
+
+
+def test_the_cache_is_limited_and_keeps_what_was_used_last(tmp_path):
+    for age, name in enumerate("abcd"):
+        (tmp_path / name).write_bytes(b"0" * 10)
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    _jax._remove_oldest(tmp_path, 40)
+    assert len(list(tmp_path.iterdir())) == 4
+    _jax._remove_oldest(tmp_path, 39)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a"]
+
+
+def test_a_full_disk_is_not_filled_further(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert _jax._usable_folder() is not None
+    monkeypatch.setattr(_jax.shutil, "disk_usage", lambda path: type("usage", (), {"free": 0})())
+    assert _jax._usable_folder() is None
+
+
+def test_a_command_keeps_the_settings_of_its_process(run):
+    before = json.dumps(jax.config.values, default=str, sort_keys=True)
+    assert run(*SIMULATE)[0] == 0
+    assert json.dumps(jax.config.values, default=str, sort_keys=True) == before
