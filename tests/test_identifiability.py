@@ -136,13 +136,15 @@ def residual_noise(flights, correlation_time):
     @eqx.filter_jit
     @eqx.filter_vmap
     def one(key):
-        noisy = eqx.tree_at(lambda p: p.flight, problem, noise(truth, key=key))
-        found = jaxos4.IBSS()(noisy, jaxos4.Bracket.default(problem.model))
-        robust = jaxos4.robust_covariance(noisy, found.parameters, found.initial_state)
-        error = found.parameters - problem.model.alpha
-        return error / found.std, error / jnp.sqrt(jnp.diagonal(robust))
+        noisy = noise(truth, key=key)
+        found = jaxos4.IBSS()(eqx.tree_at(lambda p: p.flight, problem, noisy), jaxos4.Bracket.default(problem.model))
+        return noisy.states, found.parameters, found.initial_state, found.std
 
-    return (np.asarray(x) for x in one(keys))
+    states, parameters, starts, std = one(keys)
+    flown = [eqx.tree_at(lambda p: p.flight.states, problem, each) for each in states]
+    robust = [jaxos4.robust_covariance(*known) for known in zip(flown, parameters, starts, strict=True)]
+    error = np.asarray(parameters - problem.model.alpha)
+    return error / std, error / np.sqrt(np.diagonal(robust, axis1=1, axis2=2))
 
 
 def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_not():

@@ -63,7 +63,7 @@ def test_identifiable_parameters_are_found_within_their_errors(kind):
     assert 0.1 < fit.cut < 0.25
     assert fit.rollouts > 0
     assert stages == [
-        "fitting the parameters that every flight excites",
+        "compiling, and fitting the parameters that every flight excites",
         "choosing the identifiable parameters",
         "fitting the identifiable parameters",
         "computing errors",

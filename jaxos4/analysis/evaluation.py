@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import InitialStates, Parameters, as_float
 from ..models.state import CHANNELS
@@ -61,12 +61,25 @@ class Evaluation(NamedTuple):
         return float(np.square(self.errors).sum() / 2) if self.sound else float("inf")
 
     @property
+    def jacobian(self) -> Float[np.ndarray, "windows unknowns residuals"]:
+        """The weighted `slopes` of each window; 0 for a missing measurement, and after the end of a shorter window."""
+        index, within = self.problem.cut()
+        weighted = np.where(np.isnan(self.measured), 0.0, self.slopes / self.sigma)
+        cut = weighted[:, index] * within[:, :, None]
+        return np.swapaxes(cut, 0, 1).reshape(len(index), len(weighted), -1)
+
+    @property
     def information(self) -> Float[np.ndarray, "windows unknowns unknowns"]:
         """The Fisher information of each window, in the parameters and the window's own initial state."""
-        weighted = np.where(np.isnan(self.measured), 0.0, self.slopes / self.sigma)
-        ends = np.arange(1, self.problem.windows) * self.measured.shape[0] // self.problem.windows
-        windows = [part.reshape(part.shape[0], -1) for part in np.split(weighted, ends, axis=1)]
-        return np.stack([part @ part.T for part in windows])
+        jacobian = self.jacobian
+        return jacobian @ np.swapaxes(jacobian, 1, 2)
+
+    def of_parameters(self, places: Int[np.ndarray, " free"]) -> "Evaluation":
+        """The same simulation with the other parameters known."""
+        count, unknowns = self.parameters.size, self.slopes.shape[0]
+        rows = np.concatenate([places, np.arange(count, unknowns)])
+        some = {"parameters": self.parameters[places], "nominal": self.nominal[places], "slopes": self.slopes[rows]}
+        return self._replace(**some)
 
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:

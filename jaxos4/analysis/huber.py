@@ -3,12 +3,13 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
-from .._custom_types import InitialStates, Parameters, Scalar
+from .._custom_types import InitialStates, Parameters, as_float
 from ..flight import STATE_NAMES
 from ..shooting import ShootingProblem
+from .evaluation import Evaluation, evaluate
 
 # Residuals are limited to this many standard deviations. With Gaussian noise the estimate keeps 95 % efficiency.
 CUT = 1.345
@@ -25,31 +26,39 @@ class Winsorised(NamedTuple):
     """
 
     problem: ShootingProblem
-    share: Scalar
-    residuals: Float[Array, "samples columns"]
+    share: float
+    residuals: Float[np.ndarray, "samples columns"]
 
 
-@eqx.filter_jit
 def winsorised(problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates) -> Winsorised:
     """Move each measurement whose residual exceeds 1.345 standard deviations to 1.345 standard deviations.
 
     Repeat this and a least-squares fit until the parameters no longer change. The result is Huber's estimate by the
-    method of modified residuals (Huber, Robust Statistics, section 7.8).
+    method of modified residuals (Huber, Robust Statistics, section 7.8). NumPy computes it, for one flight.
 
     **Arguments:** `parameters` and `initial_state` of a fit.
     """
-    observed, sigma = problem.measured(), problem.sigma[problem.columns]
-    errors = problem.residuals(parameters, initial_state).reshape(observed.shape) * sigma
-    measured = ~jnp.isnan(observed)
-    medians = jnp.nanmedian(jnp.where(measured, jnp.abs(errors), jnp.nan), axis=0)
-    scale = jnp.where(measured.sum(axis=0) > 1, medians / _MEDIAN, sigma)
-    scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, sigma)
-    cut = jnp.clip(errors, -CUT * scale, CUT * scale)
-    share = (measured & (cut == errors)).sum() / jnp.maximum(measured.sum(), 1)
-    channels = problem.flight.channels.at[:, problem.columns].add(cut - errors)
-    states, force = channels[:, : len(STATE_NAMES)], channels[:, len(STATE_NAMES) :]
-    moved = problem.sigma.at[problem.columns].set(scale), states
-    moved = eqx.tree_at(lambda p: (p.sigma, p.flight.states), problem, moved)
-    if problem.flight.specific_force is not None:
-        moved = eqx.tree_at(lambda p: p.flight.specific_force, moved, force)
-    return Winsorised(moved, share, jnp.where(measured, cut / scale, 0.0))
+    return winsorised_of(evaluate(problem, parameters, initial_state))
+
+
+def winsorised_of(evaluation: Evaluation) -> Winsorised:
+    """`winsorised` where the flight was simulated already."""
+    problem, sigma = evaluation.problem, evaluation.sigma
+    measured, errors = ~np.isnan(evaluation.measured), evaluation.errors * sigma
+    medians = np.array(
+        [np.median(np.abs(e[m])) if m.sum() > 1 else 0.0 for e, m in zip(errors.T, measured.T, strict=True)]
+    )
+    scale = np.where((medians > 0) & np.isfinite(medians), medians / _MEDIAN, sigma)
+    cut = np.clip(errors, -CUT * scale, CUT * scale)
+    moved, levels = np.where(measured, cut - errors, 0.0), np.array(problem.sigma)
+    levels[problem.columns] = scale
+    states, flight = np.array(problem.flight.states), problem.flight
+    of_state = problem.columns < len(STATE_NAMES)
+    states[:, problem.columns[of_state]] += moved[:, of_state]
+    changed = eqx.tree_at(lambda p: (p.sigma, p.flight.states), problem, (as_float(levels), as_float(states)))
+    if flight.specific_force is not None:
+        force = np.array(flight.specific_force)
+        force[:, problem.columns[~of_state] - len(STATE_NAMES)] += moved[:, ~of_state]
+        changed = eqx.tree_at(lambda p: p.flight.specific_force, changed, as_float(force))
+    share = float((measured & (cut == errors)).sum() / max(measured.sum(), 1))
+    return Winsorised(changed, share, np.where(measured, cut / scale, 0.0))

@@ -1,21 +1,20 @@
 """The sandwich covariance: the covariance of a fit whose residuals are coloured, or not as large as sigma says."""
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
-from .._custom_types import Covariance, InitialStates, Parameters, as_float
-from ..linalg import covariances
+from .._custom_types import InitialStates, Parameters
 from ..shooting import ShootingProblem
+from .evaluation import Evaluation, evaluate, inverse, shared_information
 
 # Residuals are taken as correlated over lags up to this share of the flight.
 _LAGS = 0.1
 # The covariance of a window's residuals is estimated from at least so many windows, each of at most so many residuals.
 _MANY_WINDOWS, _LARGEST_WINDOW = 20, 4000
 
+Covariance = Float[np.ndarray, "parameters parameters"]
 
-@eqx.filter_jit
+
 def robust_covariance(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Covariance:
@@ -23,7 +22,7 @@ def robust_covariance(
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
     too. The residuals are taken as the noise. They lack slow noise that the fit explained as motion. A flight must
-    therefore be many times longer than the correlation time of the noise.
+    therefore be many times longer than the correlation time of the noise. NumPy computes it, for one flight.
 
     **Arguments:** as for `cramer_rao_bound`, at the answer of a fit.
 
@@ -31,48 +30,33 @@ def robust_covariance(
 
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """
-    parameters = as_float(parameters)
-    start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
-    count = parameters.shape[0]
-    index, within = problem.cut()
-    errors, slopes = _linearised(problem, parameters, start)
-    inverse = covariances(jnp.einsum("uwtc,vwtc->wuv", slopes, slopes), count)[:, :, :count]
-    # The change of each estimated parameter with each residual.
-    moves = jnp.einsum("uwtc,wuv->wtcv", slopes, inverse)
-    measured = (~jnp.isnan(problem.measured())).astype(errors.dtype)
-    sound = jnp.isfinite(problem.cost(parameters, start)) & (measured.sum() > 0)
-    if problem.windows >= _MANY_WINDOWS and index.shape[1] * problem.columns.size <= _LARGEST_WINDOW:
-        covariance = _window_by_window(errors, jnp.where(within[:, :, None], measured[index], 0.0), moves)
-    else:
-        covariance = _stationary(errors[within], measured, moves[within])
-    return jnp.where(sound, covariance, jnp.inf)
+    return robust_covariance_of(evaluate(problem, parameters, initial_state))
 
 
-def _linearised(
-    problem: ShootingProblem, parameters: Parameters, start: InitialStates
-) -> tuple[Float[Array, "windows length columns"], Float[Array, "unknowns windows length columns"]]:
-    """The weighted residuals, window by window, and their derivatives in the parameters and the initial states.
-
-    All initial states take the same step: a sample depends on the initial state of its own window only.
-    """
-    count, free = parameters.shape[0], problem.free_size
-    index, within = problem.cut()
-
-    def moved(steps: Float[Array, " unknowns"]) -> Float[Array, "windows length columns"]:
-        starts = problem.split(start) + (steps[count:] if free else 0.0)
-        residuals = problem.residuals(parameters + steps[:count], starts.ravel()).reshape(-1, problem.columns.size)
-        return jnp.where(within[:, :, None], residuals[index], 0.0)
-
-    zero = jnp.zeros(count + free)
-    # One unknown after another: all at once would need one copy of the flight's forcing for each.
-    slopes = jax.lax.map(lambda step: jax.jvp(moved, (zero,), (step,))[1], jnp.eye(count + free))
-    return moved(zero), slopes
+def robust_covariance_of(evaluation: Evaluation) -> Covariance:
+    """`robust_covariance` of a flight that was simulated already."""
+    count, measured = evaluation.parameters.size, ~np.isnan(evaluation.measured)
+    if not (evaluation.sound and measured.any()):
+        return np.full((count, count), np.inf)
+    information, jacobian = evaluation.information, evaluation.jacobian
+    shared = inverse(shared_information(information, count))
+    cross, own = information[:, count:, :count], information[:, count:, count:]
+    sensitivity = np.concatenate(
+        [np.broadcast_to(shared, (len(cross), count, count)), -inverse(own) @ cross @ shared], 1
+    )
+    # The change of each estimated parameter with each weighted residual.
+    moves = np.swapaxes(jacobian, 1, 2) @ sensitivity
+    index, within = evaluation.problem.cut()
+    errors, measured = (x[index] * within[:, :, None] for x in (evaluation.errors, measured.astype(float)))
+    if len(index) >= _MANY_WINDOWS and moves.shape[1] <= _LARGEST_WINDOW:
+        return _window_by_window(errors.reshape(len(index), -1), measured.reshape(len(index), -1), moves)
+    return _stationary(errors[within], measured[within], moves.reshape(*errors.shape, count)[within])
 
 
 def _stationary(
-    errors: Float[Array, "samples columns"],
-    measured: Float[Array, "samples columns"],
-    moves: Float[Array, "samples columns parameters"],
+    errors: Float[np.ndarray, "samples columns"],
+    measured: Float[np.ndarray, "samples columns"],
+    moves: Float[np.ndarray, "samples columns parameters"],
 ) -> Covariance:
     """The covariance for stationary noise: R(t, s) depends on t - s only.
 
@@ -80,42 +64,38 @@ def _stationary(
     """
     samples, length = errors.shape[0], 2 * errors.shape[0]
 
-    def products(x: Float[Array, "samples columns"]) -> Float[Array, "lags columns columns"]:
+    def products(x: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, "lags columns columns"]:
         """Sums over all pairs of samples at each lag."""
-        transform = jnp.fft.rfft(x, length, axis=0)
-        return jnp.fft.irfft(transform[:, :, None] * jnp.conj(transform[:, None, :]), length, axis=0)
+        transform = np.fft.rfft(x, length, axis=0)
+        return np.fft.irfft(transform[:, :, None] * np.conj(transform[:, None, :]), length, axis=0)
 
-    lag = jnp.minimum(jnp.arange(length), length - jnp.arange(length))
-    pairs = jnp.maximum(jnp.round(products(measured)), 1) / (1 - jnp.minimum(lag, samples - 1) / samples)[:, None, None]
-    autocovariance = products(errors) / pairs
-    weights = jnp.clip(1 - lag / (_LAGS * samples), 0.0)
-    spectrum = jnp.fft.rfft(weights[:, None, None] * autocovariance, axis=0)
-    slopes = jnp.fft.rfft(moves, length, axis=0)
-    density = jnp.einsum("fcu,fcd,fdv->fuv", jnp.conj(slopes), spectrum, slopes)
-    return jnp.fft.irfft(density, length, axis=0)[0]
+    lag = np.minimum(np.arange(length), length - np.arange(length))
+    pairs = np.maximum(np.round(products(measured)), 1) / (1 - np.minimum(lag, samples - 1) / samples)[:, None, None]
+    weights = np.maximum(1 - lag / (_LAGS * samples), 0.0)
+    spectrum = np.fft.rfft(weights[:, None, None] * products(errors) / pairs, axis=0)
+    slopes = np.fft.rfft(moves, length, axis=0)
+    density = np.swapaxes(np.conj(slopes), 1, 2) @ spectrum @ slopes
+    return np.fft.irfft(density, length, axis=0)[0]
 
 
 def _window_by_window(
-    errors: Float[Array, "windows length columns"],
-    measured: Float[Array, "windows length columns"],
-    moves: Float[Array, "windows length columns parameters"],
+    errors: Float[np.ndarray, "windows residuals"],
+    measured: Float[np.ndarray, "windows residuals"],
+    moves: Float[np.ndarray, "windows residuals parameters"],
 ) -> Covariance:
     """The covariance for many windows: the residuals of the windows are draws of one random vector.
 
     The initial state of a window absorbs some slow noise, more at its ends than in its middle, so residuals are not
     stationary. The covariance of the vector, and of the vector with its successor, is the mean over the windows.
     """
-    windows, parameters = moves.shape[0], moves.shape[-1]
-    errors, measured = errors.reshape(windows, -1), measured.reshape(windows, -1)
-    moves = moves.reshape(windows, -1, parameters)
+    windows = len(moves)
 
     def contribution(apart: int) -> Covariance:
         """The contribution of all pairs of windows that are `apart` windows apart."""
         count = windows - apart
         pairs = measured[:count].T @ measured[apart:]
-        covariance = errors[:count].T @ errors[apart:] / jnp.maximum(pairs, 1)
-        moved = jnp.einsum("ts,wsv->wtv", covariance, moves[apart:])
-        return jnp.einsum("wtu,wtv->uv", moves[:count], moved)
+        covariance = errors[:count].T @ errors[apart:] / np.maximum(pairs, 1)
+        return np.tensordot(moves[:count], covariance @ moves[apart:], axes=((0, 1), (0, 1)))
 
     following = contribution(1)
     # Bartlett's weight of neighbours is one half.

@@ -10,13 +10,13 @@ from jaxtyping import Float
 
 from .._custom_types import as_float
 from ..analysis.diagnostics import Diagnostics
-from ..analysis.evaluation import Evaluation, evaluate
-from ..analysis.sandwich import robust_covariance
+from ..analysis.evaluation import Evaluation
+from ..analysis.sandwich import robust_covariance_of
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..results import RESULTS
 from ..shooting import ShootingProblem, padded
-from .noise_levels import refine
+from .noise_levels import evaluate_estimate, refine
 from .quality import COLOURED, diagnose
 from .results import has_answer
 
@@ -64,28 +64,26 @@ def fit_flight(
         shared = padded(weighted) if estimator.shoots and not estimator.needs_network else weighted
         return jax.block_until_ready(estimator(shared, bracket))
 
-    def residuals(weighted: ShootingProblem, estimate: Estimate) -> np.ndarray:
-        return evaluate(weighted, estimate.parameters, estimate.initial_state).errors
-
     def failed(estimate: Estimate) -> bool:
         return estimator.shoots and bool(estimate.result != RESULTS.successful)
 
-    refined = refine(problem, search, passes=_PASSES, residuals=residuals, stop=failed)
+    refined = refine(problem, search, passes=_PASSES, stop=failed)
     problem, estimate, rollouts = refined.problem, refined.estimate, refined.rollouts
     if has_answer(estimate):
         if not refined.settled:
-            problem = problem.reweighted(residuals(problem, estimate))
+            problem = problem.reweighted(evaluate_estimate(problem, estimate).errors)
         if not estimator.shoots:
             estimate = search(problem, estimate, refined.colour)
             rollouts += int(estimate.rollouts)
     if not has_answer(estimate):
         return FlightFit(problem, estimate, np.full(len(problem.model.parameter_names), np.inf), rollouts)
-    at = (estimate.parameters, estimate.initial_state)
-    evaluation = evaluate(problem, *at)
+    evaluation = evaluate_estimate(problem, estimate)
     bound, covariance = evaluation.covariance, estimate.covariance
     diagnostics = diagnose(evaluation, fitted=True)
     if estimator.shoots:
         coloured = (diagnostics.colour > COLOURED).any()
-        covariance = robust_covariance(problem, *at) if coloured else as_float(bound)
-    estimate = eqx.tree_at(lambda e: (e.covariance, e.cost), estimate, (covariance, as_float(evaluation.cost)))
+        covariance = robust_covariance_of(evaluation) if coloured else bound
+    estimate = eqx.tree_at(
+        lambda e: (e.covariance, e.cost), estimate, (as_float(covariance), as_float(evaluation.cost))
+    )
     return FlightFit(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, diagnostics, evaluation)

@@ -4,9 +4,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from .._custom_types import Parameters
-from ..analysis.huber import winsorised
+from .._custom_types import Numeric
+from ..analysis.evaluation import Evaluation, evaluate
+from ..analysis.huber import winsorised_of
 from ..estimate import Estimate
 from ..shooting import ShootingProblem
 from .results import has_answer
@@ -39,8 +41,9 @@ class Refined(NamedTuple):
     kept: float
 
 
-def _residuals(problem: ShootingProblem, estimate: Estimate) -> np.ndarray:
-    return np.asarray(problem.residuals(estimate.parameters, estimate.initial_state))
+def evaluate_estimate(problem: ShootingProblem, estimate: Estimate) -> Evaluation:
+    """The flight simulated at an estimate."""
+    return evaluate(problem, estimate.parameters, estimate.initial_state)
 
 
 def refine(
@@ -48,8 +51,8 @@ def refine(
     search: Callable[[ShootingProblem, Estimate | None, float], Estimate],
     *,
     passes: int,
-    residuals: Callable[[ShootingProblem, Estimate], np.ndarray] = _residuals,
-    start: Parameters | None = None,
+    evaluation: Callable[[ShootingProblem, Estimate], Evaluation] = evaluate_estimate,
+    start: Float[Numeric, " parameters"] | None = None,
     huber: bool = False,
     stop: Callable[[Estimate], bool] = lambda estimate: False,
 ) -> Refined:
@@ -58,7 +61,7 @@ def refine(
     - `problem`: its `sigma` is the first guess of the noise levels.
     - `search`: makes an estimate of a problem, the previous estimate (`None` at first) and its `_colour_factor`.
     - `passes`: how often noise levels are computed at most.
-    - `residuals`: computes the weighted residuals of an estimate.
+    - `evaluation`: simulates the flight at an estimate.
     - `start`: where the first search starts; needed with `huber`.
     - `huber`: whether outliers are cut, see `jaxos4.winsorised`.
     - `stop`: whether to stop after an estimate, once its noise levels are computed.
@@ -71,12 +74,11 @@ def refine(
             break
         before = weighted
         if huber:
-            weighted, share, errors = winsorised(problem, estimate.parameters, estimate.initial_state)
-            kept = float(share)
+            weighted, kept, errors = winsorised_of(evaluation(problem, estimate))
         else:
-            errors = residuals(before, estimate)
+            errors = evaluation(before, estimate).errors
             weighted = before.reweighted(errors)
-        colour = _colour_factor(np.asarray(errors).reshape(-1, problem.columns.size))
+        colour = _colour_factor(errors)
         settled = bool((np.abs(np.asarray(weighted.sigma) / np.asarray(before.sigma) - 1) < _SETTLED).all())
         if huber and previous is not None:
             std = np.sqrt(np.diagonal(estimate.covariance))

@@ -12,14 +12,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import ArrayLike, Float
 
-from .._custom_types import Parameters
-from ..analysis.fisher import cramer_rao_bound
-from ..analysis.sandwich import robust_covariance
-from ..bracket import Bracket
+from .._custom_types import as_float
+from ..analysis.evaluation import Evaluation, evaluate
+from ..analysis.sandwich import robust_covariance_of
+from ..bracket import Bracket, is_identifiable
 from ..estimate import AbstractEstimator, Estimate, check_bracket
 from ..estimators import IBSS
 from ..models.abstract import AbstractModel
@@ -57,7 +57,7 @@ class VehicleFit(NamedTuple):
     problem: ShootingProblem
     estimate: Estimate
     held: Held
-    bound: Float[Array, " parameters"]
+    bound: Float[np.ndarray, " free"]
     cut: float
     rollouts: int
 
@@ -95,30 +95,30 @@ def fit_vehicle(
     **Raises:** `ValueError` if the bracket and the model differ in the number of parameters.
     """
     check_bracket(problem, bracket)
-    model, values = problem.model, np.array(bracket.center)
+    model, values = problem.model, np.array(_centre(bracket))
     held: Held = {name: (float(values[i]), "") for i, name in enumerate(model.parameter_names) if name in SECONDARY}
-    progress("fitting the parameters that every flight excites")
-    free = free_bracket(bracket, model, held)
-    first = _refined(_holding(problem, model, held), free, free.center, huber=False)
+    progress("compiling, and fitting the parameters that every flight excites")
+    first = _refined(_Part(model, bracket, held), problem, values[_free(model, held)], huber=False)
     if not has_answer(first.estimate):
-        return VehicleFit(first.problem, first.estimate, held, first.estimate.std, 0.0, first.rollouts)
+        return _no_fit(_holding(first.problem, model, held), first.estimate, held, first.rollouts)
 
     progress("choosing the identifiable parameters")
     values[_free(model, held)] = np.asarray(first.estimate.parameters)
-    held = _not_identifiable(eqx.tree_at(lambda p: p.model, first.problem, model), values, first, bracket)
+    held = _not_identifiable(first, values, bracket)
 
     progress("fitting the identifiable parameters")
-    start = eqx.tree_at(lambda p: p.sigma, problem, first.problem.sigma)
-    free = free_bracket(bracket, model, held)
-    last = _refined(_holding(start, model, held), free, jnp.asarray(values[_free(model, held)]), huber=huber)
-    rollouts = first.rollouts + last.rollouts
+    start, part = eqx.tree_at(lambda p: p.sigma, problem, first.problem.sigma), _Part(model, bracket, held)
+    last = _refined(part, start, values[_free(model, held)], huber=huber)
+    rollouts, known = first.rollouts + last.rollouts, _holding(last.problem, model, held)
     if not has_answer(last.estimate):
-        return VehicleFit(last.problem, last.estimate, held, last.estimate.std, 0.0, rollouts)
+        return _no_fit(known, last.estimate, held, rollouts)
 
     def ibss(weighted: ShootingProblem, bracket: Bracket) -> Estimate:
-        return IBSS()(weighted, bracket, start=last.estimate.parameters, spread=last.estimate.covariance)
+        del bracket
+        whole = eqx.tree_at(lambda p: p.model, weighted, model)
+        return part.search(IBSS(), whole, last.estimate.parameters, last.estimate.covariance)
 
-    rough = VehicleFit(last.problem, last.estimate, held, last.estimate.std, 1 - last.kept, rollouts)
+    rough = VehicleFit(known, last.estimate, held, _std(last.estimate), 1 - last.kept, rollouts)
     return refit(rough, estimator or ibss, bracket, progress=progress)
 
 
@@ -140,27 +140,86 @@ def refit(
     estimate = estimator(problem, free_bracket(bracket, model, held))
     rollouts = fit.rollouts + int(estimate.rollouts)
     if not has_answer(estimate):
-        return VehicleFit(problem, estimate, held, estimate.std, 0.0, rollouts)
+        return _no_fit(problem, estimate, held, rollouts)
     progress("computing errors")
-    covariance = robust_covariance(problem, estimate.parameters, estimate.initial_state)
+    evaluation = _Part(model, bracket, held).evaluate(eqx.tree_at(lambda p: p.model, problem, model), estimate)
+    covariance, bound = robust_covariance_of(evaluation), _std(estimate)
     # Flights too short to show the noise's colour: the noise counts as white.
-    usable = jnp.isfinite(covariance).all() & (jnp.diagonal(covariance) > 0).all()
-    covariance = jnp.where(usable, covariance, estimate.covariance) / (1 - fit.cut) ** 2
-    bound, estimate = estimate.std, eqx.tree_at(lambda e: e.covariance, estimate, covariance)
+    if not (np.isfinite(covariance).all() and (np.diagonal(covariance) > 0).all()):
+        covariance = np.asarray(estimate.covariance)
+    estimate = eqx.tree_at(lambda e: e.covariance, estimate, as_float(covariance / (1 - fit.cut) ** 2))
     return VehicleFit(problem, estimate, held, bound, fit.cut, rollouts)
 
 
-def _refined(problem: ShootingProblem, bracket: Bracket, start: Parameters, *, huber: bool) -> Refined:
-    """A rough fit, repeated until noise levels, outliers and parameters settle."""
+class _Part(NamedTuple):
+    """The parameters of a model that are fitted, and those that are held.
+
+    The search and the simulation at its end take the whole model, and which parameters are held as data: all stages
+    share one program of each. `bracket`: of all parameters.
+    """
+
+    model: AbstractModel
+    bracket: Bracket
+    held: Held
+
+    @property
+    def free(self) -> np.ndarray:
+        """The places of the fitted parameters."""
+        return _free(self.model, self.held)
+
+    def complete(self, parameters: Float[ArrayLike, " free"]) -> Float[np.ndarray, " parameters"]:
+        """All parameters, from those that are fitted."""
+        values = {name: value for name, (value, _) in self.held.items()}
+        everything = np.array([values.get(name, 0.0) for name in self.model.parameter_names])
+        everything[self.free] = parameters
+        return everything
+
+    def search(
+        self,
+        ibss: IBSS,
+        problem: ShootingProblem,
+        start: Float[ArrayLike, " free"],
+        spread: Float[ArrayLike, "free free"],
+    ) -> Estimate:
+        """The fitted parameters. `problem`: of the whole model."""
+        free, count = self.free, len(self.model.parameter_names)
+        covariance, searched = np.zeros((count, count)), np.zeros(count, dtype=bool)
+        covariance[np.ix_(free, free)], searched[free] = spread, True
+        found = ibss(
+            problem,
+            self.bracket,
+            start=as_float(self.complete(start)),
+            spread=as_float(covariance),
+            free=jax.device_put(searched),
+        )
+        some = as_float(np.asarray(found.parameters)[free]), as_float(np.asarray(found.covariance)[np.ix_(free, free)])
+        return eqx.tree_at(lambda e: (e.parameters, e.covariance), found, some)
+
+    def evaluate(self, problem: ShootingProblem, estimate: Estimate) -> Evaluation:
+        """The flight simulated at an estimate. `problem`: of the whole model."""
+        parameters = as_float(self.complete(estimate.parameters))
+        return evaluate(problem, parameters, estimate.initial_state).of_parameters(self.free)
+
+
+def _refined(part: _Part, problem: ShootingProblem, start: np.ndarray, *, huber: bool) -> Refined:
+    """A rough fit, repeated until noise levels, outliers and parameters settle. `problem`: of the whole model."""
+    lower, upper = np.asarray(part.bracket.lower)[part.free], np.asarray(part.bracket.upper)[part.free]
 
     def search(weighted: ShootingProblem, previous: Estimate | None, colour: float) -> Estimate:
         if previous is None:
-            spread = jnp.diag(jnp.square(bracket.half_width / 2))
-            return IBSS(tolerance=_TOLERANCE)(weighted, bracket, start=start, spread=spread)
-        ibss, spread = IBSS(tolerance=_TOLERANCE * colour), colour**2 * previous.covariance
-        return ibss(weighted, bracket, start=previous.parameters, spread=spread)
+            return part.search(IBSS(tolerance=_TOLERANCE), weighted, start, np.diag(np.square((upper - lower) / 4)))
+        ibss, spread = IBSS(tolerance=_TOLERANCE * colour), colour**2 * np.asarray(previous.covariance)
+        return part.search(ibss, weighted, previous.parameters, spread)
 
-    return refine(problem, search, passes=_PASSES, start=start, huber=huber)
+    return refine(problem, search, passes=_PASSES, evaluation=part.evaluate, start=start, huber=huber)
+
+
+def _no_fit(problem: ShootingProblem, estimate: Estimate, held: Held, rollouts: int) -> VehicleFit:
+    return VehicleFit(problem, estimate, held, _std(estimate), 0.0, rollouts)
+
+
+def _std(estimate: Estimate) -> Float[np.ndarray, " free"]:
+    return np.sqrt(np.diagonal(estimate.covariance))
 
 
 def _holding(problem: ShootingProblem, model: AbstractModel, held: Held) -> ShootingProblem:
@@ -174,18 +233,23 @@ def _free(model: AbstractModel, held: Held) -> np.ndarray:
     return np.array([i for i, name in enumerate(model.parameter_names) if name not in held])
 
 
+def _centre(bracket: Bracket) -> Float[np.ndarray, " parameters"]:
+    return (np.asarray(bracket.lower) + np.asarray(bracket.upper)) / 2
+
+
 def free_bracket(bracket: Bracket, model: AbstractModel, held: Held) -> Bracket:
     """The bracket of the parameters that are not held."""
     free = _free(model, held)
-    return Bracket(bracket.lower[free], bracket.upper[free])
+    return Bracket(np.asarray(bracket.lower)[free], np.asarray(bracket.upper)[free])
 
 
-def _not_identifiable(problem: ShootingProblem, values: np.ndarray, first: Refined, bracket: Bracket) -> Held:
+def _not_identifiable(first: Refined, values: np.ndarray, bracket: Bracket) -> Held:
     """The parameters to hold: those that are not identifiable at these noise levels, and negative damping."""
-    names, start = problem.model.parameter_names, first.estimate.initial_state
+    names = first.problem.model.parameter_names
     # The noise is coloured, and the Cramer-Rao bound assumes that it is white.
-    std = first.colour * np.sqrt(np.diagonal(np.asarray(cramer_rao_bound(problem, jnp.asarray(values), start))))
-    center, identifiable = np.asarray(bracket.center), np.asarray(bracket.identifies(std))
+    bound = evaluate(first.problem, as_float(values), first.estimate.initial_state).covariance
+    std, center = first.colour * np.sqrt(np.diagonal(bound)), _centre(bracket)
+    identifiable = is_identifiable(std, center - np.asarray(bracket.lower))
     held = {}
     for i, name in enumerate(names):
         if not identifiable[i]:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...shooting import Rows
 from .brackets import Brackets, room
 from .stage import RowsAt, Stage
 from .view import View
@@ -24,29 +25,26 @@ class Moves(NamedTuple):
     at_end: Bool[Array, "windows unknowns"]
 
 
-def move_along_all(
-    stage: Stage, view: View, brackets: Brackets, *, whitened: bool, halvings: int, stay: Bool[Array, ""]
-) -> Moves:
+def move_along_all(stage: Stage, view: View, brackets: Brackets, *, halvings: int, stay: Bool[Array, ""]) -> Moves:
     """Bisects along each direction in turn; along none with `stay`."""
     nothing = jnp.zeros_like(view.unknowns)
     moves = Moves(view.unknowns, nothing, nothing, nothing.astype(bool))
-    size, free = nothing.shape[1], stage.problem.free_size
-    forcing_parameters = len(stage.problem.model.forcing_parameters)
-    # Whitened directions change the forcing only at the end of the list: it is recomputed only for those.
-    unchanged = size - forcing_parameters if whitened or not forcing_parameters else 0
+    changes = len(stage.problem.model.forcing_parameters)
+    first_change = view.unknowns.shape[1] - changes
     fixed = view.rows._replace(forcing_tangents=None)
-    # The directions of the initial states that this stage does not search, `own` to `free`, are skipped.
-    skipped = free - stage.own
-    for begin, end, rows_at in ((0, unchanged, lambda _: fixed), (unchanged, size, stage.with_forcing)):
-        if begin < end:
-            first = jnp.where(begin == 0, skipped, begin)
 
-            def along(i: Int[Array, ""], moves: Moves, rows_at: RowsAt = rows_at) -> Moves:
-                number = jnp.where(i < free, i - skipped, i)
-                return _move_along(stage, view, brackets, rows_at, halvings, number, moves)
+    def along(i: Int[Array, ""], moves: Moves) -> Moves:
+        number = stage.order[i]
 
-            moves = jax.lax.fori_loop(first, jnp.where(stay, first, end), along, moves)
-    return moves
+        def rows_at(unknowns: Float[Array, "windows unknowns"]) -> Rows:
+            """The last directions alone change the forcing: it is recomputed only for those."""
+            if not changes:
+                return fixed
+            return jax.lax.cond(number >= first_change, stage.with_forcing, lambda _: fixed, unknowns)
+
+        return _move_along(stage, view, brackets, rows_at, halvings, number, moves)
+
+    return jax.lax.fori_loop(0, jnp.where(stay, 0, stage.size), along, moves)
 
 
 def _move_along(

@@ -90,6 +90,7 @@ class IBSS(AbstractEstimator):
         *,
         start: Parameters | None = None,
         spread: Float[Array, "parameters parameters"] | None = None,
+        free: Bool[Array, " parameters"] | None = None,
     ) -> Estimate:
         """Identifies one flight.
 
@@ -99,10 +100,11 @@ class IBSS(AbstractEstimator):
         - `start`: where the search begins; the bracket's center by default.
         - `spread`: the covariance of `start`, which sizes the first brackets; by default that of `bracket`, with its
           half-width as two standard deviations.
+        - `free`: which parameters to search; all by default. The others stay at `start`, with a variance of 0.
 
         **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
         """
-        return self.search(problem, bracket, start=start, spread=spread)
+        return self.search(problem, bracket, start=start, spread=spread, free=free)
 
     def search(
         self,
@@ -111,6 +113,7 @@ class IBSS(AbstractEstimator):
         *,
         start: Parameters | None = None,
         spread: Float[Array, "parameters parameters"] | None = None,
+        free: Bool[Array, " parameters"] | None = None,
         cascade: Bool[Array, ""] | bool = True,
         skip: Bool[Array, ""] | None = None,
     ) -> Estimate:
@@ -128,8 +131,9 @@ class IBSS(AbstractEstimator):
         usable = bracket.usable
         start = usable.center if start is None else as_float(start)
         skip = jnp.zeros((), dtype=bool) if skip is None else skip
+        free = jnp.ones(count, dtype=bool) if free is None else free
         plan, limits = self._plan(problem), self._limits(problem, usable)
-        stage_of = stages(problem, usable, limits, plan)
+        stage_of = stages(problem, usable, limits, plan, free)
 
         def fit(number: Int[Array, ""], carry: tuple[Progress, Curvature]) -> tuple[Progress, Curvature]:
             progress, _ = carry
@@ -140,7 +144,7 @@ class IBSS(AbstractEstimator):
         # One loop, so that the search is compiled once for all stages.
         first = jnp.where(cascade, 0, len(plan) - 1)
         progress, curvature = jax.lax.fori_loop(first, len(plan), fit, (progress, _no_curvature(progress)))
-        return self._finish(problem, bracket, progress, curvature)
+        return self._finish(problem, bracket, free, progress, curvature)
 
     def _plan(self, problem: ShootingProblem) -> tuple[tuple[str, float], ...]:
         """The channels of each stage, and the share of the flight that it fits."""
@@ -196,8 +200,8 @@ class IBSS(AbstractEstimator):
         else:
             covariance = (search.basis[:, :, None, :] * search.basis[:, None, :, :]).sum(axis=-1)
         noise = jnp.maximum(misfit(search.curvature.shot.cost.sum(), stage.measurements), 1.0)
-        searched, size = stage.searched, stage.parameter_count + stage.own
-        rollouts = jnp.where(progress.done, 0, size * (1 + search.sweeps * (self.halvings + 1)))
+        searched = stage.searched
+        rollouts = jnp.where(progress.done, 0, stage.size * (1 + search.sweeps * (self.halvings + 1)))
         return Progress(
             search.unknowns,
             jnp.where(searched & searched[:, None], jnp.square(noise) * covariance, progress.spread),
@@ -227,7 +231,7 @@ class IBSS(AbstractEstimator):
 
         later = jnp.maximum(search.relative_error * view.longest_step, stage.smallest_step) * search.growth
         brackets = open_brackets(view.factor, spread, later=later, first=first)
-        moves = move_along_all(stage, view, brackets, whitened=whitened, halvings=self.halvings, stay=stay)
+        moves = move_along_all(stage, view, brackets, halvings=self.halvings, stay=stay)
 
         sound = finite & jnp.isfinite(moves.unknowns).all()
         cost, trusted = view.curvature.shot
@@ -243,13 +247,20 @@ class IBSS(AbstractEstimator):
             brackets=record_brackets(search.brackets, before + search.sweeps, view, brackets.half_width, skip=stay),
         )
 
-    def _finish(self, problem: ShootingProblem, bracket: Bracket, progress: Progress, curvature: Curvature) -> Estimate:
+    def _finish(
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        free: Bool[Array, " parameters"],
+        progress: Progress,
+        curvature: Curvature,
+    ) -> Estimate:
         count = bracket.lower.shape[0]
         initial_state = progress.unknowns[:, count:].ravel() if problem.free_size else problem.first_state()[0]
         estimate = conclude(
             bracket,
             parameters=progress.unknowns[0, :count],
-            covariance=covariance_of_shared(curvature.information, count),
+            covariance=jnp.where(free & free[:, None], covariance_of_shared(curvature.information, count), 0.0),
             initial_state=initial_state,
             cost=curvature.shot.cost.sum(),
             rollouts=progress.rollouts,

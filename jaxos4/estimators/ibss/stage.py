@@ -14,6 +14,7 @@ from ..._custom_types import Parameters, Scalar
 from ...bracket import Bracket
 from ...flight import Inputs
 from ...shooting import ROUNDING, Curvature, Length, Rows, ShootingProblem
+from .directions import sequence
 
 Limits = tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]
 RowsAt = Callable[[Float[Array, "windows unknowns"]], Rows]
@@ -28,7 +29,8 @@ class Stage(NamedTuple):
 
     - `problem`: on all channels. `parts`: the problem on each choice of channels that a stage fits.
     - `part`: the position in `parts` of what this stage fits.
-    - `own`: how many unknowns of a window's initial state this stage searches.
+    - `searched`: which unknowns of a window this stage searches; the others stay where they are.
+    - `order`: the numbers of all directions, those that this stage searches first.
     - `length`: how many samples are fitted, from the first on. `None`: all.
     - `rows`: the flight.
     - `starts`: initial states, used where these are known.
@@ -43,7 +45,8 @@ class Stage(NamedTuple):
     problem: ShootingProblem
     parts: tuple[ShootingProblem, ...]
     part: Int[Array, ""]
-    own: Int[Array, ""]
+    searched: Bool[Array, " unknowns"]
+    order: Int[Array, " unknowns"]
     length: Length
     rows: Rows
     starts: Float[Array, "windows size"]
@@ -59,10 +62,9 @@ class Stage(NamedTuple):
         return len(self.problem.model.parameter_names)
 
     @property
-    def searched(self) -> Bool[Array, " unknowns"]:
-        """Which unknowns of a window this stage searches."""
-        places = jnp.arange(self.prior.shape[-1])
-        return places < self.parameter_count + self.own
+    def size(self) -> Int[Array, ""]:
+        """Number of unknowns of a window that this stage searches."""
+        return self.searched.sum()
 
     def with_forcing(self, unknowns: Float[Array, "windows unknowns"], *, tangents: bool = False) -> Rows:
         """The rows with the forcing of these parameters, and its derivatives if wanted."""
@@ -80,7 +82,9 @@ class Stage(NamedTuple):
             none = (0, 0)
             return Curvature(shot, jnp.pad(gradient, (none, more)), jnp.pad(information, (none, more, more)))
 
-        return self._on_part(of)
+        shot, gradient, information = self._on_part(of)
+        both = self.searched & self.searched[:, None]
+        return Curvature(shot, jnp.where(self.searched, gradient, 0.0), jnp.where(both, information, 0.0))
 
     def summed(self, number: Int[Array, ""], slopes: Float[Array, " windows"]) -> Float[Array, " windows"]:
         """Slopes along direction `number`: summed over the windows, if the direction belongs to all of them."""
@@ -127,9 +131,16 @@ class Stage(NamedTuple):
 
 
 def stages(
-    problem: ShootingProblem, bracket: Bracket, limits: Limits, plan: Sequence[tuple[str, float]]
+    problem: ShootingProblem,
+    bracket: Bracket,
+    limits: Limits,
+    plan: Sequence[tuple[str, float]],
+    free: Bool[Array, " parameters"],
 ) -> Callable[[Int[Array, ""]], Stage]:
-    """The stages by number. `plan`: for each stage its channels, and the share of the flight that it fits."""
+    """The stages by number.
+
+    `plan`: for each stage its channels, and the share of the flight that it fits. `free`: the parameters to search.
+    """
     names, count = tuple(dict.fromkeys(channels for channels, _ in plan)), bracket.lower.shape[0]
     parts = tuple(problem.restrict(channels) for channels in names)
     place = np.array([names.index(channels) for channels, _ in plan])
@@ -142,13 +153,16 @@ def stages(
     known = within @ (~jnp.isnan(measured)).astype(float)
     squares = (within @ jnp.square(jnp.nan_to_num(measured))) / jnp.maximum(known, 1)
     largest = jnp.where(fitted, jnp.sqrt(squares) / problem.sigma[problem.columns], 0.0).max(axis=1)
+    own = np.arange(problem.free_size) < np.array([part.free_size for part in parts])[place, None]
+    searched = jnp.concatenate([jnp.broadcast_to(free, (len(plan), count)), own], axis=1)
     prior = 1 / jnp.square(prior_std(problem, bracket))
     prior = prior.at[:, :count].divide(problem.windows)[:, :, None] * np.eye(prior.shape[1])
     everything = Stage(
         problem=problem,
         parts=parts,
         part=jnp.asarray(place),
-        own=jnp.asarray(np.array([part.free_size for part in parts])[place]),
+        searched=searched,
+        order=jnp.argsort(~searched[:, sequence(prior.shape[1], count, problem.model.forcing_parameters)], axis=1),
         length=lengths if problem.windows == 1 else None,
         rows=problem.rows(),
         starts=problem.split(problem.first_state()[0]),
@@ -158,7 +172,7 @@ def stages(
         measurements=jnp.where(fitted, known, 0.0).sum(axis=1),
         smallest_step=jnp.maximum(jnp.sqrt(eps), ROUNDING * eps * largest),
     )
-    changing = ("part", "own", "length", "measurements", "smallest_step")
+    changing = ("part", "searched", "order", "length", "measurements", "smallest_step")
 
     def stage(number: Int[Array, ""]) -> Stage:
         values = {name: getattr(everything, name) for name in changing}

@@ -38,10 +38,8 @@ def look_around(stage: Stage, unknowns: Float[Array, "windows unknowns"], *, whi
     rows = stage.with_forcing(unknowns, tangents=True)
     curvature = stage.curvature(rows, unknowns)
     information = curvature.information + stage.prior
-    if whitened:
-        factor, basis = whitened_directions(information, stage.parameter_count, stage.problem.model.forcing_parameters)
-    else:
-        factor, basis = coordinate_directions(information, stage.parameter_count)
+    directions = whitened_directions if whitened else coordinate_directions
+    factor, basis = directions(information, stage.parameter_count, stage.problem.model.forcing_parameters)
     slopes = jnp.einsum("wud,wu->wd", basis, curvature.gradient)
     slopes = slopes.at[:, stage.problem.free_size :].set(slopes[:, stage.problem.free_size :].sum(axis=0))
     rooms = jax.vmap(lambda direction: room(unknowns, direction, stage.limits), -1, -1)(basis)
