@@ -127,9 +127,7 @@ class JointEKF(AbstractEstimator):
         )
 
 
-def _joint(
-    state: Float[Array, " size"], parameters: Parameters, free_size: int
-) -> Float[Array, " joint"]:
+def _joint(state: Float[Array, " size"], parameters: Parameters, free_size: int) -> Float[Array, " joint"]:
     return jnp.concatenate([state, parameters, state[:free_size]])
 
 
