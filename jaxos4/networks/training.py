@@ -33,9 +33,9 @@ class Purpose(enum.IntEnum):
     STEPS = 3
     CALIBRATION = 4
 
-    def place(self, number: int) -> np.ndarray:
-        """The place of a number."""
-        return np.asarray(len(Purpose) * number + self)
+    def place(self, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
+        """The place of a number, or of each number."""
+        return np.asarray(len(Purpose) * np.asarray(number) + int(self))
 
 
 CHECK = 250
@@ -141,7 +141,7 @@ def train(
     best, lowest, without_improvement, history = weights, np.inf, 0, []
     for first in range(0, steps, CHECK):
         indices = np.arange(first, min(first + CHECK, steps))
-        places = np.stack([Purpose.STEPS.place(index) for index in indices])
+        places = Purpose.STEPS.place(indices)
         weights, state, *losses = advance(features, held_out, weights, state, key, places)
         history.append([float(value) for value in losses])
         value, current = history[-1]
