@@ -76,17 +76,21 @@ class OutputError(AbstractEstimator):
         usable, count = bracket.usable, len(problem.model.parameter_names)
         starts, off = (problem.split(x) for x in problem.first_state())
         parameters = jnp.broadcast_to(usable.center, (problem.windows, count))
-        steps = rollouts = jnp.zeros((), dtype=int)
-        last, *others = dict.fromkeys((problem.channels, "rates"))
-        for channels in (*others, last):
+
+        def fit(channels: str, parameters: Array, starts: Array) -> tuple[_Search, Array, Array, Array]:
             stage = problem.restrict(channels)
             free = stage.free_size
             # The damping treats all unknowns alike in these units.
             scale = jnp.concatenate([jnp.broadcast_to(usable.half_width, parameters.shape), off[:, :free]], axis=1)
             search = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free]], axis=1), scale)
-            parameters, starts = search.best[:, :count], starts.at[:, :free].set(search.best[:, count:])
-            steps = steps + search.steps
-            rollouts = rollouts + (search.steps + 1) * (1 + count + problem.windows * free)
+            starts = starts.at[:, :free].set(search.best[:, count:])
+            return search, search.best[:, :count], starts, (search.steps + 1) * (1 + count + problem.windows * free)
+
+        search, parameters, starts, rollouts = fit("rates", parameters, starts)
+        steps = search.steps
+        if problem.channels != "rates":
+            search, parameters, starts, more = fit(problem.channels, parameters, starts)
+            steps, rollouts = steps + search.steps, rollouts + more
         return conclude(
             bracket,
             parameters=parameters[0],

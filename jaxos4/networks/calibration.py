@@ -92,7 +92,7 @@ def _standardised(regressor: Regressor, scaling: Scaling, pairs: Pair) -> Float[
         output = regressor(pair.features, pair.scale, scaling)
         return (output.u - pair.u) / (scaling.bound(pair.scale) * jnp.exp(output.log_spread))
 
-    return jax.vmap(one)(jax.tree.map(jnp.asarray, pairs))
+    return jax.vmap(one)(pairs)
 
 
 def _table(error: Float[np.ndarray, "flights parameters"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -155,7 +155,6 @@ class NetworkEstimator(eqx.Module):
 
     @eqx.filter_jit
     def _first(self, features: AbstractFeatures, samples: Pair, key: Key) -> "TrainedNetwork":
-        samples = jax.tree.map(jnp.asarray, samples)
         scaling, linear_map = scaling_and_linear_map(features, np.asarray(self.noise, float), samples)
         size = {"width": self.width, "depth": self.depth}
         regressor = first_regressor(

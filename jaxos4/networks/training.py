@@ -74,13 +74,14 @@ def draw_many(features: AbstractFeatures, scales: Float[Array, "2"], count: int,
 def draw_chunks(
     features: AbstractFeatures, scales: Float[Numeric, "2"], count: int, *, key: Key, purpose: Purpose, first: int = 0
 ) -> Pair:
-    """Simulates at least `count` flights as NumPy arrays, in chunks of `CHUNK`, all by one compiled program.
+    """Simulates at least `count` flights in chunks of `CHUNK`, all by one compiled program.
 
     Chunk i is drawn from `key` at the place `first` + i of the `purpose`.
     """
     numbers = range(first, first - (-count // CHUNK))
     drawn = [_chunk(features, scales, key, purpose.place(number)) for number in numbers]
-    return Pair(*(np.concatenate(parts) for parts in zip(*drawn, strict=True)))
+    # By NumPy: JAX would compile a program.
+    return Pair(*(jax.device_put(np.concatenate(parts)) for parts in zip(*drawn, strict=True)))
 
 
 @eqx.filter_jit
