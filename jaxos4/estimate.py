@@ -156,12 +156,24 @@ def fit_start(
 ) -> tuple[Float[Array, " starts"], Scalar, Bool[Array, ""], int]:
     """The initial state that explains the flight best with these parameters, for algorithms that do not search for it.
 
+    **Returns:** initial state, cost, whether the trajectory is sound, and number of rollouts.
+    """
+    start, rollouts = best_start(problem, parameters)
+    cost, sound = problem.shots(parameters, start)
+    return start, cost, sound, rollouts + 1
+
+
+def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[Array, " starts"], int]:
+    """The initial state that `fit_start` finds, without its cost.
+
     A free initial state takes a few Gauss-Newton steps from the first measurements, with their errors as its prior.
 
-    **Returns:** initial state, cost, whether the trajectory is sound, and number of rollouts.
+    **Returns:** initial state, and number of rollouts.
     """
     first, off = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
+    if not free:
+        return first, 0
 
     def improve(start: Float[Array, " starts"], _) -> tuple[Float[Array, " starts"], None]:
         _, gradient, information = problem.curvatures(parameters, start)
@@ -170,9 +182,7 @@ def fit_start(
         slope = gradient[:, count:] + known * problem.split(start - first)
         return start - (covariance * slope[:, None, :]).sum(axis=-1).ravel(), None
 
-    start = jax.lax.scan(improve, first, length=_START_STEPS)[0] if free else first
-    cost, sound = problem.shots(parameters, start)
-    return start, cost, sound, 1 + (_START_STEPS * (count + free) if free else 0)
+    return jax.lax.scan(improve, first, length=_START_STEPS)[0], _START_STEPS * (count + free)
 
 
 def check_recursive(problem: ShootingProblem, bracket: Bracket) -> None:

@@ -92,7 +92,7 @@ def test_simulated_features_are_those_of_the_simulated_flight(kind, free):
     initial_state = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(start)
     flight = jaxos4.simulate(PUBLISHED(), parameters, OMEGA, dt=DT, initial_state=initial_state)
     measured = features(problem_of(flight.states, free=free))
-    simulated = features.simulated(u, jnp.zeros(()), key=jax.random.key(2))
+    simulated = features.simulated(u, jnp.zeros(features.size))
     np.testing.assert_allclose(simulated, measured.values, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(measured.inflation, 1.0, rtol=1e-12)
 
@@ -105,7 +105,7 @@ def test_simulated_noise_is_that_of_noisy_flights(kind):
     keys = jax.random.split(jax.random.key(3), count)
     exact = standard_flight(duration=DURATION)
     measure = eqx.filter_jit(lambda features, k: features(problem_of(noise(exact, key=k).states)).values)
-    draw = eqx.filter_jit(lambda features, k: features.simulated(u, jnp.asarray(scale), key=k))
+    draw = eqx.filter_jit(lambda features, k: features.simulated(u, scale * jax.random.normal(k, (features.size,))))
     u = jnp.zeros(features.coordinates.center.shape)
     measured, drawn = (jax.lax.map(lambda k, one=one: one(features, k), keys) for one in (measure, draw))
     picked = slice(None) if kind == "score" else slice(300, 308)

@@ -7,6 +7,7 @@ recursively (it subtracts the mean of all rows before each row, the Helmert tran
 unit variance, and no unknown but the parameters.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -17,10 +18,12 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Scalar
 from ..bracket import Bracket
-from ..estimate import Estimate, conclude, fit_start
+from ..estimate import Estimate, best_start, conclude
 from ..linalg import invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
+
+Rows = Float[Array, "samples 3 columns"]
 
 # Standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It matters only
 # for parameters that are not excited.
@@ -44,11 +47,17 @@ class Regression(NamedTuple):
     forgetting: Scalar
     bridge: int
 
-    def rows(self, rates: Float[Array, "samples 3"]) -> Float[Array, "samples 3 columns"]:
+    def rows(self) -> tuple[Rows, Callable[[Rows], Float[Array, "samples 3"]]]:
         """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
 
-        Missing samples get rows of zeros. `rates` replaces the measured rates, with the same samples missing.
+        Missing samples get rows of zeros. The function turns the slope of a number in the rows into its slope in the
+        measured rates.
         """
+        rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
+        return rows, lambda slope: back(slope)[0]
+
+    def _rows(self, rates: Float[Array, "samples 3"]) -> Rows:
+        """The rows with other values of the measured rates; the same samples are missing."""
         measured, (filled, known) = ~jnp.isnan(self.rates), self._fill(rates)
         increments = self._increments(filled)
         usable = ~jnp.isnan(self._increments(jnp.where(known, filled, jnp.nan))).any(axis=-1)
@@ -155,7 +164,11 @@ def prior(count: int) -> Float[Array, "parameters parameters"]:
 
 
 def propagated_covariance(
-    regression: Regression, steps: Float[Array, " parameters"], inverse: Float[Array, "parameters parameters"]
+    regression: Regression,
+    rows: Rows,
+    back: Callable[[Rows], Float[Array, "samples 3"]],
+    steps: Float[Array, " parameters"],
+    inverse: Float[Array, "parameters parameters"],
 ) -> Float[Array, "parameters parameters"]:
     """The covariance of the solution `steps` from white noise in the measured rates, to first order.
 
@@ -163,17 +176,19 @@ def propagated_covariance(
     carries the noise through both the regressors and the outputs. So errors in variables are included, and the result
     holds for coloured differences and any weights. The bias, a second-order effect of the noise, is not included.
     """
-    age = jnp.arange(regression.rates.shape[0])[::-1]
-    root = jnp.sqrt(regression.forgetting**age)[:, None, None]
+    age = jnp.arange(rows.shape[0])[::-1]
+    weight = (regression.forgetting**age)[:, None, None]
+    regressors, output = rows[..., :-1], rows[..., -1]
+    residuals = output - (regressors * steps).sum(axis=-1)
 
-    def score(rates):
-        rows = root * regression.rows(rates)
-        regressors, output = rows[..., :-1], rows[..., -1]
-        residuals = output - (regressors * steps).sum(axis=-1)
-        return (regressors * residuals[..., None]).sum(axis=(0, 1))
+    def sensitivity_of(one: Float[Array, " parameters"]) -> Float[Array, "samples 3"]:
+        """The derivative of one element of g; `one` is 1 at the element."""
+        regressor = (regressors * one).sum(axis=-1)[..., None]
+        by_regressors = residuals[..., None] * one - regressor * steps
+        return back(weight * jnp.concatenate([by_regressors, regressor], axis=-1))
 
-    measured = jnp.where(jnp.isnan(regression.rates), 0.0, regression.rates)
-    sensitivity = jax.jacrev(score)(measured) * regression.problem.sigma[CASCADE_ORDER[:3]]
+    identity = jnp.eye(steps.shape[0], dtype=float)
+    sensitivity = jax.vmap(sensitivity_of)(identity) * regression.problem.sigma[CASCADE_ORDER[:3]]
     sensitivity = sensitivity.reshape(steps.shape[0], -1)
     spread = (sensitivity[:, None, :] * sensitivity[None, :, :]).sum(axis=-1) + prior(steps.shape[0])
     half = (inverse[:, :, None] * spread[None, :, :]).sum(axis=1)
@@ -196,7 +211,7 @@ def answer(
     data: Regression,
     bracket: Bracket,
     steps: Float[Array, " parameters"],
-    inverse: Float[Array, "parameters parameters"],
+    covariance: Float[Array, "parameters parameters"],
     *,
     history: Float[Array, "samples parameters"] | None = None,
 ) -> Estimate:
@@ -207,21 +222,26 @@ def answer(
     """
     problem, usable = data.problem, data.bracket
     parameters = usable.center + usable.half_width * steps if history is None else history[-1]
-    covariance = propagated_covariance(data, steps, inverse)
     covariance = usable.half_width[:, None] * covariance * usable.half_width[None, :]
     identifiable = usable.identifies(jnp.sqrt(jnp.diagonal(covariance))).all()
-    flies = jnp.isfinite(problem.cost(parameters))
-    parameters = jnp.where(identifiable | flies, parameters, usable.center)
-    initial_state, cost, sound, rollouts = fit_start(problem, parameters)
+    initial_state, rollouts = best_start(problem, parameters)
+    choices = (parameters, initial_state), (usable.center, problem.first_state()[0])
+    choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
+    # One after the other, so that the simulation is compiled once.
+    shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
+    flies = shots.sound[0] & jnp.isfinite(shots.cost[0])
+    (parameters, initial_state), shot = jax.tree.map(
+        lambda both: jnp.where(identifiable | flies, *both), (choices, shots)
+    )
     return conclude(
         bracket,
         parameters=parameters,
         covariance=covariance,
         initial_state=initial_state,
-        cost=cost,
-        rollouts=rollouts + 1,
+        cost=shot.cost,
+        rollouts=rollouts + 2,
         sweeps=1,
-        sound=sound,
+        sound=shot.sound,
         done=jnp.ones((), dtype=bool),
         history=history,
     )

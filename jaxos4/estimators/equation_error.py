@@ -3,13 +3,12 @@
 from typing import ClassVar
 
 import equinox as eqx
-from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_bracket
 from ..shooting import ShootingProblem
-from ._regression import Regression, answer, check_settings, normal_equations, regression, solve
+from ._regression import answer, check_settings, normal_equations, propagated_covariance, regression, solve
 
 
 class EquationError(AbstractEstimator):
@@ -56,8 +55,11 @@ class EquationError(AbstractEstimator):
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
         linear in them.
         """
-        data, steps, inverse = self._solved(problem, bracket)
-        return answer(data, bracket, steps, inverse)
+        check_bracket(problem, bracket)
+        data = regression(problem, bracket.usable, memory=self.memory, bridge=self.bridge)
+        rows, back = data.rows()
+        steps, inverse = solve(*normal_equations(rows))
+        return answer(data, bracket, steps, propagated_covariance(data, rows, back, steps, inverse))
 
     @eqx.filter_jit
     def solution(self, problem: ShootingProblem, bracket: Bracket) -> Parameters:
@@ -65,12 +67,7 @@ class EquationError(AbstractEstimator):
 
         **Raises:** as a call does.
         """
-        usable = bracket.usable
-        return usable.center + usable.half_width * self._solved(problem, bracket)[1]
-
-    def _solved(
-        self, problem: ShootingProblem, bracket: Bracket
-    ) -> tuple[Regression, Parameters, Float[Array, "parameters parameters"]]:
         check_bracket(problem, bracket)
-        data = regression(problem, bracket.usable, memory=self.memory, bridge=self.bridge)
-        return data, *solve(*normal_equations(data.rows(data.rates)))
+        usable = bracket.usable
+        rows, _ = regression(problem, usable, memory=self.memory, bridge=self.bridge).rows()
+        return usable.center + usable.half_width * solve(*normal_equations(rows))[0]

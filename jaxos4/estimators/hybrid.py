@@ -54,24 +54,33 @@ class Hybrid(AbstractEstimator):
 @eqx.filter_jit
 def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> Estimate:
     """Searches near the `seed`, another estimator's answer, and in the whole bracket if that answer was wrong."""
-    answered = jnp.isfinite(seed.covariance).all()
-    near = ibss.search(problem, bracket, start=seed.parameters, spread=seed.covariance, cascade=False, skip=~answered)
+    answered, usable = jnp.isfinite(seed.covariance).all(), bracket.usable
     half_width = seed.half_width(_LEVEL, simultaneous=True)
-    hit = answered & _confirms(near, seed, half_width, problem)
+    wide_spread = jnp.diag(jnp.square(usable.half_width / 2))  # the half-width is two standard deviations
 
-    def search_wide(carry: tuple[Estimate, Bool[Array, ""]]) -> tuple[Estimate, Bool[Array, ""]]:
-        near, hit = carry
-        wide = ibss.search(problem, bracket, skip=hit)
-        sound = answered & (near.result == RESULTS.successful)
-        better = ~sound | ((wide.result == RESULTS.successful) & (wide.cost < near.cost))
-        best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
-        spent = near.rollouts + wide.rollouts, near.sweeps + wide.sweeps
-        return eqx.tree_at(lambda e: (e.rollouts, e.sweeps), best, spent), jnp.ones_like(hit)
+    def search(hit: Bool[Array, ""], near: Bool[Array, ""]) -> tuple[Bool[Array, ""], Estimate]:
+        found = ibss.search(
+            problem,
+            bracket,
+            start=jnp.where(near, seed.parameters, usable.center),
+            spread=jnp.where(near, seed.covariance, wide_spread),
+            cascade=~near,
+            skip=jnp.where(near, ~answered, hit),
+        )
+        return hit | (near & answered & _confirms(found, seed, half_width, problem)), found
 
-    # A loop and not a condition: a batch in which all seeds are hits skips it.
-    best, _ = jax.lax.while_loop(lambda carry: ~carry[1], search_wide, (near, hit))
-    seeded = Bracket.around(seed.parameters, half_width)
-    return dataclasses.replace(best, rollouts=seed.rollouts + best.rollouts, seed=seeded)
+    # A loop over the two searches, so that the search is compiled once. A batch of hits skips the second.
+    hit, both = jax.lax.scan(search, jnp.zeros((), dtype=bool), jnp.asarray([True, False]))
+    near, wide = (jax.tree.map(lambda leaf, place=place: leaf[place], both) for place in (0, 1))
+    sound = answered & (near.result == RESULTS.successful)
+    better = ~hit & (~sound | ((wide.result == RESULTS.successful) & (wide.cost < near.cost)))
+    best = jax.tree.map(lambda w, n: jnp.where(better, w, n), wide, near)
+    return dataclasses.replace(
+        best,
+        rollouts=seed.rollouts + near.rollouts + wide.rollouts,
+        sweeps=near.sweeps + wide.sweeps,
+        seed=Bracket.around(seed.parameters, half_width),
+    )
 
 
 def _confirms(

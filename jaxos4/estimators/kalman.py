@@ -91,16 +91,24 @@ class JointEKF(AbstractEstimator):
             return joint[size : size + count], joint[size + count :] if problem.free_size else start
 
         def again(last: _Pass) -> _Pass:
-            before = split(last.joint)
-            joint, root, history = _run(problem, rows, prior, before)
+            before, first = split(last.joint), last.passes == 0
+            joint, root, history = _run(problem, rows, prior, before, first=first)
             std = jnp.sqrt(jnp.square(root[size : size + count]).sum(axis=1))
             moved = (jnp.abs(split(joint)[0] - before[0]) / std).max()
             # A NaN ends the passes: it stays NaN.
-            return _Pass(joint, root, history, last.passes + 1, ~(moved > _SETTLED))
+            done = jnp.where(first, self.passes == 1, ~(moved > _SETTLED))
+            return _Pass(joint, root, history, last.passes + 1, done)
 
-        once = jnp.ones((), dtype=int)
-        first = _Pass(*_run(problem, rows, prior, None), once, jnp.asarray(self.passes == 1))
-        last = jax.lax.while_loop(lambda f: ~f.done & (f.passes < self.passes), again, first)
+        joint, unknowns = _joint(start, prior.center, problem.free_size), count + problem.free_size
+        none = _Pass(
+            joint=joint,
+            root=jnp.zeros((joint.size, unknowns), dtype=float),
+            history=jnp.zeros((rows.measured[0].size, count), dtype=float),
+            passes=jnp.zeros((), dtype=int),
+            done=jnp.zeros((), dtype=bool),
+        )
+        # The first pass is one of the loop too, so that the filter is compiled once.
+        last = jax.lax.while_loop(lambda f: ~f.done & (f.passes < self.passes), again, none)
         parameters, initial_state = split(last.joint)
         cost, sound = problem.shots(parameters, initial_state)
         factor = last.root[size : size + count]
@@ -110,7 +118,7 @@ class JointEKF(AbstractEstimator):
             covariance=(factor[:, None, :] * factor[None, :, :]).sum(axis=-1),
             initial_state=initial_state,
             cost=cost,
-            rollouts=last.passes * (count + problem.free_size + 1) + 1,
+            rollouts=last.passes * (unknowns + 1) + 1,
             sweeps=last.passes,
             sound=sound,
             prior=self.prior,
@@ -119,12 +127,21 @@ class JointEKF(AbstractEstimator):
         )
 
 
+def _joint(state: Float[Array, " size"], parameters: Parameters, free_size: int) -> Float[Array, " joint"]:
+    return jnp.concatenate([state, parameters, state[:free_size]])
+
+
 def _run(
-    problem: ShootingProblem, rows: Rows, prior: Bracket, about: tuple[Parameters, Float[Array, " size"]] | None
+    problem: ShootingProblem,
+    rows: Rows,
+    prior: Bracket,
+    about: tuple[Parameters, Float[Array, " size"]],
+    *,
+    first: Bool[Array, ""],
 ) -> tuple[Float[Array, " joint"], Float[Array, "joint unknowns"], Float[Array, "samples parameters"]]:
     """One pass: the joint estimate, the root of its covariance, and the parameters after each sample.
 
-    The model is linearised around the trajectory of `about`, or around the running estimate.
+    The model is linearised around the running estimate in the `first` pass, and later around the trajectory of `about`.
     """
     count, size = prior.center.shape[0], problem.size
     start, off = problem.first_state()
@@ -133,18 +150,17 @@ def _run(
     # A known initial state has no tangent of its own.
     moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])
     filter_ = _Filter(
-        estimate=jnp.concatenate([start, prior.center, start[: problem.free_size]]),
+        estimate=_joint(start, prior.center, problem.free_size),
         root=jnp.concatenate([moving, constants]),
-        nominal=start if about is None else about[1],
+        nominal=about[1],
     )
-    variances = tuple(jnp.square(problem.sigma[CASCADE_ORDER[:size]]))
+    channels, variances = jnp.arange(size), jnp.square(problem.sigma[CASCADE_ORDER[:size]])
 
     def step(carry: _Filter, row: Rows) -> tuple[_Filter, Parameters]:
-        estimate, root, nominal = carry
-        for channel, (measured, variance) in enumerate(zip(row.measured, variances, strict=True)):
-            estimate, root = _update(estimate, root, channel, measured, variance)
+        measurements = channels, jnp.stack(row.measured), variances
+        (estimate, root), _ = jax.lax.scan(_update, carry[:2], measurements)
         states, parameters, constant = estimate[:size], estimate[size : size + count], estimate[size:]
-        point = (states, parameters) if about is None else (nominal, about[0])
+        point = jnp.where(first, states, carry.nominal), jnp.where(first, parameters, about[0])
 
         def advance(x: Float[Array, " size"], a: Parameters) -> Float[Array, " size"]:
             return stack(problem.step(unstack(x), row.forcing, tuple(a)))
@@ -160,16 +176,14 @@ def _run(
 
 
 def _update(
-    estimate: Float[Array, " joint"],
-    root: Float[Array, "joint unknowns"],
-    channel: int,
-    measured: Scalar,
-    variance: Scalar,
-) -> tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]]:
-    """Potter's update with one measurement of one state; a NaN changes nothing."""
+    filter_: tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]],
+    measurement: tuple[Int[Array, ""], Scalar, Scalar],
+) -> tuple[tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]], None]:
+    """Potter's update of estimate and root with one measurement of one state; a NaN changes nothing."""
+    (estimate, root), (channel, measured, variance) = filter_, measurement
     along = root[channel]
     total = (along * along).sum() + variance
-    gain = jnp.where(jnp.isnan(measured), 0.0, root @ along / total)
+    gain = jnp.where(jnp.isnan(measured), 0.0, (root * along).sum(axis=1) / total)
     error = jnp.where(jnp.isnan(measured), 0.0, measured - estimate[channel])
     shrink = 1 / (1 + jnp.sqrt(variance / total))
-    return estimate + gain * error, root - shrink * gain[:, None] * along[None, :]
+    return (estimate + gain * error, root - shrink * gain[:, None] * along[None, :]), None

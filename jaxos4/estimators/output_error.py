@@ -1,38 +1,52 @@
 """Output error: nonlinear least squares of the simulated against the measured trajectory, by Levenberg-Marquardt.
 
 This is the prediction-error method for a model without process noise; for white measurement noise it is maximum
-likelihood. The minimiser is optimistix's.
+likelihood.
 
-References: Ljung, System Identification, ch. 7; Jategaonkar, Flight Vehicle System Identification, ch. 4.
+References: Ljung, System Identification, ch. 7; Jategaonkar, Flight Vehicle System Identification, ch. 4; Marquardt
+1963, SIAM J. Appl. Math. 11(2), on the damping.
 """
 
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from .._custom_types import Scalar
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_bracket, conclude
-from ..linalg import covariance_of_shared, unit_directions
-from ..models.state import CHANNELS
-from ..shooting import ShootingProblem
+from ..linalg import covariance_of_shared, joint_factor
+from ..shooting import Curvature, ShootingProblem, Shot
 
-Unknowns = Float[Array, " unknowns"]
+Unknowns = Float[Array, "windows unknowns"]
+
+_FIRST_DAMPING = 1.0  # in units of the bracket: it hardly changes the first step of a flight with information
+_DAMPING_FACTOR = 10.0  # how much more, or less, is damped after a step that failed, or succeeded
+
+
+class _Search(NamedTuple):
+    """The best unknowns so far with their curvature, the next trial, and its damping."""
+
+    best: Unknowns
+    curvature: Curvature
+    trial: Unknowns
+    damping: Scalar
+    steps: Int[Array, ""]
+    done: Bool[Array, ""]
 
 
 class OutputError(AbstractEstimator):
     """Levenberg-Marquardt on the weighted residuals, from the bracket's center.
 
-    The rates are fitted first, then the attitude with them, then all channels: from a wide bracket, a direct fit of all
-    channels can end in another minimum. The Jacobian is dense: it grows with the square of the number of windows.
+    The rates are fitted first, and then all channels with them: from a wide bracket, a direct fit of all channels can
+    end in another minimum.
 
     **Arguments:**
 
-    - `tolerance`: of the step, relative and absolute in scaled unknowns, and of the cost.
+    - `tolerance`: the search ends once a step changes no unknown by more, in half-widths of the bracket, and the cost
+      by no larger share.
     - `max_steps`: for each stage.
     """
 
@@ -61,74 +75,81 @@ class OutputError(AbstractEstimator):
         check_bracket(problem, bracket)
         usable, count = bracket.usable, len(problem.model.parameter_names)
         starts, off = (problem.split(x) for x in problem.first_state())
-        parameters = usable.center
-        steps = rollouts = jnp.zeros((), dtype=int)
-        done = jnp.ones((), dtype=bool)
-        for channels, size in CHANNELS.items():
-            if size > problem.size:
-                continue
+        parameters = jnp.broadcast_to(usable.center, (problem.windows, count))
+
+        def fit(channels: str, parameters: Array, starts: Array) -> tuple[_Search, Array, Array, Array]:
             stage = problem.restrict(channels)
             free = stage.free_size
             # The damping treats all unknowns alike in these units.
-            scale = jnp.concatenate([usable.half_width, off[:, :free].ravel()])
-            solution = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free].ravel()]), scale)
-            found = solution.value * scale
-            parameters, starts = found[:count], starts.at[:, :free].set(found[count:].reshape(problem.windows, free))
-            taken = solution.stats["num_steps"]
-            steps, rollouts = steps + taken, rollouts + taken * (1 + count + problem.windows * free)
-            done = solution.result == optx.RESULTS.successful
-        initial_state = starts.ravel()
-        shots, _, information = problem.curvatures(parameters, initial_state)
+            scale = jnp.concatenate([jnp.broadcast_to(usable.half_width, parameters.shape), off[:, :free]], axis=1)
+            search = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free]], axis=1), scale)
+            starts = starts.at[:, :free].set(search.best[:, count:])
+            return search, search.best[:, :count], starts, (search.steps + 1) * (1 + count + problem.windows * free)
+
+        search, parameters, starts, rollouts = fit("rates", parameters, starts)
+        steps = search.steps
+        if problem.channels != "rates":
+            search, parameters, starts, more = fit(problem.channels, parameters, starts)
+            steps, rollouts = steps + search.steps, rollouts + more
         return conclude(
             bracket,
-            parameters=parameters,
-            covariance=covariance_of_shared(information, count),
-            initial_state=initial_state,
-            cost=shots.cost.sum(),
-            rollouts=rollouts + count + problem.free_size,
+            parameters=parameters[0],
+            covariance=covariance_of_shared(search.curvature.information, count),
+            initial_state=starts.ravel(),
+            cost=search.curvature.shot.cost.sum(),
+            rollouts=rollouts,
             sweeps=steps,
-            sound=shots.sound.all(),
-            done=done,
+            sound=search.curvature.shot.sound.all(),
+            done=search.done,
         )
 
-    def _minimise(self, problem: ShootingProblem, unknowns: Unknowns, scale: Unknowns) -> optx.Solution:
-        """The least-squares solution, in units of `scale`."""
-        count = len(problem.model.parameter_names)
+    def _minimise(self, problem: ShootingProblem, start: Unknowns, scale: Unknowns) -> _Search:
+        """The minimum of the cost. The first trial is the start itself, so that the curvature is compiled once."""
+        count, windows = len(problem.model.parameter_names), problem.windows
+        known = problem.first_state()[0]
+        # The windows share the damping of a parameter, so that it counts once.
+        unit = jnp.square(scale).at[:, :count].multiply(windows)
 
-        def residuals(scaled: Unknowns, _) -> Float[Array, " residuals"]:
-            u = scaled * scale
-            return problem.residuals(u[:count], u[count:] if problem.free_size else None)
+        def move(search: _Search) -> _Search:
+            initial_state = search.trial[:, count:].ravel() if problem.free_size else known
+            curvature = problem.curvatures(search.trial[0, :count], initial_state)
+            first, before, now = search.steps < 0, _cost(search.curvature), _cost(curvature)
+            better = first | (now < before)
+            best, curvature = jax.tree.map(
+                lambda a, b: jnp.where(better, a, b), (search.trial, curvature), (search.best, search.curvature)
+            )
+            factor = jnp.where(first, 1.0, jnp.where(better, 1 / _DAMPING_FACTOR, _DAMPING_FACTOR))
+            damping = search.damping * factor
+            step = _step(curvature, damping, unit, count)
+            taken = jnp.abs(search.trial - search.best) / scale
+            small = (taken <= self.tolerance * (1 + jnp.abs(search.best / scale))).all()
+            settled = small & ~(jnp.abs(now - before) > self.tolerance * (1 + before))
+            done = (~first & settled) | ~jnp.isfinite(step).all()
+            return _Search(best, curvature, best + step, damping, search.steps + 1, done)
 
-        solver = optx.LevenbergMarquardt(self.tolerance, self.tolerance, linear_solver=NormalCholesky())
-        return optx.least_squares(residuals, solver, unknowns / scale, max_steps=self.max_steps, throw=False)
+        size = start.shape[1]
+        zero, square = jnp.zeros(windows, dtype=float), jnp.zeros((windows, size, size), dtype=float)
+        nothing = Curvature(Shot(zero, zero > 0), jnp.zeros_like(start), square)
+        damping, none, no = (
+            jnp.full((), _FIRST_DAMPING, dtype=float),
+            -jnp.ones((), dtype=int),
+            jnp.zeros((), dtype=bool),
+        )
+        first = _Search(start, nothing, start, damping, none, no)
+        return jax.lax.while_loop(lambda search: ~search.done & (search.steps < self.max_steps), move, first)
 
 
-class NormalCholesky(lx.AbstractLinearSolver):
-    """Least squares by the normal equations, in plain operations: LAPACK's batched kernels can deadlock in a loop.
+def _cost(curvature: Curvature) -> Scalar:
+    """The cost of all windows; infinite for a trajectory that fails."""
+    cost, sound = curvature.shot
+    return jnp.where(sound.all() & jnp.isfinite(cost).all(), cost.sum(), jnp.inf)
 
-    The damping of Levenberg-Marquardt keeps the equations regular.
-    """
 
-    def init(self, operator: lx.AbstractLinearOperator, options: dict) -> tuple:
-        """The matrix M, and B with B B^T the inverse of M^T M."""
-        matrix = operator.as_matrix()
-        return matrix, unit_directions(jnp.einsum("ij,ik->jk", matrix, matrix))
-
-    def compute(self, state: tuple, vector, options: dict):
-        """Solves for one right-hand side."""
-        matrix, basis = state
-        flat = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(vector)])
-        solution = basis @ (basis.T @ (matrix.T @ flat))
-        return solution, lx.RESULTS.successful, {}
-
-    def transpose(self, state, options):
-        """Not needed: nothing is differentiated through the solution."""
-        raise NotImplementedError("NormalCholesky solves forward only.")
-
-    def conj(self, state, options):
-        """Itself: residuals are real."""
-        return state, options
-
-    def assume_full_rank(self) -> bool:
-        """Damping makes the columns independent."""
-        return True
+def _step(curvature: Curvature, damping: Scalar, unit: Unknowns, count: int) -> Unknowns:
+    """The damped Gauss-Newton step of each window's unknowns. Its first `count` unknowns are shared."""
+    information = curvature.information + jax.vmap(jnp.diag)(damping / unit)
+    basis = joint_factor(information, count).basis
+    slopes = (basis * curvature.gradient[:, :, None]).sum(axis=1)
+    shared = jnp.arange(slopes.shape[1]) >= slopes.shape[1] - count
+    slopes = jnp.where(shared, slopes.sum(axis=0), slopes)
+    return -(basis * slopes[:, None, :]).sum(axis=-1)

@@ -10,7 +10,7 @@ from .._custom_types import Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_recursive
 from ..shooting import ShootingProblem
-from ._regression import answer, check_settings, normal_equations, regression, solve
+from ._regression import answer, check_settings, normal_equations, propagated_covariance, regression, solve
 
 
 class RecursiveLeastSquares(AbstractEstimator):
@@ -55,16 +55,18 @@ class RecursiveLeastSquares(AbstractEstimator):
         in them, or a flight that is cut into windows.
         """
         check_recursive(problem, bracket)
-        usable = bracket.usable
+        usable, count = bracket.usable, bracket.lower.shape[0]
         data = regression(problem, usable, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
+        rows, back = data.rows()
 
         def update(carry, row):
-            information, moment = carry
+            information, moment, _ = carry
             added = normal_equations(row)
             carry = self.forgetting * information + added[0], self.forgetting * moment + added[1]
-            return carry, solve(*carry)[0]
+            steps, inverse = solve(*carry)
+            return (*carry, inverse), steps
 
-        count = usable.center.shape[0]
-        zero = jnp.zeros((count, count), dtype=float), jnp.zeros(count, dtype=float)
-        last, history = jax.lax.scan(update, zero, data.rows(data.rates))
-        return answer(data, bracket, *solve(*last), history=usable.center + usable.half_width * history)
+        zero = jnp.zeros((count, count), dtype=float)
+        (*_, inverse), steps = jax.lax.scan(update, (zero, jnp.zeros(count, dtype=float), zero), rows)
+        covariance = propagated_covariance(data, rows, back, steps[-1], inverse)
+        return answer(data, bracket, steps[-1], covariance, history=usable.center + usable.half_width * steps)

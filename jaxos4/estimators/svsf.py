@@ -120,28 +120,30 @@ class SVSF(AbstractEstimator):
         # The second part of `first_state` is three standard deviations.
         spread = jnp.concatenate([start[1] / 3, jnp.ones(count), jnp.zeros(count)])
         kept = (jnp.arange(spread.size) >= 3) & (jnp.arange(spread.size) < 3 + count)
+        anew, zeros = jnp.diag(jnp.where(kept, 0.0, jnp.square(spread))), jnp.zeros((3, count), dtype=float)
 
-        def again(previous: tuple[_Filter, Array], _) -> tuple[tuple[_Filter, Array], None]:
-            """One more pass: rates and average begin anew, the parameters do not."""
+        def fly(previous: tuple[_Filter, Array], _) -> tuple[tuple[_Filter, Array], None]:
+            """One pass: rates and average begin anew, the parameters do not."""
             last = previous[0]
-            covariance = jnp.where(kept[:, None] & kept, last.covariance, 0.0)
-            covariance = covariance + jnp.diag(jnp.where(kept, 0.0, jnp.square(spread)))
-            zero = jnp.zeros_like(last.residual), jnp.zeros_like(last.influence)
-            return fly(_Filter(start[0], last.parameters, *zero, last.energy, last.samples, covariance)), None
-
-        def fly(begin: _Filter) -> tuple[_Filter, Array]:
-            return jax.lax.scan(lambda f, row: self._step(rates, box, f, *row), begin, (rows, shares))
+            begin = last._replace(
+                rates=start[0],
+                residual=jnp.zeros(3, dtype=float),
+                influence=zeros,
+                covariance=jnp.where(kept[:, None] & kept, last.covariance, 0.0) + anew,
+            )
+            return jax.lax.scan(lambda f, row: self._step(rates, box, f, *row), begin, (rows, shares)), None
 
         at_center = _Filter(
             rates=start[0],
             parameters=jnp.zeros(count, dtype=float),
             residual=jnp.zeros(3, dtype=float),
-            influence=jnp.zeros((3, count), dtype=float),
+            influence=zeros,
             energy=jnp.zeros(count, dtype=float),
             samples=jnp.zeros((), dtype=float),
             covariance=jnp.diag(jnp.square(spread)),
         )
-        (last, history), _ = jax.lax.scan(again, fly(at_center), length=self.passes - 1)
+        none = jnp.zeros((samples, count), dtype=float)
+        (last, history), _ = jax.lax.scan(fly, (at_center, none), length=self.passes)
         parameters = box.center + box.half_width * (shares[:, None] * history).sum(axis=0)
         initial_state, cost, sound, rollouts = fit_start(problem, parameters)
         return conclude(

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Key, Scalar, as_float
+from ..errors import TrainingError
 from .architecture import Regressor, Scaling
 from .features import AbstractFeatures
-from .training import Pair, draw_many
+from .training import CHUNK, Pair, Purpose, draw_chunks
 
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
 LEVELS = np.array([2 * _NORMAL.cdf(z) - 1 for z in np.linspace(_NORMAL.inv_cdf(0.75), _NORMAL.inv_cdf(0.9995), 28)])
-CHUNK = 1000  # flights that are simulated at once
 _SCALES = 9  # noise scales at which intervals are calibrated, evenly spaced in the logarithm
 
 
@@ -61,7 +61,6 @@ def uncalibrated(noise: tuple[float, float], parameters: int) -> ErrorTable:
     )
 
 
-@eqx.filter_jit
 def calibrate(
     regressor: Regressor,
     scaling: Scaling,
@@ -73,31 +72,38 @@ def calibrate(
     """Measures a network's errors on `count` new simulated flights at each noise scale.
 
     Each quantile is the smallest that holds its level for one more flight. Flights that diverge do not count.
+
+    **Raises:** `TrainingError` if too few flights can be flown.
     """
-    parameters = len(features.problem.model.parameter_names)
+    parameters, chunks = len(features.problem.model.parameter_names), -(-count // CHUNK)
+    tables = []
+    for number, scale in enumerate(np.asarray(scales)):
+        both, first = np.full(2, scale), number * chunks
+        pairs = draw_chunks(features, both, count, key=key, purpose=Purpose.CALIBRATION, first=first)
+        tables.append(_table(np.asarray(_standardised(regressor, scaling, pairs))[:, :parameters]))
+    return ErrorTable(scales, *(as_float(np.stack(column)) for column in zip(*tables, strict=True)))
 
-    def standardised(pair: Pair) -> Float[Array, " parameters"]:
+
+@eqx.filter_jit
+def _standardised(regressor: Regressor, scaling: Scaling, pairs: Pair) -> Float[Array, "flights unknowns"]:
+    """Errors in units of the standard deviation that the network gives."""
+
+    def one(pair: Pair) -> Float[Array, " unknowns"]:
         output = regressor(pair.features, pair.scale, scaling)
-        return ((output.u - pair.u) / (scaling.bound(pair.scale) * jnp.exp(output.log_spread)))[:parameters]
+        return (output.u - pair.u) / (scaling.bound(pair.scale) * jnp.exp(output.log_spread))
 
-    def at(number_and_scale):
-        number, scale = number_and_scale
-        scale_key = jax.random.fold_in(key, number)
+    return jax.vmap(one)(pairs)
 
-        def errors(chunk):
-            pairs = draw_many(features, jnp.stack([scale, scale]), CHUNK, key=jax.random.fold_in(scale_key, chunk))
-            return jax.vmap(standardised)(pairs)
 
-        error = jax.lax.map(errors, jnp.arange(-(-count // CHUNK))).reshape(-1, parameters)
-        flown = jnp.isfinite(error).all(axis=1)
-        error = jnp.where(flown[:, None], error, 0.0)
-        moments = error.T @ error / flown.sum()
-        rms = jnp.sqrt(jnp.diagonal(moments))
-        relative = jnp.where(flown[:, None], jnp.abs(error) / rms, jnp.inf)
-        ordered = jnp.sort(jnp.column_stack([relative, relative.max(axis=1)]), axis=0)
-        rank = jnp.ceil((flown.sum() + 1) * as_float(LEVELS)).astype(int) - 1
-        quantiles = jnp.where((rank < flown.sum())[:, None], ordered[jnp.minimum(rank, flown.size - 1)], jnp.inf)
-        return rms, moments / (rms[:, None] * rms[None, :]), quantiles[:, :-1], quantiles[:, -1]
-
-    numbers = jnp.arange(scales.shape[0])
-    return ErrorTable(scales, *jax.lax.map(at, (numbers, scales)))
+def _table(error: Float[np.ndarray, "flights parameters"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`rms`, `correlation`, `factors` and `simultaneous` of an `ErrorTable` at one noise scale."""
+    error = error[np.isfinite(error).all(axis=1)]
+    flown = len(error)
+    rank = np.ceil((flown + 1) * LEVELS).astype(int) - 1
+    if rank[-1] >= flown:
+        raise TrainingError("too few of the held-out flights can be flown to calibrate: narrow the bracket.")
+    moments = error.T @ error / flown
+    rms = np.sqrt(np.diagonal(moments))
+    relative = np.abs(error) / rms
+    quantiles = np.sort(np.column_stack([relative, relative.max(axis=1)]), axis=0)[rank]
+    return rms, moments / np.outer(rms, rms), quantiles[:, :-1], quantiles[:, -1]

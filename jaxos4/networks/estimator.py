@@ -15,18 +15,17 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Scalar, as_float
 from ..bracket import UNIFORM_PRIOR, Bracket
-from ..errors import TrainingError
 from ..estimate import AbstractEstimator, Calibration, Estimate, check_bracket
 from ..flight import STATE_NAMES
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem
 from .architecture import Regressor, Scaling, squared_error
-from .calibration import CHUNK, LEVELS, ErrorTable, calibrate, uncalibrated
+from .calibration import LEVELS, ErrorTable, calibrate, uncalibrated
 from .features import FEATURES, AbstractFeatures, Coordinates
-from .first_weights import first_regressor, scaling_and_linear_map
+from .first_weights import first_regressor, linear_samples, scaling_and_linear_map
 from .progress_bar import training_bar
-from .training import Progress, split_key, train
+from .training import CHUNK, Pair, Progress, Purpose, train
 
 APPROXIMATORS = ("mlp", "cmac")
 
@@ -109,17 +108,17 @@ class NetworkEstimator(eqx.Module):
         import optax  # here, because it is slow to import
 
         self._check(problem, bracket)
-        start_key, train_key, held_out_key = split_key(key, 3)
-        blank = self.untrained(problem.restrict(self.channels), bracket, start_key)
+        blank = self._untrained(problem.restrict(self.channels), bracket, key)
         schedule = optax.warmup_cosine_decay_schedule(
             0.0, self.learning_rate, min(_WARM_UP_STEPS, self.steps // 2), self.steps, _LAST_RATE * self.learning_rate
         )
         scaling = blank.scaling
+        single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), scaling)
         bar = training_bar(self.steps) if progress is True else contextlib.nullcontext(progress or None)
         with bar as report:
             regressor, history = train(
                 blank.regressor,
-                lambda regressor, pair: squared_error(regressor, scaling, *pair),
+                lambda regressor, pair: squared_error(regressor, single, *pair),
                 blank.features,
                 as_float(np.asarray(self.noise)),
                 optax.contrib.muon(schedule),
@@ -127,25 +126,49 @@ class NetworkEstimator(eqx.Module):
                 steps=self.steps,
                 validation=2 * CHUNK,
                 patience=self.patience,
-                key=train_key,
+                key=key,
                 progress=report,
             )
-        errors = calibrate(regressor, scaling, blank.features, blank.errors.scales, self.held_out, held_out_key)
-        if not np.isfinite(np.asarray(errors.factors)).all():
-            raise TrainingError("too few of the held-out flights can be flown to calibrate: narrow the bracket.")
+        errors = calibrate(regressor, scaling, blank.features, blank.errors.scales, self.held_out, key)
         return TrainedNetwork(
             self, blank.features, scaling, regressor, errors, as_float(history), jax.random.key_data(key)
         )
 
+    def blank(self, problem: ShootingProblem, bracket: Bracket) -> "TrainedNetwork":
+        """A network with the shapes of a trained one and no values, for a problem with its channels."""
+        features = FEATURES[self.features].blank(problem, self._coordinates(problem, bracket))
+        unknowns, size = features.coordinates.center.shape[0], features.size
+        scaling = Scaling(jnp.zeros(size), jnp.zeros(unknowns), jnp.zeros(unknowns), jnp.zeros(()))
+        regressor = Regressor(
+            jnp.zeros((unknowns, size)), self.approximator, width=self.width, depth=self.depth, key=jax.random.key(0)
+        )
+        return self._network(features, scaling, regressor, jax.random.key(0))
+
+    def _untrained(self, problem: ShootingProblem, bracket: Bracket, key: Key) -> "TrainedNetwork":
+        """The network before training: scaled, with its linear map fitted."""
+        features = self._prepared(problem, bracket)
+        return self._first(features, linear_samples(features, np.asarray(self.noise, float), key), key)
+
     @eqx.filter_jit
-    def untrained(self, problem: ShootingProblem, bracket: Bracket, key: Key) -> "TrainedNetwork":
-        """The network before training, for a problem with its channels: scaled, with its linear map fitted."""
-        scales = as_float(np.asarray(self.noise))
-        features = FEATURES[self.features].of(problem, Coordinates.of(problem, bracket, scales[1]))
-        first_key, sample_key = jax.random.split(key)
-        scaling, linear_map = scaling_and_linear_map(features, scales, sample_key)
-        regressor = first_regressor(linear_map, self.approximator, width=self.width, depth=self.depth, key=first_key)
-        errors = uncalibrated(self.noise, len(problem.model.parameter_names))
+    def _prepared(self, problem: ShootingProblem, bracket: Bracket) -> AbstractFeatures:
+        return FEATURES[self.features].of(problem, self._coordinates(problem, bracket))
+
+    @eqx.filter_jit
+    def _first(self, features: AbstractFeatures, samples: Pair, key: Key) -> "TrainedNetwork":
+        scaling, linear_map = scaling_and_linear_map(features, np.asarray(self.noise, float), samples)
+        size = {"width": self.width, "depth": self.depth}
+        regressor = first_regressor(
+            linear_map, self.approximator, **size, key=jax.random.fold_in(key, Purpose.WEIGHTS.place(0))
+        )
+        return self._network(features, scaling, regressor, key)
+
+    def _coordinates(self, problem: ShootingProblem, bracket: Bracket) -> Coordinates:
+        return Coordinates.of(problem, bracket, as_float(self.noise[1]))
+
+    def _network(
+        self, features: AbstractFeatures, scaling: Scaling, regressor: Regressor, key: Key
+    ) -> "TrainedNetwork":
+        errors = uncalibrated(self.noise, len(features.problem.model.parameter_names))
         return TrainedNetwork(self, features, scaling, regressor, errors, jnp.zeros((0, 2)), jax.random.key_data(key))
 
     def _check(self, problem: ShootingProblem, bracket: Bracket) -> None:

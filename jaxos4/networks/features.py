@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Key, Parameters, Scalar
+from .._custom_types import Parameters, Scalar
 from ..bracket import Bracket
 from ..linalg import unit_directions
 from ..models.state import CASCADE_ORDER
@@ -77,16 +77,22 @@ class AbstractFeatures(eqx.Module):
         """Features of a measured flight; NaN if its numbers are not finite."""
 
     @abc.abstractmethod
-    def simulated(self, u: Float[Array, " unknowns"], scale: Scalar, *, key: Key) -> Float[Array, " features"]:
-        """Features of the flight at `u` with white noise of `scale` times sigma; NaN if the flight diverges."""
+    def simulated(self, u: Float[Array, " unknowns"], noise: Float[Array, " features"]) -> Float[Array, " features"]:
+        """Features of the flight at `u` with white noise; NaN if the flight diverges.
+
+        `noise`: standard normal numbers, times the noise scale.
+        """
 
     def _deviation(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
         """W (x(u) - x(0)); 0 in samples that are not measured, NaN everywhere if the flight at `u` diverges."""
-        trajectory = self.problem.predict(*self.coordinates.split(u, len(self.problem.model.parameter_names)))
+        trajectory = self._trajectory(u)
         sound = (jnp.abs(trajectory[:, :3]) < FASTEST).all()
         if self.problem.size > 3:
             sound &= (jnp.abs(trajectory[:, 4]) < jnp.pi / 2).all()
         return jnp.where(sound, self._weighted(self.problem, trajectory), jnp.nan)
+
+    def _trajectory(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
+        return self.problem.predict(*self.coordinates.split(u, len(self.problem.model.parameter_names)))
 
     def _mismatch(self, problem: ShootingProblem) -> Float[Array, "samples size"]:
         """W (y - x(0)) of a measured flight, with the weights of training; 0 unless measured here and in training."""
@@ -115,10 +121,17 @@ class Score(AbstractFeatures):
     @classmethod
     def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Score":
         """Prepares the features."""
-        reference, size = _reference(problem, coordinates), coordinates.center.shape[0]
-        bare = cls(problem, coordinates, reference, jnp.zeros((*reference.shape, size)), jnp.eye(size))
-        jacobian = jax.jacfwd(bare._deviation)(jnp.zeros(size))
+        blank = cls.blank(problem, coordinates)
+        # One simulation gives the trajectory at the center, from which there is no deviation yet, and its derivatives.
+        trajectory_and_slope = jax.jacfwd(lambda u: (blank._deviation(u), blank._trajectory(u)), has_aux=True)
+        jacobian, reference = trajectory_and_slope(jnp.zeros_like(coordinates.center))
         return cls(problem, coordinates, reference, jacobian, _noise_factor(jacobian))
+
+    @classmethod
+    def blank(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Score":
+        """Features of the right shapes, and no values."""
+        nothing, size = jnp.zeros_like(problem.measured()), coordinates.center.shape[0]
+        return cls(problem, coordinates, nothing, jnp.zeros((*nothing.shape, size)), jnp.eye(size))
 
     @property
     def size(self) -> int:
@@ -133,10 +146,10 @@ class Score(AbstractFeatures):
         inflation = jnp.linalg.norm(noise_factor, axis=1) / jnp.linalg.norm(self.noise_factor, axis=1)
         return FlightFeatures(step, inflation[: len(self.problem.model.parameter_names)])
 
-    def simulated(self, u: Float[Array, " unknowns"], scale: Scalar, *, key: Key) -> Float[Array, " features"]:
+    def simulated(self, u: Float[Array, " unknowns"], noise: Float[Array, " features"]) -> Float[Array, " features"]:
         """See `AbstractFeatures`."""
         slope = jnp.einsum("tcu,tc->u", self.jacobian, self._deviation(u))
-        return self.noise_factor @ (self.noise_factor.T @ slope + scale * jax.random.normal(key, u.shape, u.dtype))
+        return self.noise_factor @ (self.noise_factor.T @ slope + noise)
 
 
 class Raw(AbstractFeatures):
@@ -149,7 +162,13 @@ class Raw(AbstractFeatures):
     @classmethod
     def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Raw":
         """Prepares the features."""
-        return cls(problem, coordinates, _reference(problem, coordinates))
+        blank = cls.blank(problem, coordinates)
+        return cls(problem, coordinates, blank._trajectory(jnp.zeros_like(coordinates.center)))
+
+    @classmethod
+    def blank(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Raw":
+        """Features of the right shapes, and no values."""
+        return cls(problem, coordinates, jnp.zeros_like(problem.measured()))
 
     @property
     def size(self) -> int:
@@ -162,19 +181,13 @@ class Raw(AbstractFeatures):
         inflation = jnp.where(missing, jnp.inf, jnp.ones(len(self.problem.model.parameter_names)))
         return FlightFeatures(self._mismatch(problem).ravel(), inflation)
 
-    def simulated(self, u: Float[Array, " unknowns"], scale: Scalar, *, key: Key) -> Float[Array, " features"]:
+    def simulated(self, u: Float[Array, " unknowns"], noise: Float[Array, " features"]) -> Float[Array, " features"]:
         """See `AbstractFeatures`."""
         deviation = self._deviation(u)
-        noise = scale * jax.random.normal(key, deviation.shape, u.dtype)
-        return (deviation + jnp.where(_measured(self.problem), noise, 0.0)).ravel()
+        return (deviation + jnp.where(_measured(self.problem), noise.reshape(deviation.shape), 0.0)).ravel()
 
 
 FEATURES: dict[str, type[Score] | type[Raw]] = {"score": Score, "raw": Raw}
-
-
-def _reference(problem: ShootingProblem, coordinates: Coordinates) -> Float[Array, "samples size"]:
-    count = len(problem.model.parameter_names)
-    return problem.predict(*coordinates.split(jnp.zeros_like(coordinates.center), count))
 
 
 def _measured(problem: ShootingProblem) -> Bool[Array, "samples size"]:

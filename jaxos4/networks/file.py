@@ -97,7 +97,7 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
         method=header["method"],
         windows=header["windows"],
     )
-    blank = eqx.filter_eval_shape(settings.untrained, problem, Bracket.default(problem.model), jax.random.key(0))
+    blank = eqx.filter_eval_shape(settings.blank, problem, Bracket.default(problem.model))
     history = jax.ShapeDtypeStruct((header["checks"], 2), float)
     blank = eqx.tree_at(lambda n: (n.features.problem, n.history), blank, (problem, history))
 

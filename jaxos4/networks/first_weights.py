@@ -9,30 +9,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Key
-from ..linalg import covariances
+from .._custom_types import Key, Numeric
 from .architecture import Regressor, Scaling, compress
-from .calibration import CHUNK
-from .features import AbstractFeatures
-from .training import draw_many
+from .features import AbstractFeatures, Score
+from .training import CHUNK, Pair, Purpose, draw_chunks
 
 # Flights for each feature, and the ridge, of the fit of the linear map.
 _PER_FEATURE, _RIDGE = 4, 1e-6
 _DRAWN = 1024  # random numbers at once
 
 
+def linear_samples(features: AbstractFeatures, scales: Float[np.ndarray, "2"], key: Key) -> Pair:
+    """The simulated flights of `scaling_and_linear_map`."""
+    return draw_chunks(features, scales, max(CHUNK, _PER_FEATURE * features.size), key=key, purpose=Purpose.LINEAR_MAP)
+
+
 def scaling_and_linear_map(
-    features: AbstractFeatures, scales: Float[Array, "2"], key: Key
+    features: AbstractFeatures, scales: Float[Numeric, "2"], samples: Pair
 ) -> tuple[Scaling, Float[Array, "unknowns features"]]:
     """Measures the features' sizes on simulated flights, and fits the best linear map from features to unknowns."""
-    problem, coordinates = features.problem, features.coordinates
-    count = len(problem.model.parameter_names)
-    start = coordinates.split(jnp.zeros_like(coordinates.center), count)
-    # One row for each window, of the parameters and its initial state: keep the parameters of the first window only.
-    std = jnp.sqrt(jax.vmap(jnp.diagonal)(covariances(problem.curvatures(*start).information, count)))
-    unit = jnp.concatenate([std[0, :count], std[:, count:].ravel()]) / coordinates.width
+    # The score's own derivatives give the bound.
+    score = features if isinstance(features, Score) else Score.of(features.problem, features.coordinates)
+    unit = jnp.linalg.norm(score.noise_factor, axis=1)
 
-    samples = draw_many(features, scales, max(CHUNK, _PER_FEATURE * features.size), key=key)
     flown = jnp.isfinite(samples.features).all(axis=1)
     width = 1.5 * jnp.nanmedian(jnp.where(flown[:, None], jnp.abs(samples.features), jnp.nan), axis=0)
     # Scaled so that one learning rate suits both kinds of features, however many they are.

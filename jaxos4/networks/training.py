@@ -3,7 +3,7 @@
 No flight is stored. Each step simulates its own batch: parameters, initial state, noise scale and noise are new draws.
 """
 
-import functools
+import enum
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -11,14 +11,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
-from .._custom_types import Key, Scalar
+from .._custom_types import Key, Numeric, Scalar
 from ..errors import TrainingError
 from .features import AbstractFeatures
 
 if TYPE_CHECKING:
     import optax  # `train` imports it, because it is slow to import
+
+CHUNK = 1000
+"""Flights that are simulated at once, apart from the steps of training."""
+
+
+class Purpose(enum.IntEnum):
+    """What random numbers are for. They are drawn from a key and a place, and each purpose has places of its own."""
+
+    WEIGHTS = 0
+    LINEAR_MAP = 1
+    VALIDATION = 2
+    STEPS = 3
+    CALIBRATION = 4
+
+    def place(self, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
+        """The place of a number, or of each number."""
+        return np.asarray(len(Purpose) * np.asarray(number) + int(self))
+
 
 CHECK = 250
 """Steps between two evaluations of the validation loss."""
@@ -41,25 +59,34 @@ class Pair(NamedTuple):
     u: Float[Array, "*batch unknowns"]
 
 
-def draw(features: AbstractFeatures, scales: Float[Array, "2"], *, key: Key) -> Pair:
-    """Simulates one flight: unknowns uniform in the bracket, noise scale log-uniform between `scales`."""
-    u_key, scale_key, noise_key = jax.random.split(key, 3)
-    u = jax.random.uniform(u_key, features.coordinates.center.shape, minval=-1, maxval=1, dtype=float)
-    low, high = jnp.log(scales)
-    scale = jnp.exp(jax.random.uniform(scale_key, (), minval=low, maxval=high, dtype=float))
-    return Pair(features.simulated(u, scale, key=noise_key), scale, u)
-
-
 def draw_many(features: AbstractFeatures, scales: Float[Array, "2"], count: int, *, key: Key) -> Pair:
-    """Simulates `count` flights; flight i draws from `fold_in(key, i)`."""
-    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(count))
-    return jax.vmap(lambda k: draw(features, scales, key=k))(keys)
+    """Simulates `count` flights: unknowns uniform in the bracket, noise scale log-uniform between `scales`."""
+    unknowns, (low, high) = features.coordinates.center.shape[0], jnp.log(scales)
+    # All random numbers in one draw, which compiles faster than one for each flight and quantity.
+    drawn = jax.random.uniform(key, (count, unknowns + 1 + features.size), minval=-1, maxval=1, dtype=float)
+    u, scale = drawn[:, :unknowns], jnp.exp((low + high + (high - low) * drawn[:, unknowns]) / 2)
+    most = 1 - jnp.finfo(drawn.dtype).eps  # a finite number of standard deviations
+    normal = jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(drawn[:, unknowns + 1 :], -most, most))
+    noise = scale[:, None] * normal
+    return Pair(jax.vmap(features.simulated)(u, noise), scale, u)
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def split_key(key: Key, count: int) -> tuple[Key, ...]:
-    """Splits a key into a tuple of keys in one program; unpacking an array of keys would compile more."""
-    return tuple(jax.random.split(key, count))
+def draw_chunks(
+    features: AbstractFeatures, scales: Float[Numeric, "2"], count: int, *, key: Key, purpose: Purpose, first: int = 0
+) -> Pair:
+    """Simulates at least `count` flights in chunks of `CHUNK`, all by one compiled program.
+
+    Chunk i is drawn from `key` at the place `first` + i of the `purpose`.
+    """
+    numbers = range(first, first - (-count // CHUNK))
+    drawn = [_chunk(features, scales, key, purpose.place(number)) for number in numbers]
+    # By NumPy: JAX would compile a program.
+    return Pair(*(jax.device_put(np.concatenate(parts)) for parts in zip(*drawn, strict=True)))
+
+
+@eqx.filter_jit
+def _chunk(features: AbstractFeatures, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]) -> Pair:
+    return draw_many(features, jnp.asarray(scales), CHUNK, key=jax.random.fold_in(key, place))
 
 
 def train(
@@ -85,10 +112,11 @@ def train(
     """
     import optax
 
-    train_key, validation_key = split_key(key, 2)
-    held_out = eqx.filter_jit(draw_many)(features, scales, validation, key=validation_key)
-    weights, structure = eqx.partition(network, eqx.is_inexact_array)
-    _check_trainable(held_out, weights)
+    held_out = draw_chunks(features, scales, validation, key=key, purpose=Purpose.VALIDATION)
+    given, structure = eqx.partition(network, eqx.is_inexact_array)
+    _check_trainable(held_out, given)
+    # Single precision: rounding is far below the noise of a step's flights.
+    weights, held_out = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), (given, held_out))
 
     def mean_loss(weights: PyTree, pairs: Pair) -> Scalar:
         flown = jnp.isfinite(pairs.features).all(axis=1)
@@ -98,22 +126,24 @@ def train(
         return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
 
     @eqx.filter_jit
-    def advance(features, held_out, weights, state, key, indices):
-        def step(carry, key):
+    def advance(features, held_out, weights, state, key, places):
+        def step(carry, place):
             weights, state = carry
-            value, gradient = jax.value_and_grad(mean_loss)(weights, draw_many(features, scales, batch, key=key))
+            drawn = draw_many(features, scales, batch, key=jax.random.fold_in(key, place))
+            pairs = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), drawn)
+            value, gradient = jax.value_and_grad(mean_loss)(weights, pairs)
             updates, state = optimiser.update(gradient, state, weights)
             return (optax.apply_updates(weights, updates), state), value
 
-        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(indices)
-        (weights, state), values = jax.lax.scan(step, (weights, state), keys)
+        (weights, state), values = jax.lax.scan(step, (weights, state), places)
         return weights, state, values.mean(), mean_loss(weights, held_out)
 
     state = jax.jit(optimiser.init)(weights)
     best, lowest, without_improvement, history = weights, np.inf, 0, []
     for first in range(0, steps, CHECK):
         indices = np.arange(first, min(first + CHECK, steps))
-        weights, state, *losses = advance(features, held_out, weights, state, train_key, indices)
+        places = Purpose.STEPS.place(indices)
+        weights, state, *losses = advance(features, held_out, weights, state, key, places)
         history.append([float(value) for value in losses])
         value, current = history[-1]
         if not np.less(history[-1], _DIVERGED).all():
@@ -125,6 +155,7 @@ def train(
             best, lowest, without_improvement = weights, current, 0
         if without_improvement >= patience:
             break
+    best = jax.tree.map(lambda leaf, like: jnp.asarray(np.asarray(leaf), like.dtype), best, given)
     return eqx.combine(best, structure), np.asarray(history)
 
 

@@ -46,7 +46,7 @@ def blank_network(study: Study, job: Job) -> TrainedNetwork:
     """A network of ones with the shapes of the trained one: programs can be compiled with it during the training."""
     with jax.enable_x64(study.double):
         settings, problem, bracket = _training(study, job)
-        shapes = eqx.filter_eval_shape(settings.untrained, problem, bracket, jax.random.key(0))
+        shapes = eqx.filter_eval_shape(settings.blank, problem, bracket)
         arrays, others = eqx.partition(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))
         return eqx.combine(jax.tree.map(lambda leaf: jax.device_put(np.ones(leaf.shape, leaf.dtype)), arrays), others)
 
