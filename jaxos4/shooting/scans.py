@@ -119,10 +119,11 @@ def shoot_with_derivatives(
     count, size = parameters.shape[0], initial_state.shape[0]
     free = size if initial_state_is_free else 0
     unknowns = count + free
-    identity = jnp.eye(unknowns, dtype=float)
+    # NumPy, so that they are constants of the program.
+    identity = np.eye(unknowns, dtype=parameters.dtype)
     scalars = tuple(parameters)
     parameter_tangents = tuple(identity[:, :count].T)
-    start_tangents = jnp.zeros((unknowns, size), dtype=float).at[:, :free].set(identity[:, count:])
+    start_tangents = identity[:, count:] if free else np.zeros((unknowns, size), dtype=parameters.dtype)
 
     def linearised(state: State, tangent: State, row: Rows):
         if row.forcing_tangents is None:
@@ -151,8 +152,8 @@ def shoot_with_derivatives(
         )
         return following, following_tangent, total
 
-    zero = Curvature(_no_shot(), jnp.zeros(unknowns, dtype=float), 0 * identity)
-    tangents = jax.vmap(unstack)(start_tangents)
+    zero = Curvature(_no_shot(), jnp.zeros(unknowns, dtype=float), jnp.zeros((unknowns, unknowns), dtype=float))
+    tangents = jax.tree.map(jnp.asarray, unstack(start_tangents.T))
     return _fold(step, (unstack(initial_state), tangents, zero), rows, length)[2]
 
 
