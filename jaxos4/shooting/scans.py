@@ -153,7 +153,7 @@ def shoot_with_derivatives(
         return following, following_tangent, total
 
     zero = Curvature(_no_shot(), jnp.zeros(unknowns, dtype=float), jnp.zeros((unknowns, unknowns), dtype=float))
-    tangents = jax.tree.map(jnp.asarray, unstack(start_tangents.T))
+    tangents = jax.vmap(unstack)(jnp.asarray(start_tangents))
     return _fold(step, (unstack(initial_state), tangents, zero), rows, length)[2]
 
 

@@ -44,7 +44,7 @@ class IBSS(AbstractEstimator):
     **Arguments:**
 
     - `directions`: `"whitened"`: the columns of L^-T, with L L^T the Fisher information at the current estimate; the
-      cost is nearly separable along them. The rates are fitted first, then the attitude with them, then all channels.
+      cost is nearly separable along them. The rates are fitted first, then all channels.
       `"coordinate"`: the parameters themselves, against all of the problem's channels at once, in the manner of the
       paper; good on the rates, slow on more channels.
     - `halvings`: how often each bracket is halved in a sweep.
