@@ -42,15 +42,16 @@ class Airframe(eqx.Module):
     max_rotor_speed: Float[Numeric, ""] = eqx.field(converter=as_constant, default=math.inf)
 
     @property
-    def mixer(self) -> Float[Array, "4 4"]:
+    def mixer(self) -> Float[Numeric, "4 4"]:
         """The matrix that maps squared rotor speeds to roll, pitch and yaw torque [N m] and thrust [N].
 
         Reference: Eqs. (10)-(13), generalised to any layout:
         d_roll = sum y_i b w_i^2, d_pitch = -sum x_i b w_i^2, d_yaw = -d sum s_i w_i^2, U_c = sum b w_i^2.
         """
-        x, y = jnp.asarray(self.rotor_positions).T
-        b, d = self.thrust_coefficient, self.drag_coefficient
-        return jnp.stack([b * y, -b * x, -d * jnp.asarray(self.rotor_spins), b * jnp.ones(4)])
+        (x, y), b, d = self.rotor_positions.T, self.thrust_coefficient, self.drag_coefficient
+        rows = [b * y, -b * x, -d * self.rotor_spins, b * np.ones(4)]
+        # Constants that are known need no compiled program.
+        return np.stack(rows) if all(isinstance(row, np.ndarray) for row in rows) else jnp.stack(rows)
 
     @property
     def hover_speed(self) -> Scalar:

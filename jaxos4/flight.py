@@ -112,6 +112,13 @@ class Flight(eqx.Module):
         nothing = jnp.full((*self.states.shape[:-1], len(FORCE_NAMES)), jnp.nan, self.states.dtype)
         return jnp.concatenate([self.states, nothing if force is None else force], axis=-1)
 
+    @property
+    def recorded(self) -> Float[np.ndarray, "samples 15"]:
+        """`channels` of a recorded flight as NumPy, without a compiled program."""
+        states, force = np.asarray(self.states), self.specific_force
+        nothing = np.full((states.shape[0], len(FORCE_NAMES)), np.nan, states.dtype)
+        return np.concatenate([states, nothing if force is None else np.asarray(force)], axis=-1)
+
 
 def fill_gaps(
     values: Float[Array, "samples columns"], stretches: Stretches | None = None

@@ -37,7 +37,7 @@ def to_body(attitude: Attitude, earth: Vector) -> Vector:
 def with_body_velocity(flight: Flight) -> Flight:
     """Add `body_velocity` to a flight that measured velocity and attitude. Other flights are returned unchanged."""
     columns = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "vx", "vy", "vz")]
-    if bool(jnp.isnan(flight.states[:, columns]).all(axis=0).any()):
+    if np.isnan(np.asarray(flight.states)[:, columns]).all(axis=0).any():
         return flight
     *angles, vx, vy, vz = fill_gaps(flight.states[:, columns]).T
     velocity = to_body(Attitude(*angles), (vx, vy, vz))

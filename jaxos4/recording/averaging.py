@@ -16,7 +16,7 @@ def averaged(flight: Flight, dt: float) -> Flight:
     """A flight averaged to samples of `dt` [s], see `average`; unchanged if its samples are not shorter."""
     if dt <= float(flight.dt) * (1 + _EQUAL_STEPS):
         return flight
-    t, omega, channels = (np.asarray(x) for x in (flight.time, flight.omega, flight.channels))
+    t, omega, channels = (np.asarray(x) for x in (flight.time, flight.omega, flight.recorded))
     time, omega, channels = average(t, omega, channels, dt)
     force = None if flight.specific_force is None else channels[:, 12:]
     return Flight(time, omega, channels[:, :12], force, commanded=flight.commanded)

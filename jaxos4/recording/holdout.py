@@ -1,7 +1,6 @@
 """The part of a flight that is not fitted, so that it can be predicted."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from ..flight import Flight
@@ -34,7 +33,8 @@ def hold_out(flight: Flight, length: int, share: float) -> tuple[Flight, Flight 
 
 
 def _without(rows: np.ndarray, flight: Flight, *, force: bool) -> Flight:
-    blank = eqx.tree_at(lambda f: f.states, flight, jnp.where(rows[:, None], jnp.nan, flight.states))
+    blank = eqx.tree_at(lambda f: f.states, flight, as_float(np.where(rows[:, None], np.nan, flight.states)))
     if not force or flight.specific_force is None:
         return blank
-    return eqx.tree_at(lambda f: f.specific_force, blank, jnp.where(rows[:, None], jnp.nan, flight.specific_force))
+    blank_force = as_float(np.where(rows[:, None], np.nan, flight.specific_force))
+    return eqx.tree_at(lambda f: f.specific_force, blank, blank_force)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..flight import STATE_NAMES, Flight
@@ -42,12 +41,12 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
         states=states,
         specific_force=None if np.isnan(force).all() else force,
         body_velocity=velocity,
-        stretch=jnp.asarray(np.repeat(np.arange(len(lengths)), lengths)),
+        stretch=jax.device_put(np.repeat(np.arange(len(lengths)), lengths)),
         commanded=any(flight.commanded for flight in flights),
     )
 
 
 def _rows_of(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    force = np.asarray(flight.channels[:, len(STATE_NAMES) :])
+    force = flight.recorded[:, len(STATE_NAMES) :]
     velocity = None if flight.body_velocity is None else np.asarray(flight.body_velocity)
     return np.asarray(flight.omega), np.asarray(flight.states), force, velocity

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..airframe import Airframe
@@ -83,7 +82,7 @@ def prepare(
         )
     step, length = _sampling([piece for _, piece in parts], window, sample_time)
     shortest = (length - 1) * step / _NEARLY_EQUAL
-    long = [(number, piece) for number, piece in parts if float(piece.time[-1] - piece.time[0]) >= shortest]
+    long = [(number, piece) for number, piece in parts if np.ptp(np.asarray(piece.time)) >= shortest]
     coarse = [(number, with_body_velocity(averaged(piece, step))) for number, piece in long]
     kept = [(number, piece) for number, piece in coarse if piece.time.shape[0] >= length]
     numbers, pieces = tuple(number for number, _ in kept), [piece for _, piece in kept]
@@ -101,7 +100,7 @@ def prepare(
 def _available_inputs(flight: Flight, stretches: Sequence[Flight], airframe: Airframe) -> frozenset[str]:
     """What the flight joined from these stretches offers to `Term.needs`; a force, if every stretch measured it."""
     force = [
-        all(not np.isnan(np.asarray(stretch.channels)[:, len(STATE_NAMES) + axis]).all() for stretch in stretches)
+        all(not np.isnan(stretch.recorded[:, len(STATE_NAMES) + axis]).all() for stretch in stretches)
         for axis in range(len(FORCE_NAMES))
     ]
     offers = {
@@ -115,7 +114,7 @@ def _available_inputs(flight: Flight, stretches: Sequence[Flight], airframe: Air
 
 
 def _seconds(flight: Flight) -> float:
-    return float((~jnp.isnan(flight.states[:, CASCADE_ORDER[0]])).sum() * flight.dt)
+    return float((~np.isnan(np.asarray(flight.states)[:, CASCADE_ORDER[0]])).sum() * flight.dt)
 
 
 def _sampling(parts: list[Flight], window: float, sample_time: float | None) -> tuple[float, int]:
@@ -136,7 +135,7 @@ def _usable_parts(
 ) -> tuple[list[Flight], str | None]:
     """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used."""
     flight, name = recording.flight, recording.name
-    first, last = float(flight.time[0]), float(flight.time[-1])
+    first, last = np.asarray(flight.time)[[0, -1]].tolist()
     if begin is not None or end is not None:
         try:
             return [cut(flight, Stretch(first if begin is None else begin, last if end is None else end))], None

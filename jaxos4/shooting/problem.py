@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
-from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES, Flight, Inputs
+from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
@@ -92,7 +92,8 @@ class ShootingProblem(eqx.Module):
         if windows > 1 and length is not None:
             raise ValueError("`length` must be `None` if there are several windows: only a whole flight is padded.")
         if model.force_axes and np.shape(sigma) == (len(STATE_NAMES),):
-            sigma = jnp.concatenate([as_float(sigma), jnp.full(3, FORCE_SIGMA)])
+            stack = jnp.concatenate if isinstance(sigma, Tracer) else np.concatenate
+            sigma = stack([sigma, np.full(3, FORCE_SIGMA)])
         self.model, self.flight, self.sigma = model, flight, as_float(sigma)
         self.initial_state = None if initial_state is None else as_float(initial_state)
         self.channels, self.method, self.windows, self.length = channels, method, windows, length
@@ -126,9 +127,7 @@ class ShootingProblem(eqx.Module):
 
     def recorded(self) -> Float[np.ndarray, "samples columns"]:
         """`measured` as NumPy, without a compiled program."""
-        states, force = np.asarray(self.flight.states), self.flight.specific_force
-        nothing = np.full((*states.shape[:-1], len(FORCE_NAMES)), np.nan, states.dtype)
-        channels = np.concatenate([states, nothing if force is None else np.asarray(force)], axis=-1)[:, self.columns]
+        channels = self.flight.recorded[:, self.columns]
         if self.initial_state is not None:
             channels[0] = np.nan
         return channels
