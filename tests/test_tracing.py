@@ -1,4 +1,7 @@
-"""Other numbers of the same shapes are other data, not another program."""
+"""Other numbers of the same shapes are other data, not another program.
+
+An estimator takes long to compile. `eqx.filter_eval_shape` traces its program as a call does, without compiling it.
+"""
 
 import equinox as eqx
 import jax
@@ -86,7 +89,7 @@ def test_identifies_another_flight_with_other_settings_without_another_trace():
     for trial, (tolerance, reach) in enumerate([(0.02, 4.0), (0.05, 3.0), (1, 2)]):
         problem = problem_of(jaxos4.PublishedOS4, trial)
         bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
-        identify(jaxos4.IBSS(tolerance=tolerance, reach=reach), problem, bracket)
+        eqx.filter_eval_shape(identify, jaxos4.IBSS(tolerance=tolerance, reach=reach), problem, bracket)
 
 
 def test_the_estimator_itself_traces_once(counted):
@@ -95,9 +98,12 @@ def test_the_estimator_itself_traces_once(counted):
     for trial in range(3):
         problem = problem_of(model_class, trial)
         bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
-        jaxos4.IBSS(tolerance=0.01 * (1 + trial))(problem, bracket)
+        eqx.filter_eval_shape(jaxos4.IBSS(tolerance=0.01 * (1 + trial)), problem, bracket)
         counts.append(count[0])
     assert counts[0] == counts[-1]
+    # Another kind of problem is seen.
+    eqx.filter_eval_shape(jaxos4.IBSS(), problem.restrict("attitude"), bracket)
+    assert count[0] > counts[0]
 
 
 def test_the_count_would_see_a_second_trace(counted):
