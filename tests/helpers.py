@@ -141,6 +141,17 @@ def first_samples(problem):
     return [k * len(problem.flight.time) // problem.windows for k in range(problem.windows + 1)]
 
 
+def numpy_costs(problem, parameters, starts):
+    """The cost by the NumPy equations at each row of parameters and initial states, from the first sample on."""
+    order, flight = CASCADE_ORDER[: problem.size], problem.flight
+    whole = np.zeros((len(starts), 12))
+    whole[:, order] = starts
+    states = euler_trajectory(REFERENCES[type(problem.model)], parameters, flight.omega, start=whole, dt=flight.dt)
+    residuals = ((np.asarray(flight.states)[:, None] - states) / np.asarray(problem.sigma))[..., order]
+    first = 0 if problem.initial_state is None else 1  # a known first sample is no data
+    return 0.5 * np.square(residuals[first:]).sum(axis=(0, 2))
+
+
 def numpy_residuals(problem, parameters, starts):
     """W (y - x) by the NumPy equations, each window from its own start; NaN where nothing was measured."""
     flight, derivative = problem.flight, REFERENCES[type(problem.model)]

@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, noisy_states, standard_flight, standard_problem
+from helpers import DT, measured, noisy_states, standard_flight, standard_problem
+from lanes import LANES, identify
 
 import jaxos4
 from jaxos4.estimators import ESTIMATORS
@@ -129,22 +130,20 @@ def test_a_profile_is_the_parabola_of_the_bound(estimator):
 
 def residual_noise(flights, correlation_time):
     """Errors of flights with Gauss-Markov noise, in standard deviations of the bound and of the robust covariance."""
-    problem = standard_problem(channels="rates")
-    truth, noise = problem.flight, jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, correlation_time)
-    keys = jax.random.split(jax.random.key(11), flights)
-
-    @eqx.filter_jit
-    @eqx.filter_vmap
-    def one(key):
-        noisy = noise(truth, key=key)
-        found = jaxos4.IBSS()(eqx.tree_at(lambda p: p.flight, problem, noisy), jaxos4.Bracket.default(problem.model))
-        return noisy.states, found.parameters, found.initial_state, found.std
-
-    states, parameters, starts, std = one(keys)
-    flown = [eqx.tree_at(lambda p: p.flight.states, problem, each) for each in states]
-    robust = [jaxos4.robust_covariance(*known) for known in zip(flown, parameters, starts, strict=True)]
-    error = np.asarray(parameters - problem.model.alpha)
-    return error / std, error / np.sqrt(np.diagonal(robust, axis1=1, axis2=2))
+    problem, noise = standard_problem(channels="rates"), jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, correlation_time)
+    around, keys = jaxos4.Bracket.default(problem.model), jax.random.split(jax.random.key(11), flights)
+    same = [np.tile(x, (LANES, *[1] * x.ndim)) for x in (problem.flight.omega, around.lower, around.upper)]
+    naive, robust = [], []
+    for first in range(0, flights, LANES):
+        states = measured(noise, problem.flight, keys[first : first + LANES])
+        found = identify(jaxos4.IBSS(), problem, states, *map(jnp.asarray, same))
+        error = np.asarray(found.parameters - problem.model.alpha)
+        for lane in range(LANES):
+            noisy = eqx.tree_at(lambda p: p.flight.states, problem, states[lane])
+            covariance = jaxos4.robust_covariance(noisy, found.parameters[lane], found.initial_state[lane])
+            robust.append(error[lane] / np.sqrt(np.diagonal(covariance)))
+        naive.extend(error / found.std)
+    return np.array(naive), np.array(robust)
 
 
 def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_not():
