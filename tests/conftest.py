@@ -16,7 +16,7 @@ jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS") or "cpu")
 # Workers and later runs share the compiled programs.
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or pathlib.Path(__file__).resolve().parents[1] / ".pytest_cache/jax"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # Before the first import of jaxos4: all its annotated functions and modules are checked.
 jaxtyping.install_import_hook("jaxos4", "typechecker.check")
