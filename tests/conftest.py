@@ -1,8 +1,6 @@
-"""Settings and fixtures of all tests: precision, platform, runtime shape checks, property tests, real flights.
+"""Settings and fixtures of all tests: precision, platform, runtime shape checks, property tests, real flights."""
 
-The hooks below are few and simple, so that a report (for example of the number of compiled programs) can be added.
-"""
-
+import collections
 import os
 import pathlib
 import sys
@@ -18,7 +16,7 @@ jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS") or "cpu")
 # Workers and later runs share the compiled programs.
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or pathlib.Path(__file__).resolve().parents[1] / ".pytest_cache/jax"
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # Before the first import of jaxos4: all its annotated functions and modules are checked.
 jaxtyping.install_import_hook("jaxos4", "typechecker.check")
@@ -27,13 +25,53 @@ hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
-LONGEST = ("network", "experiments", "equation_error", "ibss", "kalman", "study_resume", "cli", "svsf", "study_cluster")
+LONGEST = (
+    *("experiments", "experiment_studies", "network", "equation_error", "multiple_shooting", "ibss", "kalman"),
+    *("vehicle", "identify", "estimators", "cli", "study_resume", "cli_vehicle", "svsf", "study_cluster"),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sorts the modules. The order of the tests in a module does not change."""
     places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
+
+
+PROGRAMS: collections.Counter[str] = collections.Counter()  # of this process; on the controller, of all workers
+
+
+def count_program(event: str, seconds: float, **_) -> None:
+    """Counts one program that XLA compiled or that the cache had, and the seconds that this took."""
+    if event == "/jax/core/compile/backend_compile_duration":
+        PROGRAMS.update(programs=1, milliseconds=round(1000 * seconds))
+
+
+def count_cached(event: str, **_) -> None:
+    """Counts one program that the cache had."""
+    PROGRAMS["cached"] += event == "/jax/compilation_cache/cache_hits"
+
+
+jax.monitoring.register_event_duration_secs_listener(count_program)
+jax.monitoring.register_event_listener(count_cached)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """A worker sends its counts to the controller."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["programs"] = dict(PROGRAMS)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    """The controller adds the counts of a worker; a worker that died sent none."""
+    PROGRAMS.update(getattr(node, "workeroutput", {}).get("programs", {}))
+
+
+def pytest_terminal_summary(terminalreporter) -> None:
+    """Says how many programs the tests needed. Those of processes that the tests start are not known here."""
+    cached = PROGRAMS["cached"]
+    compiled, seconds = PROGRAMS["programs"] - cached, PROGRAMS["milliseconds"] / 1000
+    terminalreporter.write_line(f"{compiled} programs compiled, {cached} from the cache, in {seconds:.0f} s")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -47,11 +85,16 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
     return LoadFileScheduling(config, log)
 
 
+MOST_MAPS = 30_000
+
+
 @pytest.fixture(scope="module", autouse=True)
-def compiled_programs_end_with_their_module() -> Iterator[None]:
-    """Compiled programs hold memory maps. A process dies at the kernel's limit of 65,530 maps."""
+def compiled_programs_end_before_the_process_does() -> Iterator[None]:
+    """Compiled programs hold memory maps. A process dies at the kernel's limit of 65,530; one module adds 25,000."""
     yield
-    jax.clear_caches()
+    maps = pathlib.Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

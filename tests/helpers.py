@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxos4
+from jaxos4.models.state import CASCADE_ORDER
 
 # The constants of the OS4 thesis, typed again instead of imported.
 OS4 = {"m": 0.650, "L": 0.23, "b": 3.13e-5, "d": 7.5e-7, "g": 9.81}
@@ -20,8 +21,11 @@ DT = 0.01
 
 @functools.cache
 def standard_flight(model_class=jaxos4.PublishedOS4, duration=5.0):
-    """The standard flight without noise."""
+    """The standard flight without noise. One of less than 5 s is its first part, so that it needs no new program."""
     model = model_class(jaxos4.OS4)
+    if duration < 5.0:
+        flight, samples = standard_flight(model_class), round(duration / DT) + 1
+        return jaxos4.Flight(*(np.asarray(x)[:samples] for x in (flight.time, flight.omega, flight.states)))
     omega = jaxos4.multisine(model.airframe, duration=duration, dt=DT)
     return jaxos4.simulate(model, model.alpha, omega, dt=DT)
 
@@ -38,10 +42,15 @@ def standard_problem(
     return jaxos4.ShootingProblem(model_class(jaxos4.OS4), flight, **arguments)
 
 
+BLOCK = 64  # draws of one call, whatever the number wanted: one program
+
+
 def noisy_states(count, model_class=jaxos4.PublishedOS4, *, seed=0, scale=1.0, duration=5.0):
-    """Noisy states of `count` standard flights. Flight i draws from `fold_in(key, i)`."""
-    flight, noise = standard_flight(model_class, duration), jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
-    return measured(noise, flight, folded(jax.random.key(seed), jnp.arange(count)))
+    """Noisy states of `count` standard flights. Flight i draws from `fold_in(key, i)`, the same for all durations."""
+    flight, noise = standard_flight(model_class, max(duration, 5.0)), jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
+    samples, key = round(duration / DT) + 1, jax.random.key(seed)
+    blocks = [measured(noise, flight, folded(key, first + np.arange(BLOCK))) for first in range(0, count, BLOCK)]
+    return jnp.asarray(np.concatenate([np.asarray(block)[:, :samples] for block in blocks])[:count])
 
 
 @jax.jit
@@ -59,8 +68,14 @@ def measured(noise, flight, keys):
 def random_starts(model, count, *, seed=0, share=0.8):
     """Starts of searches: uniform within `share` of the default bracket."""
     around = jaxos4.Bracket.default(model)
-    draws = jax.random.uniform(jax.random.key(seed), (count, 8), minval=-share, maxval=share)
-    return around.center + draws * around.half_width
+    draws = uniform(jax.random.key(seed), -(-count // BLOCK) * BLOCK)
+    return jnp.asarray(around.center + share * np.asarray(draws)[:count] * around.half_width)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def uniform(key, count):
+    """Numbers from -1 to 1, eight in each row."""
+    return jax.random.uniform(key, (count, 8), minval=-1, maxval=1)
 
 
 def published_derivative(state, omega, alpha, constants=OS4):
@@ -115,10 +130,40 @@ REFERENCES = {jaxos4.PublishedOS4: published_derivative, jaxos4.CorrectedOS4: co
 
 def euler_trajectory(derivative, alpha, omega, *, dt=DT, start=None, constants=OS4):
     """x_{k+1} = x_k + T f(x_k, u_k), one row for each sample."""
-    states = [np.zeros(12) if start is None else np.asarray(start, dtype=float)]
+    states, dt = [np.zeros(12) if start is None else np.asarray(start, dtype=float)], float(dt)
     for row in np.asarray(omega)[:-1]:
         states.append(states[-1] + dt * derivative(states[-1], row, alpha, constants))
     return np.stack(states)
+
+
+def first_samples(problem):
+    """The first sample of each window, and at the end the number of samples."""
+    return [k * len(problem.flight.time) // problem.windows for k in range(problem.windows + 1)]
+
+
+def numpy_costs(problem, parameters, starts):
+    """The cost by the NumPy equations at each row of parameters and initial states, from the first sample on."""
+    order, flight = CASCADE_ORDER[: problem.size], problem.flight
+    whole = np.zeros((len(starts), 12))
+    whole[:, order] = starts
+    states = euler_trajectory(REFERENCES[type(problem.model)], parameters, flight.omega, start=whole, dt=flight.dt)
+    residuals = ((np.asarray(flight.states)[:, None] - states) / np.asarray(problem.sigma))[..., order]
+    first = 0 if problem.initial_state is None else 1  # a known first sample is no data
+    return 0.5 * np.square(residuals[first:]).sum(axis=(0, 2))
+
+
+def numpy_residuals(problem, parameters, starts):
+    """W (y - x) by the NumPy equations, each window from its own start; NaN where nothing was measured."""
+    flight, derivative = problem.flight, REFERENCES[type(problem.model)]
+    order, ends = CASCADE_ORDER[: problem.size], first_samples(problem)
+    states = []
+    for start, first, end in zip(np.reshape(starts, (problem.windows, -1)), ends[:-1], ends[1:], strict=True):
+        whole = np.zeros(12)
+        whole[order] = start
+        states.append(
+            euler_trajectory(derivative, np.asarray(parameters), flight.omega[first:end], start=whole, dt=flight.dt)
+        )
+    return ((np.asarray(flight.states) - np.concatenate(states)) / np.asarray(problem.sigma))[:, order]
 
 
 def refused(result: tuple[int, str, str], *fragments: str) -> None:
@@ -132,7 +177,9 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
 
 def single_precision(script):
     """What a script writes as JSON in a process of its own, with JAX as it comes."""
+    cache = str(jax.config.values["jax_compilation_cache_dir"])
     environment = {**os.environ, "JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
+    environment |= {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -37,15 +37,21 @@ def lanes(states, model_class=jaxos4.PublishedOS4, channels="rates", *, free=Fal
 @functools.cache
 def bound(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
     """Standard deviations at the Cramer-Rao bound."""
-    problem = standard_problem(model_class, channels, free=free)
-    return np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, model_class().alpha)))
+    return np.sqrt(np.diagonal(_covariance(model_class, channels, free)))
 
 
 @functools.cache
 def information(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
     """The information about the parameters at the truth."""
+    covariance = _covariance(model_class, channels, free)
+    scale = np.outer(*2 * (np.sqrt(np.diagonal(covariance)),))
+    return np.linalg.inv(covariance / scale) / scale
+
+
+@functools.cache
+def _covariance(model_class, channels, free):
     problem = standard_problem(model_class, channels, free=free)
-    return np.asarray(jaxos4.fisher_information(problem, model_class().alpha))
+    return np.asarray(jaxos4.cramer_rao_bound(problem, model_class().alpha))
 
 
 def errors(estimates, model_class=jaxos4.PublishedOS4):
@@ -63,6 +69,12 @@ def assert_covered(error, std):
     """95 % intervals hold the truth as often as they say. The errors of a flight are correlated: flights count."""
     inside = np.mean(np.abs(error) < 1.96 * np.asarray(std))
     assert abs(inside - 0.95) < 4 * np.sqrt(0.95 * 0.05 / len(error)), inside
+
+
+def lost(states, share=0.3, seed=8):
+    """The states without a `share` of the measurements."""
+    gone = np.random.default_rng(seed).random(states.shape) < share
+    return jnp.asarray(np.where(gone, np.nan, states))
 
 
 def names(estimates):

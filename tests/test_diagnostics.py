@@ -7,32 +7,30 @@ import numpy as np
 import pytest
 import scipy.stats
 from helpers import measured, noisy_states, standard_flight, standard_problem
+from lanes import LANES, identify
 
 import jaxos4
 
 LAGS = 25
 
 
-@eqx.filter_jit
-@eqx.filter_vmap
-def fitted(states):
-    problem = standard_problem(states=states, channels="rates")
-    found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
-    return found.parameters, found.initial_state
-
-
 def judged(states):
     """The diagnostics of a fit to each flight."""
-    problem = standard_problem(channels="rates")
-    each = [
-        jaxos4.residual_diagnostics(eqx.tree_at(lambda p: p.flight.states, problem, flight), parameters, start)
-        for flight, parameters, start in zip(states, *fitted(states), strict=True)
-    ]
-    return jax.tree.map(lambda *values: np.stack(values), *each)
+    problem, each = standard_problem(channels="rates"), []
+    around = jaxos4.Bracket.default(problem.model)
+    settings = [np.tile(x, (LANES, 1)) for x in (around.lower, around.upper)]
+    settings = [jnp.asarray(x) for x in (np.tile(problem.flight.omega, (LANES, 1, 1)), *settings)]
+    for first in range(0, len(states), LANES):
+        some = jnp.asarray(np.resize(states[first : first + LANES], (LANES, *states.shape[1:])))
+        found = identify(jaxos4.IBSS(), problem, some, *settings)
+        for lane in range(min(LANES, len(states) - first)):
+            flight = eqx.tree_at(lambda p: p.flight.states, problem, some[lane])
+            each.append(jaxos4.residual_diagnostics(flight, found.parameters[lane], found.initial_state[lane]))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
 
 
-def coloured_states(count, noise):
-    return measured(noise, standard_flight(), jax.random.split(jax.random.key(5), count))
+def coloured_states(noise):
+    return measured(noise, standard_flight(), jax.random.split(jax.random.key(5), LANES))
 
 
 def test_figures_are_those_of_plain_numpy():
@@ -81,10 +79,10 @@ def test_missing_samples_do_not_look_like_colour(share):
 
 
 def test_coloured_noise_and_a_wrong_size_are_seen():
-    found = judged(coloured_states(32, jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.05)))
+    found = judged(coloured_states(jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.05)))
     assert (found.white_p < 1e-6).all()
     np.testing.assert_allclose(found.autocorrelation[:, :, 0].mean(), np.exp(-0.01 / 0.05), atol=0.05)
-    louder = judged(noisy_states(32, scale=1.3))
+    louder = judged(noisy_states(LANES, scale=1.3))
     assert (louder.level_p < 1e-4).all()
     np.testing.assert_allclose(louder.level.mean(), 1.69, rtol=0.03)
 
@@ -132,7 +130,7 @@ def test_sparse_measurements_are_tested_at_the_lags_that_have_pairs():
     white = judged(jnp.where(kept, noisy_states(200, seed=23), jnp.nan))
     assert abs(float((white.white_p < 0.05).mean()) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 600)
     slow = jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.1)
-    coloured = judged(jnp.where(kept, coloured_states(16, slow), jnp.nan))
+    coloured = judged(jnp.where(kept, coloured_states(slow), jnp.nan))
     assert np.median(coloured.white_p) < 1e-3
     # Five samples are half a correlation time. The fit explains some of the noise as motion.
     assert 0.3 < float(coloured.colour.mean()) < np.exp(-0.5)

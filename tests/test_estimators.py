@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import noisy_states, standard_flight, standard_problem
-from lanes import HALF, LANES, assert_chi_square, bound, errors, identify, lanes, names
+from lanes import HALF, LANES, assert_chi_square, bound, errors, identify, lanes, lost, names
 
 import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
@@ -88,9 +88,7 @@ def test_failing_lanes_leave_their_neighbours_alone(name):
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "svsf"])
 def test_missing_samples_only_cost_precision(name):
     """Three of ten measurements are lost, and the covariance still describes the errors."""
-    states = noisy_states(LANES, seed=7)
-    lost = jax.random.bernoulli(jax.random.key(8), 0.3, states.shape)
-    estimates = identify(make_estimator(name), *lanes(jnp.where(lost, jnp.nan, states)))
+    estimates = identify(make_estimator(name), *lanes(lost(noisy_states(LANES, seed=7))))
     assert set(names(estimates)) == {"successful"}
     assert (np.median(estimates.std, axis=0) > 1.05 * bound()).all()
     assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))

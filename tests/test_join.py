@@ -51,9 +51,9 @@ def test_no_window_reaches_from_one_stretch_into_the_next(lengths, length, force
     np.testing.assert_array_equal(problem.window_of_samples(), np.repeat(np.arange(windows), length))
     for w, (flight, part) in enumerate(rows):
         at = slice(length * w, length * (w + 1))
-        np.testing.assert_array_equal(joined.omega[at], flight.omega[part])
-        np.testing.assert_array_equal(joined.states[at], flight.states[part])
-        np.testing.assert_array_equal(joined.channels[at], flight.channels[part])
+        for name in ("omega", "states", "channels"):
+            found, expected = (np.asarray(getattr(each, name)) for each in (joined, flight))
+            np.testing.assert_array_equal(found[at], expected[part])
     assert joined.stretch is not None
     np.testing.assert_array_equal(joined.stretch, np.repeat(np.arange(len(whole)), [n * length for _, n in whole]))
     assert (joined.specific_force is None) == (not any(flight.specific_force is not None for flight, _ in whole))

@@ -40,9 +40,12 @@ def refinements(request):
     omega = jaxos4.multisine(model.airframe, duration=1.0, dt=COARSE)
 
     def fly(method, refinement):
-        held = jnp.concatenate([jnp.repeat(omega[:-1], refinement, axis=0), omega[-1:]])
-        flight = jaxos4.simulate(model, alpha, held, dt=COARSE / refinement, method=method)
-        return np.asarray(flight.states)[::refinement]
+        held = np.repeat(np.asarray(omega)[:-1], refinement, axis=0)
+        # As many rows for every refinement: one program.
+        rows = len(held) + 1 if method == "diffrax" else STEPS[-1] * len(omega)
+        held = np.concatenate([held, np.repeat(np.asarray(omega)[-1:], rows - len(held), axis=0)])
+        flight = jaxos4.simulate(model, alpha, jnp.asarray(held), dt=COARSE / refinement, method=method)
+        return np.asarray(flight.states)[::refinement][: len(omega)]
 
     exact = fly("diffrax", 1)
     errors = {
@@ -162,16 +165,22 @@ def test_shapes_that_do_not_fit_are_named():
 # One lane, many lanes.
 
 
+def batch(method, *arguments):
+    """Flights of lanes of parameters, rotor speeds and initial states: the tests share its program."""
+
+    def fly(alpha, omega, start):
+        return jaxos4.simulate(jaxos4.PublishedOS4(), alpha, omega, dt=DT, initial_state=start, method=method)
+
+    return eqx.filter_vmap(fly)(*map(jnp.asarray, arguments))
+
+
 @every_method
 def test_loop_and_vmap_agree(method):
     model, omega = jaxos4.PublishedOS4(), standard_flight().omega[:SAMPLES]
     alphas = model.alpha * jnp.linspace(0.8, 1.2, 3)[:, None]
-
-    def fly(alpha):
-        return jaxos4.simulate(model, alpha, omega, dt=DT, method=method)
-
-    batched = eqx.filter_vmap(fly)(alphas)
-    np.testing.assert_allclose(batched.states, [fly(alpha).states for alpha in alphas], rtol=1e-12, atol=1e-14)
+    batched = batch(method, alphas, np.tile(omega, (3, 1, 1)), np.zeros((3, 12)))
+    each = [jaxos4.simulate(model, alpha, omega, dt=DT, method=method).states for alpha in alphas]
+    np.testing.assert_allclose(batched.states, each, rtol=1e-12, atol=1e-14)
     assert name(batched) == [SUCCESS] * 3
 
 
@@ -233,15 +242,11 @@ def test_an_overflow_ends_the_flight(method):
 def test_failing_lanes_leave_their_neighbours_alone(method):
     model = jaxos4.PublishedOS4()
     omega = np.tile(hover(model), (3, 1, 1))
-    starts = np.tile(OVER / 2, (3, 1))
-
-    def fly(omega, start):
-        return jaxos4.simulate(model, PLANE, omega, dt=DT, initial_state=start, method=method)
-
-    valid = eqx.filter_vmap(fly)(jnp.asarray(omega), jnp.asarray(starts))
+    starts, alphas = np.tile(OVER / 2, (3, 1)), np.tile(PLANE, (3, 1))
+    valid = batch(method, alphas, omega, starts)
     omega[0, 4, 2] = np.nan
     starts[2] = OVER
-    mixed = eqx.filter_vmap(fly)(jnp.asarray(omega), jnp.asarray(starts))
+    mixed = batch(method, alphas, omega, starts)
     assert name(valid) == [SUCCESS] * 3
     assert name(mixed) == [NONFINITE, SUCCESS, SINGULAR]
     np.testing.assert_array_equal(mixed.states[1], valid.states[1])
