@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from ..flight import STATE_NAMES, Flight, fill_gaps
 from ..trigonometry import sincos

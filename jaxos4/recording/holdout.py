@@ -3,6 +3,7 @@
 import equinox as eqx
 import numpy as np
 
+from .._custom_types import as_float
 from ..flight import Flight
 
 # Length of a block that is held out [s]: each part of a flight then has blocks of both kinds.
