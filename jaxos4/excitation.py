@@ -9,9 +9,8 @@ paper does not state its inputs; these are our choice.
 import math
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ._custom_types import Numeric, RotorSpeeds, as_float
 from .airframe import Airframe
@@ -186,18 +185,13 @@ def _in_turn(shape: np.ndarray, intervals: int, order: list[int], peak: np.ndarr
 
 def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> RotorSpeeds:
     """Rotor speeds [rad/s] that produce these angular accelerations [rad/s^2] and carry the weight."""
-    mixer = np.asarray(_mixer(airframe), dtype=np.float64)
+    mixer = np.asarray(airframe.mixer, dtype=np.float64)
     torque = np.asarray(airframe.inertia, dtype=np.float64) * acceleration
     weight = float(airframe.mass) * float(airframe.gravity)
     hover = np.linalg.solve(mixer, np.array([0.0, 0.0, 0.0, weight]))
     change = np.linalg.solve(mixer, np.pad(torque, ((0, 0), (0, 1))).T).T
     _check_flyable(hover, change, float(airframe.max_rotor_speed), dt)
     return as_float(np.sqrt(hover + change))
-
-
-@eqx.filter_jit  # one compiled program instead of one for each operation
-def _mixer(airframe: Airframe) -> Float[Array, "4 4"]:
-    return airframe.mixer
 
 
 def _check_flyable(hover: np.ndarray, change: np.ndarray, fastest: float, dt: float) -> None:

@@ -17,9 +17,14 @@ _SIN = tuple((-1) ** i / math.factorial(2 * i + 1) for i in range(8))
 _COS = tuple((-1) ** i / math.factorial(2 * i) for i in range(9))
 
 
-@jax.custom_jvp
+@jax.jit  # traced once for all its calls in a program
 def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """`(sin(x), cos(x))` to about one ulp, for angles x [rad] of less than a million turns; NaN if x is not finite."""
+    return _sincos(x)
+
+
+@jax.custom_jvp
+def _sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     quarter = jnp.round(x * (2 / math.pi))
     r = x
     for part in _HALF_PI_SINGLE if x.dtype == jnp.float32 else _HALF_PI_DOUBLE:
@@ -33,9 +38,9 @@ def sincos(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, ".
     return jnp.where(quadrant >= 2, -sin, sin), jnp.where((quadrant == 1) | (quadrant == 2), -cos, cos)
 
 
-@sincos.defjvp
+@_sincos.defjvp
 def _sincos_jvp(primals, tangents):
-    sin, cos = sincos(*primals)
+    sin, cos = _sincos(*primals)
     (dx,) = tangents
     return (sin, cos), (cos * dx, -sin * dx)
 

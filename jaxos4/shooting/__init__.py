@@ -2,5 +2,5 @@
 
 from .padding import padded as padded
 from .problem import ROUNDING as ROUNDING, ShootingProblem as ShootingProblem
-from .rows import Rows as Rows
+from .rows import Rows as Rows, each_window as each_window
 from .scans import FASTEST as FASTEST, Curvature as Curvature, Length as Length, Shot as Shot

@@ -15,7 +15,7 @@ from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
-from .rows import Rows, windowed
+from .rows import Rows, each_window, windowed
 from .scans import Curvature, Length, Shot, predict_window, shoot, shoot_with_derivatives
 
 # Rounding errors add up over a flight, to about this many times the rounding of one measurement.
@@ -214,20 +214,23 @@ class ShootingProblem(eqx.Module):
     def predict(self, parameters: Parameters, initial_state: InitialStates) -> Float[Array, "samples columns"]:
         """The output of noise-free sensors, in the order of `columns`."""
         _, within = self.cut()
-        predict = jax.vmap(
-            lambda forcing, start: predict_window(self._advance, forcing, parameters, start, self.length)
-        )
-        return predict(self.rows(parameters).forcing, self.split(initial_state))[within]
+
+        def predict(forcing: Forcing, start: InitialState) -> Float[Array, "length columns"]:
+            return predict_window(self._advance, forcing, parameters, start, self.length)
+
+        return each_window(predict, self.rows(parameters).forcing, self.split(initial_state))[within]
 
     def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
         """The cost of all windows together."""
-        each = jax.vmap(self.shot, in_axes=(0, None, 0))(self.rows(parameters), parameters, self.split(initial_state))
+        rows, starts = self.rows(parameters), self.split(initial_state)
+        each = each_window(lambda rows, start: self.shot(rows, parameters, start), rows, starts)
         return Shot(each.cost.sum(), each.sound.all())
 
     def curvatures(self, parameters: Parameters, initial_state: InitialStates) -> Curvature:
         """The curvature of each window, in the parameters and the window's own initial state."""
         rows = self.with_forcing(self.rows(), parameters, tangents=True)
-        return jax.vmap(self.curvature, in_axes=(0, None, 0))(rows, parameters, self.split(initial_state))
+        starts = self.split(initial_state)
+        return each_window(lambda rows, start: self.curvature(rows, parameters, start), rows, starts)
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""

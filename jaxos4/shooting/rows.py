@@ -1,6 +1,7 @@
 """The data that a scan over a flight reads, cut into windows."""
 
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -19,6 +20,14 @@ class Rows(NamedTuple):
     forcing: Forcing
     measured: tuple[Float[Array, "*windows rows"], ...]
     forcing_tangents: Forcing | None = None
+
+
+def each_window(function: Callable, *arguments: Any) -> Any:
+    """`function` of each window. The only window of a flight needs no `vmap`, which takes long to trace."""
+    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
+        return jax.vmap(function)(*arguments)
+    only = jax.tree.map(lambda leaf: leaf[0], arguments)
+    return jax.tree.map(lambda leaf: leaf[None], function(*only))
 
 
 Series = TypeVar("Series", Forcing, tuple[Array, ...])

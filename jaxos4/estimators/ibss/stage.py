@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._custom_types import Parameters, Scalar
 from ...bracket import Bracket
 from ...flight import Inputs
-from ...shooting import ROUNDING, Curvature, Length, Rows, ShootingProblem
+from ...shooting import ROUNDING, Curvature, Length, Rows, ShootingProblem, each_window
 from .directions import sequence
 
 Limits = tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]
@@ -127,7 +127,7 @@ class Stage(NamedTuple):
         count, states = self.parameter_count, self.problem.size
         fitted = rows.measured[: part.size] + rows.measured[states:]
         starts = unknowns[:, count : count + part.size] if part.free_size else self.starts[:, : part.size]
-        return jax.vmap(function)(rows._replace(measured=fitted), unknowns[:, :count], starts)
+        return each_window(function, rows._replace(measured=fitted), unknowns[:, :count], starts)
 
 
 def stages(
