@@ -72,9 +72,9 @@ def test_rollout_budget(tmp_path):
     data = load_results(tmp_path / "out").squeeze()
     reached = load("rollout_budget", "plot").accuracy(data)
     assert (data["rollouts"].mean("flight").isel(limit=1) >= data["rollouts"].mean("flight").isel(limit=0)).all()
-    # One sweep of each stage is as good as the complete search; one step of output error is not.
-    assert float(reached.isel(limit=0).sel(search="IBSS, whitened")) < 1.2
-    assert float(reached.isel(limit=0).sel(search="output error")) > 2
+    # One sweep, or one step, of each stage is nearly as good as the complete search: the rates are nearly linear.
+    assert (reached.isel(limit=0) < 1.2).all()
+    assert (data["rollouts"].mean("flight").isel(limit=0) < 0.7 * data["rollouts"].mean("flight").isel(limit=1)).all()
     # Both minimise the same cost.
     np.testing.assert_allclose(reached.isel(limit=1), 1, atol=0.2)
 
