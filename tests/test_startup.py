@@ -235,3 +235,17 @@ def test_a_command_keeps_the_settings_of_its_process(run):
     before = json.dumps(jax.config.values, default=str, sort_keys=True)
     assert run(*SIMULATE)[0] == 0
     assert json.dumps(jax.config.values, default=str, sort_keys=True) == before
+
+
+def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path):
+    """It ends the process without the clean-up of Python: nothing that was printed or written may be lost."""
+    console = [sys.executable, "-c", "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import console; console()"]
+    for arguments, code, expected in (
+        (["--version"], 0, "jaxos4 "),
+        (["estimate", "nowhere.csv"], 2, "nowhere.csv: there is no such file"),
+        (["simulate", "--out", "flight.csv", "--duration", "0.5"], 0, "flight.csv: 51 samples"),
+    ):
+        done = subprocess.run([*console, *arguments], capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == code, done.stderr
+        assert expected in done.stdout + done.stderr
+    assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52

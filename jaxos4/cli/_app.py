@@ -82,7 +82,7 @@ def main() -> None:
         raise SystemExit(1) from None
 
 
-def command() -> None:
+def console() -> None:
     """The console command: `main`, and then the end of the process.
 
     Python alone would take another half second to free what JAX made.
