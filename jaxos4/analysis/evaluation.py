@@ -39,7 +39,7 @@ class Evaluation(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Whether the trajectory is finite to its end, without a pitch angle of 90 degrees."""
+        """Whether what noise-free sensors measure is finite to its end, without a pitch angle of 90 degrees."""
         states = self.predicted[:, : self.problem.size]
         if not np.isfinite(states).all() or (np.abs(states[:, : CHANNELS["rates"]]) >= FASTEST).any():
             return False
@@ -48,7 +48,7 @@ class Evaluation(NamedTuple):
     @property
     def sigma(self) -> Float[np.ndarray, " columns"]:
         """The standard deviation of the noise in each column."""
-        return np.asarray(self.problem.sigma)[self.problem.columns]
+        return np.asarray(self.problem.sigma, dtype=np.float64)[self.problem.columns]
 
     @property
     def errors(self) -> Float[np.ndarray, "samples columns"]:
@@ -83,8 +83,11 @@ class Evaluation(NamedTuple):
 
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
-        """The Cramer-Rao bound of the parameters."""
-        return inverse(shared_information(self.information, self.parameters.size))
+        """The Cramer-Rao bound of the parameters; infinite if the trajectory is not sound."""
+        count = self.parameters.size
+        if not self.sound:
+            return np.full((count, count), np.inf)
+        return inverse(shared_information(self.information, count))
 
 
 def evaluate(
@@ -92,11 +95,13 @@ def evaluate(
 ) -> Evaluation:
     """Simulate a flight with all first derivatives. `initial_state` defaults to the measured one."""
     parameters, samples = as_float(parameters), problem.flight.time.shape[0]
-    predicted, slopes, torques, nominal = map(np.asarray, _fly(padded(problem), parameters, initial_state))
+    flown = _fly(padded(problem), parameters, initial_state)
+    # In double precision from here on: a difference of information matrices would lose the digits of single precision.
+    predicted, slopes, torques, nominal = (np.asarray(x, dtype=np.float64) for x in flown)
     return Evaluation(
         problem=problem,
-        parameters=np.asarray(parameters),
-        measured=problem.recorded(),
+        parameters=np.asarray(parameters, dtype=np.float64),
+        measured=problem.recorded().astype(np.float64),
         predicted=predicted[:samples],
         slopes=slopes[:, :samples],
         torques=torques[:samples],

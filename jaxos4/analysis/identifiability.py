@@ -112,10 +112,11 @@ def identifiability_of(evaluation: Evaluation, bracket: Bracket) -> Identifiabil
         evaluation = evaluate(problem, as_float(nominal))
     half_width = (upper - lower) / 2 if valid else np.ones_like(nominal)
     information = shared_information(evaluation.information, nominal.size)
-    eigenvalues, directions = np.linalg.eigh(np.nan_to_num(information * half_width[:, None] * half_width))
+    scaled = np.nan_to_num(information * half_width[:, None] * half_width, posinf=0.0, neginf=0.0)
+    eigenvalues, directions = np.linalg.eigh(scaled)
     diagonal = np.diagonal(information)
     with np.errstate(divide="ignore"):
         alone = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 0.0)), np.inf)
     std = np.sqrt(np.diagonal(inverse(information)))
     std, alone = (x if sound else np.full_like(x, np.inf) for x in (std, alone))
-    return Identifiability(nominal, half_width, std, alone, eigenvalues, directions)
+    return Identifiability(nominal, half_width, std, alone, np.maximum(eigenvalues, 0.0), directions)

@@ -71,7 +71,7 @@ def fit_inertia(
     alpha, covariance = np.asarray(alpha, dtype=float), np.asarray(covariance, dtype=float)
     if alpha.shape[-1:] != (8,) or covariance.shape[-2:] != (8, 8):
         raise ValueError(
-            f"`alpha`, `covariance` must be of shapes (8,), (8, 8), got {alpha.shape}, {covariance.shape}."
+            f"`alpha`, `covariance` must end in the shapes (8,), (8, 8), got {alpha.shape}, {covariance.shape}."
         )
     usable = np.asarray(np.isfinite(alpha).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     factor, inertia = float(model.gyroscopic_factor), np.asarray(model.airframe.inertia, dtype=float)

@@ -1,6 +1,5 @@
 """The application: its commands and exit codes."""
 
-import contextlib
 import functools
 import os
 import sys
@@ -90,10 +89,14 @@ def console() -> None:
     try:
         main()
     except SystemExit as stop:
-        code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        if not (stop.code is None or isinstance(stop.code, int)):
+            raise  # Python prints the message
+        code = stop.code or 0
         for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(OSError, ValueError):  # its reader has gone
+            try:
                 stream.flush()
+            except (OSError, ValueError):  # the reader has gone, or the disk is full: output is lost
+                code = code or 1
         os._exit(code)
 
 

@@ -16,7 +16,7 @@ _JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in le
 
 
 def prepare() -> None:
-    """Prepares this process for JAX. A cache that the user, or a test, chose already stays."""
+    """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off."""
     gc.set_threshold(100_000, 20, 100)  # JAX makes millions of small objects that stay: rarer searches for garbage
 
     import jax

@@ -76,8 +76,8 @@ def refine(
         if huber:
             weighted, kept, errors = winsorised_of(evaluation(problem, estimate))
         else:
-            errors = evaluation(before, estimate).errors
-            weighted = before.reweighted(errors)
+            found = evaluation(before, estimate)
+            errors, weighted = found.errors, before.reweighted(found.errors, fitted=found.parameters.size)
         colour = _colour_factor(errors)
         settled = bool((np.abs(np.asarray(weighted.sigma) / np.asarray(before.sigma) - 1) < _SETTLED).all())
         if huber and previous is not None:

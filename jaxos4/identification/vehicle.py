@@ -154,8 +154,8 @@ def refit(
 class _Part(NamedTuple):
     """The parameters of a model that are fitted, and those that are held.
 
-    The search and the simulation at its end take the whole model, and which parameters are held as data: all stages
-    share one program of each. `bracket`: of all parameters.
+    The search, and the simulation at its answer, take the whole model. Which parameters are held is data to them, so
+    that all stages share two compiled programs. `bracket`: of all parameters.
     """
 
     model: AbstractModel

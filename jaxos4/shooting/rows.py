@@ -9,6 +9,8 @@ from jaxtyping import Array, Float, Int
 
 from ..models.state import Forcing
 
+Series = TypeVar("Series", Forcing, tuple[Array, ...])
+
 
 class Rows(NamedTuple):
     """One window, or a batch of windows: one leaf for each channel, one row for each sample.
@@ -28,9 +30,6 @@ def each_window(function: Callable, *arguments: Any) -> Any:
         return jax.vmap(function)(*arguments)
     only = jax.tree.map(lambda leaf: leaf[0], arguments)
     return jax.tree.map(lambda leaf: leaf[None], function(*only))
-
-
-Series = TypeVar("Series", Forcing, tuple[Array, ...])
 
 
 def windowed(series: Series, index: Int[np.ndarray, "windows length"]) -> Series:

@@ -22,9 +22,10 @@ FASTEST = 1e3
 
 # From a state, the forcing and the parameters: the state one sample later, and the output of noise-free sensors.
 Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
-
-
 Carry = TypeVar("Carry")
+# The number of rows that count in a padded flight. It is data and not a shape, so that flights of different lengths
+# share one compiled program.
+Length = Int[Array, ""] | None
 
 
 class Shot(NamedTuple):
@@ -45,11 +46,6 @@ class Curvature(NamedTuple):
     shot: Shot
     gradient: Float[Array, " unknowns"]
     information: Float[Array, "unknowns unknowns"]
-
-
-# The number of rows that count, if the flight is padded. It is a number and no shape, so that flights of different
-# lengths share one compiled program.
-Length = Int[Array, ""] | None
 
 
 def predict_window(

@@ -100,7 +100,8 @@ class IBSS(AbstractEstimator):
         - `start`: where the search begins; the bracket's center by default.
         - `spread`: the covariance of `start`, which sizes the first brackets; by default that of `bracket`, with its
           half-width as two standard deviations.
-        - `free`: which parameters to search; all by default. The others stay at `start`, with a variance of 0.
+        - `free`: which parameters to search; all by default. The others stay at `start`, which must lie
+          within `reach`, with a variance of 0.
 
         **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
         """
