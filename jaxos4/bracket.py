@@ -2,6 +2,8 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Numeric, Parameters, as_float
@@ -51,12 +53,21 @@ class Bracket(eqx.Module):
     @property
     def center(self) -> Parameters:
         """The middle of each interval."""
-        return (self.lower + self.upper) / 2
+        lower, upper = self._ends
+        return as_float((lower + upper) / 2)
 
     @property
     def half_width(self) -> Parameters:
         """Half the length of each interval."""
-        return (self.upper - self.lower) / 2
+        lower, upper = self._ends
+        return as_float((upper - lower) / 2)
+
+    @property
+    def _ends(self) -> tuple[Numeric, Numeric]:
+        """Both ends; those of a known bracket as NumPy, which needs no compiled program."""
+        if isinstance(self.lower, Tracer) or isinstance(self.upper, Tracer):
+            return self.lower, self.upper
+        return np.asarray(self.lower), np.asarray(self.upper)
 
     @property
     def valid(self) -> Bool[Array, ""]:

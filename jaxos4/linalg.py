@@ -65,17 +65,17 @@ def joint_factor(information: Float[Array, "windows n n"], count: int) -> JointF
 
 def covariances(information: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
     """The covariance of each window's unknowns, when the unknowns of all windows are estimated together."""
-    return _square(joint_factor(information, count).basis)
+    return gram(joint_factor(information, count).basis)
 
 
 def covariance_of_shared(information: Float[Array, "windows n n"], count: int) -> Float[Array, "count count"]:
     """The covariance of the `count` shared unknowns, when the unknowns of all windows are estimated together."""
-    return _square(joint_factor(information, count).basis[0, :count, -count:])
+    return gram(joint_factor(information, count).basis[0, :count, -count:])
 
 
 def invert(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse of a symmetric positive semidefinite matrix, whatever the units of its rows."""
-    return _square(unit_directions(information))
+    return gram(unit_directions(information))
 
 
 def unit_directions(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -83,6 +83,6 @@ def unit_directions(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return joint_factor(information[None], information.shape[0]).basis[0]
 
 
-def _square(matrix: Float[Array, "*batch n m"]) -> Float[Array, "*batch n n"]:
-    """M M^T."""
+def gram(matrix: Float[Array, "*batch n m"]) -> Float[Array, "*batch n n"]:
+    """M M^T of each matrix M, in plain operations."""
     return (matrix[..., :, None, :] * matrix[..., None, :, :]).sum(axis=-1)

@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from .._custom_types import Covariance, InitialStates, Parameters, as_float
-from ..linalg import covariance_of_shared, joint_factor
+from ..linalg import covariance_of_shared, gram, joint_factor
 from ..shooting import ShootingProblem
 
 
@@ -19,7 +19,7 @@ def fisher_information(
     """
     count = parameters.shape[0]
     factor = joint_factor(_information(problem, parameters, initial_state), count).factor[0, :count, -count:]
-    return (factor[:, None, :] * factor[None, :, :]).sum(axis=-1)
+    return gram(factor)
 
 
 @eqx.filter_jit

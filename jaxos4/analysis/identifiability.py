@@ -105,12 +105,12 @@ def identifiability(
 
 def identifiability_of(evaluation: Evaluation, bracket: Bracket) -> Identifiability:
     """`identifiability` where a flight was simulated already."""
-    problem, lower, upper = evaluation.problem, np.asarray(bracket.lower), np.asarray(bracket.upper)
-    nominal, valid = evaluation.nominal, bool(((upper > lower) & (upper - lower < np.inf)).all())
+    problem, nominal, half_width = evaluation.problem, evaluation.nominal, np.asarray(bracket.half_width)
+    valid = bool(((half_width > 0) & np.isfinite(half_width)).all())
     sound = valid and evaluation.sound
     if not evaluation.sound:
         evaluation = evaluate(problem, as_float(nominal))
-    half_width = (upper - lower) / 2 if valid else np.ones_like(nominal)
+    half_width = half_width if valid else np.ones_like(nominal)
     information = shared_information(evaluation.information, nominal.size)
     scaled = np.nan_to_num(information * half_width[:, None] * half_width, posinf=0.0, neginf=0.0)
     eigenvalues, directions = np.linalg.eigh(scaled)

@@ -38,7 +38,8 @@ def robust_covariance_of(evaluation: Evaluation) -> Covariance:
     count, measured = evaluation.parameters.size, ~np.isnan(evaluation.measured)
     if not (evaluation.sound and measured.any()):
         return np.full((count, count), np.inf)
-    information, jacobian = evaluation.information, evaluation.jacobian
+    jacobian = evaluation.jacobian
+    information = jacobian @ np.swapaxes(jacobian, 1, 2)
     shared = inverse(shared_information(information, count))
     cross, own = information[:, count:, :count], information[:, count:, count:]
     sensitivity = np.concatenate(

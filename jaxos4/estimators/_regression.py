@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Scalar
 from ..bracket import Bracket
 from ..estimate import Estimate, best_start, conclude
-from ..linalg import invert
+from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
 
@@ -190,7 +190,7 @@ def propagated_covariance(
     identity = jnp.eye(steps.shape[0], dtype=float)
     sensitivity = jax.vmap(sensitivity_of)(identity) * regression.problem.sigma[CASCADE_ORDER[:3]]
     sensitivity = sensitivity.reshape(steps.shape[0], -1)
-    spread = (sensitivity[:, None, :] * sensitivity[None, :, :]).sum(axis=-1) + prior(steps.shape[0])
+    spread = gram(sensitivity) + prior(steps.shape[0])
     half = (inverse[:, :, None] * spread[None, :, :]).sum(axis=1)
     covariance = (half[:, :, None] * inverse[None, :, :]).sum(axis=1)
     return (covariance + covariance.T) / 2

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Parameters, Scalar
 from ..bracket import GAUSSIAN_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_recursive, conclude
+from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
 
@@ -115,7 +116,7 @@ class JointEKF(AbstractEstimator):
         return conclude(
             bracket,
             parameters=parameters,
-            covariance=(factor[:, None, :] * factor[None, :, :]).sum(axis=-1),
+            covariance=gram(factor),
             initial_state=initial_state,
             cost=cost,
             rollouts=last.passes * (unknowns + 1) + 1,

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from .._custom_types import Parameters, as_float
 from ..bracket import GAUSSIAN_PRIOR, Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, check_recursive, conclude, fit_start
-from ..linalg import invert
+from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem
 
@@ -177,8 +177,8 @@ class SVSF(AbstractEstimator):
         unit = jnp.where(energy > 0, jnp.minimum(weakness, self.equilibration), self.equilibration)
         scaled = jnp.where(valid[:, None], unit * influence, 0.0)
         damping = jnp.square(self.damping) * jnp.where(most > 0, most / samples, 1.0)
-        gram = (scaled[:, None, :] * scaled[None, :, :]).sum(axis=-1) + damping * jnp.eye(3, dtype=float)
-        inverse = (scaled[:, :, None] * invert(gram)[:, None, :]).sum(axis=0)
+        damped = gram(scaled) + damping * jnp.eye(3, dtype=float)
+        inverse = (scaled[:, :, None] * invert(damped)[:, None, :]).sum(axis=0)
         change = (inverse * error).sum(axis=1)
         noise = jnp.sqrt(jnp.square(inverse * sigma).sum(axis=1))
         layer = self.parameter_layer * jnp.where(noise > 0, noise, 1.0)

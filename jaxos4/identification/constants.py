@@ -38,8 +38,8 @@ def vehicle_constants(names: tuple[str, ...], estimate: Estimate, bracket: Brack
     """
     values = np.asarray(estimate.parameters)
     gain = names.index("thrust_gain") if "thrust_gain" in names else None
-    lower, upper = np.asarray(bracket.lower)[:8], np.asarray(bracket.upper)[:8]
-    alpha, slopes, variance = (lower + upper) / 2, np.zeros((8, len(names))), (_UNKNOWN * (upper - lower) / 2) ** 2
+    alpha, slopes = np.asarray(bracket.center)[:8].copy(), np.zeros((8, len(names)))
+    variance = (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2
     for row, name in enumerate(PARAMETER_NAMES):
         if name not in names:
             continue

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..analysis.identifiability import identifiability
+from ..analysis.identifiability import identifiability, identifiability_of
 from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
@@ -33,7 +33,10 @@ def assess(
     problem = flight_problem(recording, model, channels=channels, initial_state=initial_state, window=window)
     fit = fit_flight(IBSS(), problem, where, progress=progress)
     problem, estimate, fitted = fit.problem, fit.estimate, has_answer(fit.estimate)
-    known = identifiability(problem, where, estimate.parameters, estimate.initial_state if fitted else None)
+    if fit.evaluation is None:
+        known = identifiability(problem, where, estimate.parameters)
+    else:
+        known = identifiability_of(fit.evaluation, where)
     names, notes = model.parameter_names, known.notes(model.parameter_names)
     std, alone, half_width, limit = map(np.asarray, (known.std, known.std_alone, known.half_width, known.noise_limit))
     finite = bool(np.isfinite(std).all())

@@ -31,8 +31,8 @@ def parameter_table(
     - `noise_limit`: by place; see `ParameterEstimate`.
     """
     std, half_width = map(np.asarray, _intervals(estimate))
-    values, bounds, lower, upper = map(np.asarray, (estimate.parameters, bound, bracket.lower, bracket.upper))
-    identifiable = is_identifiable(std, (upper - lower) / 2, prior)
+    values, bounds = np.asarray(estimate.parameters), np.asarray(bound)
+    identifiable = is_identifiable(std, np.asarray(bracket.half_width), prior)
     return {
         name: ParameterEstimate(
             estimate=float(values[i]) if identifiable[i] else None,

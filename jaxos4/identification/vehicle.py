@@ -95,7 +95,7 @@ def fit_vehicle(
     **Raises:** `ValueError` if the bracket and the model differ in the number of parameters.
     """
     check_bracket(problem, bracket)
-    model, values = problem.model, np.array(_centre(bracket))
+    model, values = problem.model, np.array(bracket.center)
     held: Held = {name: (float(values[i]), "") for i, name in enumerate(model.parameter_names) if name in SECONDARY}
     progress("compiling, and fitting the parameters that every flight excites")
     first = _refined(_Part(model, bracket, held), problem, values[_free(model, held)], huber=False)
@@ -203,11 +203,11 @@ class _Part(NamedTuple):
 
 def _refined(part: _Part, problem: ShootingProblem, start: np.ndarray, *, huber: bool) -> Refined:
     """A rough fit, repeated until noise levels, outliers and parameters settle. `problem`: of the whole model."""
-    lower, upper = np.asarray(part.bracket.lower)[part.free], np.asarray(part.bracket.upper)[part.free]
+    half_width = np.asarray(part.bracket.half_width)[part.free]
 
     def search(weighted: ShootingProblem, previous: Estimate | None, colour: float) -> Estimate:
         if previous is None:
-            return part.search(IBSS(tolerance=_TOLERANCE), weighted, start, np.diag(np.square((upper - lower) / 4)))
+            return part.search(IBSS(tolerance=_TOLERANCE), weighted, start, np.diag(np.square(half_width / 2)))
         ibss, spread = IBSS(tolerance=_TOLERANCE * colour), colour**2 * np.asarray(previous.covariance)
         return part.search(ibss, weighted, previous.parameters, spread)
 
@@ -233,10 +233,6 @@ def _free(model: AbstractModel, held: Held) -> np.ndarray:
     return np.array([i for i, name in enumerate(model.parameter_names) if name not in held])
 
 
-def _centre(bracket: Bracket) -> Float[np.ndarray, " parameters"]:
-    return (np.asarray(bracket.lower) + np.asarray(bracket.upper)) / 2
-
-
 def free_bracket(bracket: Bracket, model: AbstractModel, held: Held) -> Bracket:
     """The bracket of the parameters that are not held."""
     free = _free(model, held)
@@ -248,8 +244,8 @@ def _not_identifiable(first: Refined, values: np.ndarray, bracket: Bracket) -> H
     names = first.problem.model.parameter_names
     # The noise is coloured, and the Cramer-Rao bound assumes that it is white.
     bound = evaluate(first.problem, as_float(values), first.estimate.initial_state).covariance
-    std, center = first.colour * np.sqrt(np.diagonal(bound)), _centre(bracket)
-    identifiable = is_identifiable(std, center - np.asarray(bracket.lower))
+    std, center = first.colour * np.sqrt(np.diagonal(bound)), np.asarray(bracket.center)
+    identifiable = is_identifiable(std, np.asarray(bracket.half_width))
     held = {}
     for i, name in enumerate(names):
         if not identifiable[i]:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._custom_types import Parameters, Scalar, as_float
 from ...bracket import NO_PRIOR, Bracket
 from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
-from ...linalg import covariance_of_shared, covariances
+from ...linalg import covariance_of_shared, covariances, gram
 from ...shooting import Curvature, ShootingProblem, Shot
 from .bisection import move_along_all
 from .brackets import GROWTH, open_brackets, relative_error
@@ -199,7 +199,7 @@ class IBSS(AbstractEstimator):
         if self.directions == "coordinate":
             covariance = covariances(search.curvature.information + stage.prior, stage.parameter_count)
         else:
-            covariance = (search.basis[:, :, None, :] * search.basis[:, None, :, :]).sum(axis=-1)
+            covariance = gram(search.basis)
         noise = jnp.maximum(misfit(search.curvature.shot.cost.sum(), stage.measurements), 1.0)
         searched = stage.searched
         rollouts = jnp.where(progress.done, 0, stage.size * (1 + search.sweeps * (self.halvings + 1)))
