@@ -34,6 +34,7 @@ from .airframe import (
     load_airframe as load_airframe,
     plus_layout as plus_layout,
 )
+from .analysis.center_of_mass import CenterOfMass as CenterOfMass, center_of_mass as center_of_mass
 from .analysis.diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
 from .analysis.fisher import cramer_rao_bound as cramer_rao_bound, fisher_information as fisher_information
 from .analysis.huber import winsorised as winsorised
