@@ -22,8 +22,9 @@ _FEWEST = 4
 # The band in which the model is compared [Hz], and the smallest coherence there. Below, the flight controller's answer
 # to disturbances looks like the vehicle's answer to torque. Above, few vehicles move.
 _LOW, _HIGH, _COHERENT = 4.0, 20.0, 0.6
-# How many frequencies on either side the coherence is averaged over.
-_AROUND = 4
+_ROUNDING = 1e-9
+# The coherence is averaged over this many frequencies on either side.
+_AROUND = 2
 # Segments overlap by half: the correlation of their spectra, and that of frequencies 0, 1, 2 steps apart (Hann window).
 _OVERLAP, _NEIGHBOURS = 1 / 6, (1.0, 4 / 9, 1 / 36)
 
@@ -74,24 +75,25 @@ class AxisResponse(NamedTuple):
         clear = self.clear & np.isfinite(self.error) & (self.frequency >= low) & (self.frequency <= high)
         if not clear.any():
             return Agreement(*[math.nan] * 4)
-        frequency, error = self.frequency[clear], self.error[clear]
+        frequency, coherence = self.frequency[clear], self._around[clear]
+        weight = coherence / np.maximum(1 - coherence, _ROUNDING)
+        error = self.error[clear] * weight / weight.sum()
         apart = np.rint(np.abs(frequency[:, None] - frequency) / self.frequency[0]).astype(int)
         correlation = np.append(_NEIGHBOURS, 0.0)[np.minimum(apart, len(_NEIGHBOURS))]
-        # Without weights: a gain that is too large by chance comes with a coherence that is too large.
-        ratio = math.exp(np.log(self.gain[clear]).mean())
-        deviation = math.sqrt(error @ correlation @ error) / error.size
-        return Agreement(ratio, deviation, float(frequency[0]), float(frequency[-1]))
+        ratio = math.exp(np.average(np.log(self.gain[clear]), weights=weight))
+        return Agreement(ratio, math.sqrt(error @ correlation @ error), float(frequency[0]), float(frequency[-1]))
 
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
-        """Where the coherence exceeds 0.6, as the mean of the frequencies around each.
+        """Where the coherence exceeds 0.6, as the mean over five frequencies."""
+        return self._around > _COHERENT
 
-        One frequency may pass by chance, and its gain is then too large.
-        """
-        kernel = np.ones(2 * _AROUND + 1)
-        known = np.isfinite(self.coherence)
-        total = np.convolve(np.where(known, self.coherence, 0.0), kernel)[_AROUND:-_AROUND]
-        return known & (total > _COHERENT * np.convolve(known, kernel)[_AROUND:-_AROUND])
+    @property
+    def _around(self) -> Float[np.ndarray, " frequencies"]:
+        """The mean coherence around each frequency. By chance, a high coherence comes with a gain that is too large."""
+        kernel, known = np.ones(2 * _AROUND + 1), np.isfinite(self.coherence)
+        total, count = (np.convolve(x, kernel)[_AROUND:-_AROUND] for x in (np.where(known, self.coherence, 0.0), known))
+        return np.where(known, total / np.maximum(count, 1), 0.0)
 
 
 class FrequencyResponse(NamedTuple):
