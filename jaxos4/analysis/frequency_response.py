@@ -117,7 +117,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     """
     rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
     dt = float(problem.flight.dt)
-    known = ~np.isnan(rates).any(axis=1)
+    known = ~np.isnan(rates.sum(axis=1))
     modelled = np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
     measured = np.diff(rates, axis=0) / dt
     usable = known[1:] & known[:-1] & np.isfinite(modelled).all(axis=1)
