@@ -4,7 +4,8 @@ On a simulated flight with given rotor speeds (`jaxos4.simulate`) the inputs kno
 flight the controller answers each gust, so inputs and disturbances are correlated. This file makes such flights.
 """
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from ._custom_types import Key, RotorSpeeds, Scalar, as_float
+from ._custom_types import Key, Numeric, RotorSpeeds, Scalar, as_float
 from .airframe import Airframe
-from .flight import STATE_NAMES, Flight
-from .models.state import Attitude, Forcing, Rates, State
+from .flight import Flight
+from .models.state import CASCADE_ORDER, Forcing, stack, unstack
 from .models.vehicle import FlightModel
 from .noise import FORCE_SIGMA
 from .results import RESULTS
@@ -25,17 +26,19 @@ from .simulation import rk4_step
 
 References = Float[Array, "samples 4"]
 PerAxis = Float[Array, "3"]
+# Body rates and attitude of the vehicle.
+Motion = Float[Array, "6"]
 
 LOGGED = ("commands", "speeds")
 # The controller tilts the thrust no further than this to carry the weight: the cosine of 60 degrees.
 _STEEPEST = 0.5
 
 
-def _per_axis(name: str, low: float = 0.0) -> Callable[[ArrayLike], Array]:
+def _per_axis(name: str, low: float = 0.0) -> Callable[[ArrayLike | Sequence[float]], Array]:
     """A field's converter: accepts one number or three (roll, pitch, yaw), not below `low` unless traced."""
 
-    def convert(value: ArrayLike) -> Array:
-        array = as_float(value)
+    def convert(value: ArrayLike | Sequence[float]) -> Array:
+        array = as_float(np.asarray(value) if isinstance(value, Sequence) else value)
         if array.shape not in ((), (3,)):
             raise ValueError(f"`{name}` must be one number or three (roll, pitch, yaw), got shape {array.shape}.")
         _check(name, array, low)
@@ -49,6 +52,8 @@ def _scalar(name: str) -> Callable[[ArrayLike], Array]:
 
     def convert(value: ArrayLike) -> Array:
         array = as_float(value)
+        if array.shape != ():
+            raise ValueError(f"`{name}` must be one number, got shape {array.shape}; use `vmap` for a batch.")
         _check(name, array, 0.0)
         return array
 
@@ -110,12 +115,10 @@ class ClosedLoop(eqx.Module):
     attitude_gain: PerAxis = eqx.field(converter=_per_axis("attitude_gain"), default=(4.0, 4.0, 2.0))
     rate_gain: PerAxis = eqx.field(converter=_per_axis("rate_gain"), default=(12.0, 12.0, 6.0))
     integral_gain: PerAxis = eqx.field(converter=_per_axis("integral_gain"), default=(10.0, 10.0, 5.0))
-    controller_inertia: PerAxis | None = None
+    controller_inertia: PerAxis | None = eqx.field(
+        converter=lambda x: None if x is None else _per_axis("controller_inertia")(x), default=None
+    )
     logged: str = eqx.field(static=True, default="commands")
-
-    def __post_init__(self):
-        inertia = self.airframe.inertia if self.controller_inertia is None else self.controller_inertia
-        self.controller_inertia = _per_axis("controller_inertia")(inertia)
 
     def __check_init__(self):
         if self.logged not in LOGGED:
@@ -127,7 +130,7 @@ def random_references(
     duration: float = 20.0,
     dt: float = 0.004,
     hold: float = 0.5,
-    amplitude: tuple[float, float, float, float] = (0.3, 0.3, 0.3, 1.5),
+    amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5),
     key: Key,
 ) -> References:
     """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
@@ -140,16 +143,24 @@ def random_references(
 
     **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
 
-    **Raises:** `ValueError` for times that are not positive.
+    **Raises:** `ValueError` that names the argument.
     """
     for name, value in (("duration", duration), ("dt", dt), ("hold", hold)):
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"`{name}` must be positive and finite [s], got {value}.")
+    if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
+        raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
     time = dt * np.arange(round(duration / dt) + 1)
     steps = (time[:, None] / hold + np.arange(4) / 4).astype(int)
-    levels = jax.random.uniform(key, (int(steps.max()) + 1, 4), minval=-1, maxval=1) * as_float(amplitude)
     flown = (time >= 1) & (time <= duration - 1)
-    return jnp.where(flown[:, None], jnp.take_along_axis(levels, jnp.asarray(steps), axis=0), 0.0)
+    return _levels(key, steps, int(steps[-1, -1]) + 1, flown[:, None] * np.asarray(amplitude, dtype=float))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _levels(key: Key, steps: Int[Array, "samples 4"], count: int, amplitude: References) -> References:
+    """The level of each reference in each of its steps, of which there are at most `count`."""
+    levels = jax.random.uniform(key, (count, 4), minval=-1, maxval=1)
+    return amplitude * jnp.take_along_axis(levels, steps, axis=0)
 
 
 def fly_closed_loop(
@@ -191,7 +202,7 @@ def fly_closed_loop(
 class _Carry(NamedTuple):
     """What passes from sample to sample; `commands`: row k + 1 is the command of sample k, row 0 that before."""
 
-    state: State
+    motion: Motion
     speeds: Float[Array, "4"]
     integral: PerAxis
     commands: RotorSpeeds
@@ -208,52 +219,47 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
 
     model = FlightModel(airframe, terms=("offset", "damping", "reaction"))
     mixer, spins = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins)
-    constants = tuple(model.alpha)
-    hover = _speeds(mixer, jnp.zeros(3), airframe.mass * airframe.gravity, airframe.max_rotor_speed)[0]
+    *alpha, reaction = model.alpha[jnp.array([*range(8), -1])]
     # A command acts `late` samples after its own, and in the first `part` of a sample the one before it still acts.
     late = jnp.floor(loop.rotor_delay / dt).astype(int)
     part = loop.rotor_delay / dt - late
 
-    def physics(state: State, speeds: Array, command: Array, gust: Array) -> tuple[State, Array]:
+    def physics(motion: Motion, speeds: Array, command: Array, gust: Array) -> tuple[Motion, Array]:
         after = command + (speeds - command) * jnp.exp(-h / loop.rotor_lag)
-        squares = (speeds * speeds + speeds * after + after * after) / 3
-        roll, pitch, yaw, thrust = mixer @ squares
-        forcing = Forcing(
-            *(roll, pitch, yaw, thrust / airframe.mass),
-            residual_speed=(speeds + after) @ spins / 2,
-            spin_up=(after - speeds) @ spins / h,
-        )
-        offset = loop.offset + gust[:3]
-        parameters = (*constants[:8], *offset, *loop.damping, constants[-1])
-        return rk4_step(model, state, forcing, parameters, h), after
+        roll, pitch, yaw, thrust = mixer @ ((speeds * speeds + speeds * after + after * after) / 3)
+        residual, spin_up = (speeds + after) @ spins / 2, (after - speeds) @ spins / h
+        forcing = Forcing(roll, pitch, yaw, thrust / airframe.mass, residual, spin_up)
+        parameters = (*alpha, *(loop.offset + gust[:3]), *loop.damping, reaction)
+        return stack(rk4_step(model, unstack(motion), forcing, parameters, h)), after
 
     def sample(carry: _Carry, row):
         k, reference, gust, error = row
-        measured = jnp.stack([*carry.state.rates, *carry.state.attitude]) + error[:6]
-        specific = jnp.stack([0.0, 0.0, mixer[3] @ carry.speeds**2 / airframe.mass + gust[0, 3]]) + error[6:]
+        measured = carry.motion + error[:6]
+        thrust = mixer[3] @ jnp.square(carry.speeds) / airframe.mass + gust[0, 3]
+        specific = jnp.stack([jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust]) + error[6:]
         command, integral = _control(loop, mixer, reference, measured, carry.integral, dt)
         commands = carry.commands.at[k + 1].set(command)
         before, now = (commands[jnp.maximum(k + 1 - late - i, 0)] for i in (1, 0))
 
         def step(moving, row):
-            state, speeds = moving
+            motion, speeds = moving
             j, begin, end = row
             share = jnp.clip(substeps * part - j, 0, 1)
-            moved = physics(state, speeds, now + share * (before - now), (begin + end) / 2)
-            return moved, (speeds + moved[1]) / 2
+            motion, after = physics(motion, speeds, now + share * (before - now), (begin + end) / 2)
+            return (motion, after), (speeds + after) / 2
 
         rows = (jnp.arange(substeps), gust[:-1], gust[1:])
-        (state, speeds), means = jax.lax.scan(step, (carry.state, carry.speeds), rows)
+        (motion, speeds), means = jax.lax.scan(step, (carry.motion, carry.speeds), rows)
         omega = command if loop.logged == "commands" else means.mean(axis=0)
-        truth = jnp.stack([*carry.state.rates, *carry.state.attitude])
-        return _Carry(state, speeds, integral, commands), (omega, truth, measured, specific)
+        return _Carry(motion, speeds, integral, commands), (omega, carry.motion, measured, specific)
 
+    weight = as_float(airframe.mass * airframe.gravity)
+    hover, _ = _speeds(mixer, jnp.zeros(3), weight, airframe.max_rotor_speed)
+    first = _Carry(jnp.zeros(6), hover, jnp.zeros(3), jnp.broadcast_to(hover, (samples + 1, 4)))
     rows = substeps * np.arange(samples)[:, None] + np.arange(substeps + 1)
-    start = State(Rates(*jnp.zeros(3)), Attitude(*jnp.zeros(3)))
-    first = _Carry(start, hover, jnp.zeros(3), jnp.broadcast_to(hover, (samples + 1, 4)))
     inputs = (jnp.arange(samples), references, gusts[rows], noise)
-    omega, truth, measured, specific = jax.lax.scan(sample, first, inputs)[1]
-    return _logged(loop, dt, omega, truth, measured, specific)
+    omega, motion, measured, specific = jax.lax.scan(sample, first, inputs)[1]
+    return _log(loop, dt, omega, motion, measured, specific)
 
 
 def _control(
@@ -264,12 +270,13 @@ def _control(
     error = loop.attitude_gain * (reference[:3] - attitude) - rates
     demand = loop.rate_gain * error + integral
     upright = jnp.maximum(jnp.cos(attitude[0]) * jnp.cos(attitude[1]), _STEEPEST)
-    thrust = airframe.mass * (airframe.gravity + reference[3]) / upright
-    command, saturated = _speeds(mixer, loop.controller_inertia * demand, thrust, airframe.max_rotor_speed)
+    thrust = as_float(airframe.mass * (reference[3] + airframe.gravity) / upright)
+    inertia = as_float(airframe.inertia) if loop.controller_inertia is None else loop.controller_inertia
+    command, saturated = _speeds(mixer, inertia * demand, thrust, airframe.max_rotor_speed)
     return command, jnp.where(saturated, integral, integral + dt * loop.integral_gain * error)
 
 
-def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Scalar) -> tuple[Float[Array, "4"], Array]:
+def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> tuple[Float[Array, "4"], Array]:
     """The rotor speeds [rad/s] that make torque [N m] and thrust [N], and whether one of them saturates."""
     wanted = jnp.linalg.solve(mixer, jnp.append(torque, thrust))
     squares = jnp.clip(wanted, 0.0, jnp.asarray(fastest) ** 2)
@@ -288,17 +295,15 @@ def ornstein_uhlenbeck(key: Key, count: int, step: Scalar) -> Float[Array, "coun
     return jnp.concatenate([draws[:1], jax.lax.scan(advance, draws[0], draws[1:])[1]])
 
 
-def _logged(loop: ClosedLoop, dt: Scalar, omega: RotorSpeeds, truth: Array, measured: Array, specific: Array) -> Flight:
+def _log(loop: ClosedLoop, dt: Scalar, omega: RotorSpeeds, motion: Array, measured: Array, specific: Array) -> Flight:
     """The log up to the first sample at which the vehicle pitches to 90 degrees or a number is not finite."""
-    finite = jnp.isfinite(truth).all(axis=1)
-    valid = jnp.cumsum(~(finite & (jnp.abs(truth[:, 4]) < jnp.pi / 2))) == 0
+    finite = jnp.isfinite(motion).all(axis=1)
+    valid = jnp.cumsum(~(finite & (jnp.abs(motion[:, 4]) < jnp.pi / 2))) == 0
     result = RESULTS.where(finite[jnp.argmin(valid)], RESULTS.attitude_singularity, RESULTS.nonfinite_trajectory)
     result = RESULTS.where(valid.all(), RESULTS.successful, result)
-    samples = omega.shape[0]
-    columns = np.array([STATE_NAMES.index(name) for name in ("p", "q", "r", "phi", "theta", "psi")])
-    states = jnp.full((samples, 12), jnp.nan).at[:, columns].set(measured)
+    states = jnp.full((omega.shape[0], 12), jnp.nan).at[:, CASCADE_ORDER[:6]].set(measured)
     return Flight(
-        time=dt * jnp.arange(samples),
+        time=dt * jnp.arange(omega.shape[0]),
         omega=jnp.where(valid[:, None], omega, 0.0),
         states=jnp.where(valid[:, None], states, jnp.nan),
         specific_force=jnp.where(valid[:, None], specific, jnp.nan),
