@@ -190,13 +190,19 @@ def fly_closed_loop(
     **Raises:** `ValueError` that names the argument.
     """
     shape = jnp.shape(references)
-    if len(shape) != 2 or shape[1] != 4:
-        raise ValueError(f"`references` must have shape (samples, 4), got {shape}; use `vmap` for a batch.")
+    if len(shape) != 2 or shape[0] < 2 or shape[1] != 4:
+        raise ValueError(f"`references` must have shape (samples, 4), at least two samples, got {shape}.")
     if not isinstance(dt, Tracer) and not np.asarray(dt) > 0:
         raise ValueError(f"`dt` must be positive, got {dt}.")
     if substeps < 1:
         raise ValueError(f"`substeps` must be at least 1, got {substeps}.")
     return _fly(loop, as_float(references), as_float(dt), key, substeps)
+
+
+def fly_standard(loop: ClosedLoop, *, duration: float = 20.0, dt: float = 0.004, seed: int) -> Flight:
+    """Fly random references, with all random numbers from `seed`: what `jaxos4 simulate --closed-loop` writes."""
+    references, flight = jax.random.split(jax.random.key(seed))
+    return fly_closed_loop(loop, random_references(duration=duration, dt=dt, key=references), dt=dt, key=flight)
 
 
 class _Carry(NamedTuple):
