@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
-from ._choices import AirframeOption, Excitation, Method, Model, ModelOption, Sensors
+from ._choices import AirframeOption, Excitation, Method, Model, Sensors
 from ._output import check_output
 from ._progress import stages
 
@@ -16,33 +16,41 @@ if TYPE_CHECKING:
     from ..flight import Flight
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
-# Options of one kind of simulation only.
-OPEN, CLOSED = ("model", "excitation", "method", "noise"), ("gust", "lag", "delay", "sensors")
 
 
 def simulate(
-    context: typer.Context,
     out: Annotated[Path, typer.Option(help="The flight file to write (CSV).")],
-    model: ModelOption = Model["published"],
     airframe: AirframeOption = "os4",
-    excitation: Annotated[Excitation, typer.Option(help="Shape of the inputs.")] = Excitation["multisine"],
     duration: Annotated[
         float | None, typer.Option(help="Duration [s]. Default: 5; with --closed-loop: 20.", metavar="SECONDS")
     ] = None,
     dt: Annotated[
         float | None, typer.Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.", metavar="SECONDS")
     ] = None,
-    method: Annotated[Method, typer.Option(help="Integrator of the equations of motion.")] = Method["euler"],
-    noise: Annotated[float, typer.Option(help="White sensor noise, in multiples of the standard noise.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+    model: Annotated[Model | None, typer.Option(help="Equations of motion. Default: published.")] = None,
+    excitation: Annotated[Excitation | None, typer.Option(help="Shape of the inputs. Default: multisine.")] = None,
+    method: Annotated[
+        Method | None, typer.Option(help="Integrator of the equations of motion. Default: euler.")
+    ] = None,
+    noise: Annotated[
+        float | None, typer.Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
+    ] = None,
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
     ] = False,
     gust: Annotated[
-        float, typer.Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2].")
-    ] = 5.0,
-    lag: Annotated[float, typer.Option(help="With --closed-loop: lag of the rotors [s].")] = 0.05,
-    delay: Annotated[float, typer.Option(help="With --closed-loop: delay of the commands [s].")] = 0.01,
+        float | None,
+        typer.Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5."),
+    ] = None,
+    lag: Annotated[
+        float | None,
+        typer.Option(help="With --closed-loop: lag of the rotors. Default: 0.05.", metavar="SECONDS"),
+    ] = None,
+    delay: Annotated[
+        float | None,
+        typer.Option(help="With --closed-loop: delay of the commands. Default: 0.01.", metavar="SECONDS"),
+    ] = None,
     sensors: Annotated[
         Sensors | None,
         typer.Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
@@ -50,13 +58,21 @@ def simulate(
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
     check_output(out, Path(airframe))
-    for name in OPEN if closed_loop else CLOSED:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE":
+    of_open = {"model": model, "excitation": excitation, "method": method, "noise": noise}
+    of_closed = {"gust": gust, "lag": lag, "delay": delay, "sensors": sensors}
+    for name, value in (of_open if closed_loop else of_closed).items():
+        if value is not None:
             how = "without --closed-loop; leave it out" if closed_loop else "with --closed-loop; add that"
             raise InputError(f"--{name}: is for flights {how}.")
+    model, excitation, method = (
+        model or Model["published"],
+        excitation or Excitation["multisine"],
+        method or Method["euler"],
+    )
     duration = (20.0 if closed_loop else 5.0) if duration is None else duration
     dt = (0.004 if closed_loop else 0.01) if dt is None else dt
+    noise, gust = 0.0 if noise is None else noise, 5.0 if gust is None else gust
+    lag, delay = 0.05 if lag is None else lag, 0.01 if delay is None else delay
     for name, value, most in (("noise", noise, 1e6), ("gust", gust, 1e6), ("lag", lag, 1), ("delay", delay, 1)):
         if not 0 <= value <= most:
             raise InputError(f"--{name}: must lie in 0 to {most:g}, got {value}.")
