@@ -68,7 +68,7 @@ def fall_and_turn(motion, speeds, change, v):
     return np.array([*turning, rate[0] + np.tan(theta) * across, along, across / np.cos(theta)])
 
 
-def reference_motion(v, omega, samples, fine=25):
+def reference_motion(v, omega, samples, fine=10):
     """Rates and attitude at each sample, and mean rotor speeds over it, from the commands: small midpoint steps."""
     h, lag, delay = DT / fine, float(v.rotor_lag), float(v.rotor_delay)
     weight = float(v.airframe.mass * v.airframe.gravity)
@@ -121,14 +121,14 @@ def test_the_motion_follows_from_the_commands(rough):
     motion, _ = reference_motion(rough, np.asarray(flight.omega), samples)
     measured = np.asarray(flight.states)[:samples, RATES + ANGLES]
     assert np.abs(measured).max(axis=0).min() > 0.03
-    np.testing.assert_allclose(measured, motion, rtol=0, atol=2e-3 * np.abs(motion).max())
+    np.testing.assert_allclose(measured, motion, rtol=0, atol=2e-4)
     # The reference sees a delay that is wrong by half a millisecond.
     wrong = eqx.tree_at(lambda v: v.rotor_delay, rough, rough.rotor_delay + 5e-4)
-    assert np.abs(measured - reference_motion(wrong, np.asarray(flight.omega), samples)[0]).max() > 5e-3 * motion.max()
+    assert np.abs(measured - reference_motion(wrong, np.asarray(flight.omega), samples)[0]).max() > 5e-3
 
 
 def test_measured_speeds_are_means_over_the_samples(rough):
-    commanded, samples = fly(rough, references()), 200
+    commanded, samples = fly(rough, references()), 350
     speeds = fly(eqx.tree_at(lambda v: v.rotor_lag, loop_of(logged="speeds"), 0.04), references())
     assert (commanded.commanded, speeds.commanded) == (True, False)
     same = loop_of(rotor_lag=0.04)

@@ -117,3 +117,19 @@ def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match="--flights"):
         load("real_flight").main(flights=tmp_path, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_closed_loop(tmp_path):
+    cases = {"flights": 4, "gusts": [10.0], "duration": 6.0, "seed": 16, "estimators": ["equation-error"]}
+    report = report_of("closed_loop", tmp_path, **cases)
+    plot("closed_loop", tmp_path / "out.json", tmp_path / "figures")
+    (regression,) = report["cases"]
+    assert len(regression["flights"]) == 4
+    # A controller that answers gusts makes regression biased by tens of percent, and its intervals do not know it.
+    for row in regression["summary"].values():
+        assert row["bias"] > 0.2
+        assert row["covered"] == 0
+    # An interrupted study is continued: the flights that are there are not identified again.
+    assert report_of("closed_loop", tmp_path, **cases) == report
+    with pytest.raises(SystemExit, match="other settings"):
+        report_of("closed_loop", tmp_path, **{**cases, "seed": 17})

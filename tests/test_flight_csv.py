@@ -123,6 +123,20 @@ def test_only_what_was_measured_gets_a_column(tmp_path):
     ]
 
 
+def test_commands_are_written_as_shares_of_the_largest_speed(tmp_path):
+    flight = Flight(np.arange(3.0), np.full((3, 4), 250.0), np.zeros((3, 12)), commanded=True)
+    airframe = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(500.0))
+    write_flight(flight, tmp_path / "f.csv", airframe)
+    assert (tmp_path / "f.csv").read_text().startswith("t,command1,command2,command3,command4,")
+    again = read_flight(tmp_path / "f.csv", airframe)
+    assert again.commanded
+    assert identical(flight, again)
+    # Without the largest speed they cannot be written as commands.
+    for unknown in (None, OS4):
+        write_flight(flight, tmp_path / "g.csv", unknown)
+        assert not read_flight(tmp_path / "g.csv").commanded
+
+
 def test_single_precision_gives_back_its_bits_and_moves_a_late_start(save):
     with jax.enable_x64(False):
         flight = Flight(0.1 * np.arange(9), np.full((9, 4), 1 / 3), np.full((9, 12), 0.1))

@@ -14,6 +14,7 @@ import pytest
 
 import jaxos4
 from jaxos4.cli import _choices, _jax, train
+from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
@@ -134,6 +135,7 @@ def test_the_choices_of_the_command_line_are_the_names_in_the_tables():
     assert list(_choices.Model) == list(MODELS)
     assert list(_choices.Excitation) == list(EXCITATIONS)
     assert list(_choices.Method) == list(METHODS)
+    assert list(_choices.Sensors) == list(LOGGED)
     assert list(_choices.Channels) == list(CHANNELS)
     assert list(_choices.Features) == list(FEATURES)
     assert list(_choices.Approximator) == list(APPROXIMATORS)

@@ -27,6 +27,7 @@ ROOMS = {
     "networks": "features, training, network file",
     "analysis": "Fisher information, intervals, diagnostics",
     "estimate": "what every estimator returns",
+    "closed_loop": "a controller in gusts",
     "shooting": "model + flight: cost, residuals, slope",
     "bracket": "where to look",
     "noise": "sensors",

@@ -1,0 +1,215 @@
+"""Are moments of inertia right if a controller flew the vehicle through gusts?
+
+A controller answers gusts, so on a real flight inputs and disturbances are correlated. This makes regression and output
+error biased, however long the flight. Each flight: a quadrotor as small as a Crazyflie, 20 s of random references,
+gusts with a correlation time of 0.25 s, rotors with a lag of 50 ms and a delay of 10 ms, commands logged. The estimator
+gets an airframe whose moments of inertia are 25 % too large (even flights) or too small (odd flights); its mass, arms
+and thrust are right. The controller uses the same wrong moments.
+
+`equation-error` is a regression that knows the lag and the delay. All others are those of `jaxos4.identify`, with its
+default terms and the whole flight fitted.
+"""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import numpy as np
+import typer
+from rich.console import Console
+
+import jaxos4
+from jaxos4.report.experiment import count_results, in_words, table_of
+from jaxos4.results import NINETY_FIVE
+
+jax.config.update("jax_enable_x64", True)
+
+THRUST, FULL = 0.15, 2500.0  # of one rotor at full speed [N], and that speed [rad/s]
+VEHICLE = jaxos4.Airframe(
+    mass=0.027,
+    inertia=(1.66e-5, 1.7e-5, 2.9e-5),
+    rotor_positions=[(0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028)],
+    rotor_spins=(1.0, -1.0, 1.0, -1.0),
+    thrust_coefficient=THRUST / FULL**2,
+    drag_coefficient=0.005 * THRUST / FULL**2,
+    rotor_inertia=2e-8,
+    max_rotor_speed=FULL,
+)
+LAG, DELAY, WRONG = 0.05, 0.01, 0.25
+INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
+DT, WINDOW = 0.004, 62
+# Flights of one call of the regression, and its memory: the best on real flights.
+CHUNK, MEMORY = 25, 0.9
+
+
+def known_airframe(i: int) -> jaxos4.Airframe:
+    """What the estimator is told of flight i."""
+    return eqx.tree_at(lambda a: a.inertia, VEHICLE, VEHICLE.inertia * (1 + WRONG * (-1) ** i))
+
+
+def fly(gust: float, i: int, duration: float, seed: int) -> jaxos4.Flight:
+    """Flight i at one strength of the gusts [rad/s^2]."""
+    key = jax.random.fold_in(jax.random.key(seed), i)
+    inertia = known_airframe(i).inertia
+    loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=DELAY, gust=gust, controller_inertia=inertia)
+    references = jaxos4.random_references(duration=duration, dt=DT, key=jax.random.fold_in(key, 0))
+    return jaxos4.fly_closed_loop(loop, references, dt=DT, key=jax.random.fold_in(key, 1))
+
+
+@eqx.filter_jit
+def _regressions(flights: jaxos4.Flight, airframes: jaxos4.Airframe) -> jaxos4.Estimate:
+    def one(flight: jaxos4.Flight, airframe: jaxos4.Airframe) -> jaxos4.Estimate:
+        model = jaxos4.FlightModel(airframe, terms=("offset", "damping", "lag", "delay", "reaction"))
+        model = jaxos4.hold(model, {"rotor_lag": LAG, "rotor_delay": DELAY})
+        windows = flight.time.shape[0] // WINDOW
+        flight = jax.tree.map(lambda x: x[: windows * WINDOW] if x.ndim else x, flight)
+        problem = jaxos4.ShootingProblem(
+            model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4", windows=windows
+        )
+        return jaxos4.EquationError(memory=MEMORY)(problem, jaxos4.Bracket.default(model))
+
+    return eqx.filter_vmap(one)(flights, airframes)
+
+
+def stacked(modules: list) -> object:
+    """Modules of equal shapes as one batch."""
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *modules)
+
+
+def regress(flights: list[tuple[int, jaxos4.Flight]]) -> list[dict]:
+    """The rows of many flights by equation error. Their standard deviations are those of white gyro noise alone."""
+    rows = []
+    for first in range(0, len(flights), CHUNK):
+        some = flights[first : first + CHUNK]
+        padded = some + some[-1:] * (CHUNK - len(some))  # one program
+        begin = time.perf_counter()
+        found = _regressions(stacked([f for _, f in padded]), stacked([known_airframe(i) for i, _ in padded]))
+        results, seconds = jaxos4.result_names(jax.block_until_ready(found).result), time.perf_counter() - begin
+        alphas, stds = np.asarray(found.parameters), np.asarray(found.std)
+        for k, (i, _) in enumerate(some):
+            row: dict = {"flight": i, "result": str(results[k]), "seconds": seconds / len(some)}
+            for name, alpha in INERTIAS.items():
+                place = jaxos4.CorrectedOS4().parameter_names.index(alpha)
+                value, relative = 1 / alphas[k, place], stds[k, place] / alphas[k, place]
+                row[name] = {"estimate": value, "std": value * relative, "bound": value * relative}
+            rows.append(row)
+    return rows
+
+
+def search(estimator: str, flight: jaxos4.Flight, i: int) -> dict:
+    """The row of one flight by an estimator of `jaxos4.identify`."""
+    begin = time.perf_counter()
+    found = jaxos4.identify(flight, known_airframe(i), estimator=estimator, holdout=0.0)
+    row: dict = {"flight": i, "result": found.result, "seconds": time.perf_counter() - begin}
+    constants = {} if found.rigid_body is None else found.rigid_body.constants
+    for name, alpha in INERTIAS.items():
+        if name in constants:
+            known, value = found.parameters[alpha], constants[name]
+            # The bound of the parameter, as a share of its standard deviation.
+            bound = value.std * (known.bound or np.nan) / (known.std or np.nan)
+            row[name] = {"estimate": value.estimate, "std": value.std, "bound": bound}
+    return row
+
+
+def summary(rows: list[dict]) -> dict[str, dict]:
+    """For each moment of inertia: figures over the flights with an estimate, each with its Monte-Carlo error.
+
+    `bias`, `rmse`: as shares of the truth. `std`, `bound`: root mean square, as shares of the truth. `wrong`: the
+    share of flights that ended successful with a 95 % interval that misses the truth.
+    """
+    found = {}
+    for name, truth in zip(INERTIAS, VEHICLE.inertia.tolist(), strict=True):
+        some = [row for row in rows if name in row]
+        if not some:
+            continue
+        count = len(some)
+        values, std, bound = (np.array([row[name][k] for row in some]) / truth for k in ("estimate", "std", "bound"))
+        errors, successful = values - 1, np.array([row["result"] == "successful" for row in some])
+        covered = np.abs(errors) <= NINETY_FIVE * std
+        rmse, claimed, least = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, std, bound))
+        found[name] = {
+            "flights": count,
+            "bias": float(errors.mean()),
+            "bias_error": float(errors.std(ddof=1) / np.sqrt(count)) if count > 1 else None,
+            "rmse": rmse,
+            "std": claimed,
+            "bound": least,
+            "efficiency": rmse / least,
+            "efficiency_error": rmse / least / np.sqrt(2 * count),
+            "covered": float(covered.mean()),
+            "covered_error": float(np.sqrt(max(covered.mean() * (1 - covered.mean()), 0.05 * 0.95) / count)),
+            "wrong": float((successful & ~covered).sum() / len(rows)),
+        }
+    return found
+
+
+def print_table(report: dict, duration: float) -> None:
+    """One line for each estimator, strength of gusts and moment of inertia."""
+    headings = "gust", "estimator", "", "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]"
+    table = table_of(f"moments of inertia from flights of {duration:g} s in closed loop", (*headings, "results"))
+    for case in report["cases"]:
+        results = in_words(count_results(np.array([row["result"] for row in case["flights"]])))
+        for name, row in summary(case["flights"]).items():
+            error = "" if row["bias_error"] is None else f" +- {100 * row['bias_error']:.2g}"
+            table.add_row(
+                *(f"{case['gust']:g}", case["estimator"], name, str(row["flights"])),
+                *(f"{100 * row['bias']:.3g}{error}", f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}"),
+                f"{row['efficiency']:.2f} +- {row['efficiency_error']:.2f}",
+                f"{100 * row['covered']:.1f} +- {100 * row['covered_error']:.1f}",
+                results,
+            )
+    Console(width=150).print(table)
+
+
+def main(
+    flights: Annotated[int, typer.Option(help="Number of flights for each strength.")] = 200,
+    searches: Annotated[int, typer.Option(help="The most flights for output error, which takes longest.")] = 50,
+    gusts: Annotated[list[float], typer.Option(help="Standard deviations of the gusts [rad/s^2].")] = (5.0, 10.0, 20.0),
+    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 16,
+    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = (
+        *("equation-error", "output-error", "filter-error"),
+    ),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+) -> None:
+    """Measure bias and coverage of moments of inertia over the strength of gusts."""
+    settings = {"duration": duration, "seed": seed, "version": jaxos4.__version__, "precision": "float64"}
+    report: dict = {**settings, "cases": []}
+    if out is not None and out.exists():
+        earlier = json.loads(out.read_text())
+        if {name: earlier[name] for name in settings} != settings:
+            raise SystemExit(f"{out}: has other settings; give --out another name.")
+        report = earlier
+
+    def save() -> None:
+        for case in report["cases"]:
+            case["summary"] = summary(case["flights"])
+        if out is not None:
+            out.write_text(json.dumps(report, indent=2) + "\n")
+
+    for gust in gusts:
+        flown = [(i, fly(gust, i, duration, seed)) for i in range(flights)]
+        # A vehicle that pitches over has no log.
+        flown = [(i, flight) for i, flight in flown if flight.result == jaxos4.RESULTS.successful]
+        for name in estimators:
+            case = next((c for c in report["cases"] if (c["gust"], c["estimator"]) == (gust, name)), None)
+            if case is None:
+                case = {"gust": gust, "estimator": name, "flights": []}
+                report["cases"].append(case)
+            done = {row["flight"] for row in case["flights"]}
+            wanted = [(i, flight) for i, flight in flown if i not in done and (i < searches or name != "output-error")]
+            if name == "equation-error":
+                case["flights"] += regress(wanted)
+                save()
+                continue
+            for i, flight in wanted:
+                case["flights"].append(search(name, flight, i))
+                save()
+    print_table(report, duration)
+
+
+if __name__ == "__main__":
+    typer.run(main)
