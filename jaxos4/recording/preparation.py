@@ -16,7 +16,7 @@ from .averaging import averaged
 from .holdout import hold_out
 from .joining import join
 from .reading import Recording
-from .usable import Stretch, cut, stretches
+from .usable import Stretch, cut, nothing_usable, stretches
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -74,6 +74,8 @@ def prepare(
     parts: list[tuple[int, Flight]] = []
     for number, recording in enumerate(recordings):
         pieces, note = _usable_parts(recording, airframe, begin, end)
+        if recording.facts.too_slow:
+            raise InputError(f"{recording.name}: {recording.facts.too_slow}.")
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
         parts += [(number, piece) for piece in pieces]
     if len({piece.commanded for _, piece in parts}) > 1:
@@ -142,14 +144,12 @@ def _usable_parts(
             return [cut(flight, Stretch(first if begin is None else begin, last if end is None else end))], None
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
-    every = stretches(flight, airframe)
+    every = stretches(flight, airframe, landed=recording.facts.landed)
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
-        raise InputError(
-            f"{name}: no stretch of it can be used (from {refused[0].begin:.1f} s to {refused[0].end:.1f} s: "
-            f"{refused[0].reason}); give `begin` and `end` to use one all the same."
-        )
+        slow = f" Besides, {recording.facts.too_slow}." if recording.facts.too_slow else ""
+        raise InputError(f"{name}: {nothing_usable(every)}; give `begin` and `end` to use a part all the same.{slow}")
     if not refused:
         return [flight], None
     reasons = "; ".join(f"{part.begin:.1f} to {part.end:.1f} s: {part.reason}" for part in refused[:_MOST_REASONS])
