@@ -2,8 +2,8 @@
 
 | column | topic and field of the log | unit in the log |
 | --- | --- | --- |
-| `p, q, r` | the fastest of `vehicle_angular_velocity.xyz`, `sensor_combined.gyro_rad`, `sensor_gyro.x, y, z` | rad/s |
-| `ax, ay, az` | the fastest of `sensor_combined.accelerometer_m_s2`, `vehicle_acceleration.xyz`, `sensor_accel` | m/s^2 |
+| `p, q, r` | the fastest of `vehicle_angular_velocity`, `sensor_combined.gyro_rad`, `sensor_gyro` | rad/s |
+| `ax, ay, az` | the fastest of `sensor_combined.accelerometer_m_s2`, `vehicle_acceleration`, `sensor_accel` | m/s^2 |
 | `phi, theta, psi` | `vehicle_attitude.q`: w, x, y, z, from the body to the earth | |
 | `x, y, z` | `vehicle_local_position.x, y, z`, while `xy_valid` and `z_valid` | m |
 | `vx, vy, vz` | `vehicle_local_position.vx, vy, vz`, while `v_xy_valid` and `v_z_valid` | m/s |

@@ -8,7 +8,8 @@ A command becomes a share of full rotor speed in two steps.
    Speed is the square root of thrust.
 
 `actuator_motors` holds the share of thrust, before PX4 turns it into a signal; `actuator_outputs` holds the signal.
-If f is 0, its default, nobody measured the thrust, and both topics hold u. Speed then counts as proportional to u.
+If f is 0, its default, nobody measured the thrust, and both topics hold u. Speed then counts as proportional to u, and
+the term `curve` of a vehicle's model fits the thrust.
 
 | protocol | smallest | largest |
 | --- | --- | --- |
@@ -36,7 +37,9 @@ _OUTPUTS = 16  # of one driver
 _BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
 _LEAST_PWM, _HIGHEST_PWM = 800.0, 2200.0  # [us]
 _PWM, _DSHOT, _UAVCAN = (1000.0, 2000.0), 1999.0, (1.0, 8191.0)
-_CAN = 4  # ESC_CONNECTION_TYPE_CAN
+_CAN, _DSHOT_LINK = 4, 5  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
+_DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TIM0 and so on
+_TIMERS = 8
 
 
 class Rotors(NamedTuple):
@@ -128,8 +131,8 @@ def _thrust_curve(log: Topics) -> tuple[float, str]:
     if 0 < curve <= 1:
         return curve, f"taken as fractions of full-scale rotor speed by THR_MDL_FAC = {curve:.3g}"
     return 0.0, (
-        "taken as fractions of full-scale rotor speed. THR_MDL_FAC is 0, so nobody measured thrust against command: "
-        "inertias can be wrong by up to a factor of two; log measured speeds (esc_status), or set THR_MDL_FAC"
+        "taken as fractions of full-scale rotor speed, because THR_MDL_FAC is 0: the thrust curve was not measured "
+        "(the term curve of a vehicle fits it, if the accelerometer was logged)"
     )
 
 
@@ -152,11 +155,12 @@ def _motor_order(functions: list[int]) -> list[int] | None:
 def _limits(log: Topics, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray]:
     """The protocol, and the values of each output at which a motor idles and is at full speed, shape (4, 2)."""
     turning = values[values > 1]
-    small = bool((turning < _LEAST_PWM).any())
-    can = bank == "UAVCAN_EC" or (small and log.latest("esc_status", "esc_connectiontype") == _CAN)
-    if can or (turning > _HIGHEST_PWM).any():
+    small, link = bool((turning < _LEAST_PWM).any()), log.latest("esc_status", "esc_connectiontype")
+    if bank == "UAVCAN_EC" or (turning > _HIGHEST_PWM).any() or (small and link == _CAN):
         return "UAVCAN", _ends(log, [("UAVCAN_EC_MIN", "UAVCAN_EC_MAX")], channels, (0.0, 8191.0), _UAVCAN)
-    if small:
+    timers = [log.parameters.get(f"{bank}_TIM{i}") for i in range(_TIMERS)]
+    dshot = link == _DSHOT_LINK or log.parameters.get("DSHOT_CONFIG", 0.0) > 0
+    if small or dshot or any(timer in _DSHOT_TIMERS for timer in timers):
         least = log.parameters.get("DSHOT_MIN", 0.0)
         return "DShot", np.tile([_DSHOT * least if 0 <= least < 0.5 else 0.0, _DSHOT], (4, 1))
     names = [(f"{bank}_MIN", f"{bank}_MAX"), ("PWM_MIN", "PWM_MAX")]

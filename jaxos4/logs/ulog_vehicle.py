@@ -50,7 +50,7 @@ def check_vehicle(log: Topics) -> None:
     motors = log.fields("actuator_motors")
     others = [i for i in range(4, MOTORS) if np.nan_to_num(motors.get(f"control[{i}]", np.zeros(1))).any()]
     if others:
-        _refuse(log, f"a vehicle with {4 + len(others)} motors", f"actuator_motors.control[{others[0]}]")
+        _refuse(log, f"a vehicle that drives {4 + len(others)} motors", f"actuator_motors.control[{others[0]}]")
 
 
 def _refuse(log: Topics, what: str, name: str, kind: str = "field") -> None:

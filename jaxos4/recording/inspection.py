@@ -78,7 +78,7 @@ class Inspection(msgspec.Struct, frozen=True):
     - `findings`: why no vehicle can be identified from the log, and what to do, most important first.
     - `notes`: remarks of the reader.
     - `parts`: the stretches in order of time.
-    - `identifiable`: `None` without an airframe, without p, q and r, or with findings.
+    - `identifiable`: `None` without an airframe, without p, q and r, or if a finding excludes it.
     """
 
     log: str
@@ -111,7 +111,7 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
     nothing = "" if longest is not None else f"{nothing_usable(found)}; give the log of a flight"
     findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts))))
     identifiable = None
-    if longest is not None and not findings and airframe is not None and rates_measured:
+    if longest is not None and not facts.too_slow and airframe is not None and rates_measured:
         identifiable = _identifiable(flight, longest, airframe)
     return Inspection(
         log=str(path),
@@ -150,8 +150,10 @@ def _too_little(parts: tuple[Part, ...]) -> str:
     if not rates or max(rates) >= WEAK:
         return ""
     seconds = sum(part.end - part.begin for part in usable)
-    what = f"too little flight: in the {seconds:.1f} s that can be used, the vehicle turns with at most {max(rates):.2g}"
-    return f"{what} rad/s (standard deviation); fly rolls, pitches and turns"
+    return (
+        f"too little flight: in the {seconds:.1f} s that can be used, the vehicle turns with at most {max(rates):.2g} "
+        "rad/s (standard deviation); fly rolls, pitches and turns"
+    )
 
 
 def _part(flight: Flight, stretch: Stretch, airframe: Airframe | None) -> Part:

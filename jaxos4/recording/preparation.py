@@ -63,8 +63,11 @@ def prepare(
     window: float = WINDOW,
     sample_time: float | None = None,
     holdout: float = HOLDOUT,
+    predicted: bool = False,
 ) -> Prepared:
     """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
+
+    `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors.
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
@@ -73,9 +76,10 @@ def prepare(
     notes: list[str] = []
     parts: list[tuple[int, Flight]] = []
     for number, recording in enumerate(recordings):
-        pieces, note = _usable_parts(recording, airframe, begin, end)
-        if recording.facts.too_slow:
-            raise InputError(f"{recording.name}: {recording.facts.too_slow}.")
+        slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
+        pieces, note = _usable_parts(recording, airframe, begin, end, slow)
+        if slow:
+            raise InputError(f"{recording.name}: {slow}.")
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
         parts += [(number, piece) for piece in pieces]
     if len({piece.commanded for _, piece in parts}) > 1:
@@ -134,9 +138,12 @@ def _sampling(parts: list[Flight], window: float, sample_time: float | None) -> 
 
 
 def _usable_parts(
-    recording: Recording, airframe: Airframe, begin: float | None, end: float | None
+    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str
 ) -> tuple[list[Flight], str | None]:
-    """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used."""
+    """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used.
+
+    `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
+    """
     flight, name = recording.flight, recording.name
     first, last = np.asarray(flight.time)[[0, -1]].tolist()
     if begin is not None or end is not None:
@@ -148,8 +155,9 @@ def _usable_parts(
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
-        slow = f" Besides, {recording.facts.too_slow}." if recording.facts.too_slow else ""
-        raise InputError(f"{name}: {nothing_usable(every)}; give `begin` and `end` to use a part all the same.{slow}")
+        remedy = "give the log of a flight, or `begin` and `end` to use a part all the same"
+        besides = f" Besides, {slow}." if slow else ""
+        raise InputError(f"{name}: {nothing_usable(every)}; {remedy}.{besides}")
     if not refused:
         return [flight], None
     reasons = "; ".join(f"{part.begin:.1f} to {part.end:.1f} s: {part.reason}" for part in refused[:_MOST_REASONS])
