@@ -106,7 +106,10 @@ def _motors(log: Topics) -> Rotors | None:
 
 
 def _outputs(log: Topics) -> Rotors | None:
-    bank, channels = _bank_of_motors(log)
+    place = _bank_of_motors(log)
+    if place is None:
+        return None
+    bank, channels = place
     names = tuple(f"output[{i}]" for i in channels)
     instances = range(len(log.topics.get("actuator_outputs", [])))
     found = [log.series("actuator_outputs", names, i) for i in instances]
@@ -136,14 +139,17 @@ def _thrust_curve(log: Topics) -> tuple[float, str]:
     )
 
 
-def _bank_of_motors(log: Topics) -> tuple[str, list[int]]:
-    """The outputs of motors 1 to 4, and the beginning of their parameters' names. Old PX4: the first four of MAIN."""
+def _bank_of_motors(log: Topics) -> tuple[str, list[int]] | None:
+    """The outputs of motors 1 to 4, and the beginning of their parameters' names. Old PX4: the first four of MAIN.
+
+    None if the log says which motor an output drives, but no driver has all four motors.
+    """
     for bank in _BANKS:
         functions = [int(log.parameters.get(f"{bank}_FUNC{i + 1}", 0.0)) for i in range(_OUTPUTS)]
         order = _motor_order(functions)
         if order is not None:
             return bank, order
-    return "PWM_MAIN", [0, 1, 2, 3]
+    return None if any("_FUNC" in name for name in log.parameters) else ("PWM_MAIN", [0, 1, 2, 3])
 
 
 def _motor_order(functions: list[int]) -> list[int] | None:
