@@ -35,6 +35,7 @@ _FIRST_MOTOR = 101  # PX4's number of the output function "Motor 1"
 _RPM = 2 * math.pi / 60
 _OUTPUTS = 16  # of one driver
 _BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
+_OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other units
 _LEAST_PWM, _HIGHEST_PWM = 800.0, 2200.0  # [us]
 _PWM, _DSHOT, _UAVCAN = (1000.0, 2000.0), 1999.0, (1.0, 8191.0)
 _CAN, _DSHOT_LINK = 4, 5  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
@@ -149,7 +150,8 @@ def _bank_of_motors(log: Topics) -> tuple[str, list[int]] | None:
         order = _motor_order(functions)
         if order is not None:
             return bank, order
-    return None if any("_FUNC" in name for name in log.parameters) else ("PWM_MAIN", [0, 1, 2, 3])
+    known = any(f"{bank}_FUNC1" in log.parameters for bank in (*_BANKS, *_OTHER_BANKS))
+    return None if known else ("PWM_MAIN", [0, 1, 2, 3])
 
 
 def _motor_order(functions: list[int]) -> list[int] | None:

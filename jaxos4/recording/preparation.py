@@ -53,6 +53,11 @@ class Prepared(NamedTuple):
         """The number of windows; each lies in one stretch."""
         return self.fitted.time.shape[0] // self.length
 
+    @property
+    def battery_voltage(self) -> float | None:
+        """The median of the battery's voltage [V]. `None`: not logged."""
+        return None if self.fitted.voltage is None else float(np.median(self.fitted.voltage))
+
 
 def prepare(
     recordings: Sequence[Recording],
