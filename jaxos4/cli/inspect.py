@@ -55,8 +55,8 @@ def inspect(
     _print_parts(console, found)
     if found.identifiable is not None:
         _print_identifiable(console, found.identifiable)
-    elif not any(part.usable for part in found.parts):
-        console.print("no parameter is identifiable: no part of the log can be used.")
+    elif found.findings:
+        console.print("no parameter is identifiable, see the first lines.")
     elif vehicle is None:
         console.print("give --airframe to see which parameters are identifiable.")
     else:
@@ -69,6 +69,8 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
         f"one every {1e3 * found.sample_time:.4g} ms",
         soft_wrap=True,
     )
+    for finding in found.findings:
+        console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
     for names, unit in CHANNELS:
         measured = {name: found.measured[name] for name in names if name in found.measured}
         if not measured:

@@ -16,7 +16,7 @@ from .averaging import averaged
 from .holdout import hold_out
 from .joining import join
 from .reading import Recording
-from .usable import Stretch, cut, stretches
+from .usable import Stretch, cut, nothing_usable, stretches
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -68,8 +68,11 @@ def prepare(
     window: float = WINDOW,
     sample_time: float | None = None,
     holdout: float = HOLDOUT,
+    predicted: bool = False,
 ) -> Prepared:
     """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
+
+    `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors.
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
@@ -78,7 +81,10 @@ def prepare(
     notes: list[str] = []
     parts: list[tuple[int, Flight]] = []
     for number, recording in enumerate(recordings):
-        pieces, note = _usable_parts(recording, airframe, begin, end)
+        slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
+        pieces, note = _usable_parts(recording, airframe, begin, end, slow)
+        if slow:
+            raise InputError(f"{recording.name}: {slow}.")
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
         parts += [(number, piece) for piece in pieces]
     if len({piece.commanded for _, piece in parts}) > 1:
@@ -137,9 +143,12 @@ def _sampling(parts: list[Flight], window: float, sample_time: float | None) -> 
 
 
 def _usable_parts(
-    recording: Recording, airframe: Airframe, begin: float | None, end: float | None
+    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str
 ) -> tuple[list[Flight], str | None]:
-    """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used."""
+    """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used.
+
+    `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
+    """
     flight, name = recording.flight, recording.name
     first, last = np.asarray(flight.time)[[0, -1]].tolist()
     if begin is not None or end is not None:
@@ -147,14 +156,13 @@ def _usable_parts(
             return [cut(flight, Stretch(first if begin is None else begin, last if end is None else end))], None
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
-    every = stretches(flight, airframe)
+    every = stretches(flight, airframe, landed=recording.facts.landed)
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
-        raise InputError(
-            f"{name}: no stretch of it can be used (from {refused[0].begin:.1f} s to {refused[0].end:.1f} s: "
-            f"{refused[0].reason}); give `begin` and `end` to use one all the same."
-        )
+        remedy = "give the log of a flight, or `begin` and `end` to use a part all the same"
+        besides = f" Besides, {slow}." if slow else ""
+        raise InputError(f"{name}: {nothing_usable(every)}; {remedy}.{besides}")
     if not refused:
         return [flight], None
     reasons = "; ".join(f"{part.begin:.1f} to {part.end:.1f} s: {part.reason}" for part in refused[:_MOST_REASONS])

@@ -6,6 +6,7 @@ is not clipped, no samples are lost, and the vehicle does not crash.
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from ..errors import InputError
 from ..flight import Flight
 from .excited import RATE_COLUMNS
 
+ON_GROUND = "on the ground"
 SHORTEST = 1.0  # [s], of a usable stretch
 MOMENT = 0.1  # [s]; a rotor may rest or be at its limit for this long: about its lag
 _CARRIES = 0.3  # share of the weight; with less thrust for `_SUSTAINED`, the vehicle is on the ground
@@ -56,7 +58,9 @@ class _Saturation(NamedTuple):
     end: int
 
 
-def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
+def stretches(
+    flight: Flight, airframe: Airframe | None = None, *, landed: Sequence[tuple[float, float]] = ()
+) -> tuple[Stretch, ...]:
     """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
     **Arguments:**
@@ -64,11 +68,14 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
     - `flight`: one flight, not a batch.
     - `airframe`: the weight, and the largest rotor speed. If there is none, or if it is evidently another vehicle's
       (thrust below a third or above three times the weight), the median thrust is taken as the weight.
+    - `landed`: from when to when the vehicle itself says that it is on the ground [s], see `jaxos4.logs.LogFacts`.
     """
     time, omega = np.asarray(flight.time, dtype=float), np.asarray(flight.omega, dtype=float)
     states, dt = np.asarray(flight.states, dtype=float), float(flight.dt)
     share = _thrust_share(omega, airframe)
     ground = _ground(share, dt)
+    for begin, end in landed:
+        ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
     saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
     for label, where in (
@@ -92,6 +99,13 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
 def usable_stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
     """The usable stretches, in order; each lasts at least one second."""
     return tuple(stretch for stretch in stretches(flight, airframe) if not stretch.reason)
+
+
+def nothing_usable(every: Sequence[Stretch]) -> str:
+    """Why none of these stretches of a flight can be used: the longest one, with its reason."""
+    longest = max(every, key=lambda stretch: stretch.length)
+    never = "the vehicle never flew" if all(stretch.reason == ON_GROUND for stretch in every) else "no part can be used"
+    return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
 
 
 def cut(flight: Flight, stretch: Stretch) -> Flight:
@@ -221,7 +235,7 @@ def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) ->
         _CLIPPING: "the gyro is clipped",
         _LOST: "nothing was measured",
         _CRASHED: "an impact",
-        _GROUND: "on the ground",
+        _GROUND: ON_GROUND,
     }[label]
 
 
