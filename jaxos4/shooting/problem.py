@@ -144,17 +144,24 @@ class ShootingProblem(eqx.Module):
         return self.model.forcing(self.flight.inputs, parameters)
 
     def with_forcing(
-        self, rows: Rows, parameters: Parameters, *, inputs: Inputs | None = None, tangents: bool = False
+        self,
+        rows: Rows,
+        parameters: Parameters,
+        *,
+        inputs: Inputs | None = None,
+        index: Int[np.ndarray, "windows length"] | None = None,
+        tangents: bool = False,
     ) -> Rows:
         """Recompute the forcing for these parameters, optionally with its derivatives.
 
         Does nothing if the forcing depends on no parameter. `inputs`: `flight.inputs`, prepared outside of a loop.
+        `index`: the samples of each window, by default those of `cut`.
         """
         positions = np.asarray(self.model.forcing_parameters, dtype=int)
         if not positions.size:
             return rows
         inputs = self.flight.inputs if inputs is None else inputs
-        index, _ = self.cut()
+        index = self.cut()[0] if index is None else index
 
         def forcing(values: Float[Array, " positions"]) -> Forcing:
             new = self.model.forcing(inputs, parameters.at[positions].set(values))
