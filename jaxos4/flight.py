@@ -42,6 +42,7 @@ class Inputs(NamedTuple):
     - `velocity`: along the body's axes [m/s]. `None`: unknown.
     - `force`: the measured specific force along the body's axes [m/s^2], an input of some models. `None`: not measured.
     - `stretches`: `None`: the flight is one stretch.
+    - `voltage`: of the battery [V]. `None`: not logged.
     """
 
     omega: RotorSpeeds
@@ -49,6 +50,7 @@ class Inputs(NamedTuple):
     velocity: Float[Array, "samples 3"] | None = None
     force: Float[Array, "samples 3"] | None = None
     stretches: Stretches | None = None
+    voltage: Float[Array, " samples"] | None = None
 
 
 class Flight(eqx.Module):
@@ -63,6 +65,7 @@ class Flight(eqx.Module):
     - `stretch`: the number of the uninterrupted stretch of each sample, counted from 0. Joined flights have several
       (`jaxos4.join`), and their time counts samples. `None`: the flight is one stretch.
     - `commanded`: whether `omega` holds commands, which the rotors follow with a lag, and not measured speeds.
+    - `voltage`: of the battery [V], an input of some models; no NaN. `None`: not logged.
 
     **Raises:** `ValueError` for arrays whose shapes do not agree, or fewer than two samples.
     """
@@ -75,6 +78,7 @@ class Flight(eqx.Module):
     body_velocity: Float[Array, "samples 3"] | None = eqx.field(converter=_optional_float, default=None)
     stretch: Int[Array, " samples"] | None = None
     commanded: bool = eqx.field(static=True, default=False)
+    voltage: Float[Array, " samples"] | None = eqx.field(converter=_optional_float, default=None)
 
     def __check_init__(self):
         samples = self.time.shape
@@ -84,7 +88,8 @@ class Flight(eqx.Module):
                 f"{samples}, {self.omega.shape} and {self.states.shape}; a batch of flights is made by `vmap`."
             )
         vectors = (*samples, 3)
-        for name, shape in (("specific_force", vectors), ("body_velocity", vectors), ("stretch", samples)):
+        shapes = {"specific_force": vectors, "body_velocity": vectors, "stretch": samples, "voltage": samples}
+        for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"`{name}` must have shape {shape}, got {value.shape}.")
@@ -103,7 +108,7 @@ class Flight(eqx.Module):
         """What drives the vehicle, with gaps in the specific force filled."""
         stretches = None if self.stretch is None else Stretches.of(self.stretch)
         force = None if self.specific_force is None else fill_gaps(self.specific_force, stretches)
-        return Inputs(self.omega, self.dt, self.body_velocity, force, stretches)
+        return Inputs(self.omega, self.dt, self.body_velocity, force, stretches, self.voltage)
 
     @property
     def channels(self) -> Float[Array, "samples 15"]:

@@ -81,7 +81,8 @@ def flights(draw):
     states[draw(st.integers(0, n - 1)), draw(st.integers(0, 11))] = 0.1
     force = masked(draw, (n, 3), 1e3) if draw(st.booleans()) else None
     force = None if force is None or np.isnan(force).all() else jnp.asarray(force)
-    return Flight(time, omega, states, force)
+    voltage = draw(hnp.arrays(float, n, elements=st.floats(1e-3, 200))) if draw(st.booleans()) else None
+    return Flight(time, omega, states, force, voltage=voltage)
 
 
 @pytest.fixture(scope="module")
@@ -241,6 +242,23 @@ def test_missing_columns_and_empty_cells_are_not_measured(save):
     assert flight.specific_force is None
 
 
+def test_voltage_is_interpolated_over_what_was_not_measured(save):
+    def voltage(cells, rows=ROWS):
+        lines = [f"{row},{cell}" for row, cell in zip(rows, cells, strict=True)]
+        return read_flight_and_notes(save(csv(HEADER + ",voltage", lines)))[0].voltage
+
+    found = voltage(["", "12.0", "", "0", "11.7", ""])
+    assert found is not None
+    np.testing.assert_allclose(found, [12.0, 12.0, 11.9, 11.8, 11.7, 11.7], rtol=1e-12)
+    uneven = [row.replace("0.03,", "0.034,", 1) for row in ROWS]
+    found = voltage(["12.0", "", "", "", "", "11.5"], uneven)
+    assert found is not None
+    np.testing.assert_allclose(found, np.linspace(12.0, 11.5, 6), rtol=1e-12)
+    assert voltage([""] * 6) is None
+    assert voltage(["0", "", "-1", "0", "0", "0"]) is None
+    assert read_flight(save(csv())).voltage is None
+
+
 def test_blocks_do_not_show(save, monkeypatch):
     path = save(csv(rows=[*ROWS, "", ""]))
     whole = read_flight(path)
@@ -366,6 +384,7 @@ BAD = {
     "position": (edited(5, "q", "1e7").replace("q", "x"), ["row 5, column x", "metres"]),
     "velocity": (edited(5, "q", "1001").replace("q", "vx"), ["row 5, column vx", "m/s"]),
     "force": (edited(5, "q", "1001").replace("q", "ax"), ["row 5, column ax", "m/s^2"]),
+    "millivolts": (edited(5, "q", "11100").replace("q", "voltage"), ["row 5, column voltage", "mV, divide by 1000"]),
     "nul": (edited(3, "q", "\0"), ["row 3, column q", "not text in UTF-8"]),
     "latin-1": (edited(3, "q", "é").encode("latin-1"), ["row 3, column q", "not text in UTF-8"]),
     "utf-16": (csv().encode("utf-16"), ["row 1", "not text in UTF-8"]),

@@ -9,10 +9,12 @@ from hypothesis import given, settings, strategies as st
 
 import jaxos4
 from jaxos4.flight import Stretches, fill_gaps
-from jaxos4.recording.averaging import average
+from jaxos4.recording.averaging import average, averaged
+from jaxos4.recording.usable import Stretch, cut
+from jaxos4.shooting.padding import padded
 
 
-def stretch(samples, seed, *, force=False, velocity=False, dt=0.01, start=0.0):
+def stretch(samples, seed, *, force=False, velocity=False, voltage=False, dt=0.01, start=0.0):
     rng = np.random.default_rng(seed)
     states = rng.normal(size=(samples, 12))
     states[rng.uniform(size=states.shape) < 0.1] = np.nan
@@ -22,6 +24,7 @@ def stretch(samples, seed, *, force=False, velocity=False, dt=0.01, start=0.0):
         states=states,
         specific_force=rng.normal(size=(samples, 3)) if force else None,
         body_velocity=rng.normal(size=(samples, 3)) if velocity else None,
+        voltage=rng.uniform(10, 12, samples) if voltage else None,
     )
 
 
@@ -59,15 +62,38 @@ def test_no_window_reaches_from_one_stretch_into_the_next(lengths, length, force
     assert (joined.specific_force is None) == (not any(flight.specific_force is not None for flight, _ in whole))
 
 
-@pytest.mark.parametrize("velocities", [(True, True), (True, False), (False, False)])
-def test_velocity_is_kept_if_every_stretch_has_it(velocities):
-    flights = [stretch(30, i, velocity=v) for i, v in enumerate(velocities)]
-    joined = jaxos4.join(flights, length=10)
-    if all(velocities):
-        expected = np.concatenate([np.asarray(flight.body_velocity) for flight in flights])
-        np.testing.assert_array_equal(joined.body_velocity, expected)
+@pytest.mark.parametrize("field", ["body_velocity", "voltage"])
+@pytest.mark.parametrize("have", [(True, True), (True, False), (False, False)])
+def test_velocity_and_voltage_are_kept_if_every_stretch_has_them(field, have):
+    flights = [stretch(30, i, **{field.removeprefix("body_"): each}) for i, each in enumerate(have)]
+    joined = getattr(jaxos4.join(flights, length=10), field)
+    if all(have):
+        expected = np.concatenate([np.asarray(getattr(flight, field)) for flight in flights])
+        np.testing.assert_array_equal(joined, expected)
     else:
-        assert joined.body_velocity is None
+        assert joined is None
+
+
+def test_voltage_is_averaged_and_cut_with_the_samples():
+    flight = stretch(401, 0, voltage=True, dt=0.001)
+    coarse = averaged(flight, 0.004)
+    assert coarse.voltage is not None
+    assert coarse.voltage.shape == coarse.time.shape
+    expected = averaged_slowly(flight.time, flight.voltage[:, None], np.asarray(coarse.time), 0.004)[:, 0]
+    np.testing.assert_allclose(coarse.voltage, expected, rtol=1e-9)
+    assert averaged(stretch(401, 0, dt=0.001), 0.004).voltage is None
+    part = cut(flight, Stretch(0.1, 0.2))
+    np.testing.assert_array_equal(part.voltage, flight.voltage[100:201])
+
+
+def test_padding_repeats_the_last_voltage():
+    flight = stretch(50, 0, voltage=True)
+    problem = jaxos4.ShootingProblem(jaxos4.CorrectedOS4(), flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
+    longer = padded(problem).flight
+    assert longer.voltage is not None
+    assert longer.voltage.shape == longer.time.shape
+    np.testing.assert_array_equal(longer.voltage[:50], flight.voltage)
+    np.testing.assert_array_equal(longer.voltage[50:], flight.voltage[-1])
 
 
 def test_the_cost_of_joined_flights_is_the_sum_of_theirs():

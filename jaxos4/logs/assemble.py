@@ -14,12 +14,13 @@ from .units import check_time, check_units, force_note, thrust_note
 
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
 COMMAND_NAMES = ("command1", "command2", "command3", "command4")
-COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES)
+COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
 
 _OTHER_NAMES = {  # names that other loggers use, for the question "should 'time' be t?"
     **dict.fromkeys(("time", "timestamp", "times"), "t"),
     **{"roll": "phi", "pitch": "theta", "yaw": "psi"},
     **{"gyrox": "p", "gyroy": "q", "gyroz": "r", "accx": "ax", "accy": "ay", "accz": "az"},
+    **dict.fromkeys(("vbat", "vbatt", "batteryvoltage"), "voltage"),
 }
 MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
 
@@ -39,14 +40,17 @@ def flight_of(
         notes.extend(thrust_note(float(thrust / (airframe.mass * airframe.gravity))))
     channels = _channels(table, notes)
     with_force = any(name in table.columns for name in FORCE_NAMES)
-    time, omega, channels = _evenly(table._replace(columns={"t": table.columns["t"]}), dt, omega, channels, notes)
+    voltage = _voltage(table)
+    table = table._replace(columns={"t": table.columns["t"]})
+    time, omega, channels, voltage = _evenly(table, dt, omega, channels, voltage, notes)
     del table  # frees the memory of a long log
     dt = float(time[-1] - time[0]) / (time.size - 1)
     if np.finfo(jnp.result_type(float)).eps * abs(time[0]) > UNIFORM * dt:
         notes.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
         time = dt * np.arange(time.size)
     force = as_float(channels[:, 12:]) if with_force else None
-    flight = Flight(as_float(time), as_float(omega), as_float(channels[:, :12]), force, commanded=commanded)
+    states = as_float(channels[:, :12])
+    flight = Flight(as_float(time), as_float(omega), states, force, commanded=commanded, voltage=voltage)
     return flight, tuple(notes)
 
 
@@ -117,6 +121,15 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
     return column[last]
 
 
+def _voltage(table: Table) -> np.ndarray | None:
+    """The battery's voltage at every row [V], interpolated linearly between measured cells; 0 is not measured."""
+    if "voltage" not in table.columns:
+        return None
+    t, voltage = table.columns["t"], table.columns["voltage"]
+    measured = voltage > 0
+    return np.interp(t, t[measured], voltage[measured]) if measured.any() else None
+
+
 def _channels(table: Table, notes: list[str]) -> np.ndarray:
     """States and specific force, shape (rows, 15), with unwrapped angles."""
     channels = np.full((table.columns["t"].size, len(CHANNEL_NAMES)), np.nan)
@@ -133,13 +146,13 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
 
 
 def _evenly(
-    table: Table, dt: float, omega: np.ndarray, channels: np.ndarray, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, rotor speeds and channels on a uniform grid. Rows that already lie on one keep their values."""
+    table: Table, dt: float, omega: np.ndarray, channels: np.ndarray, voltage: np.ndarray | None, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Time, rotor speeds, channels and voltage on a uniform grid. Rows that already lie on one keep their values."""
     t = table.columns["t"]
     time = uniform_grid(t)
     if time is not None:
-        return time, omega, channels
+        return time, omega, channels, voltage
     gap = widest_gap(t, dt)
     if gap.samples > min(MAX_ROWS, MOST_SAMPLES + 10 * t.size):
         what = f"comes after a gap of {gap.length:.6g} s: at the median step of {dt:.3g} s the flight would have "
@@ -148,4 +161,4 @@ def _evenly(
     notes.append(figures)
     if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
         table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
-    return time, omega, channels
+    return time, omega, channels, None if voltage is None else np.interp(time, t, voltage)

@@ -12,9 +12,10 @@ The first row holds the names of the columns, in any order. Cells are separated 
 | `phi, theta, psi` | rad | roll, pitch, yaw |
 | `p, q, r` | rad/s | body rates |
 | `ax, ay, az` | m/s^2 | specific force |
+| `voltage` | V | the battery's voltage |
 
-A missing column or an empty cell means that the value was not measured. A flight needs `t`, all four rotors (speeds
-or commands), and at least one of the twelve states of Eq. (14).
+A missing column or an empty cell means that the value was not measured. Voltage is interpolated over empty cells. A
+flight needs `t`, all four rotors (speeds or commands), and at least one of the twelve states of Eq. (14).
 """
 
 import csv
@@ -65,7 +66,7 @@ CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_tabl
 
 
 def write_flight(flight: Flight, path: Path) -> None:
-    """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of the states and the specific force.
+    """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of states, specific force and voltage.
 
     Reading the file gives back every bit. If writing fails, an older file at `path` is unchanged.
 
@@ -83,6 +84,8 @@ def write_flight(flight: Flight, path: Path) -> None:
     measured: dict[str, np.ndarray] = dict(zip(STATE_NAMES, np.asarray(flight.states).T, strict=True))
     if flight.specific_force is not None:
         measured.update(zip(FORCE_NAMES, np.asarray(flight.specific_force).T, strict=True))
+    if flight.voltage is not None:
+        measured["voltage"] = np.asarray(flight.voltage)
     for name, column in measured.items():
         _check_cells(path, name, column, ~np.isinf(column))
         if not np.isnan(column).all():

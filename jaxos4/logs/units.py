@@ -38,6 +38,7 @@ LIMITS = {
     "theta": Limit(math.nextafter(math.pi / 2, 0), "rad", _PITCH),
     "psi": _YAW,
     **dict.fromkeys(("ax", "ay", "az"), Limit(1e3, "m/s^2", _FORCE)),
+    "voltage": Limit(200.0, "V", "the battery's voltage is in volts: if these are mV, divide by 1000"),
 }
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
 _ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))

@@ -22,6 +22,7 @@ BODY_VELOCITY = "body velocity"
 LATERAL_FORCE = "lateral specific force"
 VERTICAL_FORCE = "vertical specific force"
 FULL_SCALE = "full scale"
+VOLTAGE = "battery voltage"
 
 # Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a body velocity of 5 m/s.
 _AUTHORITY, _FAST = 0.2, 5.0

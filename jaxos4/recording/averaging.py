@@ -17,9 +17,12 @@ def averaged(flight: Flight, dt: float) -> Flight:
     if dt <= float(flight.dt) * (1 + _EQUAL_STEPS):
         return flight
     t, omega, channels = (np.asarray(x) for x in (flight.time, flight.omega, flight.recorded))
-    time, omega, channels = average(t, omega, channels, dt)
-    force = None if flight.specific_force is None else channels[:, 12:]
-    return Flight(time, omega, channels[:, :12], force, commanded=flight.commanded)
+    voltage = None if flight.voltage is None else np.asarray(flight.voltage)
+    rows = channels if voltage is None else np.column_stack([channels, voltage])
+    time, omega, rows = average(t, omega, rows, dt)
+    force = None if flight.specific_force is None else rows[:, 12:15]
+    voltage = None if voltage is None else rows[:, 15]
+    return Flight(time, omega, rows[:, :12], force, commanded=flight.commanded, voltage=voltage)
 
 
 def average(

@@ -30,10 +30,13 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
     counts = [flight.time.shape[0] // length * length for flight in flights]
     if not any(counts):
         raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
-    kept = [jax.tree.map(lambda leaf, n=n: leaf[:n], _rows_of(f)) for f, n in zip(flights, counts, strict=True) if n]
-    with_velocity = all(rows[3] is not None for rows in kept)
-    omega, states, force = (np.concatenate([rows[i] for rows in kept]) for i in range(3))
-    velocity = np.concatenate([rows[3] for rows in kept if rows[3] is not None]) if with_velocity else None
+    kept = [(flight, n) for flight, n in zip(flights, counts, strict=True) if n]
+    omega, states, channels = (_rows(kept, name) for name in ("omega", "states", "recorded"))
+    force = channels[:, len(STATE_NAMES) :]
+    velocity, voltage = (
+        None if any(getattr(flight, name) is None for flight, _ in kept) else _rows(kept, name)
+        for name in ("body_velocity", "voltage")
+    )
     lengths = [n for n in counts if n]
     return Flight(
         time=steps[0] * np.arange(sum(counts)),
@@ -43,10 +46,9 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
         body_velocity=velocity,
         stretch=jax.device_put(np.repeat(np.arange(len(lengths)), lengths)),
         commanded=any(flight.commanded for flight in flights),
+        voltage=voltage,
     )
 
 
-def _rows_of(flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    force = flight.recorded[:, len(STATE_NAMES) :]
-    velocity = None if flight.body_velocity is None else np.asarray(flight.body_velocity)
-    return np.asarray(flight.omega), np.asarray(flight.states), force, velocity
+def _rows(kept: list[tuple[Flight, int]], name: str) -> np.ndarray:
+    return np.concatenate([np.asarray(getattr(flight, name))[:n] for flight, n in kept])

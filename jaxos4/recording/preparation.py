@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
 from ..models.rotation import with_body_velocity
 from ..models.state import CASCADE_ORDER
-from ..models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, has_full_scale
+from ..models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE, has_full_scale
 from .averaging import averaged
 from .holdout import hold_out
 from .joining import join
@@ -109,6 +109,7 @@ def _available_inputs(flight: Flight, stretches: Sequence[Flight], airframe: Air
         LATERAL_FORCE: force[0] and force[1],
         VERTICAL_FORCE: force[2],
         FULL_SCALE: has_full_scale(airframe),
+        VOLTAGE: flight.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
 

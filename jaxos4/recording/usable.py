@@ -108,8 +108,9 @@ def cut(flight: Flight, stretch: Stretch) -> Flight:
         )
     part = slice(int(inside[0]), int(inside[-1]) + 1)
     force = None if flight.specific_force is None else np.asarray(flight.specific_force)[part]
+    voltage = None if flight.voltage is None else np.asarray(flight.voltage)[part]
     omega, states = np.asarray(flight.omega)[part], np.asarray(flight.states)[part]
-    return Flight(time[part], omega, states, force, flight.result, commanded=flight.commanded)
+    return Flight(time[part], omega, states, force, flight.result, commanded=flight.commanded, voltage=voltage)
 
 
 def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:

@@ -42,6 +42,7 @@ def padded(problem: ShootingProblem) -> ShootingProblem:
         specific_force=pad(flight.specific_force, np.nan),
         body_velocity=pad(flight.body_velocity),
         stretch=pad(flight.stretch),
+        voltage=pad(flight.voltage),
     )
     length = jax.device_put(np.asarray(samples))
     return eqx.tree_at(lambda p: (p.flight, p.length), problem, (longer, length), is_leaf=lambda leaf: leaf is None)
