@@ -7,6 +7,7 @@
 | `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g, or as named: `(g)`, `(m/s2)` |
 | `omega1..4` | `eRPM[0..3]`, measured | 100 electrical revolutions a minute |
 | `command1..4` | `motor[0..3]`, if there is no `eRPM` | DShot 48..2047, or PWM 1000..2000 |
+| `voltage` | `vbatLatest` of Betaflight 4, INAV's `vbat` | 0.01 V |
 | `phi, theta, psi` | INAV's `attitude[0..2]` | 0.1 deg |
 | `x, y, z` | INAV's `navPos[0..2]` | cm |
 | `vx, vy, vz` | INAV's `navVel[0..2]` | cm/s |
@@ -37,6 +38,7 @@ Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight and IN
 
 import csv
 import math
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -68,6 +70,7 @@ _KNOWN = (
     *(f"{name}[{i}]{unit}" for name in ("gyroUnfilt", "gyroADC") for i in range(3) for unit in _RATE_UNITS),
     *(f"accSmooth[{i}]{unit}" for i in range(3) for unit in _FORCE_UNITS),
     *(name for name, _ in _INAV.values()),
+    *("vbatLatest", "vbat"),
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
 
@@ -105,6 +108,7 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
+    _add_voltage(log)
     for column, (name, sign) in _INAV.items():
         if name in raw:
             values = sign * raw[name]
@@ -252,6 +256,14 @@ def _add_force(log: _Log) -> None:
         for column, name in zip(("ax", "ay", "az"), names, strict=True):
             log.add(column, name, log.raw[name] * factor)
         return
+
+
+def _add_voltage(log: _Log) -> None:
+    """The battery's voltage, from firmware whose unit is known."""
+    firmware = log.settings.get("Firmware revision", "")
+    for name, pattern in (("vbatLatest", r"Betaflight ([4-9]|\d{2,})\."), ("vbat", "INAV")):
+        if name in log.raw and re.match(pattern, firmware):
+            log.add("voltage", name, log.raw[name] / 100)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Which parts of a flight can be used for identification, and why not the others.
 
 A part is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, the gyro
-is not clipped, no samples are lost, and the vehicle does not crash.
+is not clipped, no samples are lost, and the vehicle does not crash. The rotors do not carry it if they are idle, or if
+the accelerometer does not feel them (`jaxos4.recording.resting`).
 """
 
 import itertools
@@ -15,6 +16,7 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import Flight
 from .excited import RATE_COLUMNS
+from .resting import resting
 
 SHORTEST = 1.0  # [s], of a usable stretch
 MOMENT = 0.1  # [s]; a rotor may rest or be at its limit for this long: about its lag
@@ -23,6 +25,7 @@ _SUSTAINED = 0.5  # [s]; shorter pauses of thrust happen in flight, shorter burs
 _MARGIN = 0.3  # [s], between the ground and free flight
 _GAP = 0.05  # [s], the longest without a measurement
 _LIMIT = 1e-3  # share of a rotor's largest speed; smaller differences count as none
+_LEAST_HOVER = 0.2  # share of full command; no vehicle has a thrust of 25 times its weight
 _FULL = 0.995  # share of the airframe's `max_rotor_speed`
 _CLIPPED = 5  # samples in a row at the gyro's largest value
 _SLOWEST_CLIP = 3.0  # [rad/s]: no gyro's range ends below 4.3 (250 deg/s)
@@ -67,7 +70,7 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
     """
     time, omega = np.asarray(flight.time, dtype=float), np.asarray(flight.omega, dtype=float)
     states, dt = np.asarray(flight.states, dtype=float), float(flight.dt)
-    share = _thrust_share(omega, airframe)
+    share = _thrust_share(omega, airframe, commanded=flight.commanded)
     ground = _ground(share, dt)
     saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
@@ -79,6 +82,10 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
         (_GROUND, ground),
     ):
         labels[where] = label
+    if flight.specific_force is not None:
+        force = np.asarray(flight.specific_force, dtype=float)
+        at_rest = resting(omega, force, states[:, RATE_COLUMNS], labels == _USABLE, dt)
+        labels[at_rest & (labels != _LOST)] = _GROUND
     for begin, end in _runs(labels == _USABLE):
         if time[end - 1] - time[begin] < SHORTEST - dt / 2:
             labels[begin:end] = _SHORT
@@ -113,7 +120,8 @@ def cut(flight: Flight, stretch: Stretch) -> Flight:
     return Flight(time[part], omega, states, force, flight.result, commanded=flight.commanded, voltage=voltage)
 
 
-def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
+def _thrust_share(omega: np.ndarray, airframe: Airframe | None, *, commanded: bool) -> np.ndarray:
+    """Thrust as a share of the weight. Commands below a tenth of full scale count as idle, whatever the weight."""
     squares = (omega**2).sum(axis=1)
     usual = squares[squares > 0.1 * squares.max(initial=0.0)]
     usual = float(np.median(usual)) if usual.size else 1.0
@@ -121,6 +129,11 @@ def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
         carries = float(airframe.mass * airframe.gravity / airframe.thrust_coefficient)
         if 1 / 3 < usual / carries < 3:
             usual = carries
+    full = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    if commanded and airframe is None and omega.max(initial=0.0) <= 1:
+        full = 1.0
+    if commanded and math.isfinite(full):
+        usual = max(usual, 4 * (_LEAST_HOVER * full) ** 2)
     return squares / max(usual, 1e-300)
 
 
