@@ -104,19 +104,12 @@ def _print_parts(console: "Console", found: "Inspection") -> None:
 
 
 def _print_identifiable(console: "Console", found: "IdentifiableParameters") -> None:
-    noise = ", ".join(f"{name} {sigma:.2g}" for name, sigma in found.sigma.items())
     console.print(
-        f"Identifiable from the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model "
-        f"and noise [rad/s] {noise}. Real errors are larger if the vehicle does something that the model lacks."
+        f"From the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model (how well, only "
+        "`jaxos4 estimate` can say):"
     )
-    errors = {
-        name: f"{100 * row.bound / abs(row.airframe):.2g} %"
-        if abs(row.airframe) > 3 * row.bound
-        else f"{row.bound:.2g}"
-        for name, row in found.parameters.items()
-        if not row.note and row.bound is not None
-    }
-    console.print(f"  identifiable: {', '.join(f'{name} to {error}' for name, error in errors.items()) or 'nothing'}")
+    names = [name for name, row in found.parameters.items() if row.identifiable]
+    console.print(f"  identifiable: {', '.join(names) or 'nothing'}")
     for name, row in found.parameters.items():
         if row.note:
             console.print(f"  {name}: {row.note}")

@@ -178,7 +178,7 @@ def _prepare_other(
             f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
         )
     step = float(prepared.fitted.dt)
-    other = prepare([validate], model.airframe, window=window, sample_time=step, holdout=0.0)
+    other = prepare([validate], model.airframe, window=window, sample_time=step, holdout=0.0, predicted=True)
     for term in model.terms:
         # Predictions of the rates need no accelerometer.
         if term != "accelerometer" and not TERMS[term].needs <= other.available:

@@ -18,6 +18,7 @@ from ..flight import Flight
 from .excited import RATE_COLUMNS
 from .resting import resting
 
+GROUND = "on the ground"
 SHORTEST = 1.0  # [s], of a usable stretch
 MOMENT = 0.1  # [s]; a rotor may rest or be at its limit for this long: about its lag
 _CARRIES = 0.3  # share of the weight; with less thrust for `_SUSTAINED`, the vehicle is on the ground
@@ -234,7 +235,7 @@ def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) ->
         _CLIPPING: "the gyro is clipped",
         _LOST: "nothing was measured",
         _CRASHED: "an impact",
-        _GROUND: "on the ground",
+        _GROUND: GROUND,
     }[label]
 
 
