@@ -34,8 +34,15 @@ from .airframe import (
     load_airframe as load_airframe,
     plus_layout as plus_layout,
 )
+from .analysis.center_of_mass import CenterOfMass as CenterOfMass, center_of_mass as center_of_mass
 from .analysis.diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
 from .analysis.fisher import cramer_rao_bound as cramer_rao_bound, fisher_information as fisher_information
+from .analysis.frequency_response import (
+    Agreement as Agreement,
+    AxisResponse as AxisResponse,
+    FrequencyResponse as FrequencyResponse,
+    frequency_response as frequency_response,
+)
 from .analysis.huber import winsorised as winsorised
 from .analysis.identifiability import Identifiability as Identifiability, identifiability as identifiability
 from .analysis.inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia

@@ -16,17 +16,20 @@ import jaxos4
 from jaxos4.flight import Inputs, Stretches
 from jaxos4.models import Term, TermParameter, default_terms
 from jaxos4.models.state import CASCADE_ORDER, Rates
-from jaxos4.models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE
+from jaxos4.models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE
 from jaxos4.models.vehicle import DEFAULT_TERMS
 
 ALL = tuple(jaxos4.TERMS)
 RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "flapping", "drag"))
 FULL = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, np.asarray(500.0))
+VOLTS = 11.1
 NAMES = {
     "offset": ["roll_offset", "pitch_offset", "yaw_offset"],
+    "center_of_mass": ["roll_thrust", "pitch_thrust"],
     "damping": ["roll_damping", "pitch_damping", "yaw_damping"],
     "velocity": ["roll_velocity", "pitch_velocity"],
     "flapping": ["roll_flapping", "pitch_flapping"],
+    "voltage": ["voltage_exponent"],
     "lag": ["rotor_lag"],
     "delay": ["rotor_delay"],
     "reaction": ["rotor_reaction"],
@@ -41,6 +44,7 @@ VALUES = {
     **dict(roll_velocity=0.3, pitch_velocity=-0.4, roll_flapping=0.2, pitch_flapping=-0.1, rotor_lag=0.06),
     **dict(rotor_delay=0.02, rotor_reaction=0.02, thrust_curve=0.6, thrust_gain=1.2, x_drag=0.4, y_drag=0.3),
     **dict(ax_bias=0.5, ay_bias=-0.4, az_bias=0.2, p_bias=0.03, q_bias=-0.02, r_bias=0.01),
+    **dict(roll_thrust=-0.5, pitch_thrust=0.9, voltage_exponent=0.7),
 }
 
 
@@ -62,6 +66,12 @@ def commands(seconds, dt, *, hold=0.02):
     return hover * (1 + 0.05 * np.sin(2 * np.pi * tones * t[:, None] + phases))
 
 
+def battery(samples, dt):
+    """A voltage that falls, and that dips when the rotors take more [V]."""
+    t = dt * np.arange(samples)
+    return VOLTS + 0.6 - 0.4 * t + 0.3 * np.sin(7.0 * t)
+
+
 def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
     """The states in cascade order and the specific force, on the samples: the class's equations, with Runge-Kutta."""
     v = {name: values[name] if name in sum((NAMES[t] for t in terms), []) else 0.0 for name in VALUES}
@@ -72,6 +82,9 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
     (x, y), spin = np.asarray(airframe.rotor_positions).T, np.asarray(airframe.rotor_spins)
     curve = values["thrust_curve"] if "curve" in terms else 1.0
     full = float(airframe.max_rotor_speed)
+    omega = omega * ((battery(omega.shape[0], dt) / VOLTS) ** v["voltage_exponent"])[:, None]
+    # The centre of mass (x_c, y_c): its torque in hover belongs to the offset.
+    x_c, y_c = v["pitch_thrust"] / (a6 * m), -v["roll_thrust"] / (a3 * m)
 
     def body(state, w, w_dot):
         p, q, r, phi, theta, psi = state[:6]
@@ -83,9 +96,9 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
         specific = np.array([-v["x_drag"] * vx, -v["y_drag"] * vy, v["thrust_gain"] * force.sum() / m])
         rates_dot = [
             a1 * q * r - a2 * (spin @ w) * q + a3 * (y @ force) + v["roll_offset"] - v["roll_damping"] * p
-            + v["roll_velocity"] * vy,
+            + v["roll_velocity"] * vy - a3 * y_c * (force.sum() - 9.81 * m),
             a4 * p * r + a5 * (spin @ w) * p - a6 * (x @ force) + v["pitch_offset"] - v["pitch_damping"] * q
-            + v["pitch_velocity"] * vx,
+            + v["pitch_velocity"] * vx + a6 * x_c * (force.sum() - 9.81 * m),
             a7 * p * q - a8 * d / b * (spin @ force) + v["yaw_offset"] - v["yaw_damping"] * r
             - v["rotor_reaction"] * (spin @ w_dot),
         ]  # fmt: skip
@@ -120,11 +133,13 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
 
 
 NAMES_XY = ("ax_bias", "ay_bias")
+RIGID = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7")
 
 
 def seen(model, omega, dt, *, method="rk4"):
     """What the model's sensors show, from rest, beside the flight."""
-    blank = jaxos4.Flight(dt * np.arange(omega.shape[0]), omega, np.full((omega.shape[0], 12), np.nan))
+    samples = omega.shape[0]
+    blank = jaxos4.Flight(dt * np.arange(samples), omega, np.full((samples, 12), np.nan), voltage=battery(samples, dt))
     problem = jaxos4.ShootingProblem(model, blank, sigma=np.ones(12), initial_state=np.zeros(12), method=method)
     return np.asarray(problem.predict(truth(model), jnp.zeros(12)))
 
@@ -151,18 +166,20 @@ def test_without_terms_it_is_the_corrected_model():
     ("terms", "tolerance"),
     [
         (("offset", "damping", "velocity", "gyro_bias"), 1e-7),
+        (("offset", "center_of_mass"), 1e-7),
+        (("voltage", "accelerometer"), 1e-7),
         (("curve", "accelerometer"), 1e-7),
         (("accelerometer", "drag"), 1e-7),
         (("lag", "delay", "reaction"), 2e-3),
         (tuple(term for term in ALL if term != "flapping"), 2e-3),
     ],
-    ids=["air", "curve", "drag", "rotors", "all"],
+    ids=["air", "center of mass", "voltage", "curve", "drag", "rotors", "all"],
 )
 def test_terms_are_their_equations(terms, tolerance):
     """Inputs are held, so that without a lag only Runge-Kutta errs; with one, straight lines over samples do."""
     dt = 0.005
     omega = commands(0.8, dt)
-    model = jaxos4.FlightModel(FULL, terms=terms)
+    model = jaxos4.FlightModel(FULL, terms=terms, battery_voltage=VOLTS)
     found = seen(model, omega, dt)
     states, force = reference(terms, omega, dt, fine=3)
     expected = np.concatenate([states, force[:, list(model.force_axes)]], axis=1)
@@ -214,10 +231,14 @@ def test_a_measured_velocity_takes_the_place_of_the_simulated_one():
 
 @pytest.mark.parametrize(
     ("term", "need"),
-    [("velocity", "velocity, drag need `Flight.body_vel"), ("flapping", "need `Flight.specific_force")],
+    [
+        ("velocity", "velocity, drag need `Flight.body_vel"),
+        ("flapping", "need `Flight.specific_force"),
+        ("voltage", "voltage need `Flight.voltage`"),
+    ],
 )
 def test_a_missing_measurement_is_named(term, need):
-    model = jaxos4.FlightModel(terms=(term,))
+    model = jaxos4.FlightModel(terms=(term,), battery_voltage=VOLTS)
     flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan))
     with pytest.raises(ValueError, match=need):
         jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates").cost(truth(model))
@@ -319,7 +340,7 @@ SUBSETS = [
 def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     count = max(recordings) + 1
     for terms in SUBSETS:
-        model = jaxos4.FlightModel(FULL, terms=terms, recordings=recordings)
+        model = jaxos4.FlightModel(FULL, terms=terms, recordings=recordings, battery_voltage=VOLTS)
         names = model.parameter_names
         own = [name for term in terms if term in ("offset", "gyro_bias") for name in NAMES[term]]
         shared = [name for term in terms if term not in ("offset", "gyro_bias") for name in NAMES[term]]
@@ -329,7 +350,7 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
         assert len(model.parameter_units) == len(names)
         assert model.alpha.shape == model.half_width.shape == (len(names),)
         assert np.all(np.isfinite(model.half_width) & (model.half_width > 0) & np.isfinite(model.alpha))
-        chain = {"rotor_lag", "rotor_delay", "thrust_curve"} & set(names)
+        chain = {"rotor_lag", "rotor_delay", "thrust_curve", "voltage_exponent"} & set(names)
         assert {names[i] for i in model.forcing_parameters} == chain
         assert model.is_linear == (not chain)
     # The order is that of TERMS, in whatever order they were given, and within a term recording by recording.
@@ -338,14 +359,16 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     assert two == tuple(f"{name}_{i}" for i in (1, 2) for name in NAMES["offset"])
 
 
-def test_a_thrust_curve_needs_a_full_scale():
+def test_a_thrust_curve_needs_a_full_scale_and_the_voltage_a_usual_one():
     with pytest.raises(ValueError, match="max_rotor_speed"):
         jaxos4.FlightModel(terms=("curve",))
+    with pytest.raises(ValueError, match="`battery_voltage` must be given for the term voltage"):
+        jaxos4.FlightModel(terms=("voltage",))
 
 
 @pytest.mark.parametrize("terms", [("wind",), ("lag", "lag"), ("lag", "Lag")])
 def test_terms_that_do_not_exist_are_named(terms):
-    with pytest.raises(ValueError, match="`terms` must be some of offset, damping"):
+    with pytest.raises(ValueError, match="`terms` must be some of offset, center_of_mass, damping"):
         jaxos4.FlightModel(terms=terms)
 
 
@@ -361,17 +384,19 @@ def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="
     recordings = model.recordings if len(model.recordings) == 2 else (0, 0)
     for i, recording in enumerate(recordings):
         omega = commands(seconds, dt, hold=dt)[:: 1 - 2 * i][:-1]
-        alone = jaxos4.FlightModel(model.airframe, terms=model.terms)
+        alone = jaxos4.FlightModel(model.airframe, terms=model.terms, battery_voltage=model.battery_voltage)
+        voltage = battery(omega.shape[0], dt) - 0.5 * i
         values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True))
         own = jnp.array([values.get(n, values.get(f"{n}_{recording + 1}")) for n in alone.parameter_names])
-        blank = jaxos4.Flight(dt * np.arange(omega.shape[0]), omega, np.full((omega.shape[0], 12), np.nan))
+        time = dt * np.arange(omega.shape[0])
+        blank = jaxos4.Flight(time, omega, np.full((omega.shape[0], 12), np.nan), voltage=voltage)
         problem = jaxos4.ShootingProblem(alone, blank, sigma=np.ones(12), channels=channels)
         found = np.asarray(problem.predict(own, jnp.zeros(problem.size)))
         states, force = np.full((omega.shape[0], 12), np.nan), np.full((omega.shape[0], 3), np.nan)
         states[:, CASCADE_ORDER[: problem.size]] = found[:, : problem.size]
         force[:, list(alone.force_axes)] = found[:, problem.size :]
         states, force = states + rng.normal(0, noise, states.shape), force + rng.normal(0, 10 * noise, force.shape)
-        parts.append(jaxos4.Flight(blank.time, omega, states, force))
+        parts.append(jaxos4.Flight(time, omega, states, force, voltage=voltage))
     flight = jaxos4.join(parts, length=round(2 * seconds / dt / windows))
     return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels=channels, windows=windows)
 
@@ -405,15 +430,50 @@ def test_gradient_and_information_are_the_residuals_derivatives(recordings):
 @pytest.mark.parametrize("estimator", [jaxos4.IBSS(), jaxos4.OutputError()], ids=["ibss", "output error"])
 def test_the_truth_is_found_without_noise(estimator):
     """The offsets of two recordings differ, and each is found."""
-    known = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7")
     model = jaxos4.FlightModel(FULL, terms=("offset", "lag", "delay"), recordings=(0, 1))
     whole = truth(model)
-    held = jaxos4.hold(model, {name: whole[model.parameter_names.index(name)] for name in known})
+    held = jaxos4.hold(model, {name: whole[model.parameter_names.index(name)] for name in RIGID})
     problem = eqx.tree_at(lambda p: p.model, two_flights(model, seconds=2.0), held)
     values = held.without(whole)
     off = 0.4 * jnp.cos(jnp.arange(values.size)) * held.half_width
     found = estimator(problem, jaxos4.Bracket.around(values + off, held.half_width))
     np.testing.assert_array_less(np.abs(found.parameters - values) / held.half_width, 1e-4)
+
+
+def test_the_centre_of_mass_and_the_effect_of_the_voltage_are_found():
+    model = jaxos4.FlightModel(FULL, terms=("offset", "center_of_mass", "voltage", "delay"), battery_voltage=VOLTS)
+    whole = truth(model)
+    held = jaxos4.hold(model, {name: whole[i] for i, name in enumerate(model.parameter_names) if name in RIGID})
+    problem = eqx.tree_at(lambda p: p.model, two_flights(model, seconds=3.0, noise=1e-4), held)
+    problem = eqx.tree_at(lambda p: p.sigma, problem, jnp.full_like(problem.sigma, 1e-4))
+    values = held.without(whole)
+    found = jaxos4.OutputError()(problem, jaxos4.Bracket.default(held))
+    std = np.sqrt(np.diagonal(found.covariance))
+    assert np.all(std < 0.1 * held.half_width)
+    assert np.all(np.abs(found.parameters - values) < 4 * std)
+    alpha, mass = jaxos4.CorrectedOS4(FULL).alpha, float(FULL.mass)
+    expected = {
+        "x": VALUES["pitch_thrust"] / (float(alpha[5]) * mass),
+        "y": -VALUES["roll_thrust"] / (float(alpha[2]) * mass),
+    }
+    coordinates = jaxos4.center_of_mass(held.parameter_names, found.parameters, found.covariance, FULL)
+    assert [c.axis for c in coordinates] == ["x", "y"]
+    for c in coordinates:
+        assert abs(c.value - expected[c.axis]) < 4 * c.std
+        assert c.std < 0.05 * abs(c.value)
+    assert jaxos4.center_of_mass(held.parameter_names[:2], whole[:2], np.eye(2), FULL) == ()
+
+
+def test_the_error_of_the_centre_of_mass_is_that_of_the_quotient():
+    names, values = ("pitch_thrust", "roll_thrust", "alpha6", "alpha3"), np.array([0.9, -0.5, 133.0, 120.0])
+    rng = np.random.default_rng(0)
+    spread = rng.normal(size=(4, 4)) * values[:, None] * 0.01
+    covariance = spread @ spread.T
+    draws = rng.multivariate_normal(values, covariance, 200_000)
+    expected = draws[:, 0] / draws[:, 2] / 0.65, -draws[:, 1] / draws[:, 3] / 0.65
+    for found, sample in zip(jaxos4.center_of_mass(names, values, covariance, FULL), expected, strict=True):
+        assert found.value == pytest.approx(sample.mean(), rel=1e-3)
+        assert found.std == pytest.approx(sample.std(), rel=0.02)
 
 
 def test_the_attitude_distinguishes_a_gyro_bias_from_an_offset():
@@ -449,13 +509,16 @@ def test_a_new_term_is_one_object(monkeypatch):
 
 
 def test_an_estimate_uses_the_terms_that_the_logs_allow():
-    basic, rotors = ("offset", "damping", "reaction"), ("offset", "damping", "lag", "delay", "reaction")
+    basic = ("offset", "center_of_mass", "damping", "reaction")
+    rotors = ("offset", "center_of_mass", "damping", "lag", "delay", "reaction")
     assert default_terms(frozenset()) == default_terms(frozenset({FULL_SCALE})) == basic
     assert default_terms(frozenset({COMMANDS, FULL_SCALE})) == rotors == DEFAULT_TERMS
     force = frozenset({LATERAL_FORCE, VERTICAL_FORCE})
     for available, terms in (
         (force, (*basic, "flapping", "accelerometer")),
         (force | {BODY_VELOCITY, FULL_SCALE}, (*basic, "velocity", "accelerometer")),
+        (frozenset({VOLTAGE}), basic),
+        (frozenset({COMMANDS, VOLTAGE}), (*rotors, "voltage")),
         (force | {COMMANDS}, (*rotors, "flapping", "accelerometer")),
         (force | {COMMANDS, FULL_SCALE}, (*rotors, "flapping", "curve", "accelerometer")),
     ):

@@ -56,7 +56,7 @@ def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):
     assert "flight CSV, 0.00 to 3.00 s, 301 samples, one every 10 ms" in out
     found = json.loads((tmp_path / "f.json").read_text())["identifiable"]["parameters"]
     assert found["alpha3"] == {"identifiable": True, "note": ""}
-    assert not found["alpha2"]["identifiable"]
+    assert "%" not in out.split("identifiable: ")[1]  # no bound that a fit of a real vehicle does not reach
     rows = [f"{0.01 * k:.2f},226,226,226,226,0,0,0" for k in range(200)]
     (tmp_path / "hover.csv").write_text("\n".join(["t,omega1,omega2,omega3,omega4,p,q,r", *rows]))
     code, out, err = run("inspect", "hover.csv", "--airframe", "os4")

@@ -236,6 +236,24 @@ def test_without_pyulog_it_is_said_what_to_install(save, monkeypatch):
         read_log(path)
 
 
+def parameter(name, value):
+    """A parameter of the autopilot: a whole number, or a float."""
+    kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+    key = f"{kind} {name}".encode()
+    return message("P", bytes([len(key)]) + key + struct.pack(code, value))
+
+
+def states(topic, times, **fields):
+    """A topic of whole numbers, such as vehicle_status: for each field, its value at each time."""
+    layout = "uint64_t timestamp;" + "".join(f"uint8_t {name};" for name in fields)
+    return topic, layout, "Q" + "B" * len(fields), list(zip(*fields.values(), strict=True)), np.asarray(times)
+
+
+def battery(t, volts):
+    rows = [(float(each), 4) for each in np.broadcast_to(volts, t.shape)]
+    return "battery_status", "uint64_t timestamp;float voltage_v;uint8_t cell_count;", "QfB", rows, t
+
+
 SMALL = ulog(
     [
         combined(grid(0.02, 0.6)),
@@ -243,8 +261,11 @@ SMALL = ulog(
         local_position(grid(0.1, 0.6)),
         escs(grid(0.05, 0.7, offset=-0.05)),
         motors(grid(0.1, 0.6), [[0.5] * 4] * 6),
+        states("vehicle_status", [0.0, 0.3], is_vtol=[0, 0], vehicle_type=[1, 1], system_type=[2, 2]),
+        states("vehicle_land_detected", [0.0, 0.3], landed=[1, 0], maybe_landed=[1, 0]),
+        battery(grid(0.2, 0.6), 15.0),
     ],
-    before=message("F", ESC),
+    before=message("F", ESC) + parameter("THR_MDL_FAC", 0.3) + parameter("CA_ROTOR_COUNT", 4),
 )
 
 

@@ -27,7 +27,7 @@ CHANNELS = (
 
 
 def inspect(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox CSV or Crazyflie.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox or Crazyflie.")],
     airframe: Annotated[
         str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
     ] = None,
@@ -55,8 +55,8 @@ def inspect(
     _print_parts(console, found)
     if found.identifiable is not None:
         _print_identifiable(console, found.identifiable)
-    elif not any(part.usable for part in found.parts):
-        console.print("no parameter is identifiable: no part of the log can be used.")
+    elif found.findings:
+        console.print("no parameter is identifiable, see the first lines.")
     elif vehicle is None:
         console.print("give --airframe to see which parameters are identifiable.")
     else:
@@ -69,6 +69,8 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
         f"one every {1e3 * found.sample_time:.4g} ms",
         soft_wrap=True,
     )
+    for finding in found.findings:
+        console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
     for names, unit in CHANNELS:
         measured = {name: found.measured[name] for name in names if name in found.measured}
         if not measured:
@@ -105,8 +107,8 @@ def _print_parts(console: "Console", found: "Inspection") -> None:
 
 def _print_identifiable(console: "Console", found: "IdentifiableParameters") -> None:
     console.print(
-        f"From the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model (how well, only "
-        "`jaxos4 estimate` can say):"
+        f"From the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model (how well: see "
+        "jaxos4 estimate):"
     )
     names = [name for name, row in found.parameters.items() if row.identifiable]
     console.print(f"  identifiable: {', '.join(names) or 'nothing'}")

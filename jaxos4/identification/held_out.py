@@ -77,7 +77,9 @@ def _on_another_flight(
     """The problem of another flight, and its parameters: the mean where each recording has its own."""
     values = fit._replace(estimate=eqx.tree_at(lambda e: e.parameters, fit.estimate, parameters)).values
     stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
-    other = FlightModel(model.airframe, terms=model.terms, recordings=(0,) * stretches)
+    other = FlightModel(
+        model.airframe, terms=model.terms, recordings=(0,) * stretches, battery_voltage=model.battery_voltage
+    )
     recordings = range(1, max(model.recordings) + 2)
     means = [
         values[name] if name in values else float(np.mean([values[f"{name}_{i}"] for i in recordings]))

@@ -60,7 +60,8 @@ def identify_vehicle(
     part = {"begin": begin, "end": end, "window": window, "sample_time": sample_time, "holdout": share}
     prepared = prepare(recordings, airframe, **part)
     chosen = default_terms(prepared.available) if terms is None else _checked_terms(terms, prepared.available)
-    model = FlightModel(airframe, terms=chosen, recordings=prepared.recordings)
+    voltage = prepared.battery_voltage
+    model = FlightModel(airframe, terms=chosen, recordings=prepared.recordings, battery_voltage=voltage)
     where = bracket_of(bracket, model)
     held_out, notes = _held_out(recordings, validate, prepared, model, window)
     problem = _problem(prepared, model, recordings[0].name, window)
@@ -97,6 +98,7 @@ def identify_vehicle(
             "fitted_seconds": prepared.seconds[0],
             "tested_seconds": 0.0 if held_out is None else held_out.seconds,
             "loss": loss or "huber",
+            **({"battery_voltage": voltage} if "voltage" in model.terms else {}),
             "notes": list(notes),
             **versions(problem),
         },

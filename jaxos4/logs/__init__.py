@@ -5,5 +5,11 @@ from .csv import (
     read_flight_and_notes as read_flight_and_notes,
     write_flight as write_flight,
 )
-from .formats import FORMATS as FORMATS, log_format as log_format, read_log as read_log
+from .facts import LogFacts as LogFacts, Sampling as Sampling
+from .formats import (
+    FORMATS as FORMATS,
+    log_format as log_format,
+    read_log as read_log,
+    read_log_and_facts as read_log_and_facts,
+)
 from .table import LogFormat as LogFormat, Table as Table

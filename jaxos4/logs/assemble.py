@@ -8,6 +8,7 @@ import numpy as np
 from .._custom_types import as_float
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES, Flight
+from .facts import LogFacts, Sampling, logged_rate
 from .resample import UNIFORM, resample, uniform_grid, unwrap, widest_gap
 from .table import MAX_ROWS, Table, quoted
 from .units import check_time, check_units, force_note, thrust_note
@@ -52,6 +53,24 @@ def flight_of(
     states = as_float(channels[:, :12])
     flight = Flight(as_float(time), as_float(omega), states, force, commanded=commanded, voltage=voltage)
     return flight, tuple(notes)
+
+
+def facts_of(table: Table) -> LogFacts:
+    """What the log says beside its columns. Cells that hold no value were not logged, also those of a rotor."""
+    facts = table.facts
+    speeds = any(name in table.columns and not np.isnan(table.columns[name]).all() for name in SPEED_NAMES)
+    motors = facts.motors or _slowest(table, SPEED_NAMES if speeds else COMMAND_NAMES)
+    return facts._replace(motors=motors, gyro=facts.gyro or _slowest(table, ("p", "q", "r")))
+
+
+def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
+    """The column that was logged most rarely, of those that were logged at all."""
+    t, found = table.columns["t"], []
+    for name in names:
+        logged = np.isfinite(table.columns.get(name, np.full(t.size, np.nan)))
+        if logged.any():
+            found.append(Sampling(table.names.get(name, name), logged_rate(t[logged])))
+    return min(found, key=lambda each: each.rate, default=None)
 
 
 def _measured(table: Table) -> Table:

@@ -38,6 +38,7 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
+from .facts import LogFacts, Sampling, logged_rate
 from .series import Series, at_rows, euler_angles, gyro_rows, in_order, unwrapped
 from .table import LogFormat, Path, Table, opened_bytes, quoted, refuse
 
@@ -61,6 +62,7 @@ _ANGLES = {
 _QUATERNION = {axis: (f"stateEstimate.q{axis}", 1.0) for axis in "wxyz"}
 _REMEDY = "the log is corrupt there: copy it again from the card, or choose another"
 _AGAIN = "copy it again from the card"
+_OFTEN = "raise the frequency of these variables in the deck's config.txt, and fly again"
 
 Variables = dict[str, tuple[np.ndarray, np.ndarray]]
 
@@ -97,7 +99,9 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
         columns.update(zip(_ANGLES, at_rows(rows, attitude).T, strict=True))
     if not measured:
         notes.append(f"commands are {names['command1']}.., taken as fractions of full-scale rotor speed")
-    return Table(path, columns, first_row=None, names=names, remedy=_REMEDY), tuple(notes)
+    motors = Sampling(names["omega1" if measured else "command1"], logged_rate(rotors.t))
+    facts = LogFacts(motors, Sampling(names["p"], logged_rate(rates.t)), _OFTEN)
+    return Table(path, columns, first_row=None, names=names, remedy=_REMEDY, facts=facts), tuple(notes)
 
 
 CRAZYFLIE = LogFormat("Crazyflie", "Crazyflie micro-SD log", lambda begin: begin.startswith(_MAGIC), read_crazyflie)

@@ -2,10 +2,11 @@
 
 from ..airframe import Airframe
 from ..flight import Flight
-from .assemble import flight_of
+from .assemble import facts_of, flight_of
 from .blackbox import BLACKBOX
 from .crazyflie import CRAZYFLIE
 from .csv import CSV
+from .facts import LogFacts
 from .table import LogFormat, Path, opened_bytes
 from .ulog import ULOG
 
@@ -33,9 +34,17 @@ def read_log(
 
     **Raises:** `InputError`, one line: the file, the place in it, what is wrong and what to do.
     """
+    flight, notes, _ = read_log_and_facts(path, airframe, full_scale=full_scale)
+    return flight, notes
+
+
+def read_log_and_facts(
+    path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
+) -> tuple[Flight, tuple[str, ...], LogFacts]:
+    """Read a log as `read_log` does, and return also what it says beside the flight, before any resampling."""
     table, notes = log_format(path).read(path)
     flight, more = flight_of(table, airframe, full_scale=full_scale)
-    return flight, (*notes, *more)
+    return flight, (*notes, *more), facts_of(table)
 
 
 def log_format(path: Path) -> LogFormat:

@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float
 from .resample import REACH, UNIFORM, unwrap
 from .table import MAX_ROWS, Path, refuse
 
+_FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
+_FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
 _DISORDER = 0.01  # share of samples that may be late or repeated in an intact log
 
 
@@ -32,10 +34,13 @@ def gyro_rows(
 ) -> tuple[Float[np.ndarray, " rows"], dict[str, np.ndarray]]:
     """Use the gyro's samples as rows, and bring the rotors to them: `measured` speeds [rad/s], or commands [0..1].
 
+    A gyro that is faster than 1 kHz is averaged to 1 kHz.
+
     **Returns:** the times of the rows [s], and the columns `t` (from 0), `p, q, r`, and `omega1..4` or `command1..4`.
 
     **Raises:** `InputError` if rates and rotors do not overlap in time, or there are more than `MAX_ROWS` rows.
     """
+    rates = _at_most(_FASTEST_ROWS, rates)
     inside = covered(rates.t, rotors.t)
     if np.count_nonzero(inside) < 2:
         refuse(path, "rates and motors were not logged at the same time; record both in one flight")
@@ -51,7 +56,8 @@ def gyro_rows(
 def at_rows(rows: Float[np.ndarray, " rows"], series: Series) -> Float[np.ndarray, "rows columns"]:
     """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
 
-    Values are interpolated linearly to the time of the row, but not across a gap. Angles must be unwrapped.
+    Values are interpolated linearly to the time of the row, but not across a gap. A sensor that is faster than the rows
+    is averaged over the time from half a step before the row to half a step after it. Angles must be unwrapped.
     """
     out = np.full((rows.size, series.values.shape[1]), np.nan)
     step = float(np.median(np.diff(rows))) if rows.size > 1 else 0.0
@@ -59,6 +65,9 @@ def at_rows(rows: Float[np.ndarray, " rows"], series: Series) -> Float[np.ndarra
         measured = np.isfinite(values)
         t, values = series.t[measured], values[measured]
         if t.size == 0:
+            continue
+        if t.size > 1 and np.median(np.diff(t)) < _FASTER * step:
+            out[:, column] = _means(rows, step, t, values)
             continue
         near = _nearest(rows, t)
         at = np.unique(near[np.abs(rows[near] - t) <= step])
@@ -116,6 +125,35 @@ def euler_angles(quaternion: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray
 def unwrapped(t: Float[np.ndarray, " samples"], angles: Float[np.ndarray, "samples 3"]) -> Series:
     """Roll, pitch, yaw [rad] as a series, with the jumps of 2 pi removed from roll and yaw."""
     return Series(t, np.column_stack([unwrap(angles[:, 0])[0], angles[:, 1], unwrap(angles[:, 2])[0]]))
+
+
+def _at_most(step: float, series: Series) -> Series:
+    """The series, averaged to one sample each `step` [s] if it is faster. Gaps stay gaps."""
+    if series.t.size < 2 or np.median(np.diff(series.t)) >= _FASTER * step:
+        return series
+    grid = series.t[0] + step * (np.unique(np.floor((series.t - series.t[0]) / step)) + 0.5)
+    kept = np.isfinite(series.values).all(axis=1)
+    if np.count_nonzero(kept) < 2:
+        return series
+    means = np.column_stack([_means(grid, step, series.t[kept], values[kept]) for values in series.values.T])
+    measured = np.isfinite(means).all(axis=1)
+    return Series(grid[measured], means[measured]) if np.count_nonzero(measured) > 1 else series
+
+
+def _means(rows: np.ndarray, width: float, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Means over `width` around each row, of values interpolated linearly. NaN at the ends and across a gap."""
+    steps = np.diff(t)
+    total = np.append(0.0, np.cumsum((values[:-1] + values[1:]) / 2 * steps))
+    gaps = np.append(0, np.cumsum(steps > REACH * np.median(steps)))
+    integral, before = [], []
+    for edge in (rows - width / 2, rows + width / 2):
+        left = np.clip(np.searchsorted(t, edge, side="right") - 1, 0, t.size - 2)
+        after = edge - t[left]
+        slope = (values[left + 1] - values[left]) / steps[left]
+        integral.append(total[left] + (values[left] + slope * after / 2) * after)
+        before.append(left)
+    whole = (rows - width / 2 >= t[0]) & (rows + width / 2 <= t[-1]) & (gaps[before[1] + 1] == gaps[before[0]])
+    return np.where(whole, (integral[1] - integral[0]) / width, np.nan)
 
 
 def _nearest(grid: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import BinaryIO, NamedTuple, NoReturn, TextIO
 import numpy as np
 
 from ..errors import InputError
+from .facts import LogFacts
 
 Path = str | os.PathLike[str]
 
@@ -23,6 +24,8 @@ class Table(NamedTuple):
     - `first_row`: the row of the file, counted from 1, that holds entry 0; `None` if the format has no rows.
     - `names`: the log's own name of a column, if it is another.
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
+    - `facts`: what the log says beside its columns. How often motors and gyro were written follows from the cells, if
+      `facts` does not say it.
     """
 
     path: Path
@@ -31,6 +34,7 @@ class Table(NamedTuple):
     first_row: int | None = 2
     names: Mapping[str, str] = MappingProxyType({})
     remedy: str = ""
+    facts: LogFacts = LogFacts()
 
     def refuse(self, what: str, *, index: int | None = None, column: str | None = None) -> NoReturn:
         """Raise an `InputError` about entry `index` of `column`."""

@@ -20,16 +20,18 @@ _MOST_FIELDS = 1024  # of one message, with those of arrays and nested messages;
 _DEEPEST = 3  # levels of messages inside messages
 _HEADER = struct.Struct("<HB")
 _FIELD = re.compile(rb"([A-Za-z0-9_]+)(?:\[(\d{1,5})\])? ([A-Za-z0-9_]+)")
+_PARAMETER = re.compile(rb"(int32_t|float) ([A-Za-z0-9_]{1,32})")
 _BASIC = {
     b"int8_t", b"uint8_t", b"int16_t", b"uint16_t", b"int32_t", b"uint32_t", b"int64_t", b"uint64_t",
     b"float", b"double", b"bool", b"char",
 }  # fmt: skip
 
 
-def needed_messages(path: Path, topics: Collection[str]) -> tuple[bytes, int]:
-    """A smaller ULog file with only the needed `topics`, and the number of bytes cut off at the end of the log.
+def needed_messages(path: Path, topics: Collection[str]) -> tuple[bytes, dict[str, float], int]:
+    """A smaller ULog file with only the needed `topics`, the autopilot's parameters, and the number of bytes cut off.
 
-    A loss of power ends a log in the middle of a message or fills its end with zeros. All messages before are kept.
+    A loss of power ends a log in the middle of a message or fills its end with zeros. All messages before are kept. If
+    a parameter was changed while the log was written, its last value counts.
 
     **Raises:** `InputError`, one line, for a file that is not ULog, is corrupt, or has a newer format.
     """
@@ -47,10 +49,11 @@ class _Walk:
         self.used: set[bytes] = set()
         self.definitions, self.data = bytearray(), bytearray()
         self.appended: tuple[int, ...] = ()
+        self.parameters: dict[str, float] = {}
         self.wanted: set[int] = set()
         self.others: set[int] = set()
 
-    def through(self, file: BinaryIO) -> tuple[bytes, int]:
+    def through(self, file: BinaryIO) -> tuple[bytes, dict[str, float], int]:
         start = file.read(16)
         if not start.startswith(MAGIC):
             refuse(self.path, "is not a ULog file of version 1; give a .ulg file")
@@ -73,7 +76,7 @@ class _Walk:
                 break
             self._take(kind, header, body)
             self.position += len(header) + length
-        return bytes(start + self.definitions + self.data), cut
+        return bytes(start + self.definitions + self.data), self.parameters, cut
 
     def _take(self, kind: int, header: bytes, body: bytes) -> None:
         if kind == ord("D"):
@@ -86,6 +89,8 @@ class _Walk:
             self.formats[body.partition(b":")[0]] = body
         elif kind == ord("A"):
             self._announce(header, body)
+        elif kind == ord("P"):
+            self._set_parameter(body)
         elif kind == ord("B"):
             if len(body) >= 16 and (body[8] & 0xFE or any(body[9:16])):
                 refuse(self.path, "has a newer ULog format than this reader knows; update jaxos4")
@@ -93,6 +98,15 @@ class _Walk:
                 self.appended = struct.unpack_from("<QQQ", body, 16)
         elif not ord("A") <= kind <= ord("Z"):
             self._corrupt("no message begins there")
+
+    def _set_parameter(self, body: bytes) -> None:
+        """A damaged parameter is ignored: the flight does not depend on most of them."""
+        parts = _PARAMETER.fullmatch(body[1 : 1 + body[0]]) if body else None
+        if parts is None or len(body) != 1 + body[0] + 4:
+            return
+        value = float(struct.unpack("<i" if parts[1] == b"int32_t" else "<f", body[-4:])[0])
+        if math.isfinite(value):
+            self.parameters[parts[2].decode()] = value
 
     def _announce(self, header: bytes, body: bytes) -> None:
         if len(body) < 4:

@@ -15,20 +15,26 @@ _SHORTEST_LAG = 0.05
 
 
 class Grid(NamedTuple):
-    """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that."""
+    """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that.
+
+    `voltage`: the battery's, divided by the voltage to which the airframe's rotor speeds belong.
+    """
 
     dt: Scalar
     stretch: Int[Array, " samples"]
     first: Int[Array, " samples"]
     last: Int[Array, " samples"]
+    voltage: Float[Array, " samples"] | None = None
 
     @classmethod
-    def of(cls, inputs: Inputs) -> "Grid":
-        """The grid of a flight's inputs."""
+    def of(cls, inputs: Inputs, battery_voltage: Scalar | None = None) -> "Grid":
+        """The grid of a flight's inputs. `battery_voltage`: to which the airframe's rotor speeds belong [V]."""
+        known = inputs.voltage is not None and battery_voltage is not None
+        voltage = inputs.voltage / battery_voltage if known else None
         if inputs.stretches is not None:
-            return cls(inputs.dt, *inputs.stretches)
+            return cls(inputs.dt, *inputs.stretches, voltage)
         zeros = jnp.zeros(inputs.omega.shape[0], dtype=int)
-        return cls(inputs.dt, zeros, zeros, zeros + inputs.omega.shape[0] - 1)
+        return cls(inputs.dt, zeros, zeros, zeros + inputs.omega.shape[0] - 1, voltage)
 
 
 class Speeds(NamedTuple):

@@ -26,6 +26,8 @@ VOLTAGE = "battery voltage"
 
 # Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a body velocity of 5 m/s.
 _AUTHORITY, _FAST = 0.2, 5.0
+# The specific thrust in hover [m/s^2]. Torque proportional to it belongs to the term `offset`.
+_HOVER = 9.81
 # The yaw torque of the rotors as a share of their roll torque.
 _YAW = 0.2
 _AXES = ("roll", "pitch", "yaw")
@@ -101,14 +103,14 @@ class Term:
         return any((self.command, self.speed, self.thrust))
 
 
-def _authority(axis: int, speed: float = 1.0) -> Callable[[Airframe], Scalar]:
-    """The share `_AUTHORITY` of the rotors' torque over the inertia [rad/s^2], divided by `speed`."""
+def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
+    """The share `_AUTHORITY` of the rotors' torque over the inertia [rad/s^2], divided by `per`."""
 
     def share(airframe: Airframe) -> Scalar:
         arm = jnp.abs(jnp.asarray(airframe.rotor_positions)).mean()
         torque = 2 * arm * airframe.mass * airframe.gravity / 4
         limit = _AUTHORITY * torque * jnp.array([1.0, 1.0, _YAW]) / jnp.asarray(airframe.inertia)
-        return limit[axis] / speed
+        return limit[axis] / per
 
     return share
 
@@ -130,6 +132,11 @@ def _add_damping(total: Rates, values: Values, rates: Rates, forcing: Forcing) -
     )
 
 
+def _add_center_of_mass(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
+    thrust = forcing.thrust - _HOVER
+    return Rates(total.p + values["roll_thrust"] * thrust, total.q + values["pitch_thrust"] * thrust, total.r)
+
+
 def _add_velocity(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
     vx, vy, _ = required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
     return Rates(total.p + values["roll_velocity"] * vy, total.q + values["pitch_velocity"] * vx, total.r)
@@ -143,6 +150,11 @@ def _add_flapping(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
 def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
     spin_up = required(forcing.spin_up, "`forcing` must come from `FlightModel.forcing`.")
     return total._replace(r=total.r - values["rotor_reaction"] * spin_up)
+
+
+def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpeeds:
+    voltage = required(grid.voltage, _missing(VOLTAGE, "voltage"))
+    return omega * (voltage ** values["voltage_exponent"])[:, None]
 
 
 def _bend_thrust(squares: SquaredSpeeds, values: Values, speeds: Speeds, airframe: Airframe) -> SquaredSpeeds:
@@ -179,6 +191,13 @@ TERMS: dict[str, Term] = {
         by_default=lambda available: True,
         angular_acceleration=_add_offset,
     ),
+    "center_of_mass": Term(
+        "a torque proportional to thrust above hover, from an offset centre of mass: roll_thrust, pitch_thrust [rad/m]",
+        # The bracket is an offset of 10 % of the arm.
+        tuple(TermParameter(f"{x}_thrust", "rad/m", _authority(i, _HOVER)) for i, x in enumerate(_AXES[:2])),
+        by_default=lambda available: True,
+        angular_acceleration=_add_center_of_mass,
+    ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
         tuple(TermParameter(f"{x}_damping", "1/s", 5.0) for x in _AXES),
@@ -199,6 +218,13 @@ TERMS: dict[str, Term] = {
         # The drag of the rotors is proportional to the body velocity: the force replaces a missing velocity.
         by_default=lambda available: BODY_VELOCITY not in available,
         angular_acceleration=_add_flapping,
+    ),
+    "voltage": Term(
+        "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
+        (TermParameter("voltage_exponent", "1", 0.5, center=0.5),),
+        needs=frozenset({VOLTAGE, COMMANDS}),
+        by_default=lambda available: True,
+        command=_scale_commands,
     ),
     "lag": Term(
         "rotors follow their commands as first-order systems: rotor_lag [s]",

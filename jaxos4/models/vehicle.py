@@ -7,6 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import ArrayLike, Float
 
 from .._custom_types import Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
@@ -22,6 +23,7 @@ from .terms import (
     FULL_SCALE,
     LATERAL_FORCE,
     TERMS,
+    VOLTAGE,
     Constant,
     Term,
     TermParameter,
@@ -37,15 +39,20 @@ DEFAULT_TERMS = default_terms(frozenset({COMMANDS}))
 class FlightModel(AbstractModel):
     """`CorrectedOS4` and the effects that real vehicles show. Each term is optional.
 
-        p' = alpha1 q r - alpha2 Omega_r q + alpha3 d_roll + roll_offset - roll_damping p
-             + roll_velocity v_y + roll_flapping a_y
-        q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset - pitch_damping q
-             + pitch_velocity v_x + pitch_flapping a_x
+        p' = alpha1 q r - alpha2 Omega_r q + alpha3 d_roll + roll_offset + roll_thrust (U_c / m - 9.81)
+             - roll_damping p + roll_velocity v_y + roll_flapping a_y
+        q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset + pitch_thrust (U_c / m - 9.81)
+             - pitch_damping q + pitch_velocity v_x + pitch_flapping a_x
         r' = alpha7 p q + alpha8 d_yaw + yaw_offset - yaw_damping r - rotor_reaction Omega_r'
-        omega_i' = (command_i(t - rotor_delay) - omega_i) / rotor_lag
+        omega_i' = (u_i(t - rotor_delay) - omega_i) / rotor_lag,    u_i = command_i (V / V_0)^voltage_exponent
         a_z = thrust_gain U_c / m + az_bias,    a_x = ax_bias - x_drag v_x,    a_y = ay_bias - y_drag v_y
 
     The last line is the specific force, as an accelerometer at the centre of mass measures it.
+
+    A centre of mass at (x_c, y_c) in the frame of the rotor positions gives the thrust U_c the torque
+    (-x_c, -y_c, 0) x (0, 0, U_c) = (-y_c U_c, x_c U_c, 0). So roll_thrust = -alpha3 m y_c and pitch_thrust =
+    alpha6 m x_c (`jaxos4.center_of_mass`). Only thrust above hover counts, so that an estimate can distinguish it from
+    a constant torque. Rotors of unequal thrust cause the same torque.
 
     **Arguments:**
 
@@ -55,14 +62,17 @@ class FlightModel(AbstractModel):
       rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
       own offsets and gyro biases. All other parameters are the vehicle's.
+    - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V]. The term `voltage`
+      needs it, and `Flight.voltage`.
 
     **Raises:** `ValueError` for a term that does not exist or is given twice, recordings that are not counted from 0,
-    or a term that needs `airframe.max_rotor_speed` if that is not known.
+    or a term that needs `airframe.max_rotor_speed` or `battery_voltage` if that is not known.
     """
 
     airframe: Airframe
     terms: tuple[str, ...] = eqx.field(static=True)
     recordings: tuple[int, ...] = eqx.field(static=True)
+    battery_voltage: Scalar | None
 
     def __init__(
         self,
@@ -70,6 +80,7 @@ class FlightModel(AbstractModel):
         *,
         terms: tuple[str, ...] = DEFAULT_TERMS,
         recordings: tuple[int, ...] = (0,),
+        battery_voltage: Float[ArrayLike, ""] | None = None,
     ):
         unknown = [term for term in terms if term not in TERMS]
         if unknown or len(set(terms)) < len(terms):
@@ -79,7 +90,11 @@ class FlightModel(AbstractModel):
         unscaled = [term for term in terms if FULL_SCALE in TERMS[term].needs]
         if unscaled and not has_full_scale(airframe):
             raise ValueError(f"`airframe.max_rotor_speed` must be known for the term {unscaled[0]}: set it.")
+        powered = [term for term in terms if VOLTAGE in TERMS[term].needs]
+        if powered and battery_voltage is None:
+            raise ValueError(f"`battery_voltage` must be given for the term {powered[0]}: it is the usual voltage.")
         self.airframe, self.terms, self.recordings = airframe, tuple(terms), tuple(recordings)
+        self.battery_voltage = None if battery_voltage is None else as_float(battery_voltage)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -115,7 +130,7 @@ class FlightModel(AbstractModel):
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The chain from commands to torque and thrust: each term acts at its place."""
-        airframe, grid, omega = self.airframe, Grid.of(inputs), inputs.omega
+        airframe, grid, omega = self.airframe, Grid.of(inputs, self.battery_voltage), inputs.omega
         for change, values in self._contributions("command", parameters):
             omega = change(omega, values, grid)
         speeds = measured_speeds(omega, grid)

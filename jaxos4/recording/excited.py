@@ -11,7 +11,7 @@ from ..flight import STATE_NAMES, Flight
 
 RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
 _ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi"))
-_GOOD, _WEAK = 0.3, 0.1  # [rad/s], standard deviation of a body rate
+_GOOD, WEAK = 0.3, 0.1  # [rad/s], standard deviation of a body rate
 _OVER_NOISE = 5.0  # a rate below this many times the gyro's noise is not excited
 
 
@@ -62,7 +62,7 @@ def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
 def _verdict(size: float, noise: float) -> str:
     if math.isnan(size):
         return "not measured"
-    if size < _WEAK or (not math.isnan(noise) and size < _OVER_NOISE * noise):
+    if size < WEAK or (not math.isnan(noise) and size < _OVER_NOISE * noise):
         return "none"
     return "good" if size >= _GOOD else "weak"
 

@@ -11,13 +11,13 @@ from ..airframe import Airframe
 from ..analysis.identifiability import identifiability
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, Flight
-from ..logs import log_format, read_log
+from ..logs import LogFacts, log_format, read_log_and_facts
 from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem
-from .excited import RATE_COLUMNS, excitation
+from .excited import RATE_COLUMNS, WEAK, excitation
 from .signs import opposite_axes, opposite_note
-from .usable import Stretch, cut, stretches
+from .usable import Stretch, cut, nothing_usable, stretches
 
 # The identifiability is computed from this much of a stretch [s], in windows of this length [s].
 _LONGEST, _WINDOW = 20.0, 0.5
@@ -75,9 +75,10 @@ class Inspection(msgspec.Struct, frozen=True):
     - `log`, `format`: the file, and "CSV", "ULog", "blackbox" or "Crazyflie".
     - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
     - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
+    - `findings`: why no vehicle can be identified from the log, and what to do, most important first.
     - `notes`: remarks of the reader.
     - `parts`: the stretches in order of time.
-    - `identifiable`: `None` without an airframe, without p, q and r, or without a usable stretch.
+    - `identifiable`: `None` without an airframe, without p, q and r, or if a finding excludes it.
     """
 
     log: str
@@ -87,6 +88,7 @@ class Inspection(msgspec.Struct, frozen=True):
     end: float
     sample_time: float
     measured: dict[str, Channel]
+    findings: tuple[str, ...]
     notes: tuple[str, ...]
     parts: tuple[Part, ...]
     identifiable: IdentifiableParameters | None
@@ -101,15 +103,17 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
 
     **Raises:** `InputError` for a file that cannot be read as a log.
     """
-    flight, notes = read_log(path, airframe, full_scale=1.0)
-    found = stretches(flight, airframe)
+    flight, notes, facts = read_log_and_facts(path, airframe, full_scale=1.0)
+    found = stretches(flight, airframe, landed=facts.landed)
     longest = max((part for part in found if not part.reason), key=lambda part: part.length, default=None)
     rates_measured = not np.isnan(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=0).any()
-    if airframe is not None:
-        usable = [cut(flight, part) for part in found if not part.reason]
-        notes = [*notes, *filter(None, [opposite_note(opposite_axes(usable, airframe))])]
+    parts = tuple(_part(flight, stretch, airframe) for stretch in found)
+    nothing = "" if longest is not None else f"{nothing_usable(found)}; give the log of a flight"
+    usable = [cut(flight, part) for part in found if not part.reason]
+    opposite = "" if airframe is None else opposite_note(opposite_axes(usable, airframe))
+    findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts), opposite)))
     identifiable = None
-    if longest is not None and airframe is not None and rates_measured:
+    if longest is not None and not facts.too_slow and airframe is not None and rates_measured:
         identifiable = _identifiable(flight, longest, airframe)
     return Inspection(
         log=str(path),
@@ -118,14 +122,15 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
         begin=float(flight.time[0]),
         end=float(flight.time[-1]),
         sample_time=float(flight.dt),
-        measured=_measured(flight),
-        notes=tuple(notes),
-        parts=tuple(_part(flight, stretch, airframe) for stretch in found),
+        measured=_measured(flight, facts),
+        findings=findings,
+        notes=notes,
+        parts=parts,
         identifiable=identifiable,
     )
 
 
-def _measured(flight: Flight) -> dict[str, Channel]:
+def _measured(flight: Flight, facts: LogFacts) -> dict[str, Channel]:
     columns = dict(zip(CHANNEL_NAMES, np.asarray(flight.channels).T, strict=True))
     columns |= {f"rotor{i + 1}": speed for i, speed in enumerate(np.asarray(flight.omega).T)}
     time, channels = np.asarray(flight.time), {}
@@ -133,9 +138,24 @@ def _measured(flight: Flight) -> dict[str, Channel]:
         at = np.flatnonzero(np.isfinite(values))
         if at.size:
             rate = at.size / float(flight.time[-1] - flight.time[0])
+            if name.startswith("rotor") and facts.motors is not None:
+                rate = facts.motors.rate  # each sample of the flight has a speed, measured or held
             gaps = np.diff(np.concatenate([time[:1], time[at], time[-1:]]))
             channels[name] = Channel(rate, float(gaps.max()), float(values[at].min()), float(values[at].max()))
     return channels
+
+
+def _too_little(parts: tuple[Part, ...]) -> str:
+    """A finding, if the vehicle hardly turns in its usable parts."""
+    usable = [part for part in parts if part.usable]
+    rates = [axis.rate for part in usable for axis in part.excitation.values() if axis.rate is not None]
+    if not rates or max(rates) >= WEAK:
+        return ""
+    seconds = sum(part.end - part.begin for part in usable)
+    return (
+        f"too little flight: in the {seconds:.1f} s that can be used, the vehicle turns with at most {max(rates):.2g} "
+        "rad/s (standard deviation); fly rolls, pitches and turns"
+    )
 
 
 def _part(flight: Flight, stretch: Stretch, airframe: Airframe | None) -> Part:

@@ -17,7 +17,7 @@ from .holdout import hold_out
 from .joining import join
 from .reading import Recording
 from .signs import opposite_axes, opposite_note
-from .usable import GROUND, Stretch, cut, stretches
+from .usable import Stretch, cut, nothing_usable, stretches
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -54,6 +54,11 @@ class Prepared(NamedTuple):
         """The number of windows; each lies in one stretch."""
         return self.fitted.time.shape[0] // self.length
 
+    @property
+    def battery_voltage(self) -> float | None:
+        """The median of the battery's voltage [V]. `None`: not logged."""
+        return None if self.fitted.voltage is None else float(np.median(self.fitted.voltage))
+
 
 def prepare(
     recordings: Sequence[Recording],
@@ -68,7 +73,8 @@ def prepare(
 ) -> Prepared:
     """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
 
-    `predicted`: they are predicted and not fitted, so that messages do not name options of the fit.
+    `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors, and
+    messages do not name options of the fit.
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
@@ -77,9 +83,11 @@ def prepare(
     notes: list[str] = []
     parts: list[tuple[int, Flight]] = []
     for number, recording in enumerate(recordings):
-        pieces, note = _usable_parts(recording, airframe, begin, end, predicted)
-        opposite = opposite_note(opposite_axes(pieces, airframe))
-        if opposite:
+        slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
+        pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
+        if slow:
+            raise InputError(f"{recording.name}: {slow}.")
+        if opposite := opposite_note(opposite_axes(pieces, airframe)):
             raise InputError(f"{recording.name}: {opposite}.")
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
         parts += [(number, piece) for piece in pieces]
@@ -144,9 +152,12 @@ def _sampling(slowest: float, window: float, sample_time: float | None) -> tuple
 
 
 def _usable_parts(
-    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, predicted: bool
+    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str, predicted: bool
 ) -> tuple[list[Flight], str | None]:
-    """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used."""
+    """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used.
+
+    `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
+    """
     flight, name = recording.flight, recording.name
     first, last = np.asarray(flight.time)[[0, -1]].tolist()
     if begin is not None or end is not None:
@@ -154,17 +165,13 @@ def _usable_parts(
             return [cut(flight, Stretch(first if begin is None else begin, last if end is None else end))], None
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
-    every = stretches(flight, airframe)
+    every = stretches(flight, airframe, landed=recording.facts.landed)
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
-        remedy = "give `begin` and `end` to use one all the same"
-        if predicted or refused[0].reason == GROUND:
-            remedy = "give the log of a flight"
-        raise InputError(
-            f"{name}: no stretch of it can be used (from {refused[0].begin:.1f} s to {refused[0].end:.1f} s: "
-            f"{refused[0].reason}); {remedy}."
-        )
+        remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
+        besides = f" Besides, {slow}." if slow else ""
+        raise InputError(f"{name}: {nothing_usable(every)}; {remedy}.{besides}")
     if not refused:
         return [flight], None
     reasons = "; ".join(f"{part.begin:.1f} to {part.end:.1f} s: {part.reason}" for part in refused[:_MOST_REASONS])

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..flight import Flight
-from ..logs import read_log
+from ..logs import LogFacts, read_log_and_facts
 
 
 class Recording(NamedTuple):
@@ -17,11 +17,13 @@ class Recording(NamedTuple):
     - `flight`: what was recorded.
     - `name`: in messages and in the provenance. Usually the path of the file.
     - `notes`: what the reader changed in the data, one line each.
+    - `facts`: what the log says beside the flight, such as how often motors and gyro were written.
     """
 
     flight: Flight
     name: str
     notes: tuple[str, ...] = ()
+    facts: LogFacts = LogFacts()
 
     @property
     def named_notes(self) -> tuple[str, ...]:
@@ -38,8 +40,8 @@ class Recording(NamedTuple):
 
 def read_recording(path: str | os.PathLike[str], airframe: Airframe | None = None) -> Recording:
     """Read a log in any format that `jaxos4.read_log` knows, named by its path. Arguments and errors are the same."""
-    flight, notes = read_log(path, airframe)
-    return Recording(flight, os.fspath(path), tuple(notes))
+    flight, notes, facts = read_log_and_facts(path, airframe)
+    return Recording(flight, os.fspath(path), notes, facts)
 
 
 def as_recordings(

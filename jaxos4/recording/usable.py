@@ -7,6 +7,7 @@ the accelerometer does not feel them (`jaxos4.recording.resting`).
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..flight import Flight
 from .excited import RATE_COLUMNS
 from .resting import resting
 
-GROUND = "on the ground"
+ON_GROUND = "on the ground"
 SHORTEST = 1.0  # [s], of a usable stretch
 MOMENT = 0.1  # [s]; a rotor may rest or be at its limit for this long: about its lag
 _CARRIES = 0.3  # share of the weight; with less thrust for `_SUSTAINED`, the vehicle is on the ground
@@ -35,6 +36,14 @@ _IMPACT_TIME = 0.02  # [s]
 _AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s], until the rotors stop; not trusted before the impact
 
 _USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last one that applies counts
+_NAMES = {
+    _USABLE: "",
+    _SHORT: f"less than {SHORTEST:g} s between others",
+    _CLIPPING: "the gyro is clipped",
+    _LOST: "nothing was measured",
+    _CRASHED: "an impact",
+    _GROUND: ON_GROUND,
+}
 
 
 class Stretch(NamedTuple):
@@ -60,7 +69,9 @@ class _Saturation(NamedTuple):
     end: int
 
 
-def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
+def stretches(
+    flight: Flight, airframe: Airframe | None = None, *, landed: Sequence[tuple[float, float]] = ()
+) -> tuple[Stretch, ...]:
     """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
     **Arguments:**
@@ -68,11 +79,14 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
     - `flight`: one flight, not a batch.
     - `airframe`: the weight, and the largest rotor speed. If there is none, or if it is evidently another vehicle's
       (thrust below a third or above three times the weight), the median thrust is taken as the weight.
+    - `landed`: from when to when the vehicle itself says that it is on the ground [s], see `jaxos4.logs.LogFacts`.
     """
     time, omega = np.asarray(flight.time, dtype=float), np.asarray(flight.omega, dtype=float)
     states, dt = np.asarray(flight.states, dtype=float), float(flight.dt)
     share = _thrust_share(omega, airframe, commanded=flight.commanded)
     ground = _ground(share, dt)
+    for begin, end in landed:
+        ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
     saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
     for label, where in (
@@ -100,6 +114,15 @@ def stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch
 def usable_stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
     """The usable stretches, in order; each lasts at least one second."""
     return tuple(stretch for stretch in stretches(flight, airframe) if not stretch.reason)
+
+
+def nothing_usable(every: Sequence[Stretch]) -> str:
+    """Why none of these stretches of a flight can be used: the longest one, with its reason."""
+    longest = max(every, key=lambda stretch: stretch.length)
+    no_flight = {_NAMES[_GROUND], _NAMES[_SHORT], _NAMES[_LOST]}
+    grounded = longest.reason == ON_GROUND and all(stretch.reason in no_flight for stretch in every)
+    never = "the vehicle never flew" if grounded else "no part can be used"
+    return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
 
 
 def cut(flight: Flight, stretch: Stretch) -> Flight:
@@ -229,14 +252,7 @@ def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) ->
             if each.begin < end and each.end > begin:
                 rotors.setdefault(each.what, set()).add(each.rotor)
         return "; ".join(f"rotor {', '.join(map(str, sorted(which)))} {what}" for what, which in rotors.items())
-    return {
-        _USABLE: "",
-        _SHORT: f"less than {SHORTEST:g} s between others",
-        _CLIPPING: "the gyro is clipped",
-        _LOST: "nothing was measured",
-        _CRASHED: "an impact",
-        _GROUND: GROUND,
-    }[label]
+    return _NAMES[label]
 
 
 def _samples(seconds: float, dt: float) -> int:

@@ -1,0 +1,179 @@
+"""A check of a fit without parameters: the frequency response from modelled to measured angular acceleration."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._custom_types import Parameters, as_float
+from ..models.state import CASCADE_ORDER, Rates
+from ..results import NINETY_FIVE
+from ..shooting import ShootingProblem
+
+# Length of a segment [s]: its inverse is the resolution in frequency [Hz].
+_SEGMENT = 1.0
+# With fewer averages there are no errors.
+_FEWEST = 4
+# The band in which the model is compared [Hz], and the smallest coherence there. Below, the flight controller's answer
+# to disturbances looks like the vehicle's answer to torque. Above, few vehicles move.
+_LOW, _HIGH, _COHERENT = 4.0, 20.0, 0.6
+_ROUNDING = 1e-9
+# The coherence is averaged over this many frequencies on either side.
+_AROUND = 2
+# Segments overlap by half: the correlation of their spectra, and that of frequencies 0, 1, 2 steps apart (Hann window).
+_OVERLAP, _NEIGHBOURS = 1 / 6, (1.0, 4 / 9, 1 / 36)
+
+
+class Agreement(NamedTuple):
+    """The measured response divided by the model's: its geometric mean over frequencies with a clear response.
+
+    - `ratio`: 1 if the model is right, 2 if the vehicle answers twice as strongly as the model says. NaN: no part of
+      the band has a coherence above 0.6.
+    - `error`: standard deviation of the ratio's logarithm.
+    - `low`, `high`: the first and the last frequency that counted [Hz].
+    """
+
+    ratio: float
+    error: float
+    low: float
+    high: float
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval of the ratio."""
+        factor = math.exp(NINETY_FIVE * self.error)
+        return self.ratio / factor, self.ratio * factor
+
+
+class AxisResponse(NamedTuple):
+    """The frequency response of one axis. A model that is right has gain 1 and phase 0.
+
+    - `frequency`: [Hz].
+    - `gain`: measured over modelled angular acceleration.
+    - `phase`: of the measured before the modelled one [rad]. A measured response that comes late has a negative phase.
+    - `coherence`: the share of the measured response that depends linearly on the modelled one, 0 to 1.
+    - `error`: standard deviation of the gain's logarithm, and of the phase [rad].
+    - `half_width`: of the 95 % interval of the gain, as a share of the gain, and of the phase [rad].
+    - `averages`: how many independent segments of the flight were averaged.
+    """
+
+    frequency: Float[np.ndarray, " frequencies"]
+    gain: Float[np.ndarray, " frequencies"]
+    phase: Float[np.ndarray, " frequencies"]
+    coherence: Float[np.ndarray, " frequencies"]
+    error: Float[np.ndarray, " frequencies"]
+    half_width: Float[np.ndarray, " frequencies"]
+    averages: float
+
+    def agreement(self, low: float = _LOW, high: float = _HIGH) -> Agreement:
+        """How strongly the vehicle answers compared with the model, from `low` to `high` [Hz]."""
+        clear = self.clear & np.isfinite(self.error) & (self.frequency >= low) & (self.frequency <= high)
+        if not clear.any():
+            return Agreement(*[math.nan] * 4)
+        frequency, coherence = self.frequency[clear], self._around[clear]
+        weight = coherence / np.maximum(1 - coherence, _ROUNDING)
+        error = self.error[clear] * weight / weight.sum()
+        apart = np.rint(np.abs(frequency[:, None] - frequency) / self.frequency[0]).astype(int)
+        correlation = np.append(_NEIGHBOURS, 0.0)[np.minimum(apart, len(_NEIGHBOURS))]
+        ratio = math.exp(np.average(np.log(self.gain[clear]), weights=weight))
+        return Agreement(ratio, math.sqrt(error @ correlation @ error), float(frequency[0]), float(frequency[-1]))
+
+    @property
+    def clear(self) -> Bool[np.ndarray, " frequencies"]:
+        """Where the coherence exceeds 0.6, as the mean over five frequencies."""
+        return self._around > _COHERENT
+
+    @property
+    def _around(self) -> Float[np.ndarray, " frequencies"]:
+        """The mean coherence around each frequency. By chance, a high coherence comes with a gain that is too large."""
+        kernel, known = np.ones(2 * _AROUND + 1), np.isfinite(self.coherence)
+        total, count = (np.convolve(x, kernel)[_AROUND:-_AROUND] for x in (np.where(known, self.coherence, 0.0), known))
+        return np.where(known, total / np.maximum(count, 1), 0.0)
+
+
+class FrequencyResponse(NamedTuple):
+    """The frequency response of each axis, from modelled to measured angular acceleration."""
+
+    roll: AxisResponse
+    pitch: AxisResponse
+    yaw: AxisResponse
+
+
+def frequency_response(problem: ShootingProblem, parameters: Parameters) -> FrequencyResponse:
+    """The frequency response from the angular acceleration that the model says to the measured one, for each axis.
+
+    The input is the model's p', q', r' at the measured rates and rotor speeds. The output is the difference of measured
+    rates over the sample time. Spectra are averaged over segments of 1 s that overlap by half (Welch 1967), in all
+    stretches in which p, q and r were measured. No simulation is involved, so that errors do not add up over time.
+
+    **In closed loop** the response is biased where disturbances dominate. The flight controller answers a disturbance
+    by torque against it, and the vehicle then seems to answer torque too weakly, or in the other direction, with high
+    coherence. This happens at low frequencies, at which the controller is fast enough. Therefore `agreement` begins at
+    4 Hz. Gyro noise that the controller feeds back does the same at high frequencies.
+
+    **Arguments:** a problem, and the parameters of a fit.
+
+    Errors are those of Gaussian signals with this coherence (Bendat and Piersol, Random Data, section 9.2).
+    """
+    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
+    dt = float(problem.flight.dt)
+    known = ~np.isnan(rates).any(axis=1)
+    modelled = np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
+    measured = np.diff(rates, axis=0) / dt
+    usable = known[1:] & known[:-1] & np.isfinite(modelled).all(axis=1)
+    if problem.flight.stretch is not None:
+        usable &= np.diff(np.asarray(problem.flight.stretch)) == 0
+    length = max(round(_SEGMENT / dt / 2) * 2, 8)
+    begins = _segments(usable, length)
+    axes = [response(modelled[:, i], measured[:, i], begins, length, dt) for i in range(3)]
+    return FrequencyResponse(*axes)
+
+
+@eqx.filter_jit
+def _modelled(
+    problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
+) -> Float[Array, "samples-1 3"]:
+    """The model's angular acceleration from each sample to the next, at the mean of their rates [rad/s^2]."""
+    forcing = jax.tree.map(lambda leaf: leaf[:-1], problem.forcing(parameters))
+    middle = Rates(*((rates[1:] + rates[:-1]) / 2).T)
+    return jnp.stack(problem.model.angular_acceleration(middle, forcing, tuple(parameters)), axis=1)
+
+
+def _segments(usable: Bool[np.ndarray, " samples"], length: int) -> list[int]:
+    """Where segments begin: as many as fit into each usable run of samples, overlapping by half."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], usable.astype(np.int8), [0]])))
+    runs = edges.reshape(-1, 2).tolist()
+    return [at for begin, end in runs for at in range(begin, end - length + 1, length // 2)]
+
+
+def response(
+    u: Float[np.ndarray, " samples"], y: Float[np.ndarray, " samples"], begins: Sequence[int], length: int, dt: float
+) -> AxisResponse:
+    """The frequency response from u to y, averaged over segments of `length` samples from `begins` on.
+
+    **Arguments:** signals with one sample every `dt` [s], and segments that overlap by half.
+    """
+    from scipy.special import stdtrit  # slow to import
+
+    window = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+    chosen = slice(1, length // 2)  # neither the mean nor the Nyquist frequency
+    uu, yy, uy = np.zeros(length // 2 - 1), np.zeros(length // 2 - 1), np.zeros(length // 2 - 1, dtype=complex)
+    for at in begins:
+        parts = (x[at : at + length] for x in (u, y))
+        a, b = (np.fft.rfft(window * (part - part.mean()))[chosen] for part in parts)
+        uu, yy, uy = uu + np.abs(a) ** 2, yy + np.abs(b) ** 2, uy + a.conj() * b
+    averages = len(begins) / (1 + 2 * _OVERLAP**2)
+    freedom = 2 * (averages - 1) if averages >= _FEWEST else math.nan
+    with np.errstate(all="ignore"):
+        found = uy / uu
+        coherence = np.minimum(np.abs(uy) ** 2 / (uu * yy), 1.0)
+        error = np.sqrt((1 - coherence) / (coherence * freedom))
+    half_width = float(stdtrit(freedom, 0.975)) * error
+    frequency = np.arange(1, length // 2) / (length * dt)
+    gain, phase = np.abs(found), np.angle(found)
+    return AxisResponse(frequency, gain, phase, coherence, error, half_width, averages)

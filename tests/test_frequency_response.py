@@ -1,0 +1,159 @@
+"""The frequency response of modelled to measured acceleration: against SciPy, known systems, and its own errors."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import standard_flight
+from scipy import signal
+
+import jaxos4
+from jaxos4.analysis.frequency_response import response
+
+DT, LENGTH = 0.004, 250
+MODEL = jaxos4.FlightModel(terms=("offset", "damping", "lag"))
+
+
+def begins(samples):
+    return list(range(0, samples - LENGTH + 1, LENGTH // 2))
+
+
+def noisy(u, system, sigma, rng):
+    numerator, denominator = system
+    return signal.lfilter(numerator, denominator, u) + rng.normal(0, sigma, u.size)
+
+
+def test_spectra_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=2000)
+    y = noisy(u, ([0.5, 0.2], [1, -0.4]), 0.3, rng)
+    found = response(u, y, begins(u.size), LENGTH, DT)
+    window = np.sin(np.pi * (np.arange(LENGTH) + 0.5) / LENGTH) ** 2
+    settings = dict(fs=1 / DT, window=window, nperseg=LENGTH, noverlap=LENGTH // 2, detrend="constant")
+    frequency, cross = signal.csd(u, y, **settings)
+    power = signal.welch(u, **settings)[1]
+    expected = (cross / power)[1:-1]
+    np.testing.assert_allclose(found.frequency, frequency[1:-1], rtol=1e-12)
+    np.testing.assert_allclose(found.gain * np.exp(1j * found.phase), expected, rtol=1e-9)
+    np.testing.assert_allclose(found.coherence, signal.coherence(u, y, **settings)[1][1:-1], rtol=1e-9)
+
+
+def test_bands_hold_the_truth_as_often_as_they_say():
+    """A system with a flat response, so that the resolution does not bias it; coherences of 0.67 and 0.95."""
+    rng, trials, truth = np.random.default_rng(1), 400, 0.5
+    gains, phases, logs, ratios = [], [], [], []
+    for k in range(trials):
+        u = rng.normal(size=12 * LENGTH)
+        y = truth * u + rng.normal(0, 0.5 * (0.7 if k % 2 else 0.23), u.size)
+        found = response(u, y, begins(u.size), LENGTH, DT)
+        gains.append(np.abs(found.gain / truth - 1) < found.half_width * found.gain / truth)
+        phases.append(np.abs(found.phase) < found.half_width)
+        agreement = found.agreement()
+        logs.append(math.log(agreement.ratio / truth) / agreement.error)
+        ratios.append(agreement.interval[0] < truth < agreement.interval[1])
+    for inside in (gains, phases):
+        # Neighbouring frequencies are correlated: the trial is the unit.
+        share = np.mean(inside, axis=1)
+        assert abs(share.mean() - 0.95) < 3 * share.std() / np.sqrt(trials) + 0.01
+    assert abs(np.mean(logs)) < 4 / np.sqrt(trials)
+    assert np.std(logs) == pytest.approx(1.0, abs=4 / np.sqrt(2 * trials))
+    assert np.mean(ratios) == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / trials))
+
+
+def test_gain_and_phase_of_a_known_system():
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=200 * LENGTH)
+    system = ([0.3], [1, -0.7])
+    found = response(u, noisy(u, system, 0.1, rng), begins(u.size), LENGTH, DT)
+    _, exact = signal.freqz(*system, worN=2 * np.pi * found.frequency * DT)
+    quotient = found.gain * np.exp(1j * found.phase) / exact
+    assert np.abs(np.log(np.abs(quotient)) / found.error).max() < 5
+    assert np.abs(np.angle(quotient) / found.error).max() < 5
+    assert found.error.max() < 0.05
+    assert found.averages == pytest.approx(0.947 * 399, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """30 s of noise on the rotors' speeds, with the rates that the model says and gyro noise."""
+    rng = np.random.default_rng(0)
+    samples = round(30 / DT) + 1
+    slow = signal.lfilter([0.05], [1, -0.95], rng.normal(size=(samples, 4)), axis=0)
+    omega = float(jaxos4.OS4.hover_speed) * (1 + 0.02 * slow / slow.std())
+    values = MODEL.alpha.at[8:].set(jnp.array([0.1, -0.1, 0.05, 4.0, 4.0, 2.0, 0.05]))
+    blank = jaxos4.Flight(DT * np.arange(samples), omega, np.full((samples, 12), np.nan), commanded=True)
+    problem = jaxos4.ShootingProblem(
+        MODEL, blank, sigma=np.ones(12), channels="rates", method="rk4", initial_state=np.zeros(12)
+    )
+    rates = np.array(problem.predict(values, jnp.zeros(3))) + rng.normal(0, 0.002, (samples, 3))
+    states = np.full((samples, 12), np.nan)
+    states[:, [7, 9, 11]] = rates
+    flight = eqx.tree_at(lambda f: f.states, blank, jnp.asarray(states))
+    return jaxos4.ShootingProblem(MODEL, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", method="rk4"), values
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_the_right_model_has_gain_one_and_phase_zero(flown, held):
+    problem, values = flown
+    if held:
+        model = jaxos4.hold(MODEL, {"rotor_lag": 0.05, "alpha7": values[6]})
+        problem, values = eqx.tree_at(lambda p: p.model, problem, model), model.without(values)
+    found = jaxos4.frequency_response(problem, values)
+    for axis in found[:2]:
+        agreement = axis.agreement()
+        assert abs(math.log(agreement.ratio)) < 4 * agreement.error + 2e-3
+        assert agreement.error < 0.02
+        clear = axis.clear & (axis.frequency >= 2) & (axis.frequency <= 20)
+        assert np.all(np.abs(axis.phase[clear]) < 5 * axis.error[clear] + 0.01)
+
+
+@pytest.mark.parametrize(("name", "factor", "axis"), [("alpha3", 2.0, "roll"), ("alpha6", 0.5, "pitch")])
+def test_a_wrong_inertia_shows_as_its_factor(flown, name, factor, axis):
+    problem, values = flown
+    wrong = values.at[MODEL.parameter_names.index(name)].mul(factor)
+    found = jaxos4.frequency_response(problem, wrong)
+    agreement = getattr(found, axis).agreement()
+    assert agreement.ratio * factor == pytest.approx(1.0, abs=0.06)
+    low, high = agreement.interval
+    assert not low < 1 < high
+    other = found.pitch if axis == "roll" else found.roll
+    assert other.agreement().ratio == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_response_that_comes_late_has_a_negative_phase(flown):
+    problem, values = flown
+    early = values.at[-1].set(0.03)  # the true lag is 0.05 s
+    axis = jaxos4.frequency_response(problem, early).roll
+    at = np.argmin(np.abs(axis.frequency - 3))
+    expected = math.atan(2 * math.pi * 3 * 0.03) - math.atan(2 * math.pi * 3 * 0.05)
+    assert axis.phase[at] == pytest.approx(expected, abs=0.1)
+
+
+def test_gaps_and_stretches_are_not_crossed(flown):
+    """Gaps and ends of stretches take segments away; rubbish beside them changes nothing else."""
+    problem, values = flown
+    states = np.array(problem.flight.states)
+    states[1000:1010] = np.nan
+    states[2500:, [7, 9, 11]] += 5.0  # a jump where the second stretch begins
+    stretch = jnp.asarray((np.arange(states.shape[0]) >= 2500).astype(int))
+    model = jaxos4.FlightModel(terms=MODEL.terms, recordings=(0, 0))
+    flight = eqx.tree_at(lambda f: f.states, problem.flight, jnp.asarray(states))
+    flight = eqx.tree_at(lambda f: f.stretch, flight, stretch, is_leaf=lambda x: x is None)
+    cut = eqx.tree_at(lambda p: (p.model, p.flight), problem, (model, flight), is_leaf=lambda x: x is None)
+    found, whole = jaxos4.frequency_response(cut, values), jaxos4.frequency_response(problem, values)
+    assert 0 < found.roll.averages < whole.roll.averages
+    assert found.roll.agreement().ratio == pytest.approx(whole.roll.agreement().ratio, abs=0.03)
+
+
+def test_too_short_a_flight_has_no_answer():
+    flight = standard_flight()
+    short = jax.tree.map(lambda leaf: leaf[:80] if jnp.ndim(leaf) else leaf, flight)
+    problem = jaxos4.ShootingProblem(jaxos4.CorrectedOS4(), short, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
+    found = jaxos4.frequency_response(problem, problem.model.alpha)
+    for axis in found:
+        assert axis.averages == 0
+        assert not axis.clear.any()
+        assert math.isnan(axis.agreement().ratio)
