@@ -315,6 +315,22 @@ def test_the_gyros_scale_is_read(save):
     check(flight, names=RATES, atol=5e-3)
 
 
+@pytest.mark.parametrize(
+    ("firmware", "name", "known"),
+    [
+        ("Betaflight 4.2.11 (948ba6339)", "vbatLatest", True),
+        ("Betaflight 3.0.1", "vbatLatest", False),
+        ("INAV 7.1", "vbat", True),
+    ],
+)
+def test_the_voltage_is_read_if_its_unit_is_known(firmware, name, known, save):
+    columns = recorded(T) | {name: np.rint(1650 - 20 * T).astype(int)}
+    flight, _ = read_log(save(bbl(columns, settings={"acc_1G": 2048, "Firmware revision": firmware})))
+    assert (flight.voltage is not None) == known
+    if known:
+        np.testing.assert_allclose(flight.voltage, 16.5 - 0.2 * T, atol=0.006)
+
+
 def test_sessions_follow_each_other(save):
     columns = recorded(T)
     flight, notes = read_log(save(bbl(columns) + b"\xff" * 99 + bbl(columns, end=False)))
@@ -406,6 +422,19 @@ BAD = {
     "settings above": ('"acc_1G","2048"\n' + "\n".join(LINES[:5]) + "\n1,2", "row 7"),
     "too fast": (blackbox_csv(recorded(T[:50], scale=200)), "beyond 60 rad/s; its unit is not the one"),
 }
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "sessions"), [("btfl_001.bbl", 24991, 2), ("btfl_002.bbl", 66640, 1), ("LOG00037.BFL", 16774, 1)]
+)
+def test_real_logs(name, rows, sessions, shared_flights):
+    """The number of frames is that of another decoder."""
+    flight, notes = read_log(shared_flights / "betaflight" / f"fc_{name}", full_scale=1.0)
+    assert any(f"{rows} rows were resampled" in note for note in notes)
+    assert any(f"{sessions} sessions" in note for note in notes) == (sessions > 1)
+    size = np.linalg.norm(np.asarray(flight.specific_force), axis=1)
+    assert np.nanmedian(size) == pytest.approx(GRAVITY, rel=0.1)
+    assert 3 * 3.5 < float(np.median(flight.voltage)) < 6 * 4.3
 
 
 def test_commands_need_a_full_scale(save):

@@ -87,19 +87,15 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
 
 
 def _print_parts(console: "Console", found: "Inspection") -> None:
-    import rich.box
-    from rich.table import Table
+    from ..report.whole import Listing
 
-    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("from [s]", "to [s]", "use"):
-        table.add_column(heading, justify="left" if heading == "use" else "right", no_wrap=heading != "use")
-    for heading in ("roll", "pitch", "yaw"):
-        table.add_column(heading, no_wrap=True)
+    rows = []
     shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:MOST_PARTS]
     for part in sorted(shown, key=lambda part: part.begin):
         axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
-        table.add_row(f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""]))
-    console.print(table)
+        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
+    headings, numbers = ("from [s]", "to [s]", "use", "roll", "pitch", "yaw"), ("from [s]", "to [s]")
+    Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
     if len(found.parts) > len(shown):
         console.print(f"and {len(found.parts) - len(shown)} shorter parts")
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
