@@ -28,18 +28,18 @@ class Listing(NamedTuple):
 
     def print_on(self, console: Console) -> None:
         """Print the table. Notes are its last column, or lines below it if the terminal is too narrow."""
-        table = self._table(self.rows)
-        longest = max(map(len, self.notes), default=0)
-        if not longest:
-            print_whole(console, table)
-        elif console.width - needed_width(table) > min(longest, _WORDS):
+        if any(self.notes):
             rows = [[*row, note] for row, note in zip(self.rows, self.notes, strict=True)]
-            print_whole(console, self._table(rows, last="note"))
-        else:
-            print_whole(console, table)
-            for row, note in zip(self.rows, self.notes, strict=True):
-                if note:
-                    console.print(f"{row[0]}: {note}", markup=False, highlight=False)
+            table = self._table(rows, last="note")
+            if needed_width(table) <= console.width:
+                print_whole(console, table)
+                return
+        print_whole(console, self._table(self.rows))
+        names: dict[str, list[str]] = {}
+        for row, note in zip(self.rows, self.notes, strict=False):
+            names.setdefault(note, []).append(row[0])
+        for note in filter(None, names):
+            console.print(f"{', '.join(names[note])}: {note}", markup=False, highlight=False)
 
     def _table(self, rows: Sequence[Sequence[str]], *, last: str = "") -> Table:
         table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
