@@ -8,7 +8,7 @@ from test_flight_csv import CRAZYFLIE
 
 from jaxos4.errors import InputError
 from jaxos4.flight import Flight
-from jaxos4.logs import read_log
+from jaxos4.logs import read_log, write_flight
 from jaxos4.recording import Recording, cut, usable_stretches
 from jaxos4.recording.preparation import prepare
 from jaxos4.recording.signs import opposite_axes, opposite_note
@@ -86,6 +86,18 @@ def test_real_flights(name, shared_flights):
     assert opposite_axes(parts, CRAZYFLIE) == []
     assert opposite_axes(parts, turned(CRAZYFLIE, "rotor_spins")) == ["yaw"]
     assert opposite_axes(parts, turned(CRAZYFLIE, "rotor_positions")) == ["roll", "pitch"]
+
+
+def test_inspect_questions_the_spins(run, tmp_path):
+    write_flight(flown(CRAZYFLIE, 0), tmp_path / "flight.csv")
+    lines = [f"{name} = {np.asarray(getattr(CRAZYFLIE, name)).tolist()}" for name in CRAZYFLIE.__dataclass_fields__]
+    good = "\n".join(lines)
+    (tmp_path / "good.toml").write_text(good)
+    (tmp_path / "bad.toml").write_text(good.replace("[1.0, -1.0, 1.0, -1.0]", "[-1, 1, -1, 1]"))
+    assert "answer" not in run("inspect", "flight.csv", "--airframe", "good.toml")[1]
+    code, out, err = run("inspect", "flight.csv", "--airframe", "bad.toml")
+    assert (code, err) == (0, "")
+    assert "cannot identify a vehicle: yaw answers the rotors with the opposite sign" in out
 
 
 def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():
