@@ -5,6 +5,7 @@ import pytest
 from helpers import refused
 from hypothesis import given, settings, strategies as st
 from recorded_logs import FRD, check, crazyflie, force, message, rates, speeds, ulog
+from scipy.signal import butter, lfilter, sosfiltfilt
 from test_flight_csv import CRAZYFLIE
 from test_inspect import VEHICLE
 from test_logs_ulog import (
@@ -23,7 +24,7 @@ from test_logs_ulog import (
 
 from jaxos4.errors import InputError
 from jaxos4.logs import read_log, read_log_and_facts
-from jaxos4.logs.facts import LogFacts, Sampling, logged_rate
+from jaxos4.logs.facts import SLOWEST_RATE, LogFacts, Sampling, logged_rate
 from jaxos4.logs.series import Series, at_rows, gyro_rows
 
 T = 2500.0  # the test airframe's full scale [rad/s]
@@ -325,27 +326,50 @@ def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, 
     assert "identifiable: alpha1" not in out
     result = run("estimate", name, "--model", "flight", "--airframe", "vehicle.toml")
     refused(result, f"jaxos4: {name}: {words}", remedy)
+    assert read_log(save(kind(0.1)), CRAZYFLIE)[1][-1].startswith(words)
     fast = read_log_and_facts(save(kind(0.02)), CRAZYFLIE)[2]
     assert fast.motors == Sampling(REMEDIES[kind][0], pytest.approx(50.0, rel=0.01))
     assert fast.too_slow == ""
 
 
-def test_the_limit_is_what_rotors_need():
-    """A command that was logged at the limit tells a speed; a command at 10 Hz does not."""
-    t, lag = 0.001 * np.arange(20_000), 0.02
-    command = np.cumsum(np.random.default_rng(0).normal(0, 1, t.size)) * 0.001**0.5
-    command -= np.convolve(command, np.ones(500) / 500, mode="same")  # nothing slower than 2 Hz
+def closed_loop(lag, *, seconds=40, delay=0.01, dt=0.001):
+    """Commands and body rate of one axis in closed loop, with unit inertia and gusts."""
+    rng, size = np.random.default_rng(0), round(seconds / dt)
+    wanted = np.repeat(rng.uniform(-3, 3, size // 400 + 1), 400)[:size]
+    gusts = np.zeros(size)
+    kicks = 2.0 * np.sqrt(2 * dt / 0.25) * rng.normal(size=size)
+    command, rate, rotor, integral, gain = np.zeros(size), np.zeros(size), 0.0, 0.0, 1 / (4 * (lag + 0.02))
+    for k in range(1, size):
+        error = wanted[k - 1] - rate[k - 1]
+        integral += error * dt
+        command[k] = gain * (error + integral)
+        rotor += dt / lag * (command[max(k - round(delay / dt), 0)] - rotor)
+        gusts[k] = gusts[k - 1] * (1 - dt / 0.25) + kicks[k]
+        rate[k] = rate[k - 1] + dt * (rotor + gusts[k])
+    return command, rate
 
-    def followed(u):
-        out = np.zeros_like(u)
-        for k in range(1, u.size):
-            out[k] = out[k - 1] + 0.001 / lag * (u[k - 1] - out[k - 1])
-        return out
 
-    true = followed(command)
-    missed = [np.var(followed(command[(np.arange(t.size) // n) * n]) - true) / np.var(true) for n in (25, 100)]
-    assert missed[0] < 0.15
-    assert missed[1] > 0.4
+def identified(command, rate, every, dt=0.001):
+    """1 / inertia from commands of which one in `every` was logged, at the lag and the delay that fit best."""
+    band = butter(2, [1.0, 15.0], btype="band", fs=1 / dt, output="sos")
+    held = command[np.arange(command.size) // every * every]
+    acceleration = sosfiltfilt(band, np.gradient(rate, dt))[1000:-1000]
+    fits = []
+    for lag in (0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.065, 0.08, 0.1):
+        torque = sosfiltfilt(band, lfilter([dt / lag], [1, dt / lag - 1], held))
+        for delay in range(0, 40, 4):
+            moved = np.roll(torque, delay)[1000:-1000]
+            fits.append(((moved @ acceleration) ** 2 / (moved @ moved), moved @ acceleration / (moved @ moved)))
+    return max(fits)[1]
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.08])
+def test_the_limit_of_40_hz_is_what_rotors_with_these_lags_need(lag):
+    flown = closed_loop(lag)
+    best = identified(*flown, 4)
+    assert best == pytest.approx(1, abs=0.15)
+    assert identified(*flown, round(1000 / SLOWEST_RATE)) == pytest.approx(best, rel=0.08)
+    assert identified(*flown, 100) < 0.75 * best  # at 10 Hz
 
 
 # Real logs

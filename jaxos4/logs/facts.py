@@ -9,8 +9,8 @@ SLOWEST_RATE = 40.0
 """The fewest samples a second of motors and gyro that identify a vehicle [Hz].
 
 Rotors follow their commands with a lag of 20 to 80 ms. Commands one lag apart or further tell too little of the speeds
-between them: at 10 Hz, a rotor with a lag of 20 ms has forgotten each command before the next one is logged. At 40 Hz,
-commands are 25 ms apart, and torques are known up to 20 Hz, which holds nearly all that rotors with this lag can do.
+between them. In closed loop, with the lag and delay that fit best, commands at 10 Hz make inertias 1.4 to 2.1 times too
+large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 """
 
 _JITTER = 0.95  # a log at a nominal rate may be this much slower

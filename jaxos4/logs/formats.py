@@ -34,14 +34,17 @@ def read_log(
 
     **Raises:** `InputError`, one line: the file, the place in it, what is wrong and what to do.
     """
-    flight, notes, _ = read_log_and_facts(path, airframe, full_scale=full_scale)
-    return flight, notes
+    flight, notes, facts = read_log_and_facts(path, airframe, full_scale=full_scale)
+    return flight, (*notes, *([facts.too_slow] if facts.too_slow else []))
 
 
 def read_log_and_facts(
     path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...], LogFacts]:
-    """Read a log as `read_log` does, and return also what it says beside the flight, before any resampling."""
+    """Read a log as `read_log` does, and return also what it says beside the flight, before any resampling.
+
+    The rates of logging are in the facts only, and not in the notes.
+    """
     table, notes = log_format(path).read(path)
     flight, more = flight_of(table, airframe, full_scale=full_scale)
     return flight, (*notes, *more), facts_of(table)
