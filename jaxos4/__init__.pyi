@@ -4,6 +4,7 @@ from . import (
     airframe as airframe,
     analysis as analysis,
     bracket as bracket,
+    closed_loop as closed_loop,
     errors as errors,
     estimate as estimate,
     estimators as estimators,
@@ -49,6 +50,11 @@ from .analysis.inertia import InertiaFit as InertiaFit, fit_inertia as fit_inert
 from .analysis.prediction import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
 from .analysis.sandwich import robust_covariance as robust_covariance
 from .bracket import Bracket as Bracket
+from .closed_loop import (
+    ClosedLoop as ClosedLoop,
+    fly_closed_loop as fly_closed_loop,
+    random_references as random_references,
+)
 from .errors import InputError as InputError, TrainingError as TrainingError
 from .estimate import AbstractEstimator as AbstractEstimator, Estimate as Estimate
 from .estimators import (

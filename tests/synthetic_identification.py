@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from jaxos4 import Predictions
+from jaxos4 import AxisResponse, FrequencyResponse, Predictions
 from jaxos4.identification.results import (
     ChannelFit,
     Constant,
@@ -68,9 +68,23 @@ def identified_vehicle(**changes) -> VehicleIdentification:
         "noise": {"p": 0.41},
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
         "predictions": synthetic_predictions(),
+        "response": synthetic_response(),
         "provenance": settings | changes.pop("provenance", {}),
     }
     return VehicleIdentification(**COMMON | given | changes)
+
+
+def synthetic_response() -> FrequencyResponse:
+    """Roll 1.25 times the model, pitch half of it, yaw without a clear response."""
+    frequency = np.arange(1.0, 60.0)
+    coherence = 0.97 / (1 + (frequency / 14) ** 6)
+
+    def axis(ratio: float, share: float) -> AxisResponse:
+        error = np.sqrt((1 - share * coherence) / (share * coherence * 80))
+        flat = np.full(frequency.size, ratio)
+        return AxisResponse(frequency, flat, 0.01 * frequency, share * coherence, error, 2 * error, 41.0)
+
+    return FrequencyResponse(axis(1.25, 1.0), axis(0.5, 0.9), axis(1.0, 0.3))
 
 
 def synthetic_predictions(starts=160) -> Predictions:

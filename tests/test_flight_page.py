@@ -8,12 +8,20 @@ import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
-from synthetic_identification import COLOURED, WHITE, identified_flight, identified_vehicle, synthetic_predictions
+from synthetic_identification import (
+    COLOURED,
+    WHITE,
+    identified_flight,
+    identified_vehicle,
+    synthetic_predictions,
+    synthetic_response,
+)
 
 from jaxos4.identification.results import HeldParameter, RigidBody, Validation
 from jaxos4.report import print_identification, write_flight_page
 from jaxos4.report.figures_prediction import predicted_rates
-from jaxos4.report.style import styles
+from jaxos4.report.figures_response import frequency_responses
+from jaxos4.report.style import drawing, styles
 
 EVIL = "</script><script>alert(1)</script>"
 
@@ -43,6 +51,7 @@ def test_the_page_says_what_was_found(tmp_path):
         "377 starts",
         "0.248 0.73 ± 0.14 0.41 0.400 0.800",
         "0.5 s ahead",
+        "Frequency response Measured angular acceleration over",
         "jaxos4 estimate flight.csv --model flight --report flight.html",
         "t is not uniform",
         "window 0.25",
@@ -69,10 +78,26 @@ def test_the_figure_holds_the_predictions_and_a_band_of_95_percent():
     assert (errors <= half + 1e-9).mean() == pytest.approx(0.95, abs=0.015)
 
 
+def test_the_figure_says_how_strongly_each_axis_answers():
+    found = synthetic_response()
+    with drawing():
+        figure = frequency_responses(found, styles(["ibss"])["ibss"])
+    low, high = found.roll.agreement().interval
+    titles = [panel.get_title(loc="left") for panel in figure.axes[:3]]
+    assert titles[0] == f"roll: 1.25 ({low:.2f} to {high:.2f}) times the model"
+    assert titles[1].startswith("pitch: 0.50 (")
+    assert titles[2] == "yaw: no clear response"
+    for row, values in ((0, found.roll.gain), (3, np.degrees(found.roll.phase)), (6, found.roll.coherence)):
+        np.testing.assert_allclose(figure.axes[row].lines[0].get_ydata(), values)
+    # What is not clear has no band and no strong line.
+    assert not figure.axes[2].collections[0].get_paths()
+    assert np.isnan(np.asarray(figure.axes[2].lines[1].get_ydata(), dtype=float)).all()
+
+
 def test_without_predictions_and_constants_the_page_leaves_them_out(tmp_path):
-    changes = {"predictions": None, "skill": None, "rigid_body": RigidBody()}
+    changes = {"predictions": None, "skill": None, "response": None, "rigid_body": RigidBody()}
     text, said = written(tmp_path / "flight.html", **changes)
-    for words in ("Measured against predicted", "Skill", "Constants"):
+    for words in ("Measured against predicted", "Skill", "Constants", "Frequency response"):
         assert words not in said
     assert len(text) < 100_000
 

@@ -22,7 +22,6 @@ _FEWEST = 4
 # The band in which the model is compared [Hz], and the smallest coherence there. Below, the flight controller's answer
 # to disturbances looks like the vehicle's answer to torque. Above, few vehicles move.
 _LOW, _HIGH, _COHERENT = 4.0, 20.0, 0.6
-_ROUNDING = 1e-9
 # The coherence is averaged over this many frequencies on either side.
 _AROUND = 2
 # Segments overlap by half: the correlation of their spectra, and that of frequencies 0, 1, 2 steps apart (Hann window).
@@ -75,25 +74,20 @@ class AxisResponse(NamedTuple):
         clear = self.clear & np.isfinite(self.error) & (self.frequency >= low) & (self.frequency <= high)
         if not clear.any():
             return Agreement(*[math.nan] * 4)
-        frequency, coherence = self.frequency[clear], self._around[clear]
-        weight = coherence / np.maximum(1 - coherence, _ROUNDING)
-        error = self.error[clear] * weight / weight.sum()
+        frequency, error = self.frequency[clear], self.error[clear]
         apart = np.rint(np.abs(frequency[:, None] - frequency) / self.frequency[0]).astype(int)
         correlation = np.append(_NEIGHBOURS, 0.0)[np.minimum(apart, len(_NEIGHBOURS))]
-        ratio = math.exp(np.average(np.log(self.gain[clear]), weights=weight))
-        return Agreement(ratio, math.sqrt(error @ correlation @ error), float(frequency[0]), float(frequency[-1]))
+        # Without weights: by chance, a gain that is too large comes with a coherence that is too large.
+        ratio = math.exp(np.log(self.gain[clear]).mean())
+        deviation = math.sqrt(error @ correlation @ error) / error.size
+        return Agreement(ratio, deviation, float(frequency[0]), float(frequency[-1]))
 
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
-        """Where the coherence exceeds 0.6, as the mean over five frequencies."""
-        return self._around > _COHERENT
-
-    @property
-    def _around(self) -> Float[np.ndarray, " frequencies"]:
-        """The mean coherence around each frequency. By chance, a high coherence comes with a gain that is too large."""
+        """Where the coherence exceeds 0.6, as the mean over five frequencies: one can pass by chance."""
         kernel, known = np.ones(2 * _AROUND + 1), np.isfinite(self.coherence)
         total, count = (np.convolve(x, kernel)[_AROUND:-_AROUND] for x in (np.where(known, self.coherence, 0.0), known))
-        return np.where(known, total / np.maximum(count, 1), 0.0)
+        return known & (total > _COHERENT * count)
 
 
 class FrequencyResponse(NamedTuple):
@@ -114,7 +108,8 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     **In closed loop** the response is biased where disturbances dominate. The flight controller answers a disturbance
     by torque against it, and the vehicle then seems to answer torque too weakly, or in the other direction, with high
     coherence. This happens at low frequencies, at which the controller is fast enough. Therefore `agreement` begins at
-    4 Hz. Gyro noise that the controller feeds back does the same at high frequencies.
+    4 Hz. Gyro noise that the controller feeds back does the same at high frequencies. A fit of the same flight can have
+    the same bias: a ratio other than 1 shows that the model is wrong, a ratio of 1 does not show that it is right.
 
     **Arguments:** a problem, and the parameters of a fit.
 
@@ -122,7 +117,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     """
     rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
     dt = float(problem.flight.dt)
-    known = ~np.isnan(rates).any(axis=1)
+    known = ~np.isnan(rates.sum(axis=1))
     modelled = np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
     measured = np.diff(rates, axis=0) / dt
     usable = known[1:] & known[:-1] & np.isfinite(modelled).all(axis=1)

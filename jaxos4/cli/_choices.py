@@ -13,6 +13,7 @@ from ..estimators import ESTIMATORS
 Model = StrEnum("Model", list(("published", "corrected")))
 Excitation = StrEnum("Excitation", list(("multisine", "doublet", "3211", "chirp")))
 Method = StrEnum("Method", list(("euler", "rk4", "diffrax")))
+Sensors = StrEnum("Sensors", list(("commands", "speeds")))
 Channels = StrEnum("Channels", list(("rates", "attitude", "all")))
 InitialState = StrEnum("InitialState", ["free", "known"])
 Estimator = StrEnum("Estimator", list(ESTIMATORS))

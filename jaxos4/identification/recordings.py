@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..airframe import Airframe
+from ..analysis.frequency_response import frequency_response
 from ..bracket import Bracket
 from ..errors import InputError
 from ..estimate import AbstractEstimator, Estimate
@@ -88,6 +89,7 @@ def identify_vehicle(
         noise={CHANNEL_NAMES[i]: float(noise[i]) for i in fit.problem.columns},
         skill=skill,
         predictions=predicted,
+        response=frequency_response(fit.problem, estimate.parameters) if fit.answered else None,
         provenance={
             "flights": [recording.name for recording in recordings],
             "validate": None if validate is None else validate.name,

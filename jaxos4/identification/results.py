@@ -5,6 +5,7 @@ from typing import Any, SupportsFloat
 
 import msgspec
 
+from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.identifiability import Identifiability
 from ..analysis.prediction import Predictions
 from ..estimate import Estimate
@@ -167,7 +168,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON."""
-        fields = _fields(self, "rigid_body", "estimate", "problem", "predictions")
+        fields = _fields(self, "rigid_body", "estimate", "problem", "predictions", "response")
         return msgspec.to_builtins(fields | {"constants": self.rigid_body.to_dict()})
 
 
@@ -190,6 +191,8 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False)
     - `noise`: standard deviation of the residuals by channel.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
     - `predictions`: the predictions themselves; not in `to_dict`.
+    - `response`: the frequency response from modelled to measured angular acceleration, with the fitted data; not in
+      `to_dict`. `None` without an answer.
     """
 
     held: dict[str, HeldParameter]
@@ -197,6 +200,7 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False)
     noise: dict[str, float]
     skill: PredictionSkill | None
     predictions: Predictions | None
+    response: FrequencyResponse | None
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):

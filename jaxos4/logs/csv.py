@@ -28,7 +28,7 @@ from .._files import write_atomically
 from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
-from .assemble import COLUMN_NAMES as COLUMN_NAMES, SPEED_NAMES, flight_of
+from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES, flight_of
 from .csv_text import read_table
 from .table import LogFormat, Path, printable
 
@@ -65,10 +65,15 @@ def read_flight_and_notes(
 CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()))
 
 
-def write_flight(flight: Flight, path: Path) -> None:
+def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
     """Write a flight as CSV: `t`, `omega1..4`, and the measured columns of states, specific force and voltage.
 
     Reading the file gives back every bit. If writing fails, an older file at `path` is unchanged.
+
+    **Arguments:**
+
+    - `airframe`: its `max_rotor_speed` turns the rotor speeds of a `commanded` flight into `command1..4`. Without it,
+      the file has `omega1..4`, and a reader takes them for measured speeds.
 
     **Raises:** `InputError` for a batch of flights, or for values that a file cannot contain (an infinity, a rotor
     speed that is not finite); `OSError` if the file cannot be written.
@@ -78,7 +83,10 @@ def write_flight(flight: Flight, path: Path) -> None:
             f"{printable(os.fspath(path))}: one file holds one flight, got a batch of shape {flight.time.shape[:-1]}; "
             "write each flight to its own file."
         )
-    columns = {"t": np.asarray(flight.time), **dict(zip(SPEED_NAMES, np.asarray(flight.omega).T, strict=True))}
+    names, omega = SPEED_NAMES, np.asarray(flight.omega)
+    if flight.commanded and airframe is not None and np.isfinite(airframe.max_rotor_speed):
+        names, omega = COMMAND_NAMES, omega / np.asarray(airframe.max_rotor_speed)
+    columns = {"t": np.asarray(flight.time), **dict(zip(names, omega.T, strict=True))}
     for name, column in columns.items():
         _check_cells(path, name, column, np.isfinite(column))
     measured: dict[str, np.ndarray] = dict(zip(STATE_NAMES, np.asarray(flight.states).T, strict=True))

@@ -29,8 +29,8 @@ class Grid(NamedTuple):
     @classmethod
     def of(cls, inputs: Inputs, battery_voltage: Scalar | None = None) -> "Grid":
         """The grid of a flight's inputs. `battery_voltage`: to which the airframe's rotor speeds belong [V]."""
-        known = inputs.voltage is not None and battery_voltage is not None
-        voltage = inputs.voltage / battery_voltage if known else None
+        voltage = inputs.voltage
+        voltage = None if voltage is None or battery_voltage is None else voltage / battery_voltage
         if inputs.stretches is not None:
             return cls(inputs.dt, *inputs.stretches, voltage)
         zeros = jnp.zeros(inputs.omega.shape[0], dtype=int)

@@ -24,7 +24,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     """
     figure, panels = grid(9, columns=3, width=9.0, height=1.75)
     top = min(_HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
-    drawn, model = [], None
+    shown: list[Artist] = []
     for column, (name, axis) in enumerate(zip(found._fields, found, strict=True)):
         gain, phase, coherence = panels[column::3]
         drawn = _response(gain, axis, axis.gain, axis.gain * np.exp([-axis.half_width, axis.half_width]), look)
@@ -34,6 +34,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
         model = gain.axhline(1.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
         phase.axhline(0.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
         coherence.axhline(0.6, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[1])
+        shown = [*drawn, model]
         gain.set_title(f"{name}: {_said(axis)}")
         gain.set_yscale("log")
         gain.set_ylim(_GAINS)
@@ -50,7 +51,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
     for panel, label in zip(panels[::3], ("gain", "phase [degrees]", "coherence"), strict=True):
         panel.set_ylabel(label)
     labels = ("measured over modelled", "95 %", "coherence below 0.6", "the model")
-    figure.legend([*drawn, model], labels, loc="outside lower left", ncols=4)
+    figure.legend(shown, labels, loc="outside lower left", ncols=4)
     return figure
 
 

@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._files import check_writable, write_atomically
+from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
 from ..identification.results import Constant, PredictionSkill, RateSkill, VehicleIdentification
 from ..results import NINETY_FIVE
 from .figures_prediction import BAND, predicted_rates
+from .figures_response import frequency_responses
 from .inline import Drawing, drawings
 from .numbers import MISSING, plain
 from .page import environment
@@ -58,6 +60,7 @@ def _page(found: VehicleIdentification, title: str) -> str:
             starts=None if found.skill is None else found.skill.starts,
             drawings=() if found.predictions is None else _drawn(found.predictions, provenance["sample_time"], look),
             band=f"{100 * BAND:g}",
+            responses=() if found.response is None else _responses(found.response, look),
             command=provenance.get("command", ""),
             notes=provenance.get("notes", ()),
             provenance=[(name.replace("_", " "), _text(x)) for name, x in provenance.items() if name not in _APART],
@@ -71,6 +74,12 @@ def _drawn(predicted: Predictions, sample_time: float, look: Style) -> tuple[Dra
     with drawing():
         files = [svg(predicted_rates(predicted, sample_time, at, look)) for at in range(len(labels))]
     return drawings(files, labels, chosen, stem="predictions", description="Measured and predicted body rates p, q, r")
+
+
+def _responses(found: FrequencyResponse, look: Style) -> tuple[Drawing, ...]:
+    with drawing():
+        file = svg(frequency_responses(found, look))
+    return drawings([file], [""], 0, stem="response", description="Frequency response of roll, pitch and yaw")
 
 
 def _about(found: VehicleIdentification) -> str:

@@ -1,0 +1,358 @@
+"""`fly_closed_loop`: the physics and the controller against a second implementation in NumPy, gusts, limits, failures.
+
+Unless a test says otherwise: no gusts, no noise.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import refused
+
+import jaxos4
+from jaxos4.closed_loop import fly_standard, ornstein_uhlenbeck
+
+DT, SECONDS = 0.004, 20.0
+SAMPLES = round(SECONDS / DT) + 1
+RATES, ANGLES = [7, 9, 11], [6, 8, 10]
+SUCCESS = jaxos4.RESULTS.successful
+QUIET = {"gyro_noise": 0.0, "attitude_noise": 0.0, "force_noise": 0.0}
+NO_GAINS = {"attitude_gain": 0.0, "rate_gain": 0.0, "integral_gain": 0.0}
+FULL_THRUST, FULL_SPEED = 0.15, 2500.0
+THRUST = FULL_THRUST / FULL_SPEED**2
+CRAZYFLIE = jaxos4.Airframe(
+    mass=0.027,
+    inertia=(1.66e-5, 1.7e-5, 2.9e-5),
+    rotor_positions=[(0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028)],
+    rotor_spins=(1.0, -1.0, 1.0, -1.0),
+    thrust_coefficient=THRUST,
+    drag_coefficient=0.005 * THRUST,
+    rotor_inertia=2e-8,
+    max_rotor_speed=FULL_SPEED,
+)
+VEHICLES = {"crazyflie": CRAZYFLIE, "os4": jaxos4.OS4}
+every_vehicle = pytest.mark.parametrize("airframe", VEHICLES.values(), ids=VEHICLES)
+LEVEL = np.zeros((SAMPLES, 4))
+
+
+def loop_of(airframe=CRAZYFLIE, **settings):
+    return jaxos4.ClosedLoop(airframe, **{**QUIET, **settings})
+
+
+def references(seed=0):
+    return jaxos4.random_references(duration=SECONDS, dt=DT, key=jax.random.key(seed))
+
+
+def fly(loop, wanted=LEVEL, *, seed=1):
+    """All flights have one length, and share one program."""
+    return jaxos4.fly_closed_loop(loop, jnp.asarray(wanted), dt=DT, key=jax.random.key(seed))
+
+
+# The second implementation.
+
+
+def fall_and_turn(motion, speeds, change, v):
+    """The derivative of rates and attitude from Newton and Euler, with one force for each rotor."""
+    airframe = v.airframe
+    (x, y), spin = np.asarray(airframe.rotor_positions).T, np.asarray(airframe.rotor_spins)
+    inertia, rotor = np.asarray(airframe.inertia), float(airframe.rotor_inertia)
+    force = float(airframe.thrust_coefficient) * speeds**2
+    yaw = -float(airframe.drag_coefficient) * spin @ speeds**2 - rotor * spin @ change
+    rate, (phi, theta, _) = motion[:3], motion[3:]
+    momentum = inertia * rate + [0, 0, rotor * spin @ speeds]
+    turning = (np.array([y @ force, -x @ force, yaw]) - np.cross(rate, momentum)) / inertia
+    turning += np.asarray(v.offset) - np.asarray(v.damping) * rate
+    across = rate[1] * np.sin(phi) + rate[2] * np.cos(phi)
+    along = rate[1] * np.cos(phi) - rate[2] * np.sin(phi)
+    return np.array([*turning, rate[0] + np.tan(theta) * across, along, across / np.cos(theta)])
+
+
+def reference_motion(v, omega, samples, fine=25):
+    """Rates and attitude at each sample, and mean rotor speeds over it, from the commands: small midpoint steps."""
+    h, lag, delay = DT / fine, float(v.rotor_lag), float(v.rotor_delay)
+    weight = float(v.airframe.mass * v.airframe.gravity)
+    hover = np.sqrt(np.linalg.solve(np.asarray(v.airframe.mixer), [0, 0, 0, weight]))
+    motion, speeds, motions, means = np.zeros(6), hover, [], []
+    for k in range(samples):
+        motions.append(motion)
+        sums = np.zeros(4)
+        for j in range(fine):
+            row = int(np.floor(k + (j + 0.5) / fine - delay / DT))
+            u = omega[row] if row >= 0 else hover
+            after = u + (speeds - u) * np.exp(-h / lag)
+            middle = u + (speeds - u) * np.exp(-h / 2 / lag)
+            change = (after - speeds) / h
+            half = motion + h / 2 * fall_and_turn(motion, speeds, change, v)
+            motion = motion + h * fall_and_turn(half, middle, change, v)
+            sums += (speeds + after) / 2
+            speeds = after
+        means.append(sums / fine)
+    return np.array(motions), np.array(means)
+
+
+def reference_commands(v, measured, wanted, inertia):
+    """The commands of the controller, from what it measured."""
+    mass, gravity, full = (float(getattr(v.airframe, n)) for n in ("mass", "gravity", "max_rotor_speed"))
+    integral, rows = np.zeros(3), []
+    for rates, angles, reference in zip(measured[:, RATES], measured[:, ANGLES], wanted, strict=True):
+        error = np.asarray(v.attitude_gain) * (reference[:3] - angles) - rates
+        torque = inertia * (np.asarray(v.rate_gain) * error + integral)
+        thrust = mass * (gravity + reference[3]) / max(np.cos(angles[0]) * np.cos(angles[1]), 0.5)
+        squares = np.linalg.inv(np.asarray(v.airframe.mixer)) @ [*torque, thrust]
+        rows.append(np.sqrt(np.clip(squares, 0, full**2)))
+        if (squares >= 0).all() and (squares <= full**2).all():
+            integral = integral + DT * np.asarray(v.integral_gain) * error
+    return np.array(rows)
+
+
+@pytest.fixture(scope="module")
+def rough():
+    """A flight with everything that the second implementation knows; the delay is 2.7 samples."""
+    inertia = 1.25 * np.asarray(CRAZYFLIE.inertia)
+    return loop_of(
+        **{"rotor_lag": 0.04, "rotor_delay": 2.7 * DT, "offset": (3.0, -2.0, 1.0), "damping": (1.5, 0.8, 0.4)},
+        controller_inertia=inertia,
+    )
+
+
+def test_the_motion_follows_from_the_commands(rough):
+    flight, samples = fly(rough, references()), 400
+    motion, _ = reference_motion(rough, np.asarray(flight.omega), samples)
+    measured = np.asarray(flight.states)[:samples, RATES + ANGLES]
+    assert np.abs(measured).max(axis=0).min() > 0.03
+    np.testing.assert_allclose(measured, motion, rtol=0, atol=2e-3 * np.abs(motion).max())
+    # The reference sees a delay that is wrong by half a millisecond.
+    wrong = eqx.tree_at(lambda v: v.rotor_delay, rough, rough.rotor_delay + 5e-4)
+    assert np.abs(measured - reference_motion(wrong, np.asarray(flight.omega), samples)[0]).max() > 5e-3 * motion.max()
+
+
+def test_measured_speeds_are_means_over_the_samples(rough):
+    commanded, samples = fly(rough, references()), 200
+    speeds = fly(eqx.tree_at(lambda v: v.rotor_lag, loop_of(logged="speeds"), 0.04), references())
+    assert (commanded.commanded, speeds.commanded) == (True, False)
+    same = loop_of(rotor_lag=0.04)
+    _, means = reference_motion(same, np.asarray(fly(same, references()).omega), samples)
+    np.testing.assert_allclose(np.asarray(speeds.omega)[:samples], means, rtol=1e-5)
+
+
+def test_commands_follow_from_the_measurements(rough):
+    """Also with noise, gusts and saturation, because the log has what the controller saw."""
+    noisy = jaxos4.ClosedLoop(CRAZYFLIE, gust=40.0, controller_inertia=rough.controller_inertia)
+    for loop in (rough, noisy):
+        flight, wanted = fly(loop, references()), np.asarray(references())
+        states = np.asarray(flight.states)
+        expected = reference_commands(loop, states, wanted, np.asarray(rough.controller_inertia))
+        np.testing.assert_allclose(np.asarray(flight.omega), expected, rtol=1e-6, atol=1e-6)
+
+
+# What the vehicle does.
+
+
+@every_vehicle
+def test_hovering_stays_level(airframe):
+    flight = fly(loop_of(airframe))
+    np.testing.assert_allclose(np.asarray(flight.states)[:, RATES + ANGLES], 0, atol=1e-12)
+    np.testing.assert_allclose(np.asarray(flight.omega), float(airframe.hover_speed), rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(flight.specific_force)[:, 2], float(airframe.gravity), rtol=1e-12)
+
+
+@every_vehicle
+def test_it_tracks_its_references_with_a_wrong_inertia_and_an_offset(airframe):
+    time = DT * np.arange(SAMPLES)
+    wanted = np.where(time[:, None] >= [1.0, 2.0, 3.0, 4.0], [0.3, -0.2, 0.4, 1.0], 0.0)
+    for wrong in (0.75, 1.25):
+        inertia = wrong * np.asarray(airframe.inertia)
+        flight = fly(loop_of(airframe, offset=(2.0, -1.0, 0.5), controller_inertia=inertia), wanted)
+        np.testing.assert_allclose(np.asarray(flight.states)[-1, ANGLES], wanted[-1, :3], atol=0.01)
+        vertical = np.asarray(flight.specific_force)[-1, 2] * np.cos(0.3) * np.cos(-0.2) - float(airframe.gravity)
+        np.testing.assert_allclose(vertical, 1.0, atol=0.01)
+
+
+@every_vehicle
+def test_the_standard_flight(airframe):
+    """The vehicle flies through gusts, excites all axes, and its log has what an autopilot's log has."""
+    loop = jaxos4.ClosedLoop(airframe, gust=(5.0, 5.0, 2.0))
+    flight = fly_standard(loop, seed=3)
+    assert flight.result == SUCCESS
+    states, force = np.asarray(flight.states), np.asarray(flight.specific_force)
+    assert np.isnan(np.delete(states, RATES + ANGLES, axis=1)).all()
+    assert (np.std(states[:, RATES], axis=0) > 0.2).all()
+    assert (np.abs(states[:, ANGLES]).max(axis=0) < 1).all()
+    np.testing.assert_allclose(force.std(axis=0)[:2], 0.3, rtol=0.05)
+    # Second differences of the rates are white noise of the gyro and little else.
+    noise = np.diff(states[:, RATES], n=2, axis=0).std(axis=0) / np.sqrt(6)
+    np.testing.assert_allclose(noise, 0.02, rtol=0.1)
+    assert (np.asarray(flight.omega) <= float(airframe.max_rotor_speed)).all()
+
+
+def test_rotors_saturate_at_their_limits():
+    omega = np.asarray(fly(loop_of(gust=40.0)).omega)
+    assert (omega.min(), omega.max()) == (0.0, FULL_SPEED)
+
+
+def test_commands_can_act_at_once():
+    flight = fly(loop_of(rotor_lag=0.0, rotor_delay=0.0), references())
+    assert flight.result == SUCCESS
+    # The specific force at a sample is the thrust of the command before it.
+    thrust = THRUST * np.square(np.asarray(flight.omega)).sum(axis=1) / 0.027
+    np.testing.assert_allclose(np.asarray(flight.specific_force)[1:, 2], thrust[:-1], rtol=1e-12)
+
+
+# Gusts.
+
+
+def test_gusts_have_their_strength_and_their_correlation_time():
+    """A controller without gains answers nothing: the body rates are the integral of the gusts."""
+    strength, duration = np.array([1e-3, 2e-3, 3e-3]), 0.05
+    flight = fly(loop_of(gust=strength, gust_time=duration, thrust_gust=0.5, **NO_GAINS))
+    gust = np.diff(np.asarray(flight.states)[:, RATES], axis=0) / DT
+    force = np.asarray(flight.specific_force)[:, 2] - 9.81
+    # 20 s are 400 correlation times: the variance has a standard error of 7 %.
+    np.testing.assert_allclose(gust.std(axis=0) / strength, 1, atol=0.14)
+    np.testing.assert_allclose(force.std() / 0.5, 1, atol=0.14)
+    for shift in (5, 12, 25):
+        found = (gust[shift:] * gust[:-shift]).mean(axis=0) / gust.var(axis=0)
+        np.testing.assert_allclose(found, np.exp(-shift * DT / duration), atol=0.2)
+
+
+def test_the_process_is_exact():
+    step, count = 0.02, 200_000
+    noise = np.asarray(ornstein_uhlenbeck(jax.random.key(0), count, jnp.asarray(step)))
+    error = np.sqrt(2 / (count * step))  # of a variance
+    np.testing.assert_allclose(noise.var(axis=0), 1, atol=4 * error)
+    assert np.abs(np.corrcoef(noise.T) - np.eye(4)).max() < 4 * error
+    for shift in (1, 50, 100):
+        found = (noise[shift:] * noise[:-shift]).mean(axis=0)
+        np.testing.assert_allclose(found, np.exp(-shift * step), atol=4 * error)
+    # Innovations are white and have the right size.
+    fresh = noise[1:] - np.exp(-step) * noise[:-1]
+    np.testing.assert_allclose(fresh.var(axis=0), -np.expm1(-2 * step), rtol=4 * np.sqrt(2 / count))
+
+
+# Batches and failures.
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    """Four loops: two vehicles, one that pitches over, one whose rates grow without bound."""
+    return [
+        jaxos4.ClosedLoop(CRAZYFLIE, gust=10.0),
+        jaxos4.ClosedLoop(jaxos4.OS4, gust=2.0, rotor_lag=0.02, rotor_delay=0.005),
+        loop_of(offset=(0.0, 2.0, 0.0), **NO_GAINS),
+        loop_of(offset=(1.0, 0.0, 0.0), damping=-1e3, **NO_GAINS),
+    ]
+
+
+def test_a_batch_is_a_loop_and_a_failure_stays_in_its_lane(fleet):
+    single = [fly(loop, references(i), seed=i) for i, loop in enumerate(fleet)]
+    loops = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *fleet)
+    keys = jnp.stack([jax.random.key(i) for i in range(4)])
+    wanted = jnp.stack([references(i) for i in range(4)])
+    together = eqx.filter_vmap(lambda v, r, key: jaxos4.fly_closed_loop(v, r, dt=DT, key=key))(loops, wanted, keys)
+    names = ["successful", "successful", "attitude_singularity", "nonfinite_trajectory"]
+    assert jaxos4.result_names(together.result).tolist() == names
+    for i, alone in enumerate(single):
+        assert jaxos4.result_names(alone.result) == names[i]
+        for field in ("omega", "states", "specific_force"):
+            # The sums of a batch are in another order.
+            found, expected = np.asarray(getattr(together, field))[i], np.asarray(getattr(alone, field))
+            np.testing.assert_allclose(found[:500], expected[:500], rtol=1e-6, atol=1e-9)
+    for i in (2, 3):
+        states, omega = np.asarray(together.states)[i][:, RATES + ANGLES], np.asarray(together.omega)[i]
+        failed = np.isnan(states).any(axis=1)
+        assert failed.any()
+        first = int(np.argmax(failed))
+        assert failed[first:].all()
+        assert (omega[first:] == 0).all()
+        assert np.isfinite(omega).all()
+
+
+def test_the_key_determines_the_flight():
+    loop = jaxos4.ClosedLoop(CRAZYFLIE, gust=5.0)
+    one, same, other = (np.asarray(fly(loop, seed=seed).states)[:, RATES] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert np.abs(one - other).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("settings", "fragment"),
+    [
+        ({"gust": -1.0}, "`gust`"),
+        ({"gust": (1.0, 2.0)}, r"`gust`.*\(2,\)"),
+        ({"gust": np.nan}, "`gust`"),
+        ({"rotor_lag": -0.1}, "`rotor_lag`"),
+        ({"gust_time": np.array([0.1, 0.2])}, "`gust_time`"),
+        ({"offset": np.inf}, "`offset`"),
+        ({"controller_inertia": -1.0}, "`controller_inertia`"),
+        ({"logged": "both"}, "`logged`.*'both'"),
+    ],
+)
+def test_wrong_settings_are_named(settings, fragment):
+    with pytest.raises(ValueError, match=fragment):
+        jaxos4.ClosedLoop(CRAZYFLIE, **settings)
+
+
+def test_wrong_arguments_are_named():
+    key = jax.random.key(0)
+    with pytest.raises(ValueError, match="`references`"):
+        jaxos4.fly_closed_loop(loop_of(), jnp.zeros((1, 4)), key=key)
+    with pytest.raises(ValueError, match="`dt`"):
+        jaxos4.fly_closed_loop(loop_of(), jnp.zeros((5, 4)), dt=0.0, key=key)
+    with pytest.raises(ValueError, match="`substeps`"):
+        jaxos4.fly_closed_loop(loop_of(), jnp.zeros((5, 4)), key=key, substeps=0)
+    for wrong in ({"duration": 0.0}, {"hold": -1.0}, {"amplitude": (1.0,)}):
+        with pytest.raises(ValueError, match=f"`{next(iter(wrong))}`"):
+            jaxos4.random_references(**wrong, key=key)
+
+
+# The command line.
+
+AIRFRAME = """
+mass = 0.027
+inertia = [1.66e-5, 1.7e-5, 2.9e-5]
+rotor_positions = [[0.028, -0.028], [-0.028, -0.028], [-0.028, 0.028], [0.028, 0.028]]
+thrust_coefficient = 2.4e-8
+drag_coefficient = 1.2e-10
+rotor_inertia = 2e-8
+max_rotor_speed = 2500.0
+"""
+
+
+def test_simulate_writes_what_estimate_reads(run, tmp_path):
+    (tmp_path / "crazyflie.toml").write_text(AIRFRAME)
+    code, out, err = run("simulate", "--closed-loop", "--airframe", "crazyflie.toml", "--out", "a.csv")
+    assert (code, err) == (0, "")
+    assert "5001 samples of 0.004 s, closed loop, commands, gusts of 5 rad/s^2" in " ".join(out.split())
+    airframe = jaxos4.load_airframe(tmp_path / "crazyflie.toml")
+    flight = jaxos4.read_flight(tmp_path / "a.csv", airframe)
+    assert flight.commanded
+    expected = fly_standard(jaxos4.ClosedLoop(airframe, gust=5.0), seed=0)
+    np.testing.assert_allclose(flight.omega, expected.omega, rtol=1e-12)
+    np.testing.assert_array_equal(flight.states, expected.states)
+    np.testing.assert_array_equal(flight.specific_force, expected.specific_force)
+    # An airframe without a largest speed has a log of speeds.
+    code, out, _ = run("simulate", "--closed-loop", "--out", "b.csv", "--gust", "2")
+    assert (code, "speeds" in out) == (0, True)
+    assert not jaxos4.read_flight(tmp_path / "b.csv").commanded
+
+
+@pytest.mark.parametrize(
+    ("options", "fragments"),
+    [
+        (["--closed-loop", "--gust", "-1"], ["--gust"]),
+        (["--closed-loop", "--lag", "nan"], ["--lag"]),
+        (["--closed-loop", "--delay", "5"], ["--delay"]),
+        (["--closed-loop", "--duration", "-1"], ["duration"]),
+        (["--closed-loop", "--dt", "0"], ["dt"]),
+        (["--closed-loop", "--duration", "0.001"], ["at least two samples"]),
+        (["--closed-loop", "--sensors", "commands"], ["--sensors", "os4", "max_rotor_speed"]),
+        (["--closed-loop", "--excitation", "chirp"], ["--excitation", "leave it out"]),
+        (["--closed-loop", "--noise", "1"], ["--noise", "leave it out"]),
+        (["--gust", "3"], ["--gust", "--closed-loop"]),
+        (["--sensors", "speeds"], ["--sensors", "--closed-loop"]),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(run, tmp_path, options, fragments):
+    refused(run("simulate", "--out", "new.csv", *options), *fragments)
+    assert not list(tmp_path.iterdir())
