@@ -24,7 +24,7 @@ from test_flight_csv import CRAZYFLIE
 from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.logs import log_format, read_log
-from jaxos4.logs.blackbox_frames import _GROUPS, _Stream
+from jaxos4.logs.blackbox_numbers import Numbers
 from jaxos4.recording import usable_stretches
 
 RATES = ("p", "q", "r")
@@ -276,9 +276,9 @@ VALUES = st.one_of(st.integers(-3, 3), st.integers(-40, 40), st.integers(-(2**15
 def test_each_encoding_comes_back(values):
     whole = {6: values, 7: values[:3], 8: values[:4], 10: values[:3]}
     for encoding, numbers in whole.items():
-        stream = object.__new__(_Stream)
-        stream.data, stream.at = WRITERS[encoding][0](numbers), 0
-        assert _GROUPS[encoding](stream, len(numbers)) == numbers
+        stream, found = Numbers(WRITERS[encoding][0](numbers)), []
+        stream.read(encoding, len(numbers), found)
+        assert found == numbers
         assert stream.at == len(stream.data)
 
 

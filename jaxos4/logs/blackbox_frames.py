@@ -15,6 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .blackbox_numbers import TAG8_4, TOGETHER, Numbers
+
 _TIME, _ITERATION = "time", "loopIteration"
 _MARKER = re.compile(rb"[IPSGHE]")
 _LONGEST_FRAME = 1024  # bytes
@@ -23,11 +25,8 @@ _FARTHEST, _MOST_ITERATIONS = 10_000_000, 5000  # [us], from one frame to the ne
 _AT_ONCE = 4096  # rows
 _END = b"End of log"
 
-(_SIGNED, _UNSIGNED, _NEGATIVE_14, _TAG8, _TAG2_3, _TAG8_4, _NULL, _TAG2_3_VARIABLE) = (0, 1, 3, 6, 7, 8, 9, 10)
-(_PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT, _1500, _VBATREF, _MINMOTOR) = (
-    *(1, 2, 3, 4, 5, 6),
-    *(8, 9, 11),
-)
+(_PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT) = range(1, 7)
+(_1500, _VBATREF, _MINMOTOR) = (8, 9, 11)
 
 
 class BadHeader(Exception):
@@ -100,15 +99,14 @@ def _kind(settings: dict[str, str], letter: str) -> _Kind | None:
     if letter != "P" and len(names) != len(encodings):
         raise BadHeader("its header is damaged")
     groups: list[tuple[int, int]] = []
-    most = {_TAG8: 8, _TAG2_3: 3, _TAG8_4: 4, _TAG2_3_VARIABLE: 3}
     for encoding in encodings:
-        if encoding not in (_SIGNED, _UNSIGNED, _NEGATIVE_14, _TAG8, _TAG2_3, _TAG8_4, _NULL, _TAG2_3_VARIABLE):
+        if encoding not in TOGETHER:
             raise BadHeader(f"its frames have an encoding that is not known, {encoding}")
-        if groups and groups[-1][0] == encoding and groups[-1][1] < most.get(encoding, _MOST_FIELDS):
+        if groups and groups[-1][0] == encoding and groups[-1][1] < TOGETHER[encoding]:
             groups[-1] = (encoding, groups[-1][1] + 1)
         else:
             groups.append((encoding, 1))
-    if _TAG8_4 in encodings and settings.get("Data version", "2") != "2":
+    if TAG8_4 in encodings and settings.get("Data version", "2") != "2":
         raise BadHeader("its frames are of version 1")
     return _Kind(names, groups, predictors)
 
@@ -174,11 +172,12 @@ class _Predictor:
 
 
 class _Stream:
-    """The frames of a session in order. `at`: the number of bytes read."""
+    """The frames of a session in order."""
 
     def __init__(self, data: bytes, kinds: dict[str, _Kind], predictor: _Predictor):
         self.data, self.kinds, self.predictor = data, {ord(letter): kind for letter, kind in kinds.items()}, predictor
-        self.at, self.damaged, self.ended = 0, 0, False
+        self.numbers = Numbers(data)
+        self.damaged, self.ended = 0, False
         self.time, self.iteration = kinds["I"].names.index(_TIME), kinds["I"].names.index(_ITERATION)
         self.last: tuple[int, int] | None = None  # iteration and time of the last frame
 
@@ -190,17 +189,17 @@ class _Stream:
         data, size = self.data, len(self.data)
         block: list[list[int]] = []  # a complete frame, and the differences after it
         intact = False  # no difference can be trusted before the first complete frame
-        while self.at < size and not self.ended:
-            begin, letter = self.at, data[self.at]
-            self.at += 1
+        while self.numbers.at < size and not self.ended:
+            begin, letter = self.numbers.at, data[self.numbers.at]
+            self.numbers.at += 1
             try:
                 values = self._values(letter)
             except IndexError:  # the end of the data, in the middle of a frame
                 values = None
-            whole = self.at == size or self.ended or _MARKER.match(data, self.at) is not None
-            if values is None or self.at - begin > _LONGEST_FRAME or not whole:
+            whole = self.numbers.at == size or self.ended or _MARKER.match(data, self.numbers.at) is not None
+            if values is None or self.numbers.at - begin > _LONGEST_FRAME or not whole:
                 following = _MARKER.search(data, begin + 1)
-                self.at = following.start() if following else size
+                self.numbers.at = following.start() if following else size
                 self.damaged += intact or not block
                 intact = False
             elif letter == _I:
@@ -246,144 +245,28 @@ class _Stream:
             return None
         values: list[int] = []
         for encoding, count in kind.groups:
-            if encoding == _SIGNED or (encoding == _TAG8 and count == 1):
-                self._signed(count, values)
-            elif encoding == _UNSIGNED:
-                self._unsigned(count, values)
-            elif encoding == _NULL:
-                values += [0] * count
-            else:
-                values += _GROUPS[encoding](self, count)[:count]
+            self.numbers.read(encoding, count, values)
         return values
 
     def _event(self) -> list[int] | None:
         """Skip an event; `None` if it is not known."""
-        event, values = self._byte(), []
+        event, values = self.numbers.byte(), []
         if event == 255:
-            self.ended = self.data.startswith(_END, self.at)
+            self.ended = self.data.startswith(_END, self.numbers.at)
             return [] if self.ended else None
         if event == 13:  # an adjustment, of a whole number or of a real one
-            if self._byte() & 0x80:
-                self.at += 4
+            if self.numbers.byte() & 0x80:
+                self.numbers.at += 4
             else:
-                self._unsigned(1, values)
+                self.numbers.unsigned(1, values)
         elif event in _EVENTS:
-            self._unsigned(_EVENTS[event], values)
+            self.numbers.unsigned(_EVENTS[event], values)
         else:
             return None
         if event == 14:  # logging goes on after a pause
             self.last = None
         return values
 
-    def _byte(self) -> int:
-        self.at += 1
-        return self.data[self.at - 1]
-
-    def _unsigned(self, count: int, values: list[int]) -> None:
-        """Seven bits a byte, the lowest first; the eighth says that another byte follows."""
-        data, at = self.data, self.at
-        for _ in range(count):
-            byte = data[at]
-            at += 1
-            value, shift = byte & 0x7F, 7
-            while byte & 0x80 and shift < 35:
-                byte = data[at]
-                at += 1
-                value |= (byte & 0x7F) << shift
-                shift += 7
-            values.append(value)
-        self.at = at
-
-    def _signed(self, count: int, values: list[int]) -> None:
-        """The same, with the sign in the lowest bit."""
-        begin = len(values)
-        self._unsigned(count, values)
-        for i in range(begin, len(values)):
-            values[i] = (values[i] >> 1) ^ -(values[i] & 1)
-
-    def _negative_14(self, count: int) -> list[int]:
-        values: list[int] = []
-        self._unsigned(count, values)
-        return [-_extended(value, 14) for value in values]
-
-    def _tag8(self, count: int) -> list[int]:
-        """A byte says which of up to eight numbers are not 0."""
-        header, values = self._byte(), []
-        for i in range(count):
-            if header >> i & 1:
-                self._signed(1, values)
-            else:
-                values.append(0)
-        return values
-
-    def _tag2_3(self, _: int) -> list[int]:
-        """Three numbers of 2, 4 or 6 bits, or of whole bytes."""
-        lead = self._byte()
-        width = lead >> 6
-        if width == 0:
-            return [_extended(lead >> shift, 2) for shift in (4, 2, 0)]
-        if width == 1:
-            second = self._byte()
-            return [_extended(value, 4) for value in (lead, second >> 4, second)]
-        if width == 2:
-            return [_extended(value, 6) for value in (lead, self._byte(), self._byte())]
-        return self._of_bytes(lead)
-
-    def _tag2_3_variable(self, _: int) -> list[int]:
-        """Three numbers of 2, of 5, 5, 4, or of 8, 7, 7 bits, or of whole bytes."""
-        lead = self._byte()
-        width = lead >> 6
-        if width == 0:
-            return [_extended(lead >> shift, 2) for shift in (4, 2, 0)]
-        if width == 3:
-            return self._of_bytes(lead)
-        bits = lead & 0x3F
-        for _ in range(width):
-            bits = bits << 8 | self._byte()
-        if width == 1:
-            return [_extended(bits >> 9, 5), _extended(bits >> 4, 5), _extended(bits, 4)]
-        return [_extended(bits >> 14, 8), _extended(bits >> 7, 7), _extended(bits, 7)]
-
-    def _of_bytes(self, lead: int) -> list[int]:
-        """Three numbers of one to four bytes each, the lowest byte first."""
-        values = []
-        for shift in (0, 2, 4):
-            length = (lead >> shift & 3) + 1
-            values.append(_extended(int.from_bytes(self._bytes(length), "little"), 8 * length))
-        return values
-
-    def _bytes(self, length: int) -> bytes:
-        self.at += length
-        if self.at > len(self.data):
-            raise IndexError
-        return self.data[self.at - length : self.at]
-
-    def _tag8_4(self, _: int) -> list[int]:
-        """Four numbers of 0, 4, 8 or 16 bits, in a row of half bytes."""
-        header, values = self._byte(), []
-        bits = held = 0
-        for i in range(4):
-            width = (0, 4, 8, 16)[header >> 2 * i & 3]
-            while held < width:
-                bits, held = bits << 8 | self._byte(), held + 8
-            held -= width
-            values.append(_extended(bits >> held, width) if width else 0)
-            bits &= (1 << held) - 1
-        return values
-
 
 _I, _P, _E = b"IPE"
 _EVENTS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}  # event: how many numbers it has
-_GROUPS = {
-    _NEGATIVE_14: _Stream._negative_14,
-    _TAG8: _Stream._tag8,
-    _TAG2_3: _Stream._tag2_3,
-    _TAG8_4: _Stream._tag8_4,
-    _TAG2_3_VARIABLE: _Stream._tag2_3_variable,
-}
-
-
-def _extended(value: int, bits: int) -> int:
-    """The lowest `bits` as a signed number."""
-    value &= (1 << bits) - 1
-    return value - (1 << bits) if value >> (bits - 1) else value
