@@ -71,7 +71,7 @@ def test_events_of_other_rates_and_a_quaternion(save):
         ("gyros", GYRO, T, sensors(T)),
         ("estimate", [f"stateEstimate.q{axis}(f)" for axis in "xyzw"] + ["stateEstimate.z(e)"], slow,
          np.column_stack([q, position(slow)[:, 2]])),
-        ("motors", MOTORS + ["pm.vbat(f)"], commands, np.column_stack([ratios(commands), np.full(commands.size, 4.0)])),
+        ("motors", MOTORS + ["pm.vbat(f)"], commands, np.column_stack([ratios(commands), 4.0 - 0.1 * commands])),
         ("never", ["a.b(B)"], np.zeros(0), np.zeros((0, 1))),
     ]  # fmt: skip
     flight, notes = read_log(save(crazyflie(events)), CRAZYFLIE)
@@ -81,8 +81,21 @@ def test_events_of_other_rates_and_a_quaternion(save):
         flight.omega, 2500 * ratios(np.asarray(flight.time) + 3.0) / 65535, atol=2500 * 0.05 * 2 * 0.008
     )
     assert any("motor.m1" in note for note in notes)
+    np.testing.assert_allclose(flight.voltage, 4.0 - 0.1 * (np.asarray(flight.time) + 3.0), atol=1e-3)
     with pytest.raises(InputError, match=r"field motor\.m1: the rotor speed of full command is not known"):
         read_log(save(crazyflie(events)))
+
+
+def test_measured_speeds_are_used_before_commands(save):
+    """In whatever event, and however often, they are logged."""
+    slow = T[::4]
+    events = [
+        ("motors", GYRO + MOTORS, T, np.column_stack([sensors(T), ratios(T)])),
+        ("speeds", RPMS, slow, np.rint(speeds(slow) / RPM)),
+    ]
+    flight, _ = read_log(save(crazyflie(events)), CRAZYFLIE)
+    assert not flight.commanded
+    np.testing.assert_allclose(flight.omega, speeds(np.asarray(flight.time) + 3.002), atol=1.0)
 
 
 def test_a_log_cut_by_a_loss_of_power_is_read_to_there(save):

@@ -11,7 +11,7 @@ from jaxos4.flight import Flight
 from jaxos4.logs import read_log
 from jaxos4.recording import stretches
 from jaxos4.recording.excited import excitation, gyro_noise
-from jaxos4.recording.usable import Stretch, cut, usable_stretches
+from jaxos4.recording.usable import Stretch, cut, nothing_usable, usable_stretches
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)
@@ -125,6 +125,88 @@ def test_a_bump_in_flight_is_no_crash():
     assert reasons(Flight(time, omega, states, force))[-1][2] == "an impact"
 
 
+# Ground and flight by the accelerometer
+
+
+def wandering(seed, *, dt=0.01, seconds=20.0, change=0.35):
+    """Time, commands whose thrust wanders slowly, and their thrust as a share of its mean."""
+    rng = np.random.default_rng(seed)
+    time = dt * np.arange(round(seconds / dt))
+    collective = sum(np.sin(2 * np.pi * f * time + rng.uniform(0, 6)) for f in (0.3, 0.7, 1.1)) / 3
+    turn = 0.05 * np.sin(2 * np.pi * 2.3 * time + rng.uniform(0, 6))[:, None] * [1, -1, 1, -1]
+    command = (1 + change * collective)[:, None] + turn + rng.normal(0, 0.02, (time.size, 4))
+    thrust = (command**2).sum(axis=1)
+    return time, command, thrust / thrust.mean()
+
+
+def sensed(time, vertical, seed, *, tilt=(0.0, 0.0)):
+    """States with a moving gyro, and the specific force with vibration."""
+    rng = np.random.default_rng(seed)
+    states = np.full((time.size, 12), np.nan)
+    states[:, [P, Q, R]] = rng.normal(0, 0.02, (time.size, 3)) + 0.4 * np.sin(7 * time)[:, None]
+    force = np.column_stack([np.full(time.size, tilt[0]), np.full(time.size, tilt[1]), vertical])
+    return states, force + rng.normal(0, 0.5, force.shape)
+
+
+@given(seed=st.integers(0, 99), size=st.floats(0.15, 0.6), gain=st.floats(0.5, 1.5), commanded=st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_the_accelerometer_tells_ground_from_flight(seed, size, gain, commanded):
+    """The same rotors: in flight the vertical force follows the thrust, on the ground it does not."""
+    time, command, thrust = wandering(seed)
+    for flying in (True, False):
+        vertical = 9.81 * (1 + gain * (thrust - 1)) if flying else np.full(time.size, 9.81)
+        states, force = sensed(time, vertical, seed)
+        flight = Flight(time, size * command, states, force, commanded=commanded)
+        usable = usable_stretches(flight)
+        if flying:
+            assert [(part.begin, part.end) for part in usable] == [(0.0, pytest.approx(time[-1]))]
+        else:
+            assert usable == ()
+            assert "the vehicle never flew" in nothing_usable(stretches(flight))
+
+
+@given(seed=st.integers(0, 99))
+@settings(max_examples=20, deadline=None)
+def test_steady_thrust_proves_nothing(seed):
+    """A hover with constant thrust, and an accelerometer that repeats one value, are left alone."""
+    time, command, thrust = wandering(seed, change=0.03)
+    states, force = sensed(time, np.full(time.size, 9.81), seed)
+    assert len(usable_stretches(Flight(time, 0.5 * command, states, force))) == 1
+    time, command, thrust = wandering(seed)
+    assert len(usable_stretches(Flight(time, 0.5 * command, states, np.full_like(force, 9.81)))) == 1
+
+
+def test_the_ground_before_a_flight_is_left_out():
+    time, command, thrust = wandering(3, seconds=40)
+    on_ground = time < 15
+    states, force = sensed(time, np.where(on_ground, 9.81, 9.81 * thrust), 3)
+    (usable,) = usable_stretches(Flight(time, 0.5 * command, states, force))
+    assert usable.begin == pytest.approx(15, abs=1.5)
+    assert usable.end == pytest.approx(40, abs=0.1)
+
+
+def test_a_vehicle_on_its_side_is_left_out():
+    time, command, _ = wandering(1, change=0.0)
+    states, force = sensed(time, np.full(time.size, 9.81), 1)
+    crashed = time > 12
+    force[crashed] = [9.0, 2.5, 2.0] + np.random.default_rng(0).normal(0, 0.05, (crashed.sum(), 3))
+    states[np.ix_(crashed, [P, Q, R])] *= 0.01
+    (usable,) = usable_stretches(Flight(time, 0.5 * command, states, force))
+    assert usable.end == pytest.approx(12, abs=0.2)
+
+
+@pytest.mark.parametrize(("command", "flies"), [(0.05, False), (0.1, False), (0.15, True), (0.4, True)])
+def test_idle_commands_are_no_flight(command, flies):
+    time, commands, _ = wandering(2, change=0.05)
+    states, _ = sensed(time, np.full(time.size, 9.81), 2)
+    flight = Flight(time, command * commands, states, commanded=True)
+    assert bool(usable_stretches(flight)) == flies
+    scaled = Flight(time, 2500 * command * commands, states, commanded=True)
+    assert bool(usable_stretches(scaled, CRAZYFLIE)) == flies
+    measured = Flight(time, command * commands, states)  # speeds have no full scale
+    assert usable_stretches(measured)
+
+
 def test_short_parts_between_others_are_left_out():
     parts = hovering(rest=((5, 5.3), (6, 6.3)))
     found = reasons(flight_of(parts))
@@ -232,3 +314,13 @@ def test_real_flights(name, usable, axes, shared_flights):
     assert tuple(each.verdict for each in found) == axes
     bare, _ = read_log(shared_flights / f"arpl_crazyflie_{name}.csv", full_scale=1.0)
     assert len(usable_stretches(bare)) == len(kept)
+
+
+@pytest.mark.parametrize(("name", "usable"), [("001.bbl", 0.0), ("002.bbl", 0.7), ("LOG00037.BFL", 0.9)])
+def test_real_flights_of_betaflight(name, usable, shared_flights):
+    """The second session of the first was carried by hand, with idle throttle."""
+    path = shared_flights / "betaflight" / f"fc_{name if name[0] == 'L' else 'btfl_' + name}"
+    flight, _ = read_log(path, full_scale=1.0)
+    kept = sum(part.length for part in usable_stretches(flight))
+    duration = float(flight.time[-1] - flight.time[0])
+    assert kept == 0 if usable == 0 else kept > usable * duration

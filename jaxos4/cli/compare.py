@@ -24,13 +24,14 @@ def compare(
 
         from ..report import error_table, write_report
         from ..report.progress import count_outcomes, run_with_bar
+        from ..report.whole import print_whole
         from ..study import comparison, use_all_cores
 
     use_all_cores()
     wanted, folder = (comparison.QUICK, "comparison-quick") if quick else (comparison.STANDARD, "comparison")
     directory = Path(folder) if out is None else out
     dataset = run_with_bar(wanted, directory)
-    Console(highlight=False).print(error_table(dataset))
+    print_whole(Console(highlight=False), error_table(dataset))
     with stages("drawing"):
         page, *_ = write_report(dataset, directory, with_pdf=not quick)
     typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")

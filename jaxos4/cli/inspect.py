@@ -27,7 +27,7 @@ CHANNELS = (
 
 
 def inspect(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox CSV or Crazyflie.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox or Crazyflie.")],
     airframe: Annotated[
         str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
     ] = None,
@@ -87,38 +87,27 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
 
 
 def _print_parts(console: "Console", found: "Inspection") -> None:
-    import rich.box
-    from rich.table import Table
+    from ..report.whole import Listing
 
-    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("from [s]", "to [s]", "use"):
-        table.add_column(heading, justify="left" if heading == "use" else "right", no_wrap=heading != "use")
-    for heading in ("roll", "pitch", "yaw"):
-        table.add_column(heading, no_wrap=True)
+    rows = []
     shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:MOST_PARTS]
     for part in sorted(shown, key=lambda part: part.begin):
         axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
-        table.add_row(f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""]))
-    console.print(table)
+        rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
+    headings, numbers = ("from [s]", "to [s]", "use", "roll", "pitch", "yaw"), ("from [s]", "to [s]")
+    Listing(headings, rows, numbers, wraps=("use",)).print_on(console)
     if len(found.parts) > len(shown):
         console.print(f"and {len(found.parts) - len(shown)} shorter parts")
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
 
 
 def _print_identifiable(console: "Console", found: "IdentifiableParameters") -> None:
-    noise = ", ".join(f"{name} {sigma:.2g}" for name, sigma in found.sigma.items())
     console.print(
-        f"Identifiable from the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model "
-        f"and noise [rad/s] {noise}. Real errors are larger if the vehicle does something that the model lacks."
+        f"From the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model (how well: see "
+        "jaxos4 estimate):"
     )
-    errors = {
-        name: f"{100 * row.bound / abs(row.airframe):.2g} %"
-        if abs(row.airframe) > 3 * row.bound
-        else f"{row.bound:.2g}"
-        for name, row in found.parameters.items()
-        if not row.note and row.bound is not None
-    }
-    console.print(f"  identifiable: {', '.join(f'{name} to {error}' for name, error in errors.items()) or 'nothing'}")
+    names = [name for name, row in found.parameters.items() if row.identifiable]
+    console.print(f"  identifiable: {', '.join(names) or 'nothing'}")
     for name, row in found.parameters.items():
         if row.note:
             console.print(f"  {name}: {row.note}")

@@ -1,4 +1,4 @@
-"""Blackbox logs of Betaflight and INAV, as CSV: from `blackbox_decode`, or exported by Blackbox Explorer.
+"""Blackbox logs of Betaflight and INAV: `.bbl` and `.BFL` files, or CSV of `blackbox_decode` or Blackbox Explorer.
 
 | column | column of the log | unit in the log |
 | --- | --- | --- |
@@ -7,6 +7,7 @@
 | `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g, or as named: `(g)`, `(m/s2)` |
 | `omega1..4` | `eRPM[0..3]`, measured | 100 electrical revolutions a minute |
 | `command1..4` | `motor[0..3]`, if there is no `eRPM` | DShot 48..2047, or PWM 1000..2000 |
+| `voltage` | `vbatLatest` of Betaflight 4, INAV's `vbat` | 0.01 V |
 | `phi, theta, psi` | INAV's `attitude[0..2]` | 0.1 deg |
 | `x, y, z` | INAV's `navPos[0..2]` | cm |
 | `vx, vy, vz` | INAV's `navVel[0..2]` | cm/s |
@@ -14,10 +15,15 @@
 The unfiltered gyro is preferred: the filters of the flight controller delay the rates by some milliseconds, which the
 estimators would attribute to the vehicle. Commands count as fractions of the airframe's `max_rotor_speed`.
 
-**Settings.** Explorer writes the settings of the log above the header. The reader uses `acc_1G`, `motor_poles`,
-`motorOutput`, `maxthrottle` and `blackbox_high_resolution` (rates are in tenths of a deg/s).
-`blackbox_decode` writes no settings. The reader then assumes 14 poles and rates in deg/s, takes 1 g from the median of
-the accelerometer and the protocol from the range of the commands, and notes each of these assumptions.
+**Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
+reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle`, `gyro_scale` and
+`blackbox_high_resolution` (rates are in tenths of a deg/s). `blackbox_decode` writes no settings: they are taken from
+the `.bbl` or `.BFL` file beside the CSV, if it is there (`LOG00001.02.csv`: second session of `LOG00001.BFL`). If not,
+the reader assumes 14 poles and rates in deg/s, takes 1 g from the median of the accelerometer and the protocol from the
+range of the commands, and notes each of these assumptions.
+
+**Sessions.** A vehicle writes one session each time that it is armed. The sessions of a `.bbl` or `.BFL` file follow
+each other in one flight, with an unmeasured second between them.
 
 **Frames.** Gyro and accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose
 down, yaw counter-clockwise seen from above. (The firmware's own telemetry has the opposite signs of pitch and yaw.)
@@ -32,15 +38,16 @@ Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight and IN
 
 import csv
 import math
+import re
 from typing import NamedTuple
 
 import numpy as np
 
+from .blackbox_raw import MAGIC, gyro_unit, read_sessions, settings_beside
 from .csv_text import read_table
-from .table import LogFormat, Path, Table, opened, refuse
+from .table import LogFormat, Path, Table, opened, opened_bytes, refuse
 
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
-_RAW = b"H Product:Blackbox"
 _MOST_SETTINGS = 5000  # lines above the header
 _LONGEST_LINE = 1 << 16
 _DEGREE = math.pi / 180
@@ -63,15 +70,19 @@ _KNOWN = (
     *(f"{name}[{i}]{unit}" for name in ("gyroUnfilt", "gyroADC") for i in range(3) for unit in _RATE_UNITS),
     *(f"accSmooth[{i}]{unit}" for i in range(3) for unit in _FORCE_UNITS),
     *(name for name, _ in _INAV.values()),
+    *("vbatLatest", "vbat"),
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
 
 
 class _Log(NamedTuple):
-    """A blackbox log: its own columns `raw` and `settings`, and our `columns`, the log's `names` of them, `notes`."""
+    """A blackbox log: its own columns `raw` and `settings`, and our `columns`, the log's `names` of them, `notes`.
+
+    `header`: the row of the CSV's header; `None` for a log that was not decoded.
+    """
 
     path: Path
-    header: int
+    header: int | None
     settings: dict[str, str]
     raw: dict[str, np.ndarray]
     columns: dict[str, np.ndarray]
@@ -88,10 +99,8 @@ class _Log(NamedTuple):
 
 def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
-    settings, skip = _settings(path)
-    table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
-    raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    log = _Log(path, skip + 1, settings, raw, {}, {}, [])
+    log, table = _decoded(path) if _is_raw(path) else _csv(path)
+    raw = log.raw
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
         refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
@@ -99,6 +108,7 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
+    _add_voltage(log)
     for column, (name, sign) in _INAV.items():
         if name in raw:
             values = sign * raw[name]
@@ -108,14 +118,37 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     return table._replace(columns=log.columns, unknown=(), names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
+def _decoded(path: Path) -> tuple[_Log, Table]:
+    """A `.bbl` or `.BFL` file."""
+    raw, settings, notes = read_sessions(path, _KNOWN)
+    return _Log(path, None, settings, raw, {}, {}, notes), Table(path, {}, first_row=None)
+
+
+def _csv(path: Path) -> tuple[_Log, Table]:
+    """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
+    settings, skip = _settings(path)
+    notes = []
+    if not settings:
+        settings, beside = settings_beside(path)
+        notes += [f"settings are taken from {beside} beside it"] * bool(settings)
+    table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
+    raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
+    return _Log(path, skip + 1, settings, raw, {}, {}, notes), table
+
+
+def _is_raw(path: Path) -> bool:
+    with opened_bytes(path) as file:
+        return file.seekable() and file.read(len(MAGIC)) == MAGIC
+
+
 def _recognises(begin: bytes) -> bool:
-    if begin.startswith(_RAW):
+    if begin.startswith(MAGIC):
         return True
     lines = begin.decode("utf-8-sig", errors="replace").splitlines()
     return any(_is_header(line) for line in lines[:_MOST_SETTINGS])
 
 
-BLACKBOX = LogFormat("blackbox", "blackbox CSV", _recognises, read_blackbox)
+BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
 
 
 def _is_header(line: str) -> bool:
@@ -128,8 +161,6 @@ def _settings(path: Path) -> tuple[dict[str, str], int]:
     with opened(path) as file:
         for number in range(_MOST_SETTINGS):
             line = file.readline(_LONGEST_LINE)
-            if number == 0 and line.startswith(_RAW.decode()):
-                refuse(path, f"is a blackbox log that is not decoded; decode it by blackbox_decode, or {_EXPORT}")
             if _is_header(line):
                 return settings, number
             if not line:
@@ -157,14 +188,15 @@ def _add_rates(log: _Log) -> None:
             names = [f"{field}[{i}]{unit}" for i in range(3)]
             if not all(name in log.raw for name in names):
                 continue
-            fine = 10.0 if unit == "" and log.setting("blackbox_high_resolution", 1, 1) else 1.0
+            if unit == "":
+                factor *= gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
             if unit == "" and not log.settings:
                 log.notes.append(
-                    f"{field} is taken as deg/s: with blackbox_high_resolution its unit is 0.1 deg/s, and only an "
-                    "export by Blackbox Explorer says so"
+                    f"{field} is taken as deg/s: with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or "
+                    ".BFL file, or keep it beside this one"
                 )
             for column, name in zip("pqr", names, strict=True):
-                log.add(column, name, log.raw[name] * factor / fine)
+                log.add(column, name, log.raw[name] * factor)
             return
     refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
 
@@ -209,6 +241,11 @@ def _add_force(log: _Log) -> None:
         names = [f"accSmooth[{i}]{unit}" for i in range(3)]
         if not all(name in log.raw for name in names):
             continue
+        if log.setting("acc_1G", 0, 0) is not None or not any(np.ptp(_finite(log.raw[name])) for name in names):
+            log.notes.append(
+                "the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked"
+            )
+            return
         if factor is None:
             one = log.setting("acc_1G", 1, 65535)
             if one is None:
@@ -219,6 +256,14 @@ def _add_force(log: _Log) -> None:
         for column, name in zip(("ax", "ay", "az"), names, strict=True):
             log.add(column, name, log.raw[name] * factor)
         return
+
+
+def _add_voltage(log: _Log) -> None:
+    """The battery's voltage, from firmware whose unit is known."""
+    firmware = log.settings.get("Firmware revision", "")
+    for name, pattern in (("vbatLatest", r"Betaflight ([4-9]|\d{2,})\."), ("vbat", "INAV")):
+        if name in log.raw and re.match(pattern, firmware):
+            log.add("voltage", name, log.raw[name] / 100)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

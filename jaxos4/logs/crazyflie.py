@@ -8,6 +8,7 @@
 | `x, y, z` | `stateEstimate.x, y, z` | m |
 | `vx, vy, vz` | `stateEstimate.vx, vy, vz` | m/s |
 | `omega1..4` | `rpm.m1..m4`, measured, interpolated linearly in the square | rpm |
+| `voltage` | `pm.vbat` | V |
 | `command1..4` | `motor.m1..m4`, or `pwm.m1_pwm..m4_pwm`, if there is no `omega1..4` | 0..65535 |
 
 Any event may hold a variable; if several do, the one with the most samples is used. A command is held until the next
@@ -51,6 +52,7 @@ _RATES = {"p": ("gyro.x", _DEGREE), "q": ("gyro.y", _DEGREE), "r": ("gyro.z", _D
 _OTHERS = {  # each is read by itself
     **{name: (f"acc.{name[1]}", _GRAVITY) for name in ("ax", "ay", "az")},
     **{name: (f"stateEstimate.{name}", 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")},
+    "voltage": ("pm.vbat", 1.0),
 }
 _ANGLES = {
     "phi": ("stateEstimate.roll", _DEGREE),

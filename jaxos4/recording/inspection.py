@@ -16,9 +16,9 @@ from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem
 from .excited import RATE_COLUMNS, WEAK, excitation
+from .signs import opposite_axes, opposite_note
 from .usable import Stretch, cut, nothing_usable, stretches
 
-RATES = ("p", "q", "r")
 # The identifiability is computed from this much of a stretch [s], in windows of this length [s].
 _LONGEST, _WINDOW = 20.0, 0.5
 
@@ -51,22 +51,22 @@ class Part(msgspec.Struct, frozen=True):
     excitation: dict[str, AxisExcitation]
 
 
-class ParameterBound(msgspec.Struct, frozen=True):
-    """One alpha: the airframe's value, the Cramer-Rao bound (`None`: infinite), and why it is not identifiable."""
+class IdentifiableParameter(msgspec.Struct, frozen=True):
+    """Whether one alpha is identifiable, and why not."""
 
-    airframe: float
-    bound: float | None
-    unit: str
+    identifiable: bool
     note: str
 
 
 class IdentifiableParameters(msgspec.Struct, frozen=True):
-    """The bounds of alpha_1..8 from the body rates of one stretch [s], at the noise `sigma` of p, q, r [rad/s]."""
+    """Which of alpha_1..8 are identifiable from the body rates of one stretch [s], at the gyro's noise.
+
+    How well depends on what the vehicle does beside the model, which only a fit shows.
+    """
 
     begin: float
     end: float
-    sigma: dict[str, float]
-    parameters: dict[str, ParameterBound]
+    parameters: dict[str, IdentifiableParameter]
 
 
 class Inspection(msgspec.Struct, frozen=True):
@@ -109,7 +109,9 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
     rates_measured = not np.isnan(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=0).any()
     parts = tuple(_part(flight, stretch, airframe) for stretch in found)
     nothing = "" if longest is not None else f"{nothing_usable(found)}; give the log of a flight"
-    findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts))))
+    usable = [cut(flight, part) for part in found if not part.reason]
+    opposite = "" if airframe is None else opposite_note(opposite_axes(usable, airframe))
+    findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts), opposite)))
     identifiable = None
     if longest is not None and not facts.too_slow and airframe is not None and rates_measured:
         identifiable = _identifiable(flight, longest, airframe)
@@ -173,11 +175,10 @@ def _identifiable(flight: Flight, stretch: Stretch, airframe: Airframe) -> Ident
     known = identifiability(problem, Bracket.default(model), model.alpha)
     notes = known.notes(model.parameter_names)
     parameters = {
-        name: ParameterBound(float(model.alpha[i]), _finite(known.std[i]), unit, notes.get(name, ""))
-        for i, (name, unit) in enumerate(zip(model.parameter_names, model.parameter_units, strict=True))
+        name: IdentifiableParameter(name not in notes and math.isfinite(known.std[i]), notes.get(name, ""))
+        for i, name in enumerate(model.parameter_names)
     }
-    noise = {name: float(sigma[column]) for name, column in zip(RATES, RATE_COLUMNS, strict=True)}
-    return IdentifiableParameters(stretch.begin, stretch.end, noise, parameters)
+    return IdentifiableParameters(stretch.begin, stretch.end, parameters)
 
 
 def _finite(x: SupportsFloat) -> float | None:

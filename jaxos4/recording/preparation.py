@@ -16,6 +16,7 @@ from .averaging import averaged
 from .holdout import hold_out
 from .joining import join
 from .reading import Recording
+from .signs import opposite_axes, opposite_note
 from .usable import Stretch, cut, nothing_usable, stretches
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
@@ -72,7 +73,8 @@ def prepare(
 ) -> Prepared:
     """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
 
-    `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors.
+    `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors, and
+    messages do not name options of the fit.
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
@@ -82,16 +84,24 @@ def prepare(
     parts: list[tuple[int, Flight]] = []
     for number, recording in enumerate(recordings):
         slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
-        pieces, note = _usable_parts(recording, airframe, begin, end, slow)
+        pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
         if slow:
             raise InputError(f"{recording.name}: {slow}.")
+        if opposite := opposite_note(opposite_axes(pieces, airframe)):
+            raise InputError(f"{recording.name}: {opposite}.")
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
         parts += [(number, piece) for piece in pieces]
     if len({piece.commanded for _, piece in parts}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
-    step, length = _sampling([piece for _, piece in parts], window, sample_time)
+    slowest = max(float(piece.dt) for _, piece in parts)
+    if predicted and sample_time is not None and slowest > sample_time * _NEARLY_EQUAL:
+        raise InputError(
+            f"{recordings[0].name}: has one sample every {slowest:.4g} s, the fitted logs one every {sample_time:.4g} "
+            f"s; give `sample_time` {slowest:.4g}, or another `validate`."
+        )
+    step, length = _sampling(slowest, window, sample_time)
     shortest = (length - 1) * step / _NEARLY_EQUAL
     long = [(number, piece) for number, piece in parts if np.ptp(np.asarray(piece.time)) >= shortest]
     coarse = [(number, with_body_velocity(averaged(piece, step))) for number, piece in long]
@@ -99,8 +109,8 @@ def prepare(
     numbers, pieces = tuple(number for number, _ in kept), [piece for _, piece in kept]
     unused = [recording for i, recording in enumerate(recordings) if i not in numbers]
     if unused:
-        remedy = "leave it out or give a shorter one" if kept else "give a shorter one"
-        raise InputError(f"{unused[0].name}: no part is as long as `window` {window:g}; {remedy}.")
+        remedy = "leave this log out, or give a shorter `window`" if kept else "give a shorter `window`"
+        raise InputError(f"{unused[0].name}: no part is as long as a window, {window:g} s; {remedy}.")
     flight = join(pieces, length=length)
     fitted, tested = hold_out(flight, length, holdout)
     available = _available_inputs(flight, pieces, airframe)
@@ -129,9 +139,8 @@ def _seconds(flight: Flight) -> float:
     return float((~np.isnan(np.asarray(flight.states)[:, CASCADE_ORDER[0]])).sum() * flight.dt)
 
 
-def _sampling(parts: list[Flight], window: float, sample_time: float | None) -> tuple[float, int]:
-    """The sample time [s], and how many samples make a window."""
-    slowest = max(float(flight.dt) for flight in parts)
+def _sampling(slowest: float, window: float, sample_time: float | None) -> tuple[float, int]:
+    """The sample time [s], and how many samples make a window. `slowest`: the longest sample of the logs [s]."""
     step = max(SAMPLE_TIME if sample_time is None else sample_time, slowest)
     if sample_time is not None and step > sample_time * _NEARLY_EQUAL:
         raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
@@ -143,7 +152,7 @@ def _sampling(parts: list[Flight], window: float, sample_time: float | None) -> 
 
 
 def _usable_parts(
-    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str
+    recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str, predicted: bool
 ) -> tuple[list[Flight], str | None]:
     """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used.
 
@@ -160,7 +169,7 @@ def _usable_parts(
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
-        remedy = "give the log of a flight, or `begin` and `end` to use a part all the same"
+        remedy = "give the log of a flight" + ("" if predicted else ", or `begin` and `end` to use a part all the same")
         besides = f" Besides, {slow}." if slow else ""
         raise InputError(f"{name}: {nothing_usable(every)}; {remedy}.{besides}")
     if not refused:
@@ -169,7 +178,7 @@ def _usable_parts(
     seconds = sum(stretch.length for stretch in usable)
     return [cut(flight, stretch) for stretch in usable], (
         f"{seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {reasons}"
-        f"{'; ...' if len(refused) > _MOST_REASONS else ''} (`begin` and `end` override)"
+        f"{'; ...' if len(refused) > _MOST_REASONS else ''}{'' if predicted else ' (`begin` and `end` override)'}"
     )
 
 

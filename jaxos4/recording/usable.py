@@ -1,7 +1,8 @@
 """Which parts of a flight can be used for identification, and why not the others.
 
 A part is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, the gyro
-is not clipped, no samples are lost, and the vehicle does not crash.
+is not clipped, no samples are lost, and the vehicle does not crash. The rotors do not carry it if they are idle, or if
+the accelerometer does not feel them (`jaxos4.recording.resting`).
 """
 
 import itertools
@@ -16,6 +17,7 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import Flight
 from .excited import RATE_COLUMNS
+from .resting import resting
 
 ON_GROUND = "on the ground"
 SHORTEST = 1.0  # [s], of a usable stretch
@@ -25,6 +27,7 @@ _SUSTAINED = 0.5  # [s]; shorter pauses of thrust happen in flight, shorter burs
 _MARGIN = 0.3  # [s], between the ground and free flight
 _GAP = 0.05  # [s], the longest without a measurement
 _LIMIT = 1e-3  # share of a rotor's largest speed; smaller differences count as none
+_LEAST_HOVER = 0.2  # share of full command; no vehicle has a thrust of 25 times its weight
 _FULL = 0.995  # share of the airframe's `max_rotor_speed`
 _CLIPPED = 5  # samples in a row at the gyro's largest value
 _SLOWEST_CLIP = 3.0  # [rad/s]: no gyro's range ends below 4.3 (250 deg/s)
@@ -33,6 +36,14 @@ _IMPACT_TIME = 0.02  # [s]
 _AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s], until the rotors stop; not trusted before the impact
 
 _USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last one that applies counts
+_NAMES = {
+    _USABLE: "",
+    _SHORT: f"less than {SHORTEST:g} s between others",
+    _CLIPPING: "the gyro is clipped",
+    _LOST: "nothing was measured",
+    _CRASHED: "an impact",
+    _GROUND: ON_GROUND,
+}
 
 
 class Stretch(NamedTuple):
@@ -72,7 +83,7 @@ def stretches(
     """
     time, omega = np.asarray(flight.time, dtype=float), np.asarray(flight.omega, dtype=float)
     states, dt = np.asarray(flight.states, dtype=float), float(flight.dt)
-    share = _thrust_share(omega, airframe)
+    share = _thrust_share(omega, airframe, commanded=flight.commanded)
     ground = _ground(share, dt)
     for begin, end in landed:
         ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
@@ -86,6 +97,10 @@ def stretches(
         (_GROUND, ground),
     ):
         labels[where] = label
+    if flight.specific_force is not None:
+        force = np.asarray(flight.specific_force, dtype=float)
+        at_rest = resting(omega, force, states[:, RATE_COLUMNS], labels == _USABLE, dt)
+        labels[at_rest & (labels != _LOST)] = _GROUND
     for begin, end in _runs(labels == _USABLE):
         if time[end - 1] - time[begin] < SHORTEST - dt / 2:
             labels[begin:end] = _SHORT
@@ -104,7 +119,9 @@ def usable_stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[
 def nothing_usable(every: Sequence[Stretch]) -> str:
     """Why none of these stretches of a flight can be used: the longest one, with its reason."""
     longest = max(every, key=lambda stretch: stretch.length)
-    never = "the vehicle never flew" if all(stretch.reason == ON_GROUND for stretch in every) else "no part can be used"
+    no_flight = {_NAMES[_GROUND], _NAMES[_SHORT], _NAMES[_LOST]}
+    grounded = longest.reason == ON_GROUND and all(stretch.reason in no_flight for stretch in every)
+    never = "the vehicle never flew" if grounded else "no part can be used"
     return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
 
 
@@ -127,7 +144,8 @@ def cut(flight: Flight, stretch: Stretch) -> Flight:
     return Flight(time[part], omega, states, force, flight.result, commanded=flight.commanded, voltage=voltage)
 
 
-def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
+def _thrust_share(omega: np.ndarray, airframe: Airframe | None, *, commanded: bool) -> np.ndarray:
+    """Thrust as a share of the weight. Commands below a tenth of full scale count as idle, whatever the weight."""
     squares = (omega**2).sum(axis=1)
     usual = squares[squares > 0.1 * squares.max(initial=0.0)]
     usual = float(np.median(usual)) if usual.size else 1.0
@@ -135,6 +153,11 @@ def _thrust_share(omega: np.ndarray, airframe: Airframe | None) -> np.ndarray:
         carries = float(airframe.mass * airframe.gravity / airframe.thrust_coefficient)
         if 1 / 3 < usual / carries < 3:
             usual = carries
+    full = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    if commanded and airframe is None and omega.max(initial=0.0) <= 1:
+        full = 1.0
+    if commanded and math.isfinite(full):
+        usual = max(usual, 4 * (_LEAST_HOVER * full) ** 2)
     return squares / max(usual, 1e-300)
 
 
@@ -229,14 +252,7 @@ def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) ->
             if each.begin < end and each.end > begin:
                 rotors.setdefault(each.what, set()).add(each.rotor)
         return "; ".join(f"rotor {', '.join(map(str, sorted(which)))} {what}" for what, which in rotors.items())
-    return {
-        _USABLE: "",
-        _SHORT: f"less than {SHORTEST:g} s between others",
-        _CLIPPING: "the gyro is clipped",
-        _LOST: "nothing was measured",
-        _CRASHED: "an impact",
-        _GROUND: ON_GROUND,
-    }[label]
+    return _NAMES[label]
 
 
 def _samples(seconds: float, dt: float) -> int:

@@ -2,9 +2,7 @@
 
 from collections.abc import Iterator
 
-import rich.box
 from rich.console import Console
-from rich.table import Table
 
 from ..estimators import ESTIMATORS
 from ..identification.quality import COLOURED
@@ -17,6 +15,7 @@ from ..identification.results import (
     VehicleIdentification,
 )
 from ..results import NINETY_FIVE
+from .whole import Listing
 
 # The share of fits of true models that a test of all channels' residuals may reject.
 _SIGNIFICANCE = 0.01
@@ -25,10 +24,13 @@ _SIGNIFICANCE = 0.01
 def print_identification(console: Console, found: Identification) -> None:
     """Prints parameters, moments of inertia and the quality of the fit. Without an answer it prints why."""
     for part in _parts(found):
-        console.print(part, markup=False, highlight=False if isinstance(part, str) else None)
+        if isinstance(part, Listing):
+            part.print_on(console)
+        else:
+            console.print(part, markup=False, highlight=False)
 
 
-def _parts(found: Identification) -> Iterator[str | Table]:
+def _parts(found: Identification) -> Iterator[str | Listing]:
     if found.result == "nonfinite_trajectory" and isinstance(found, FlightIdentification):
         shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
         yield (
@@ -44,7 +46,7 @@ def _parts(found: Identification) -> Iterator[str | Table]:
         yield from _of_vehicle(found)
 
 
-def _of_flight(found: FlightIdentification) -> Iterator[str | Table]:
+def _of_flight(found: FlightIdentification) -> Iterator[str | Listing]:
     yield _parameters(found, digits=5, with_bound=True)
     limits = [
         f"{name} {row.noise_limit:.2g}"
@@ -119,7 +121,7 @@ def _validation(validation: Validation) -> str:
     return f"validation on {validation.flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
 
 
-def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Table]:
+def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Listing]:
     yield _parameters(found, digits=4, with_bound=False)
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
@@ -151,34 +153,29 @@ def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Table]:
     )
 
 
-def _skill(skill: PredictionSkill) -> Table:
-    table = _table(("ahead", "p", "q", "r", "equation error: p, q, r"))
+def _skill(skill: PredictionSkill) -> Listing:
+    rows = []
     rates = (skill.p, skill.q, skill.r)
     for i, horizon in enumerate(skill.horizons):
         cells = [f"{_share(rate.skill[i])} +- {_share(rate.std[i])}" for rate in rates]
-        table.add_row(f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates))
-    return table
+        rows.append((f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates)))
+    return Listing(("ahead", "p", "q", "r", "equation error: p, q, r"), rows)
 
 
-def _parameters(found: Identification, *, digits: int, with_bound: bool) -> Table:
-    table = _table(("parameter", "unit", "estimate", "95 % interval", *["bound"] * with_bound, "note"))
+def _parameters(found: Identification, *, digits: int, with_bound: bool) -> Listing:
+    rows = []
     for name, row in found.parameters.items():
         cells = ["-", "-", "-"]
         if row.estimate is not None and row.ci95 is not None:
             low, high = row.ci95
             bound = "-" if row.bound is None else f"{row.bound:.2g}"
             cells = [f"{row.estimate:.{digits}g}", f"[{low:.{digits}g}, {high:.{digits}g}]", bound]
-        table.add_row(name, row.unit, *cells[: 2 + with_bound], row.note)
-    return table
+        rows.append((name, row.unit, *cells[: 2 + with_bound]))
+    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * with_bound)
+    return Listing(headings, rows, ("estimate", "bound"), [row.note for row in found.parameters.values()])
 
 
 def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _table(headings: tuple[str, ...]) -> Table:
-    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in headings:
-        right = heading in ("estimate", "bound")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "note")
-    return table
+    if value is None:
+        return "-"
+    return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"

@@ -23,9 +23,13 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
 
 def _rich(table: tables.Table) -> Table:
     made = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=0)  # 80 columns must do
-    made.add_column("", no_wrap=True)
-    for heading in table.headings:
-        made.add_column(Text(heading), justify="right", no_wrap=True)
+    rows = [row for group in table.groups for row in group.rows]
+    labels = (*(row.label for row in rows), *(group.label for group in table.groups))
+    made.add_column("", no_wrap=True, min_width=max(map(len, labels), default=0))
+    for i, heading in enumerate(table.headings):
+        cells = (row.cells[i] for row in rows)
+        widest = max(len(heading), *(len(cell.text) + len(cell.mark) for cell in cells))
+        made.add_column(Text(heading), justify="right", no_wrap=True, min_width=widest)
     for group in table.groups:
         made.add_row(Text(group.label, style="bold"))
         for row in group.rows:

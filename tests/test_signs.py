@@ -1,0 +1,119 @@
+"""A vehicle that turns against its airframe is found, whatever its controller does against gusts."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from test_flight_csv import CRAZYFLIE
+
+from jaxos4.errors import InputError
+from jaxos4.flight import Flight
+from jaxos4.logs import read_log, write_flight
+from jaxos4.recording import Recording, cut, usable_stretches
+from jaxos4.recording.preparation import prepare
+from jaxos4.recording.signs import opposite_axes, opposite_note
+
+DT = 0.004
+
+
+def flown(airframe, seed, *, gust=20.0, reference=2.0, lag=0.04, seconds=15.0):
+    """Rates of a vehicle under a rate controller with damping, references and gusts; the rotors lag their commands."""
+    rng = np.random.default_rng(seed)
+    samples = round(seconds / DT)
+    inertia, mixer = np.asarray(airframe.inertia, dtype=float), np.asarray(airframe.mixer, dtype=float)
+    hover = np.full(4, float(airframe.hover_speed) ** 2)
+    rate, last, disturbance, wanted, real = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), hover.copy()
+    omega, rates = np.empty((samples, 4)), np.empty((samples, 3))
+    gain = np.array([15.0, 15.0, 6.0])
+    for k in range(samples):
+        if k % 60 == 0:
+            wanted = reference * rng.normal(size=3)
+        measured = rate + rng.normal(0, 0.01, 3)
+        torque = inertia * (gain * (wanted - measured) - 0.01 * gain * (measured - last) / DT)
+        last = measured
+        command = np.linalg.solve(mixer, [*torque, hover.sum() * float(airframe.thrust_coefficient)])
+        command = np.clip(command, 0.1 * hover, 3 * hover)
+        omega[k], rates[k] = np.sqrt(command), measured
+        real = real + DT / lag * (command - real)
+        disturbance = disturbance - DT / 0.25 * disturbance + gust * np.sqrt(2 * DT / 0.25) * rng.normal(size=3)
+        rate = rate + DT * ((mixer @ real)[:3] / inertia + disturbance * [1, 1, 0.2])
+    states = np.full((samples, 12), np.nan)
+    states[:, [7, 9, 11]] = rates
+    return Flight(DT * np.arange(samples), omega, states, commanded=True)
+
+
+def turned(airframe, what):
+    return eqx.tree_at(lambda a: getattr(a, what), airframe, -np.asarray(getattr(airframe, what)))
+
+
+@given(seed=st.integers(0, 999), gust=st.sampled_from([0.0, 5.0, 40.0]), lag=st.floats(0.02, 0.07))
+@settings(max_examples=12, deadline=None)
+def test_wrong_signs_are_found_and_right_ones_never(seed, gust, lag):
+    flight = flown(CRAZYFLIE, seed, gust=gust, lag=lag)
+    assert opposite_axes([flight], CRAZYFLIE) == []
+    assert opposite_axes([flight], turned(CRAZYFLIE, "rotor_positions")) == ["roll", "pitch"]
+    if gust < 40:
+        assert opposite_axes([flight], turned(CRAZYFLIE, "rotor_spins")) == ["yaw"]
+
+
+@given(seed=st.integers(0, 999), reference=st.sampled_from([0.0, 0.1]))
+@settings(max_examples=8, deadline=None)
+def test_gusts_alone_do_not_change_the_sign(seed, reference):
+    assert opposite_axes([flown(CRAZYFLIE, seed, reference=reference)], CRAZYFLIE) == []
+
+
+def test_a_vehicle_that_does_not_turn_is_not_judged():
+    flight = flown(CRAZYFLIE, 0)
+    still = Flight(flight.time, flight.omega, 0.001 * np.asarray(flight.states), commanded=True)
+    assert opposite_axes([still], turned(CRAZYFLIE, "rotor_spins")) == []
+    assert opposite_axes([], CRAZYFLIE) == []
+    assert opposite_note([]) == ""
+
+
+def test_a_fit_is_refused_with_the_remedy():
+    recording = Recording(flown(CRAZYFLIE, 0), "a.bbl")
+    with pytest.raises(InputError, match=r"a.bbl: yaw answers .* \(props in or out\); change all four signs"):
+        prepare([recording], turned(CRAZYFLIE, "rotor_spins"))
+    with pytest.raises(InputError, match=r"a.bbl: roll and pitch answer .* not in the order of the log; correct them"):
+        prepare([recording], turned(CRAZYFLIE, "rotor_positions"))
+    assert prepare([recording], CRAZYFLIE).windows > 0
+
+
+@pytest.mark.parametrize("name", ["rollpitch", "yaw_a", "hover"])
+def test_real_flights(name, shared_flights):
+    flight, _ = read_log(shared_flights / f"arpl_crazyflie_{name}.csv", CRAZYFLIE)
+    parts = [cut(flight, stretch) for stretch in usable_stretches(flight, CRAZYFLIE)]
+    assert opposite_axes(parts, CRAZYFLIE) == []
+    assert opposite_axes(parts, turned(CRAZYFLIE, "rotor_spins")) == ["yaw"]
+    assert opposite_axes(parts, turned(CRAZYFLIE, "rotor_positions")) == ["roll", "pitch"]
+
+
+def test_inspect_questions_the_spins(run, tmp_path):
+    write_flight(flown(CRAZYFLIE, 0), tmp_path / "flight.csv")
+    lines = [f"{name} = {np.asarray(getattr(CRAZYFLIE, name)).tolist()}" for name in CRAZYFLIE.__dataclass_fields__]
+    good = "\n".join(lines)
+    (tmp_path / "good.toml").write_text(good)
+    (tmp_path / "bad.toml").write_text(good.replace("[1.0, -1.0, 1.0, -1.0]", "[-1, 1, -1, 1]"))
+    assert "answer" not in run("inspect", "flight.csv", "--airframe", "good.toml")[1]
+    code, out, err = run("inspect", "flight.csv", "--airframe", "bad.toml")
+    assert (code, err) == (0, "")
+    assert "cannot identify a vehicle: yaw answers the rotors with the opposite sign" in out
+
+
+def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():
+    flight = flown(CRAZYFLIE, 0, seconds=6.0)
+    resting = Recording(Flight(flight.time, 0.1 * np.asarray(flight.omega), flight.states, commanded=True), "other.csv")
+    options = {"sample_time": 0.004, "holdout": 0.0}
+    with pytest.raises(InputError, match="the vehicle never flew .* or `begin` and `end`"):
+        prepare([resting], CRAZYFLIE, **options)
+    with pytest.raises(InputError, match="the vehicle never flew") as predicted:
+        prepare([resting], CRAZYFLIE, **options, predicted=True)
+    slow = Recording(Flight(*(np.asarray(x)[::5] for x in (flight.time, flight.omega, flight.states))), "other.csv")
+    with pytest.raises(InputError, match="other.csv: has one sample every 0.02 s.* or another `validate`") as slower:
+        prepare([slow], CRAZYFLIE, **options, predicted=True)
+    for error in (predicted, slower):
+        assert "`begin`" not in str(error.value)
+    rest = np.asarray(flight.omega) * (np.asarray(flight.time)[:, None] > 2)
+    partly = Recording(Flight(flight.time, rest, flight.states, commanded=True), "other.csv")
+    assert "(`begin` and `end` override)" in prepare([partly], CRAZYFLIE, **options).notes[-1]
+    assert "override" not in prepare([partly], CRAZYFLIE, **options, predicted=True).notes[-1]
