@@ -61,6 +61,7 @@ from .estimators import (
     IBSS as IBSS,
     SVSF as SVSF,
     EquationError as EquationError,
+    FilterError as FilterError,
     Hybrid as Hybrid,
     JointEKF as JointEKF,
     OutputError as OutputError,

@@ -1,4 +1,5 @@
 from .equation_error import EquationError as EquationError
+from .filter_error import FilterError as FilterError, FilterFit as FilterFit
 from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS
 from .kalman import JointEKF as JointEKF

@@ -255,9 +255,7 @@ def _cost(innovations: Innovations, unknowns: Unknowns, region: _Region) -> Scal
     return jnp.where(innovations.sound.all() & jnp.isfinite(cost), cost, jnp.inf)
 
 
-def _posterior(
-    search: _Search, region: _Region, count: int
-) -> tuple[Unknowns, Float[Array, "unknowns unknowns"]]:
+def _posterior(search: _Search, region: _Region, count: int) -> tuple[Unknowns, Float[Array, "unknowns unknowns"]]:
     """Gradient and information about all unknowns, with the prior; a held parameter has only the prior's."""
     gradient, information = joint(
         search.innovations.gradient.sum(axis=-1), search.innovations.information.sum(axis=-1), count

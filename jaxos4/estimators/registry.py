@@ -44,6 +44,7 @@ ESTIMATORS = Estimators(
         "network": "..networks:TrainedNetwork",
         "hybrid": ".hybrid:Hybrid",
         "output-error": ".output_error:OutputError",
+        "filter-error": ".filter_error:FilterError",
         "equation-error": ".equation_error:EquationError",
         "rls": ".recursive_least_squares:RecursiveLeastSquares",
         "svsf": ".svsf:SVSF",

@@ -131,9 +131,7 @@ def _restart(p: _Covariance, restart: Bool[Array, " lanes"], step: _Step) -> _Co
     )
 
 
-def _measure(
-    p: _Covariance, is_measured: Bool[Array, "channels lanes"], step: _Step
-) -> tuple[_Covariance, "Gains"]:
+def _measure(p: _Covariance, is_measured: Bool[Array, "channels lanes"], step: _Step) -> tuple[_Covariance, "Gains"]:
     """The covariance after a measurement, and the gains that belong to it."""
     is_rate = np.arange(p.rate.shape[0])[:, None] < _RATES
     variance = jnp.where(is_rate, p.rate, p.disturbance) + step.sensor
