@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 def estimate(
     flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
-    estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
+    estimator: Annotated[
+        Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
+    ] = None,
     model: Annotated[
         VehicleModel, typer.Option(help="The equations: as printed, corrected, or those of a real vehicle.")
     ] = VehicleModel["published"],
@@ -78,7 +80,7 @@ def estimate(
     if report is not None and not is_vehicle:
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
     options: dict[str, Any] = {
-        "estimator": estimator.value,
+        "estimator": None if estimator is None else estimator.value,
         "bracket": None if bracket is None else read_toml(bracket),
         "channels": None if channels is None else channels.value,
         "initial_state": initial_state.value,
