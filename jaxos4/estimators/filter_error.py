@@ -34,6 +34,8 @@ from ..shooting.rows import windowed
 # The number of samples in a lane. Specific force is compared as means over this time [s]: accelerometers feel
 # vibrations, and their low-pass filters differ.
 _LANE, _BLOCK = 384, 0.25
+# A flight has at least so many lanes, whose disagreement shows errors of the model, unless they would be too short.
+_FEWEST_LANES, _SHORTEST_LANE = 8, 80
 # After so many samples a filter has settled.
 _SETTLING = 128
 # The least share of a block that must be measured.
@@ -41,8 +43,8 @@ _MEASURED = 0.125
 # A gap of this length ends what a filter knows [s].
 _GAP = 0.1
 # Time constants of the disturbance at which searches for the noise start [s]: the likelihood has several maxima.
-_STARTS = np.array([0.2, 0.02, 1.0])
-_SHORTEST, _LONGEST = 0.25, 30.0  # time constants: in samples, in seconds
+_STARTS = np.array([0.2, 0.03])
+_SHORTEST, _LONGEST = 0.25, 3.0  # time constants: in samples, in seconds
 _NOISE_REACH = 1e8  # factor to either side: simulated flights have no disturbance
 _NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
 _LONGEST_STEP = 1.0  # of a logarithm
@@ -290,7 +292,7 @@ def _lanes(samples: int, wanted: int = _LANE) -> Int[np.ndarray, "lanes time"]:
     A lane begins with the end of the lane before it, which its filter needs to settle. The first lane begins with the
     flight. Samples beyond the last do not exist.
     """
-    lanes = max(round((samples - _SETTLING) / wanted), 1)
+    lanes = max(round((samples - _SETTLING) / wanted), min((samples - _SETTLING) // _SHORTEST_LANE, _FEWEST_LANES), 1)
     settling = _SETTLING if lanes > 1 else 0
     length = -(-(samples - settling) // lanes)
     return length * np.arange(lanes)[:, None] + np.arange(settling + length)

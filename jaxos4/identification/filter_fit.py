@@ -1,6 +1,6 @@
 """The fit of a real vehicle by filter error, which treats what the model lacks as a disturbance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -18,7 +18,7 @@ from ..shooting import ShootingProblem
 from ..shooting.filtering import Noise
 from .jackknife import disagreement, parts_of
 from .results import Disturbance
-from .vehicle import Held, VehicleFit, holding
+from .vehicle import Held, VehicleFit, holding, negative_damping
 
 _PRIOR_NOTE = "not identifiable from these flights; the intervals of the others allow for its bracket"
 
@@ -54,16 +54,26 @@ def fit_by_filter(
     """
     model, names = problem.model, problem.model.parameter_names
     progress("compiling, and fitting parameters and disturbances")
-    found = jax.block_until_ready(estimator.fit(problem, bracket))
+    found = jax.block_until_ready(estimator.fit(problem, bracket, held=jnp.zeros(len(names), dtype=bool)))
+    steps, negative = int(found.steps), negative_damping(names, *_mean_and_std(found))
+    if negative:
+        progress("fitting again without negative damping")
+        bracket = _around_zero(bracket, names, negative)
+        found = jax.block_until_ready(
+            estimator.fit(problem, bracket, held=jnp.asarray([name in negative for name in names]))
+        )
+        steps += int(found.steps)
     progress("computing errors")
-    values, covariance = np.asarray(found.parameters), np.asarray(found.covariance)
-    std, half_width = np.sqrt(np.maximum(np.diagonal(covariance), 0.0)), np.asarray(bracket.half_width)
+    (values, std), covariance = _mean_and_std(found), np.asarray(found.covariance)
+    half_width = np.asarray(bracket.half_width)
     sound = bool(np.isfinite(values).all() and np.isfinite(std).all() and np.asarray(found.innovations.sound).all())
     factor = _widening(found, half_width, recording) if sound else np.ones(values.size)
     identifiable = np.asarray(is_identifiable(std, half_width, GAUSSIAN_PRIOR))
     if not sound or not identifiable.any():
         identifiable[:] = True
     held: Held = {name: (float(values[i]), _PRIOR_NOTE) for i, name in enumerate(names) if not identifiable[i]}
+    held |= negative
+    identifiable &= [name not in negative for name in names]
     free = np.flatnonzero(identifiable)
     known = holding(_with_noise(problem, found), model, held)
     spread = np.diag(factor) @ covariance @ np.diag(factor)
@@ -72,13 +82,23 @@ def fit_by_filter(
         covariance=as_float(spread[np.ix_(free, free)] if sound else np.full((free.size, free.size), np.inf)),
         initial_state=as_float(np.nan_to_num(problem.recorded()[0, :3])),
         cost=jnp.asarray(found.innovations.cost.sum()),
-        rollouts=jnp.asarray(int(found.steps) * (1 + values.size)),
+        rollouts=jnp.asarray(steps * (1 + values.size)),
         sweeps=found.steps,
         result=_result(found, bracket, free, sound),
     )
     fit = VehicleFit(known, estimate, held, std[free], 0.0, int(estimate.rollouts))
     widened = {names[i]: float(factor[i]) for i in free if factor[i] > 1}
     return Filtered(fit, _disturbances(problem, found), widened, found.noise)
+
+
+def _mean_and_std(found: FilterFit) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(found.parameters), np.sqrt(np.maximum(np.diagonal(np.asarray(found.covariance)), 0.0))
+
+
+def _around_zero(bracket: Bracket, names: Sequence[str], some: Held) -> Bracket:
+    """The bracket, centred at 0 for some parameters."""
+    center = np.where([name in some for name in names], 0.0, np.asarray(bracket.center))
+    return Bracket.around(center, np.asarray(bracket.half_width))
 
 
 def _result(found: FilterFit, bracket: Bracket, free: np.ndarray, sound: bool) -> RESULTS:

@@ -8,7 +8,7 @@ Therefore:
 3. The identifiable parameters are fitted together. Outliers are cut. Standard errors allow for coloured residuals.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -239,6 +239,15 @@ def free_bracket(bracket: Bracket, model: AbstractModel, held: Held) -> Bracket:
     return Bracket(np.asarray(bracket.lower)[free], np.asarray(bracket.upper)[free])
 
 
+def negative_damping(names: Sequence[str], values: np.ndarray, std: np.ndarray) -> Held:
+    """The dampings that came out negative, which are held at 0."""
+    return {
+        name: (0.0, "came out negative, which is impossible in air")
+        for name, value, error in zip(names, values, std, strict=True)
+        if name in _DAMPING and value < -_NEGATIVE * error
+    }
+
+
 def _not_identifiable(first: Refined, values: np.ndarray, bracket: Bracket) -> Held:
     """The parameters to hold: those that are not identifiable at these noise levels, and negative damping."""
     names = first.problem.model.parameter_names
@@ -246,11 +255,12 @@ def _not_identifiable(first: Refined, values: np.ndarray, bracket: Bracket) -> H
     bound = evaluate(first.problem, as_float(values), first.estimate.initial_state).covariance
     std, center = first.colour * np.sqrt(np.diagonal(bound)), np.asarray(bracket.center)
     identifiable = is_identifiable(std, np.asarray(bracket.half_width))
-    held = {}
-    for i, name in enumerate(names):
-        if not identifiable[i]:
-            held[name] = (float(center[i]), "not identifiable from these flights")
-        elif name in _DAMPING and values[i] < -_NEGATIVE * std[i]:
-            held[name] = (0.0, "came out negative, which is impossible in air")
+    negative = negative_damping(names, values, std)
+    held = {
+        name: (float(center[i]), "not identifiable from these flights")
+        for i, name in enumerate(names)
+        if not identifiable[i]
+    }
+    held = negative | held
     # At least one parameter must be free.
     return held if len(held) < len(names) else {name: held[name] for name in SECONDARY if name in held}
