@@ -1,19 +1,16 @@
 """`FilterError`: its filters and its likelihood against NumPy, and flights in closed loop, for which it is made."""
 
-import dataclasses
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, noisy_states, single_precision, standard_flight, standard_problem
-from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, lost, names
+from helpers import DT, noisy_states, standard_flight, standard_problem
+from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, names
 
 import jaxos4
 from jaxos4.estimators import FilterError
-from jaxos4.estimators.filter_error import _lanes, _observed, joint
+from jaxos4.estimators.filter_error import _lanes, _observed
 from jaxos4.shooting.filtering import Noise, filter_gains, innovate
 
 MODEL = jaxos4.PublishedOS4()

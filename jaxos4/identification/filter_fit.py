@@ -54,21 +54,20 @@ def fit_by_filter(
     """
     model, names = problem.model, problem.model.parameter_names
     progress("compiling, and fitting parameters and disturbances")
-    found = jax.block_until_ready(estimator.fit(problem, bracket, held=jnp.zeros(len(names), dtype=bool)))
+    found = jax.block_until_ready(estimator.fit(problem, bracket))
     steps, negative = int(found.steps), negative_damping(names, *_mean_and_std(found))
     if negative:
         progress("fitting again without negative damping")
         bracket = _around_zero(bracket, names, negative)
-        found = jax.block_until_ready(
-            estimator.fit(problem, bracket, held=jnp.asarray([name in negative for name in names]))
-        )
+        held_at_zero = np.array([name in negative for name in names])
+        found = jax.block_until_ready(estimator.fit(problem, bracket, held=held_at_zero, start=found))
         steps += int(found.steps)
     progress("computing errors")
     (values, std), covariance = _mean_and_std(found), np.asarray(found.covariance)
     half_width = np.asarray(bracket.half_width)
     sound = bool(np.isfinite(values).all() and np.isfinite(std).all() and np.asarray(found.innovations.sound).all())
     factor = _widening(found, half_width, recording) if sound else np.ones(values.size)
-    identifiable = np.asarray(is_identifiable(std, half_width, GAUSSIAN_PRIOR))
+    identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
     if not sound or not identifiable.any():
         identifiable[:] = True
     held: Held = {name: (float(values[i]), _PRIOR_NOTE) for i, name in enumerate(names) if not identifiable[i]}
