@@ -121,6 +121,8 @@ def test_the_registry_makes_every_estimator_and_names_misuse():
         (jaxos4.IBSS, "reach", [-1.0], "must be positive"),
         (jaxos4.OutputError, "tolerance", [0.0, -1.0], "must be positive"),
         (jaxos4.OutputError, "max_steps", [0], "must be an integer of at least 1"),
+        (jaxos4.FilterError, "tolerance", [0.0, np.nan], "must be positive"),
+        (jaxos4.FilterError, "max_steps", [0], "must be an integer of at least 1"),
         (jaxos4.EquationError, "memory", [-0.1, 1.5, np.nan], r"must lie in \[0, 1\]"),
         (jaxos4.EquationError, "bridge", [-1], "must be an integer of at least 0"),
         (jaxos4.RecursiveLeastSquares, "forgetting", [0.0, 1.1], r"must lie in \(0, 1\]"),

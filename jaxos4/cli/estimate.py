@@ -33,7 +33,9 @@ _OS4, _PUBLISHED = "os4", "published"
 
 def estimate(
     flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
-    estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
+    estimator: Annotated[
+        Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
+    ] = None,
     model: Annotated[
         VehicleModel | None,
         typer.Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
@@ -81,7 +83,7 @@ def estimate(
     if report is not None and model not in (None, "flight"):
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
     options: dict[str, Any] = {
-        "estimator": estimator.value,
+        "estimator": None if estimator is None else estimator.value,
         "bracket": None if bracket is None else read_toml(bracket),
         "channels": None if channels is None else channels.value,
         "initial_state": initial_state.value,

@@ -43,11 +43,13 @@ _GAP = 0.1
 # Time constants of the disturbance at which searches for the noise start [s]: the likelihood has several maxima.
 _STARTS = np.array([0.2, 0.02, 1.0])
 _SHORTEST, _LONGEST = 0.25, 30.0  # time constants: in samples, in seconds
-_NOISE_REACH = 1e4  # factor to either side
+_NOISE_REACH = 1e8  # factor to either side: simulated flights have no disturbance
 _NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
 _LONGEST_STEP = 1.0  # of a logarithm
 _NOISE_TOLERANCE = 0.1  # of the log-likelihood
 _DAMPING, _FACTOR, _LEAST, _MOST = 1e-2, 10.0, 1e-9, 1e8
+# Added to the information about each logarithm of the noise: without it, steps along a flat likelihood are too long.
+_NOISE_DAMPING = 1.0
 Unknowns = Float[Array, " unknowns"]
 
 
@@ -112,7 +114,7 @@ class FilterError(AbstractEstimator):
     needs_network: ClassVar[bool] = False
 
     tolerance: float = eqx.field(static=True, default=0.05)
-    max_steps: int = eqx.field(static=True, default=50)
+    max_steps: int = eqx.field(static=True, default=100)
 
     def __check_init__(self):
         if not self.tolerance > 0:
@@ -154,7 +156,7 @@ class FilterError(AbstractEstimator):
         index = _lanes(problem.flight.time.shape[0])
         observed, dt, model = _observed(problem, index), problem.flight.dt, problem.model
         inputs, count = problem.flight.inputs, bracket.center.shape[0]
-        samples = np.clip(index, 0, problem.flight.time.shape[0] - 1)
+        samples = np.minimum(index, problem.flight.time.shape[0] - 1)
         rows = Rows(windowed(problem.forcing(bracket.center), samples), ())
 
         def evaluate(unknowns: Unknowns) -> Innovations:
@@ -220,7 +222,8 @@ class FilterError(AbstractEstimator):
             stuck = ((best <= region.lower) & (gradient > 0)) | ((best >= region.upper) & (gradient < 0))
             gradient, moves = jnp.where(stuck, 0.0, gradient), ~stuck[:, None] & ~stuck
             diagonal = jnp.diagonal(curvature)
-            damped = jnp.where(moves, curvature, jnp.diag(diagonal)) + jnp.diag(diagonal * damping)
+            least = jnp.where(np.arange(diagonal.size) < count, 0.0, _NOISE_DAMPING)
+            damped = jnp.where(moves, curvature, jnp.diag(diagonal)) + jnp.diag(diagonal * damping + least)
             step = -(invert(damped) * gradient).sum(axis=-1)
             longest = jnp.where(np.arange(step.size) < count, jnp.inf, _LONGEST_STEP)
             trial = jnp.clip(best + jnp.clip(step, -longest, longest), region.lower, region.upper)
@@ -281,14 +284,16 @@ def joint(
     return total, whole
 
 
-def _lanes(samples: int) -> Int[np.ndarray, "lanes time"]:
-    """The samples of each lane. A lane begins with the end of the lane before it, which its filter needs to settle.
+def _lanes(samples: int, wanted: int = _LANE) -> Int[np.ndarray, "lanes time"]:
+    """The samples of each lane, of which there are about `wanted` after those that settle its filter.
 
-    In the first lane, these samples do not exist: they are negative. Samples beyond the last do not exist either.
+    A lane begins with the end of the lane before it, which its filter needs to settle. The first lane begins with the
+    flight. Samples beyond the last do not exist.
     """
-    lanes = max(round(samples / _LANE), 1)
-    length, settling = -(-samples // lanes), _SETTLING if lanes > 1 else 0
-    return length * np.arange(lanes)[:, None] + np.arange(-settling, length)
+    lanes = max(round((samples - _SETTLING) / wanted), 1)
+    settling = _SETTLING if lanes > 1 else 0
+    length = -(-(samples - settling) // lanes)
+    return length * np.arange(lanes)[:, None] + np.arange(settling + length)
 
 
 def _lanes_last(forcing: Forcing) -> Forcing:
@@ -298,40 +303,43 @@ def _lanes_last(forcing: Forcing) -> Forcing:
 def _observed(problem: ShootingProblem, index: Int[np.ndarray, "lanes time"]) -> Observed:
     """The measurements in lanes, where filters restart, and which innovations count.
 
-    A filter restarts after a gap, and where another stretch begins. Until it has settled its innovations do not count:
-    the controller knew the disturbance then, and the filter does not. At the begin of the flight they count.
+    A filter restarts in a gap, and where another stretch begins. Until it has settled its innovations do not count: the
+    controller knew the disturbance then, and the filter does not. At the beginning of the flight they count.
     """
-    flight, samples = problem.flight, problem.flight.time.shape[0]
-    own = np.arange(index.shape[1]) >= index.shape[1] - np.diff(index[:, 0], append=index[-1, -1] + 1).min()
-    exists, place = (index >= 0) & (index < samples), np.clip(index, 0, samples - 1)
+    flight, samples, lanes = problem.flight, problem.flight.time.shape[0], index.shape[0]
+    row = np.arange(index.shape[1])
+    exists, place = (index < samples).T, np.minimum(index, samples - 1)
+    # Each sample counts in one lane.
+    own = ((row >= _SETTLING) | (index[:, :1] == 0)).T
     measured = problem.measured()
     missing = jnp.isnan(measured[:, :3]).all(axis=1)
     stretch = jnp.zeros(samples, dtype=int) if flight.stretch is None else flight.stretch
 
     def follow(carry, row):
         gap, since = carry
-        is_missing, another, k = row
-        restart = another | (~is_missing & (gap * flight.dt >= _GAP))
+        is_missing, another = row
+        # In a long gap each sample restarts, so that no trajectory runs away there.
+        restart = another | (gap * flight.dt >= _GAP)
         since = jnp.where(restart, 0, since + 1)
         return (jnp.where(is_missing, gap + 1, 0), since), (restart, since >= _SETTLING)
 
     another = jnp.concatenate([jnp.zeros(1, dtype=bool), jnp.diff(stretch) != 0])
     first = jnp.zeros((), dtype=int), jnp.full((), _SETTLING, dtype=int)
-    _, (restart, settled) = jax.lax.scan(follow, first, (missing, another, np.arange(samples)))
+    _, (restart, settled) = jax.lax.scan(follow, first, (missing, another))
 
     def in_lanes(series: Array) -> Array:
         return jnp.moveaxis(series[place], 0, -1)  # lanes last
 
-    begins = np.argmax(exists, axis=1)[:, None] == np.arange(index.shape[1])
-    if problem.initial_state is not None:
-        begins = begins & (index != 0)
-    restarts = in_lanes(restart) | begins.T
-    measured = jnp.where(exists.T[:, None], in_lanes(measured), jnp.nan)
-    means, count, closes = _block_means(measured[:, 3:], restarts, flight.dt)
     known = None
+    begins = np.broadcast_to(row[:, None] == 0, exists.shape)
     if problem.initial_state is not None:
-        known = jnp.where((index == 0).any(axis=1), problem.initial_state[CASCADE_ORDER[:3]][:, None], 0.0)
-    counts = in_lanes(settled) & (exists & own).T
+        is_first = np.arange(lanes) == 0
+        begins = begins & ~is_first
+        known = jnp.where(is_first, problem.initial_state[CASCADE_ORDER[:3]][:, None], 0.0)
+    restarts = in_lanes(restart) | begins | ~exists
+    measured = jnp.where(exists[:, None], in_lanes(measured), jnp.nan)
+    means, count, closes = _block_means(measured[:, 3:], restarts, flight.dt)
+    counts = in_lanes(settled) & exists & own
     return Observed(jnp.concatenate([measured[:, :3], means], axis=1), restarts, counts, count, closes, known)
 
 

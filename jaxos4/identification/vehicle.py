@@ -100,7 +100,7 @@ def fit_vehicle(
     progress("compiling, and fitting the parameters that every flight excites")
     first = _refined(_Part(model, bracket, held), problem, values[_free(model, held)], huber=False)
     if not has_answer(first.estimate):
-        return _no_fit(_holding(first.problem, model, held), first.estimate, held, first.rollouts)
+        return _no_fit(holding(first.problem, model, held), first.estimate, held, first.rollouts)
 
     progress("choosing the identifiable parameters")
     values[_free(model, held)] = np.asarray(first.estimate.parameters)
@@ -109,7 +109,7 @@ def fit_vehicle(
     progress("fitting the identifiable parameters")
     start, part = eqx.tree_at(lambda p: p.sigma, problem, first.problem.sigma), _Part(model, bracket, held)
     last = _refined(part, start, values[_free(model, held)], huber=huber)
-    rollouts, known = first.rollouts + last.rollouts, _holding(last.problem, model, held)
+    rollouts, known = first.rollouts + last.rollouts, holding(last.problem, model, held)
     if not has_answer(last.estimate):
         return _no_fit(known, last.estimate, held, rollouts)
 
@@ -136,7 +136,7 @@ def refit(
     """
     model = fit.problem.model.model if isinstance(fit.problem.model, HeldParameters) else fit.problem.model
     held = fit.held if held is None else held
-    problem = _holding(fit.problem, model, held)
+    problem = holding(fit.problem, model, held)
     estimate = estimator(problem, free_bracket(bracket, model, held))
     rollouts = fit.rollouts + int(estimate.rollouts)
     if not has_answer(estimate):
@@ -222,7 +222,7 @@ def _std(estimate: Estimate) -> Float[np.ndarray, " free"]:
     return np.sqrt(np.diagonal(estimate.covariance))
 
 
-def _holding(problem: ShootingProblem, model: AbstractModel, held: Held) -> ShootingProblem:
+def holding(problem: ShootingProblem, model: AbstractModel, held: Held) -> ShootingProblem:
     """The problem for `model` with the parameters in `held` known."""
     free = hold(model, {name: value for name, (value, _) in held.items()}) if held else model
     return eqx.tree_at(lambda p: p.model, problem, free)

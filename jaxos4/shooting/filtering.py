@@ -29,6 +29,8 @@ Series = Float[Array, "time channels lanes"]
 _RATES = 3
 # Standard deviation of the rates before the first measurement of a lane [rad/s]: as good as unknown.
 _UNKNOWN_RATE = 1e3
+# The sample time over the time constant below which a Taylor series is more exact.
+_SHORT = 0.03
 
 
 class Noise(NamedTuple):
@@ -115,8 +117,10 @@ def _step_of(noise: Noise, dt: Scalar) -> _Step:
     share = dt / tau
     lost, lost_twice = -jnp.expm1(-share), -jnp.expm1(-2 * share)
     is_rate = np.arange(strength.shape[0])[:, None] < _RATES
-    # A difference of nearly equal numbers: in double precision exact enough for time constants of 1e4 samples.
-    rate = jnp.where(is_rate, 2 * variance * tau**2 * jnp.maximum(share - 2 * lost + lost_twice / 2, 0.0), 0.0)
+    # For long time constants a difference of nearly equal numbers, and so its Taylor series.
+    series = share**3 / 3 * (1 - share * (3 / 4 - share * (7 / 20 - share * (1 / 8 - share * (31 / 840)))))
+    spread = jnp.where(share < _SHORT, series, share - 2 * lost + lost_twice / 2)
+    rate = jnp.where(is_rate, 2 * variance * tau**2 * spread, 0.0)
     cross = jnp.where(is_rate, variance * tau * lost**2, 0.0)
     reach = jnp.where(is_rate, tau * lost, 0.0)
     return _Step(jnp.exp(-share), reach, _Covariance(rate, cross, variance * lost_twice), variance, jnp.exp(2 * sensor))
@@ -200,8 +204,8 @@ class _Feedback(NamedTuple):
 
     rate: tuple[Lanes, ...]
     disturbance: tuple[Lanes, ...]
-    reach: tuple[Lanes, ...]
-    kept: tuple[Lanes, ...]
+    reach: tuple[Scalar, ...]
+    kept: tuple[Scalar, ...]
 
 
 def innovate(
@@ -231,8 +235,9 @@ def innovate(
     scalars, positions, unknowns = tuple(parameters), np.asarray(forcing_parameters, dtype=int), count + 3
     basis = tuple(np.eye(unknowns, count, dtype=parameters.dtype).T)
     gains, gain_slopes = filter_gains(observed, noise, dt)
+    move, observe = (jax.vmap(function, in_axes=(0, 0, None)) for function in (move, observe))
 
-    def transition(noise: Noise) -> tuple[tuple[Lanes, ...], tuple[Lanes, ...]]:
+    def transition(noise: Noise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
         step = _step_of(noise, dt)
         return tuple(step.reach[:_RATES, 0]), tuple(step.kept[:, 0])
 
@@ -260,6 +265,8 @@ def innovate(
     def body(carry, row):
         known, slopes, sound = carry
         forcing, tangents, gain, gain_slope, row = row
+        for x in known.rates:
+            sound = sound & ((jnp.abs(x) < FASTEST) | row[1])
         feedback = _Feedback(tuple(gain.rate[:_RATES]), tuple(gain.disturbance), reach, kept)
         by_gain = (tuple(jnp.moveaxis(leaf, 0, 1)) for leaf in (gain_slope.rate[:, :_RATES], gain_slope.disturbance))
         nothing = jnp.zeros((count, lanes), dtype=float)
@@ -283,8 +290,6 @@ def innovate(
             )
             wide = jax.tree.map(lambda t: jnp.zeros((unknowns, lanes), dtype=float).at[positions].set(t), tangents)
             slopes, by_errors = jax.vmap(push)(slopes, wide, basis, direction)
-        for x in known.rates:
-            sound = sound & (jnp.abs(x) < FASTEST)
         return (known, slopes, sound), (jnp.stack(errors), jnp.stack(by_errors))
 
     zero = jnp.zeros(lanes, dtype=float)
