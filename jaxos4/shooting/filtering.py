@@ -1,10 +1,10 @@
 """Kalman filters for disturbances that a model does not contain: the inner loops of filter error.
 
-A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a force
-per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s. The
-filter of a body rate knows the rate and its disturbance; that of a specific force knows its disturbance. Channels share
-no covariance, and the covariances do not depend on the parameters of the model. So the gains are computed first, and
-then the innovations.
+A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a
+force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
+The filter of a body rate knows the rate and its disturbance; that of a specific force knows its disturbance. Channels
+share no covariance, and the covariances do not depend on the parameters of the model. So the gains are computed first,
+and then the innovations.
 
 Arrays have the axes (time, channels, lanes). A lane is one part of the flight.
 """
