@@ -16,6 +16,11 @@ from .errors import InputError
 
 ALTERNATING_SPINS = (1.0, -1.0, 1.0, -1.0)
 
+GUESS = "guess"
+"""In an airframe's file, instead of `inertia`, `drag_coefficient` or `rotor_inertia`: guessed from mass and rotors."""
+# In units of m r^2, m r^2 and r b, for rotors at the distance r: those of published quadrotors are within 40 %.
+_GUESSED_INERTIA, _GUESSED_ROTOR_INERTIA, _GUESSED_DRAG = (0.3, 0.3, 0.5), 1e-3, 0.1
+
 
 class Airframe(eqx.Module):
     """A rigid quadrotor with any layout of four rotors, in a frame with x forward, y left and z up.
@@ -135,7 +140,12 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
     The keys of the file, in SI units: `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, `drag_coefficient`,
     `rotor_inertia`; either `arm` (plus layout) or `rotor_positions = [[x1, y1], ...]`; optionally `rotor_spins`,
-    `gravity` and `max_rotor_speed`.
+    `gravity` and `max_rotor_speed`. `hover_speed`, at which the rotors carry the weight [rad/s], can replace
+    `thrust_coefficient`.
+
+    `inertia`, `drag_coefficient` and `rotor_inertia` can be `"guess"`. With the mass m, and the rotors' distance r from
+    the centre (root mean square), the guesses are: inertia m r^2 [0.3, 0.3, 0.5], drag coefficient 0.1 r times the
+    thrust coefficient, rotor inertia 0.001 m r^2. They are good enough to begin a search.
 
     **Raises:** `InputError` with one line that names the wrong key; `OSError` if the file cannot be read.
     """
@@ -163,15 +173,23 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
             raise InputError(f"`arm` must be positive, got {arm}.")
         table["rotor_positions"] = plus_layout(arm)
     table.setdefault("rotor_spins", ALTERNATING_SPINS)
+    hover_speed = table.pop("hover_speed", None)
+    if hover_speed is not None and "thrust_coefficient" in table:
+        raise InputError("`hover_speed` and `thrust_coefficient` exclude each other; keep one of them.")
+    given = table.keys() | ({"thrust_coefficient"} if hover_speed is not None else set())
     required = [name for name in _SHAPES if name not in _OPTIONAL]
-    missing = [name for name in required if name not in table]
+    missing = [name for name in required if name not in given]
     if missing:
         raise InputError(f"`{missing[0]}` is missing; an airframe needs {', '.join(required)}.")
     unknown = [name for name in table if name not in _SHAPES]
     if unknown:
-        raise InputError(f"`{unknown[0]}` is not a known key; the keys are arm, {', '.join(_SHAPES)}.")
-    constants = {name: _numbers(name, value, _SHAPES[name]) for name, value in table.items()}
+        raise InputError(f"`{unknown[0]}` is not a known key; the keys are arm, hover_speed, {', '.join(_SHAPES)}.")
+    guessed = [name for name in _GUESSABLE if isinstance(table[name], str) and table[name] == GUESS]
+    constants = {name: _numbers(name, value, _SHAPES[name]) for name, value in table.items() if name not in guessed}
     _check_sizes(constants, table)
+    if hover_speed is not None:
+        constants["thrust_coefficient"] = _thrust_coefficient(hover_speed, constants)
+    constants |= {name: value for name, value in _guesses(constants).items() if name in guessed}
     airframe = Airframe(**constants)
     mixer = np.asarray(airframe.mixer)
     scale = np.abs(mixer).max(axis=1, keepdims=True)
@@ -182,6 +200,25 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
     return airframe
 
 
+def _thrust_coefficient(hover_speed: Any, constants: dict[str, np.ndarray]) -> np.ndarray:
+    """With which four rotors at `hover_speed` carry the weight."""
+    speed = _numbers("hover_speed", hover_speed, ()).item()
+    if not 1e-3 < speed < 1e6:
+        raise InputError(f"`hover_speed` must be positive and of a rotor's size in rad/s, got {_short(hover_speed)}.")
+    return np.asarray(constants["mass"] * constants.get("gravity", 9.81) / (4 * speed**2))
+
+
+def _guesses(constants: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The values for `GUESS`, see `load_airframe`."""
+    square = (constants["rotor_positions"] ** 2).sum(axis=1).mean()
+    guesses = {
+        "inertia": constants["mass"] * square * np.asarray(_GUESSED_INERTIA),
+        "drag_coefficient": constants["thrust_coefficient"] * np.sqrt(square) * _GUESSED_DRAG,
+        "rotor_inertia": constants["mass"] * square * _GUESSED_ROTOR_INERTIA,
+    }
+    return {name: np.asarray(value) for name, value in guesses.items()}
+
+
 def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> None:
     for name in _POSITIVE & constants.keys():
         least, most = (0.0, np.inf) if name == "max_rotor_speed" else (1e-15, 1e6)
@@ -189,15 +226,15 @@ def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> Non
             raise InputError(
                 f"`{name}` must be positive and of a quadrotor's size in SI units, got {_short(table[name])}."
             )
-    if constants["rotor_inertia"] < 0:
+    if constants.get("rotor_inertia", np.zeros(())) < 0:
         raise InputError(f"`rotor_inertia` must not be negative, got {table['rotor_inertia']}.")
     for name in ("rotor_positions", "rotor_inertia"):
-        if np.any(np.abs(constants[name]) > 1e3):
+        if name in constants and np.any(np.abs(constants[name]) > 1e3):
             raise InputError(f"`{name}` must be of a quadrotor's size in SI units, got {_short(table[name])}.")
     if np.any(np.abs(constants["rotor_spins"]) != 1):
         raise InputError(f"`rotor_spins` must be 1 (counter-clockwise) or -1, got {_short(table['rotor_spins'])}.")
-    inertia = constants["inertia"]
-    if 2 * inertia.max() > inertia.sum():
+    inertia = constants.get("inertia")
+    if inertia is not None and 2 * inertia.max() > inertia.sum():
         raise InputError(
             f"`inertia` {inertia.tolist()} breaks the triangle inequality: no moment may exceed the sum of the others."
         )
@@ -206,6 +243,7 @@ def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> Non
 _VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
 _SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
 _OPTIONAL = {"gravity", "max_rotor_speed"}
+_GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
 _POSITIVE = _SHAPES.keys() - {"rotor_positions", "rotor_spins", "rotor_inertia"}
 
 

@@ -25,6 +25,13 @@ class RESULTS(eqx.Enumeration):
         "the flight differs from the network's training in inputs, sampling or start, or has more noise or gaps: "
         "train a network for this flight"
     )
+    implausible = (
+        "the estimate contradicts physics or the airframe file: correct what is named, and do not use the numbers"
+    )
+    no_skill = (
+        "the fit predicts measurements that were not fitted no better than constant rates: fly with more excitation, "
+        "or correct the airframe"
+    )
     max_sweeps = "the search did not converge within the largest number of sweeps: allow more sweeps"
 
 
@@ -36,6 +43,8 @@ NAMES = (
     "attitude_singularity",
     "bracket_invalid",
     "network_mismatch",
+    "implausible",
+    "no_skill",
     "max_sweeps",
 )
 

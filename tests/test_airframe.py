@@ -1,3 +1,4 @@
+import json
 import subprocess
 import sys
 
@@ -127,6 +128,29 @@ def test_toml_with_an_arm_and_with_positions(tmp_path):
     assert (airframe.gravity, airframe.max_rotor_speed) == (9.8, 900.0)
 
 
+def test_guesses_and_the_hover_speed(tmp_path):
+    path = tmp_path / "quad.toml"
+    guesses = 'inertia = "guess"\ndrag_coefficient = "guess"\nrotor_inertia = "guess"\n'
+    path.write_text(f"mass = 0.65\narm = 0.23\nhover_speed = 225.7\n{guesses}")
+    airframe = load_airframe(path)
+    np.testing.assert_allclose(airframe.hover_speed, 225.7, rtol=1e-12)
+    np.testing.assert_allclose(airframe.thrust_coefficient, 3.13e-5, rtol=1e-3)
+    square = 0.65 * 0.23**2
+    np.testing.assert_allclose(airframe.inertia, [0.3 * square, 0.3 * square, 0.5 * square])
+    np.testing.assert_allclose(airframe.rotor_inertia, 1e-3 * square)
+    np.testing.assert_allclose(airframe.drag_coefficient, 0.023 * airframe.thrust_coefficient)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_guessed_inertias_are_within_40_percent(tmp_path, name):
+    preset, path = PRESETS[name], tmp_path / "quad.toml"
+    keys = {key: np.asarray(getattr(preset, key)).tolist() for key in ("mass", "rotor_positions", "drag_coefficient")}
+    keys |= {"hover_speed": float(preset.hover_speed), "inertia": "guess", "rotor_inertia": 1e-5}
+    path.write_text("\n".join(f"{key} = {json.dumps(value)}" for key, value in keys.items()))
+    ratio = np.asarray(load_airframe(path).inertia) / np.asarray(preset.inertia)
+    assert (np.abs(ratio - 1) < 0.4).all(), ratio
+
+
 def test_presets_by_name():
     assert all(load_airframe(name) is preset for name, preset in PRESETS.items())
 
@@ -159,6 +183,12 @@ BAD = {
     "no yaw": ("rotor_spins", GOOD + "rotor_spins = [1, 1, 1, 1]"),
     "negative speed": ("max_rotor_speed", GOOD + "max_rotor_speed = -1"),
     "no TOML": ("TOML", "mass: 0.65"),
+    "two thrusts": ("hover_speed", GOOD + "hover_speed = 200"),
+    "hovers at rest": ("hover_speed", _replaced("thrust_coefficient", "hover_speed = 0")),
+    "hovers as text": ("hover_speed", _replaced("thrust_coefficient", 'hover_speed = "guess"')),
+    "hovers without mass": ("mass", _replaced("mass", "").replace("thrust_coefficient = 3.13e-5", "hover_speed = 200")),
+    "guessed mass": ("mass", _replaced("mass", 'mass = "guess"')),
+    "guessed without arms": ("rotor_positions", _replaced("arm", "rotor_positions = [[0, 0], [0, 0], [0, 0], [0, 0]]")),
 }
 
 

@@ -1,4 +1,4 @@
-"""`jaxos4 estimate --model flight`: the parameters of a simulated vehicle from two logs, and wrong requests."""
+"""`jaxos4 estimate` of real vehicles: the parameters of a simulated vehicle from two logs, and wrong requests."""
 
 import json
 from pathlib import Path
@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import refused
+from test_logs_ulog import everything
 
 import jaxos4
 from jaxos4.cli._choices import VehicleModel
 from jaxos4.recording.preparation import prepare
-from jaxos4.recording.reading import read_recording
+from jaxos4.recording.reading import read_recording, vehicle_evidence
 
 AIRFRAME = """
 mass = 0.65
@@ -65,9 +66,8 @@ def command(vehicle, *flights):
 def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
     out = tmp_path / "found.json"
     code, page_text, err = run(
-        *("estimate", str(vehicle / "flight1.csv"), str(vehicle / "flight2.csv"), "--model", "flight"),
-        *("--airframe", str(vehicle / "airframe.toml"), "--terms", ",".join(TERMS), "--out", str(out)),
-        *("--report", str(tmp_path / "found.html")),
+        *(*command(vehicle, "flight1.csv", "flight2.csv"), "--terms", ",".join(TERMS)),
+        *("--out", str(out), "--report", str(tmp_path / "found.html")),
     )
     assert code == 0, err
     report = json.loads(out.read_text(encoding="utf-8"))
@@ -82,6 +82,11 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
     page = (tmp_path / "found.html").read_text(encoding="utf-8")
     assert all(name in page for name in TRUTH)
     assert report["provenance"]["terms"] == list(TERMS)
+    # The log says that it is of a real vehicle, and the page says that this decided.
+    assert report["model"] == "flight"
+    chosen = "flight1.csv has commands, not rotor speeds: taken as a real vehicle's (--model flight)"
+    assert report["provenance"]["notes"][0] == f"{vehicle}/{chosen}"
+    assert "note: " in page_text
 
 
 @pytest.mark.parametrize(
@@ -100,8 +105,10 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path):
         (("--model", "flight", "--estimator", "kalman"), "--estimator"),
         (("--model", "flight", "--channels", "rates"), "--channels"),
         (("--model", "flight", "--initial-state", "known"), "--initial-state"),
-        (("--terms", "offset"), "--terms"),
-        (("--from", "1"), "--from"),
+        (("--terms", "wings"), "--terms: knows no `wings`"),
+        (("--model", "published", "--terms", "offset"), "--terms"),
+        (("--model", "published", "--from", "1"), "--from"),
+        (("--model", "published", "--report", "r.html"), "--report"),
     ],
 )
 def test_wrong_requests_are_one_line(run, vehicle, options, said):
@@ -109,7 +116,30 @@ def test_wrong_requests_are_one_line(run, vehicle, options, said):
 
 
 def test_only_the_flight_model_takes_several_flights(run, vehicle):
-    refused(run(*command(vehicle, "flight1.csv", "flight2.csv")), "--model flight for several")
+    several = run(*command(vehicle, "flight1.csv", "flight2.csv"), "--model", "corrected")
+    refused(several, "--model flight for several")
+
+
+def test_a_vehicle_needs_an_airframe(run, vehicle, tmp_path):
+    remedy = ("needs --airframe", "--airframe-out mine.toml")
+    refused(run("estimate", str(vehicle / "flight1.csv")), "flight1.csv has commands", *remedy)
+    assert run("simulate", "--duration", "1", "--out", "os4.csv")[0] == 0
+    refused(run("estimate", "os4.csv", "--model", "flight"), "--model flight", *remedy)
+    refused(run("estimate", "os4.csv", "--report", "r.html"), "--report", "os4.csv has no sign")
+
+
+def test_a_log_shows_whether_its_vehicle_is_real(vehicle, tmp_path):
+    commands = read_recording(vehicle / "flight1.csv", full_scale=1.0)
+    assert vehicle_evidence(commands) == "has commands, not rotor speeds"
+    flight = commands.flight
+    force = np.ones((flight.time.shape[0], 3))
+    felt = commands._replace(flight=jaxos4.Flight(flight.time, flight.omega, flight.states, force))
+    assert vehicle_evidence(felt) == "has an accelerometer"
+    speeds = commands._replace(flight=jaxos4.Flight(flight.time, flight.omega, flight.states))
+    assert vehicle_evidence(speeds) == ""
+    (tmp_path / "log").write_bytes(everything())
+    assert vehicle_evidence(speeds._replace(name=str(tmp_path / "log"))) == "is a log of a vehicle (PX4 ULog)"
+    assert vehicle_evidence(speeds._replace(name="flight 1")) == ""
 
 
 def test_each_measurement_is_either_fitted_or_held_out(vehicle):

@@ -24,11 +24,16 @@ UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 NOISE = Noise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 1.0], [0.02, 0.01, 0.03])))
 
 
+def one_lane(samples=501):
+    return np.arange(samples)[None]
+
+
 @eqx.filter_jit
-def likelihood(problem, parameters, noise, lane=10**6):
-    """The innovations of a problem whose forcing depends on no parameter; by default in one lane."""
-    index = _lanes(problem.flight.time.shape[0], lane)
-    observed, place = _observed(problem, index), np.minimum(index, problem.flight.time.shape[0] - 1)
+def likelihood(problem, parameters, noise, *, cut=False):
+    """The innovations of a problem whose forcing depends on no parameter; in one lane, unless the flight is `cut`."""
+    samples = problem.flight.time.shape[0]
+    index = _lanes(samples) if cut else one_lane(samples)
+    observed, place = _observed(problem, index), np.minimum(index, samples - 1)
     forcing = jax.tree.map(lambda leaf: leaf[place].T, problem.forcing(parameters))
     step, observe, dt = problem.step, problem.model.observe, problem.flight.dt
     nothing = {"forcing_tangents": None, "forcing_parameters": ()}
@@ -92,7 +97,7 @@ def textbook(noise, measured, restart):
 
 
 def test_the_gains_are_those_of_a_textbook_filter():
-    observed = _observed(disturbed(), _lanes(501))
+    observed = _observed(disturbed(), one_lane())
     (gains, _), measured = filter_gains(observed, NOISE, jnp.asarray(DT)), ~np.isnan(observed.measured)
     assert observed.restart[:, 0].nonzero()[0].tolist() == [0, *range(210, 231)]
     assert observed.counts[:, 0].nonzero()[0].tolist() == [*range(210), *range(230 + 128, 501)]
@@ -112,7 +117,7 @@ def test_the_variance_that_a_disturbance_adds_is_exact(tau):
     noise = Noise(*(jnp.log(jnp.array([x, 1.0, 1.0])) for x in (3.0, tau, 1e-9)))
     measured = jnp.array([0.0, 0.0])[:, None, None] * jnp.ones((1, 3, 1))
     first = jnp.zeros((2, 1), dtype=bool)
-    observed = _observed(standard_problem(channels="rates", duration=0.1), _lanes(11))
+    observed = _observed(standard_problem(channels="rates", duration=0.1), one_lane(11))
     observed = observed._replace(measured=measured, restart=first)
     gains, _ = filter_gains(observed, noise, jnp.asarray(DT))
     moved, added = transition(3.0, tau)
@@ -207,7 +212,7 @@ def test_the_information_is_the_covariance_of_the_gradient():
 def test_the_likelihood_does_not_depend_on_the_lanes():
     problem = disturbed()
     alone = likelihood(problem, MODEL.alpha, NOISE)
-    cut = likelihood(problem, MODEL.alpha, NOISE, 90)
+    cut = likelihood(problem, MODEL.alpha, NOISE, cut=True)
     assert (alone.cost.shape, cut.cost.shape) == ((1,), (4,))
     np.testing.assert_allclose(cut.cost.sum(), alone.cost.sum(), atol=0.2)
     np.testing.assert_allclose(cut.gradient.sum(axis=(0, 2)), alone.gradient.sum(axis=(0, 2)), rtol=0.05, atol=1.0)
@@ -250,7 +255,7 @@ def test_a_known_start_is_used_in_flights_of_several_lanes():
     start = np.array(long.flight.states[0])
     start[RATES] = 0.3, -0.2, 0.1
     problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
-    observed = _observed(problem, _lanes(501, 90))
+    observed = _observed(problem, _lanes(501))
     assert observed.restart[0].tolist() == [False, True, True, True]
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
     gains, _ = filter_gains(observed, NOISE, jnp.asarray(DT))
@@ -281,7 +286,7 @@ def joined(flight):
 def test_another_recording_restarts_the_filter():
     problem = standard_problem(channels="rates", free=True, states=noisy_states(1, seed=4)[0])
     problem = eqx.tree_at(lambda p: p.flight, problem, joined(problem.flight))
-    observed = _observed(problem, _lanes(501))
+    observed = _observed(problem, one_lane())
     assert observed.restart[:, 0].nonzero()[0].tolist() == [0, 251]
     assert (~observed.counts[:, 0]).nonzero()[0].tolist() == list(range(251, 251 + 128))
     found = FilterError()(problem, jaxos4.Bracket.default(MODEL))

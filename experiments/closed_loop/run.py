@@ -59,6 +59,12 @@ def fly(gust: float, i: int, duration: float, seed: int) -> jaxos4.Flight:
     return jaxos4.fly_closed_loop(loop, references, dt=DT, key=jax.random.fold_in(key, 1))
 
 
+def turned_over(flight: jaxos4.Flight) -> bool:
+    """Whether the gusts threw the vehicle on its side: then it is lost, and nobody has its log."""
+    angles = np.asarray(flight.states)[:, [jaxos4.STATE_NAMES.index(name) for name in ("phi", "theta")]]
+    return bool(flight.result != jaxos4.RESULTS.successful) or bool((np.abs(angles) > np.pi / 2).any())
+
+
 @eqx.filter_jit
 def _regressions(flights: jaxos4.Flight, airframes: jaxos4.Airframe) -> jaxos4.Estimate:
     def one(flight: jaxos4.Flight, airframe: jaxos4.Airframe) -> jaxos4.Estimate:
@@ -102,7 +108,8 @@ def regress(flights: list[tuple[int, jaxos4.Flight]]) -> list[dict]:
 def search(estimator: str, flight: jaxos4.Flight, i: int) -> dict:
     """The row of one flight by an estimator of `jaxos4.identify`."""
     begin = time.perf_counter()
-    found = jaxos4.identify(flight, known_airframe(i), estimator=estimator, holdout=0.0)
+    whole = {"begin": float(flight.time[0]), "end": float(flight.time[-1])}  # one length of all flights: one program
+    found = jaxos4.identify(flight, known_airframe(i), estimator=estimator, holdout=0.0, **whole)
     row: dict = {"flight": i, "result": found.result, "seconds": time.perf_counter() - begin}
     constants = {} if found.rigid_body is None else found.rigid_body.constants
     for name, alpha in INERTIAS.items():
@@ -192,8 +199,7 @@ def main(
 
     for gust in gusts:
         flown = [(i, fly(gust, i, duration, seed)) for i in range(flights)]
-        # A vehicle that pitches over has no log.
-        flown = [(i, flight) for i, flight in flown if flight.result == jaxos4.RESULTS.successful]
+        flown = [(i, flight) for i, flight in flown if not turned_over(flight)]
         for name in estimators:
             case = next((c for c in report["cases"] if (c["gust"], c["estimator"]) == (gust, name)), None)
             if case is None:

@@ -118,7 +118,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
     dt = float(problem.flight.dt)
     known = ~np.isnan(rates.sum(axis=1))
-    modelled = np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
+    modelled = modelled_acceleration(problem, parameters)
     measured = np.diff(rates, axis=0) / dt
     usable = known[1:] & known[:-1] & np.isfinite(modelled).all(axis=1)
     if problem.flight.stretch is not None:
@@ -127,6 +127,16 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     begins = _segments(usable, length)
     axes = [response(modelled[:, i], measured[:, i], begins, length, dt) for i in range(3)]
     return FrequencyResponse(*axes)
+
+
+def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[np.ndarray, "samples-1 3"]:
+    """The model's angular acceleration from each sample to the next at the measured rates [rad/s^2].
+
+    A rate that was not measured counts as 0.
+    """
+    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
+    known = ~np.isnan(rates.sum(axis=1))
+    return np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
 
 
 @eqx.filter_jit

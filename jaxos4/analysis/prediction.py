@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._custom_types import Parameters
+from .._custom_types import Parameters, as_float
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
+from .disturbance import Disturbances, transition
 
 HORIZONS = (0.1, 0.25, 0.5)
 RATES = CASCADE_ORDER[:3]
@@ -54,7 +55,11 @@ class Skill(NamedTuple):
 
 
 def predictions(
-    problem: ShootingProblem, parameters: Parameters, *, horizons: tuple[float, ...] = HORIZONS
+    problem: ShootingProblem,
+    parameters: Parameters,
+    *,
+    horizons: tuple[float, ...] = HORIZONS,
+    disturbance: Disturbances | None = None,
 ) -> Predictions:
     """Predict the body rates from many starts, with the recorded rotor speeds.
 
@@ -62,7 +67,7 @@ def predictions(
     omitted if one of these rates is missing, or if the longest horizon reaches beyond the stretch.
 
     **Arguments:** `problem` gives model, flight and method; its windows and channels have no effect. `horizons` [s] are
-    positive.
+    positive. `disturbance`: fades from its value at the start, as the past lets expect; by default there is none.
 
     **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """
@@ -71,7 +76,11 @@ def predictions(
     start, initial = starts(flight, horizons)
     rates = np.asarray(flight.states)[:, RATES]
     rate_problem = ShootingProblem(problem.model, flight, sigma=problem.sigma, channels="rates", method=problem.method)
-    predicted = _predict(rate_problem, parameters, jnp.asarray(start), jnp.asarray(initial), int(ahead.max()))
+    if disturbance is None:
+        disturbance = Disturbances(np.zeros(rates.shape), np.ones(3))
+    first, fading = as_float(disturbance.value[start]), as_float(disturbance.time_constant)
+    begin = jnp.asarray(start), jnp.asarray(initial), first
+    predicted = _predict(rate_problem, parameters, *begin, fading, int(ahead.max()))
     at = start[:, None] + ahead
     return Predictions(start, ahead * dt, initial, np.asarray(predicted)[:, ahead], rates[at])
 
@@ -104,22 +113,29 @@ def _predict(
     parameters: Parameters,
     start: Int[Array, " starts"],
     initial: Float[Array, "starts 3"],
+    disturbance: Float[Array, "starts 3"],
+    time_constant: Float[Array, "3"],
     steps: int,
 ) -> Float[Array, "starts steps_and_one 3"]:
     model, scalars, forcing = problem.model, tuple(parameters), problem.forcing(parameters)
+    kept, reach = transition(time_constant, problem.flight.dt)
 
-    def fly(first: Int[Array, ""], measured: Float[Array, "3"]) -> Float[Array, "steps_and_one 3"]:
+    def fly(
+        first: Int[Array, ""], measured: Float[Array, "3"], pushed: Float[Array, "3"]
+    ) -> Float[Array, "steps_and_one 3"]:
         rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
         row = jax.tree.map(lambda leaf: leaf[0], rows)
         # A gyro bias is part of the measurement, not of the state.
         added = jnp.stack(model.observe(unstack(measured), row, scalars)[:3]) - measured
 
-        def step(state: State, row) -> tuple[State, Float[Array, "3"]]:
-            return problem.step(state, row, scalars), jnp.stack(model.observe(state, row, scalars)[:3])
+        def step(carry: tuple[State, Array], row) -> tuple[tuple[State, Array], Float[Array, "3"]]:
+            state, pushed = carry
+            rates = jnp.stack(problem.step(state, row, scalars).rates) + reach * pushed
+            return (unstack(rates), kept * pushed), jnp.stack(model.observe(state, row, scalars)[:3])
 
-        return jax.lax.scan(step, unstack(measured - added), rows)[1]
+        return jax.lax.scan(step, (unstack(measured - added), pushed), rows)[1]
 
-    return jax.vmap(fly)(start, initial)
+    return jax.vmap(fly)(start, initial, disturbance)
 
 
 def skill(predicted: Predictions) -> Skill:

@@ -16,7 +16,21 @@ def check_output(out: Path, *inputs: Path | None) -> None:
             raise InputError(f"{out}: would overwrite an input; give the output another name.")
 
 
+def check_different(**outputs: Path | None) -> None:
+    """Refuses two outputs that are one file. Takes options by their names in Python."""
+    names: dict[Path, str] = {}
+    for name, out in outputs.items():
+        option = f"--{name.replace('_', '-')}"
+        if out is not None and (other := names.setdefault(out.resolve(), option)) != option:
+            raise InputError(f"{out}: {other} and {option} name one file; give them two.")
+
+
+def write_text(text: str, out: Path) -> None:
+    """Writes a text file."""
+    with write_atomically(out) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
 def write_json(report: dict[str, Any], out: Path) -> None:
     """Writes a JSON file. A number that is not finite is an error of the program."""
-    with write_atomically(out) as beside:
-        beside.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", out)

@@ -10,7 +10,6 @@ import typer
 from .._files import read_toml
 from ..errors import InputError
 from ._choices import (
-    AirframeOption,
     BracketOption,
     ChannelsOption,
     Estimator,
@@ -22,20 +21,28 @@ from ._choices import (
     WindowOption,
 )
 from ._messages import in_options, option_names
-from ._output import check_output, write_json
+from ._output import check_different, check_output, write_json
 from ._progress import stages
 
 if TYPE_CHECKING:
     from ..identification import Identification
+    from ..recording import Recording
+
+_OS4, _PUBLISHED = "os4", "published"
 
 
 def estimate(
     flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
-    estimator: Annotated[Estimator, typer.Option(help="The algorithm.")] = Estimator["ibss"],
+    estimator: Annotated[
+        Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
+    ] = None,
     model: Annotated[
-        VehicleModel, typer.Option(help="The equations: as printed, corrected, or those of a real vehicle.")
-    ] = VehicleModel["published"],
-    airframe: AirframeOption = "os4",
+        VehicleModel | None,
+        typer.Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
+    ] = None,
+    airframe: Annotated[
+        str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
+    ] = None,
     bracket: BracketOption = None,
     channels: ChannelsOption = None,
     initial_state: InitialStateOption = InitialState["free"],
@@ -47,38 +54,36 @@ def estimate(
         Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
     ] = None,
     terms: Annotated[
-        str | None, typer.Option(help="With --model flight: offset,damping,...; default: what the logs allow.")
+        str | None, typer.Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")
     ] = None,
     begin: Annotated[
         float | None,
-        typer.Option("--from", metavar="SECONDS", help="With --model flight: use the logs from this time on."),
+        typer.Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on."),
     ] = None,
     end: Annotated[
-        float | None, typer.Option("--to", metavar="SECONDS", help="With --model flight: use the logs up to this time.")
+        float | None, typer.Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
     ] = None,
     sample_time: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="With --model flight: the sample time to average to.")
+        float | None, typer.Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
     ] = None,
     holdout: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="With --model flight: the share to predict; default: 0.25.")
+        float | None, typer.Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
     ] = None,
-    loss: Annotated[Loss | None, typer.Option(help="With --model flight: huber (default) cuts outliers.")] = None,
+    loss: Annotated[Loss | None, typer.Option(help="Real vehicle: huber (default) cuts outliers.")] = None,
     report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="With --model flight: an HTML report to write.")
+        Path | None, typer.Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")
     ] = None,
     out: OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
     for target in (out, report):
         if target is not None:
-            check_output(target, *flights, Path(airframe), bracket, network, validate)
-    if out is not None and report is not None and out.resolve() == report.resolve():
-        raise InputError(f"{out}: --out and --report name one file; give them two.")
-    is_vehicle = model == "flight"
-    if report is not None and not is_vehicle:
+            check_output(target, *flights, None if airframe is None else Path(airframe), bracket, network, validate)
+    check_different(out=out, report=report)
+    if report is not None and model not in (None, "flight"):
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
     options: dict[str, Any] = {
-        "estimator": estimator.value,
+        "estimator": None if estimator is None else estimator.value,
         "bracket": None if bracket is None else read_toml(bracket),
         "channels": None if channels is None else channels.value,
         "initial_state": initial_state.value,
@@ -98,21 +103,40 @@ def estimate(
         from ..recording import read_recording
 
         progress("reading")
-        vehicle = load_airframe(airframe)
-        recordings = [read_recording(path, vehicle) for path in flights]
+        vehicle = load_airframe(airframe or _OS4)
+        # Without an airframe, commands are read only to find out that one is needed.
+        full_scale = 1.0 if airframe is None and model in (None, "flight") else None
+        recordings = [read_recording(path, vehicle, full_scale=full_scale) for path in flights]
+        evidence = "" if model is not None else _evidence(recordings)
+        is_vehicle = model == "flight" or bool(evidence)
+        if is_vehicle and airframe is None:
+            why = evidence or "--model flight"
+            begin_one = f"`jaxos4 inspect {shlex.quote(str(flights[0]))} --airframe-out mine.toml` begins one"
+            raise InputError(f"{why}: a real vehicle needs --airframe; {begin_one}.")
+        if report is not None and not is_vehicle:
+            raise InputError(f"--report: is for real vehicles, and {flights[0]} has no sign of one; leave it out.")
         other = None if validate is None else read_recording(validate, vehicle)
-        subject = vehicle if is_vehicle else MODELS[model](vehicle)
+        subject = vehicle if is_vehicle else MODELS[model or _PUBLISHED](vehicle)
         found = identify(recordings, subject, validate=other, progress=progress, **options)
-    _publish(_with_command(found, airframe), out, report, title=", ".join(path.name for path in flights))
+    notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
+    title = ", ".join(path.name for path in flights)
+    _publish(_with_command(found, airframe or _OS4, notes), out, report, title=title)
 
 
-def _with_command(found: "Identification", airframe: str) -> "Identification":
-    """The identification with the command in its provenance, and its notes in the words of the command line."""
+def _evidence(recordings: "list[Recording]") -> str:
+    """The first log that is evidently of a real vehicle, and why; empty if none is."""
+    from ..recording import vehicle_evidence
+
+    return next((f"{each.name} {why}" for each in recordings if (why := vehicle_evidence(each))), "")
+
+
+def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "Identification":
+    """The identification with the command in its provenance, and all notes in the words of the command line."""
     import msgspec
 
     asked = {
         "airframe": airframe,
-        "notes": [in_options(note) for note in found.provenance["notes"]],
+        "notes": [*notes, *(in_options(note) for note in found.provenance["notes"])],
         "command": shlex.join(["jaxos4", *sys.argv[1:]]),
     }
     return msgspec.structs.replace(found, provenance=found.provenance | asked)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ._choices import OutOption
-from ._output import check_output, write_json
+from ._output import check_different, check_output, write_json, write_text
 from ._progress import stages
 
 if TYPE_CHECKING:
@@ -31,26 +31,38 @@ def inspect(
     airframe: Annotated[
         str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
     ] = None,
+    airframe_out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.toml", help="An airframe to write: what the log knows, and what must be measured."),
+    ] = None,
     out: OutOption = None,
 ) -> None:
     """Show what a log contains, which parts of it can be used, and which parameters they identify."""
-    if out is not None:
-        check_output(out, log, None if airframe is None else Path(airframe))
+    for target in (out, airframe_out):
+        if target is not None:
+            check_output(target, log, None if airframe is None else Path(airframe))
+    check_different(out=out, airframe_out=airframe_out)
     with stages("loading the library") as progress:
         from rich.console import Console
 
         from ..airframe import load_airframe
         from ..logs import log_format
+        from ..recording import read_recording
+        from ..recording.drafting import airframe_draft
         from ..recording.inspection import inspect_log
 
         progress("reading")
         vehicle = None if airframe is None else load_airframe(airframe)
         if vehicle is not None:
             progress("reading, and finding the identifiable parameters")
-        found = inspect_log(log, vehicle)
+        recording = read_recording(log, vehicle, full_scale=1.0)
+        found = inspect_log(recording, vehicle)
+        draft = None if airframe_out is None else airframe_draft(recording, airframe)
     console = Console(highlight=False, markup=False)
     if out is not None:
         write_json(found.to_dict(), out)
+    if draft is not None and airframe_out is not None:
+        write_text(draft.text, airframe_out)
     _print_contents(console, found, log_format(log).label)
     _print_parts(console, found)
     if found.identifiable is not None:
@@ -58,9 +70,13 @@ def inspect(
     elif found.findings:
         console.print("no parameter is identifiable, see the first lines.")
     elif vehicle is None:
-        console.print("give --airframe to see which parameters are identifiable.")
+        begins = "" if draft is not None else " (--airframe-out begins one)"
+        console.print(f"give --airframe to see which parameters are identifiable{begins}.", soft_wrap=True)
     else:
         console.print("identifiable parameters are computed only if p, q and r were measured.")
+    if draft is not None:
+        still = f"; weigh or measure, and fill in: {', '.join(draft.missing)}" if draft.missing else ""
+        console.print(f"airframe: {airframe_out}{still}", soft_wrap=True)
 
 
 def _print_contents(console: "Console", found: "Inspection", label: str) -> None:

@@ -34,6 +34,8 @@ from ..shooting.rows import windowed
 # The number of samples in a lane. Specific force is compared as means over this time [s]: accelerometers feel
 # vibrations, and their low-pass filters differ.
 _LANE, _BLOCK = 384, 0.25
+# A flight has at least so many lanes, whose disagreement shows errors of the model, unless they would be too short.
+_FEWEST_LANES, _SHORTEST_LANE = 8, 80
 # After so many samples a filter has settled.
 _SETTLING = 128
 # The least share of a block that must be measured.
@@ -41,8 +43,8 @@ _MEASURED = 0.125
 # A gap of this length ends what a filter knows [s].
 _GAP = 0.1
 # Time constants of the disturbance at which searches for the noise start [s]: the likelihood has several maxima.
-_STARTS = np.array([0.2, 0.02, 1.0])
-_SHORTEST, _LONGEST = 0.25, 30.0  # time constants: in samples, in seconds
+_STARTS = np.array([0.2, 0.03])
+_SHORTEST, _LONGEST = 0.25, 3.0  # time constants: in samples, in seconds
 _NOISE_REACH = 1e8  # factor to either side: simulated flights have no disturbance
 _NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
 _LONGEST_STEP = 1.0  # of a logarithm
@@ -143,15 +145,37 @@ class FilterError(AbstractEstimator):
             prior=GAUSSIAN_PRIOR,
         )
 
-    @eqx.filter_jit
     def fit(
-        self, problem: ShootingProblem, bracket: Bracket, *, held: Bool[Array, " parameters"] | None = None
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        *,
+        held: Bool[Array | np.ndarray, " parameters"] | None = None,
+        start: FilterFit | None = None,
     ) -> FilterFit:
         """The estimate with the noise, and without a simulation. The problem's windows do not matter.
 
         - `held`: which parameters stay at the bracket's center.
+        - `start`: where the search starts. By default there are two searches, from the bracket's center.
         """
         check_bracket(problem, bracket)
+        count, channels = bracket.lower.shape[0], problem.restrict("rates").columns.size
+        given, first = np.asarray(start is not None), jnp.zeros(count + 3 * channels, dtype=float)
+        if start is not None:
+            first = jnp.concatenate([start.parameters, jnp.stack(start.noise, axis=1).ravel()])
+        held = np.zeros(count, dtype=bool) if held is None else held
+        return self._fit(problem, bracket, jnp.asarray(held), jnp.asarray(given), first)
+
+    @eqx.filter_jit
+    def _fit(
+        self,
+        problem: ShootingProblem,
+        bracket: Bracket,
+        held: Bool[Array, " parameters"],
+        given: Bool[Array, ""],
+        start: Unknowns,
+    ) -> FilterFit:
+        """`fit` with a `start` that counts only if it is `given`: one program for both."""
         problem, bracket = problem.restrict("rates"), bracket.usable
         index = _lanes(problem.flight.time.shape[0])
         observed, dt, model = _observed(problem, index), problem.flight.dt, problem.model
@@ -176,18 +200,21 @@ class FilterError(AbstractEstimator):
             )
 
         noise = jnp.stack(_first_noise(observed, dt), axis=1)
-        region = _region(bracket, jnp.zeros(count, dtype=bool) if held is None else held, noise, dt)
+        region = _region(bracket, held, noise, dt)
 
-        def search(found: _Search, time_constant: Scalar) -> tuple[_Search, None]:
+        def search(i: Int[Array, ""], found: _Search) -> _Search:
             """The better of the search so far and one from another time constant."""
-            first = jnp.concatenate([found.best[:count], noise.at[:, 1].set(jnp.log(time_constant)).ravel()])
+            time_constant = jnp.log(jnp.asarray(_STARTS))[i]
+            first = jnp.concatenate([found.best[:count], noise.at[:, 1].set(time_constant).ravel()])
+            first = jnp.where(given, start, first)
+            first = jnp.where(region.free, first, region.center)
             other = self._search(evaluate, first, region, count)
             better = ~(other.cost >= found.cost)
             other = other._replace(steps=found.steps + other.steps)
-            return jax.tree.map(lambda a, b: jnp.where(better, a, b), other, found._replace(steps=other.steps)), None
+            return jax.tree.map(lambda a, b: jnp.where(better, a, b), other, found._replace(steps=other.steps))
 
         nothing = self._nothing(evaluate, jnp.concatenate([bracket.center, noise.ravel()]))
-        found, _ = jax.lax.scan(search, nothing, jnp.asarray(_STARTS))
+        found = jax.lax.fori_loop(0, jnp.where(given, 1, _STARTS.size), search, nothing)
         _, curvature = _posterior(found, region, count)
         free = region.free[:count]
         covariance = jnp.where(free[:, None] & free, invert(curvature)[:count, :count], 0.0)
@@ -290,7 +317,7 @@ def _lanes(samples: int, wanted: int = _LANE) -> Int[np.ndarray, "lanes time"]:
     A lane begins with the end of the lane before it, which its filter needs to settle. The first lane begins with the
     flight. Samples beyond the last do not exist.
     """
-    lanes = max(round((samples - _SETTLING) / wanted), 1)
+    lanes = max(round((samples - _SETTLING) / wanted), min((samples - _SETTLING) // _SHORTEST_LANE, _FEWEST_LANES), 1)
     settling = _SETTLING if lanes > 1 else 0
     length = -(-(samples - settling) // lanes)
     return length * np.arange(lanes)[:, None] + np.arange(settling + length)

@@ -25,7 +25,7 @@ def identify(
     flights: Flights,
     subject: AbstractModel | Airframe,
     *,
-    estimator: str | AbstractEstimator = "ibss",
+    estimator: str | AbstractEstimator | None = None,
     bracket: Intervals = None,
     channels: str | None = None,
     initial_state: str = "free",
@@ -52,7 +52,8 @@ def identify(
 
     - `flights`: a `Flight`, a `Recording` (a flight with a name), or several for a vehicle.
     - `subject`: a model in alpha_1..8, such as `PublishedOS4()`, or the `Airframe` of a real vehicle.
-    - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. A vehicle needs one that shoots.
+    - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
+      `"filter-error"` for a vehicle, which flies in closed loop. The others for a vehicle are those that shoot.
     - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
     - `window`: length of the windows for multiple shooting [s]; by default none for a model, 0.25 s for a vehicle.
     - `validate`: another flight, which is not fitted but predicted.
@@ -71,7 +72,7 @@ def identify(
     - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.
     - `sample_time`: average to samples of this length [s]; by default 0.004 s if the recordings have shorter ones.
     - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
-    - `loss`: `"huber"` cuts outliers, `"squares"` does not; by default `"huber"`.
+    - `loss`: of an estimator that shoots: `"huber"` cuts outliers, `"squares"` does not; by default `"huber"`.
 
     **Returns:** a `FlightIdentification` for a model, a `VehicleIdentification` for an airframe. Check `result`.
 
@@ -91,6 +92,7 @@ def identify(
             raise InputError(f"`initial_state` {initial_state}: each window has its own initial state; leave it out.")
         return identify_vehicle(recordings, subject, validate=other, **of_vehicle, **common)
     _check_model(subject, recordings, of_vehicle)
+    common["estimator"] = "ibss" if estimator is None else estimator
     return identify_flight(recordings[0], subject, initial_state=initial_state, validate=other, **of_model, **common)
 
 

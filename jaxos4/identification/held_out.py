@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..analysis.disturbance import disturbances
 from ..analysis.prediction import HORIZONS, Predictions, Skill, predictions, skill, starts
 from ..bracket import Bracket
 from ..errors import InputError
@@ -15,6 +16,7 @@ from ..flight import Flight
 from ..models.held import hold
 from ..models.vehicle import FlightModel
 from ..shooting import ShootingProblem
+from ..shooting.filtering import Noise
 from .results import PredictionSkill, RateSkill, finite_or_none
 from .vehicle import VehicleFit
 
@@ -48,27 +50,39 @@ def check_starts(held_out: HeldOut) -> None:
         ) from None
 
 
-def predict_held_out(fit: VehicleFit, model: FlightModel, held_out: HeldOut) -> tuple[Predictions, PredictionSkill]:
+def predict_held_out(
+    fit: VehicleFit, model: FlightModel, held_out: HeldOut, noise: Noise | None = None
+) -> tuple[Predictions, PredictionSkill]:
     """Predict the rates of measurements that were not fitted, by the fit and by a regression with the same terms.
 
-    `model`: with all parameters, held or not.
+    - `model`: with all parameters, held or not.
+    - `noise`: of filter error, which predicts the disturbance too, from the measurements before each start.
     """
 
-    def scored(parameters: Array) -> tuple[Predictions, Skill]:
+    def scored(parameters: Array, noise: Noise | None) -> tuple[Predictions, Skill]:
         if held_out.fitted_vehicle:
             problem = eqx.tree_at(lambda p: p.flight, fit.problem, held_out.flight)
+            whole = eqx.tree_at(lambda p: p.flight, fit.problem, _joined(fit.problem.flight, held_out.flight))
         else:
             problem, parameters = _on_another_flight(fit, model, parameters, held_out.flight)
-        predicted = predictions(problem, parameters)
+            whole = problem
+        known = None if noise is None else disturbances(whole, parameters, noise)
+        predicted = predictions(problem, parameters, disturbance=known)
         return predicted, skill(predicted)
 
-    predicted, own = scored(fit.estimate.parameters)
-    _, regressed = scored(_regression(fit.problem, fit.estimate.parameters))
+    predicted, own = scored(fit.estimate.parameters, noise)
+    _, regressed = scored(_regression(fit.problem, fit.estimate.parameters), None)
     tables = (own.skill, own.std, own.rmse, own.persistence, regressed.skill)
     rates = {
         rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
     }
     return predicted, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
+
+
+def _joined(fitted: Flight, tested: Flight) -> Flight:
+    """All measurements: those that were fitted and those that were not."""
+    states = np.where(np.isnan(np.asarray(tested.states)), fitted.states, tested.states)
+    return eqx.tree_at(lambda f: f.states, tested, jnp.asarray(states))
 
 
 def _on_another_flight(

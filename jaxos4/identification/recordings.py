@@ -7,10 +7,10 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..analysis.frequency_response import frequency_response
-from ..bracket import Bracket
+from ..bracket import NO_PRIOR, Bracket
 from ..errors import InputError
 from ..estimate import AbstractEstimator, Estimate
-from ..estimators import IBSS, make_estimator
+from ..estimators import IBSS, FilterError, make_estimator
 from ..flight import CHANNEL_NAMES
 from ..models.terms import FULL_SCALE, TERMS, default_terms
 from ..models.vehicle import FlightModel
@@ -18,7 +18,9 @@ from ..recording.preparation import HOLDOUT, WINDOW, Prepared, prepare
 from ..recording.reading import Recording
 from ..results import result_names
 from ..shooting import ShootingProblem
+from .checks import doubts_of
 from .constants import vehicle_constants
+from .filter_fit import fit_by_filter
 from .held_out import HeldOut, check_starts, predict_held_out
 from .network import vehicle_network_for
 from .parameters import parameter_table
@@ -31,13 +33,15 @@ from .vehicle import Search, VehicleFit, fit_vehicle, free_bracket
 _FIRST_SIGMA = 0.5
 # The largest Jacobian of output error [GiB]; a search needs a few of them.
 _LARGEST_JACOBIAN = 1.0
+# The estimator of a vehicle, which flies in closed loop.
+DEFAULT = "filter-error"
 
 
 def identify_vehicle(
     recordings: Sequence[Recording],
     airframe: Airframe,
     *,
-    estimator: str | AbstractEstimator,
+    estimator: str | AbstractEstimator | None,
     bracket: Intervals,
     terms: Sequence[str] | None,
     begin: float | None,
@@ -51,11 +55,17 @@ def identify_vehicle(
     progress: Callable[[str], None],
 ) -> VehicleIdentification:
     """What `jaxos4.identify` does with an airframe. The arguments are the same."""
+    estimator = DEFAULT if estimator is None else estimator
     name, kind = name_and_class(estimator)
+    by_filter = issubclass(kind, FilterError)
     if loss not in (None, "huber", "squares"):
         raise InputError(f"`loss`: must be huber or squares, got {loss!r}.")
-    if not kind.shoots:
-        raise InputError(f"`estimator` {name}: does not shoot, which a vehicle needs; use one of {shooting_names()}.")
+    if not kind.shoots and not by_filter:
+        raise InputError(
+            f"`estimator` {name}: does not shoot, which a vehicle needs; use {DEFAULT} or one of {shooting_names()}."
+        )
+    if by_filter and loss == "huber":
+        raise InputError(f"`loss` huber: {name} models what others cut as outliers; leave it out.")
     started, window = time.perf_counter(), WINDOW if window is None else window
     share = holdout if holdout is not None else 0.0 if validate is not None else HOLDOUT
     part = {"begin": begin, "end": end, "window": window, "sample_time": sample_time, "holdout": share}
@@ -66,27 +76,42 @@ def identify_vehicle(
     where = bracket_of(bracket, model)
     held_out, notes = _held_out(recordings, validate, prepared, model, window)
     problem = _problem(prepared, model, recordings[0].name, window)
-    _check_memory(problem, name)
-    last = _last_search(estimator, kind, recordings[0].name, seed)
-    fit = fit_vehicle(problem, where, estimator=last, huber=loss != "squares", progress=progress)
+    disturbances, widened, process = {}, {}, None
+    if by_filter:
+        settings = estimator if isinstance(estimator, FilterError) else FilterError()
+        number = np.asarray(prepared.recordings)[_stretches(prepared)]
+        filtered = fit_by_filter(problem, where, estimator=settings, recording=number, progress=progress)
+        fit, disturbances, widened, process = filtered
+    else:
+        _check_memory(problem, name)
+        last = _last_search(estimator, kind, recordings[0].name, seed)
+        fit = fit_vehicle(problem, where, estimator=last, huber=loss != "squares", progress=progress)
     estimate, free, noise = fit.estimate, fit.problem.model, np.asarray(fit.problem.sigma)
     predicted = skill = None
     if fit.answered and held_out is not None:
         progress("predicting what was not fitted")
-        predicted, skill = predict_held_out(fit, model, held_out)
-    table = parameter_table(free, estimate, fit.bound, free_bracket(where, model, fit.held)) if fit.answered else {}
+        predicted, skill = predict_held_out(fit, model, held_out, process)
+    prior = kind.prior if by_filter else NO_PRIOR
+    some = free_bracket(where, model, fit.held)
+    table = parameter_table(free, estimate, fit.bound, some, prior=prior) if fit.answered else {}
+    body = vehicle_constants(free.parameter_names, estimate, where, airframe) if fit.answered else RigidBody()
+    doubts = doubts_of(table, body.constants, skill, airframe) if fit.answered else ()
+    result = str(result_names(estimate.result))
     return VehicleIdentification(
         estimator=name,
         model="flight",
-        result=str(result_names(estimate.result)),
+        result=doubts[0].result if doubts and result == "successful" else result,
         rollouts=fit.rollouts,
         cost=finite_or_none(estimate.cost),
         seconds=time.perf_counter() - started,
         parameters=table,
-        rigid_body=vehicle_constants(free.parameter_names, estimate, where, airframe) if fit.answered else RigidBody(),
+        rigid_body=body,
         held=_held_parameters(fit, model),
         cut=fit.cut,
         noise={CHANNEL_NAMES[i]: float(noise[i]) for i in fit.problem.columns},
+        doubts=doubts,
+        disturbances=disturbances,
+        widened=widened,
         skill=skill,
         predictions=predicted,
         response=frequency_response(fit.problem, estimate.parameters) if fit.answered else None,
@@ -99,7 +124,7 @@ def identify_vehicle(
             "sample_time": float(prepared.fitted.dt),
             "fitted_seconds": prepared.seconds[0],
             "tested_seconds": 0.0 if held_out is None else held_out.seconds,
-            "loss": loss or "huber",
+            "loss": "likelihood" if by_filter else loss or "huber",
             **({"battery_voltage": voltage} if "voltage" in model.terms else {}),
             "notes": list(notes),
             **versions(problem),
@@ -107,6 +132,12 @@ def identify_vehicle(
         estimate=estimate,
         problem=fit.problem,
     )
+
+
+def _stretches(prepared: Prepared) -> np.ndarray:
+    """The stretch of each sample."""
+    stretch = prepared.fitted.stretch
+    return np.zeros(prepared.fitted.time.shape[0], dtype=int) if stretch is None else np.asarray(stretch)
 
 
 def _held_out(

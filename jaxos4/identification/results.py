@@ -120,6 +120,31 @@ class RateSkill(msgspec.Struct, frozen=True):
     equation_error: list[float | None]
 
 
+class Disturbance(msgspec.Struct, frozen=True):
+    """What acts on a channel besides the model, by filter error.
+
+    - `strength`: standard deviation of the disturbance, in `unit`. `time_constant`: of its correlation [s].
+    - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel; of specific force: of means
+      over 0.25 s.
+    """
+
+    strength: float
+    unit: str
+    time_constant: float
+    sensor: float
+
+
+class Doubt(msgspec.Struct, frozen=True):
+    """A reason not to trust an estimate. `result`: the name of the result code that it leads to."""
+
+    result: str
+    cause: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.cause}; {self.remedy}"
+
+
 class PredictionSkill(msgspec.Struct, frozen=True):
     """Skill of `starts` predictions of measurements that were not fitted, by horizon [s]."""
 
@@ -189,6 +214,9 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False)
     - `held`: parameters that were not estimated.
     - `cut`: the share of the measurements that Huber's loss cut.
     - `noise`: standard deviation of the residuals by channel.
+    - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
+    - `disturbances`: by channel, from filter error; empty for other estimators.
+    - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
     - `predictions`: the predictions themselves; not in `to_dict`.
     - `response`: the frequency response from modelled to measured angular acceleration, with the fitted data; not in
@@ -198,6 +226,9 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False)
     held: dict[str, HeldParameter]
     cut: float
     noise: dict[str, float]
+    doubts: tuple[Doubt, ...]
+    disturbances: dict[str, Disturbance]
+    widened: dict[str, float]
     skill: PredictionSkill | None
     predictions: Predictions | None
     response: FrequencyResponse | None

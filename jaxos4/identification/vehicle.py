@@ -8,7 +8,7 @@ Therefore:
 3. The identifiable parameters are fitted together. Outliers are cut. Standard errors allow for coloured residuals.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -100,7 +100,7 @@ def fit_vehicle(
     progress("compiling, and fitting the parameters that every flight excites")
     first = _refined(_Part(model, bracket, held), problem, values[_free(model, held)], huber=False)
     if not has_answer(first.estimate):
-        return _no_fit(_holding(first.problem, model, held), first.estimate, held, first.rollouts)
+        return _no_fit(holding(first.problem, model, held), first.estimate, held, first.rollouts)
 
     progress("choosing the identifiable parameters")
     values[_free(model, held)] = np.asarray(first.estimate.parameters)
@@ -109,7 +109,7 @@ def fit_vehicle(
     progress("fitting the identifiable parameters")
     start, part = eqx.tree_at(lambda p: p.sigma, problem, first.problem.sigma), _Part(model, bracket, held)
     last = _refined(part, start, values[_free(model, held)], huber=huber)
-    rollouts, known = first.rollouts + last.rollouts, _holding(last.problem, model, held)
+    rollouts, known = first.rollouts + last.rollouts, holding(last.problem, model, held)
     if not has_answer(last.estimate):
         return _no_fit(known, last.estimate, held, rollouts)
 
@@ -136,7 +136,7 @@ def refit(
     """
     model = fit.problem.model.model if isinstance(fit.problem.model, HeldParameters) else fit.problem.model
     held = fit.held if held is None else held
-    problem = _holding(fit.problem, model, held)
+    problem = holding(fit.problem, model, held)
     estimate = estimator(problem, free_bracket(bracket, model, held))
     rollouts = fit.rollouts + int(estimate.rollouts)
     if not has_answer(estimate):
@@ -222,7 +222,7 @@ def _std(estimate: Estimate) -> Float[np.ndarray, " free"]:
     return np.sqrt(np.diagonal(estimate.covariance))
 
 
-def _holding(problem: ShootingProblem, model: AbstractModel, held: Held) -> ShootingProblem:
+def holding(problem: ShootingProblem, model: AbstractModel, held: Held) -> ShootingProblem:
     """The problem for `model` with the parameters in `held` known."""
     free = hold(model, {name: value for name, (value, _) in held.items()}) if held else model
     return eqx.tree_at(lambda p: p.model, problem, free)
@@ -239,6 +239,15 @@ def free_bracket(bracket: Bracket, model: AbstractModel, held: Held) -> Bracket:
     return Bracket(np.asarray(bracket.lower)[free], np.asarray(bracket.upper)[free])
 
 
+def negative_damping(names: Sequence[str], values: np.ndarray, std: np.ndarray) -> Held:
+    """The dampings that came out negative, which are held at 0."""
+    return {
+        name: (0.0, "came out negative, which is impossible in air")
+        for name, value, error in zip(names, values, std, strict=True)
+        if name in _DAMPING and value < -_NEGATIVE * error
+    }
+
+
 def _not_identifiable(first: Refined, values: np.ndarray, bracket: Bracket) -> Held:
     """The parameters to hold: those that are not identifiable at these noise levels, and negative damping."""
     names = first.problem.model.parameter_names
@@ -246,11 +255,12 @@ def _not_identifiable(first: Refined, values: np.ndarray, bracket: Bracket) -> H
     bound = evaluate(first.problem, as_float(values), first.estimate.initial_state).covariance
     std, center = first.colour * np.sqrt(np.diagonal(bound)), np.asarray(bracket.center)
     identifiable = is_identifiable(std, np.asarray(bracket.half_width))
-    held = {}
-    for i, name in enumerate(names):
-        if not identifiable[i]:
-            held[name] = (float(center[i]), "not identifiable from these flights")
-        elif name in _DAMPING and values[i] < -_NEGATIVE * std[i]:
-            held[name] = (0.0, "came out negative, which is impossible in air")
+    negative = negative_damping(names, values, std)
+    held = {
+        name: (float(center[i]), "not identifiable from these flights")
+        for i, name in enumerate(names)
+        if not identifiable[i]
+    }
+    held = negative | held
     # At least one parameter must be free.
     return held if len(held) < len(names) else {name: held[name] for name in SECONDARY if name in held}

@@ -3,5 +3,9 @@
 from .averaging import averaged as averaged
 from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
 from .joining import join as join
-from .reading import Recording as Recording, read_recording as read_recording
+from .reading import (
+    Recording as Recording,
+    read_recording as read_recording,
+    vehicle_evidence as vehicle_evidence,
+)
 from .usable import Stretch as Stretch, cut as cut, stretches as stretches, usable_stretches as usable_stretches

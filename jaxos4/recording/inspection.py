@@ -1,7 +1,6 @@
 """Inspection of a log: its contents, the stretches in flight, their excitation, and the identifiable parameters."""
 
 import math
-from pathlib import Path
 from typing import Any, SupportsFloat
 
 import msgspec
@@ -11,11 +10,12 @@ from ..airframe import Airframe
 from ..analysis.identifiability import identifiability
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES, Flight
-from ..logs import LogFacts, log_format, read_log_and_facts
+from ..logs import LogFacts, log_format
 from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem
 from .excited import RATE_COLUMNS, WEAK, excitation
+from .reading import Recording
 from .signs import opposite_axes, opposite_note
 from .usable import Stretch, cut, nothing_usable, stretches
 
@@ -98,12 +98,14 @@ class Inspection(msgspec.Struct, frozen=True):
         return msgspec.to_builtins(self)
 
 
-def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
-    """Reads a log of any known format and describes it. Without an airframe, torques and parameters are unknown.
+def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
+    """Describe a log. Without an airframe, torques and parameters are unknown.
 
-    **Raises:** `InputError` for a file that cannot be read as a log.
+    **Arguments:**
+
+    - `recording`: of a file, read with the same `airframe`, and with `full_scale=1.0`.
     """
-    flight, notes, facts = read_log_and_facts(path, airframe, full_scale=1.0)
+    flight, facts = recording.flight, recording.facts
     found = stretches(flight, airframe, landed=facts.landed)
     longest = max((part for part in found if not part.reason), key=lambda part: part.length, default=None)
     rates_measured = not np.isnan(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=0).any()
@@ -116,15 +118,15 @@ def inspect_log(path: Path, airframe: Airframe | None = None) -> Inspection:
     if longest is not None and not facts.too_slow and airframe is not None and rates_measured:
         identifiable = _identifiable(flight, longest, airframe)
     return Inspection(
-        log=str(path),
-        format=log_format(path).name,
+        log=recording.name,
+        format=log_format(recording.name).name,
         samples=int(flight.time.shape[0]),
         begin=float(flight.time[0]),
         end=float(flight.time[-1]),
         sample_time=float(flight.dt),
         measured=_measured(flight, facts),
         findings=findings,
-        notes=notes,
+        notes=recording.notes,
         parts=parts,
         identifiable=identifiable,
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..flight import Flight
-from ..logs import LogFacts, read_log_and_facts
+from ..logs import FORMATS, LogFacts, log_format, read_log_and_facts
 
 
 class Recording(NamedTuple):
@@ -38,10 +38,27 @@ class Recording(NamedTuple):
         )
 
 
-def read_recording(path: str | os.PathLike[str], airframe: Airframe | None = None) -> Recording:
+def read_recording(
+    path: str | os.PathLike[str], airframe: Airframe | None = None, *, full_scale: float | None = None
+) -> Recording:
     """Read a log in any format that `jaxos4.read_log` knows, named by its path. Arguments and errors are the same."""
-    flight, notes, facts = read_log_and_facts(path, airframe)
+    flight, notes, facts = read_log_and_facts(path, airframe, full_scale=full_scale)
     return Recording(flight, os.fspath(path), notes, facts)
+
+
+def vehicle_evidence(recording: Recording) -> str:
+    """What shows that a file is the log of a real vehicle, as the end of a sentence; empty if nothing does.
+
+    A simulation of the OS4 has rotor speeds and states. A vehicle logs commands, or has an accelerometer, or writes a
+    format of its own.
+    """
+    if recording.flight.commanded:
+        return "has commands, not rotor speeds"
+    if recording.flight.specific_force is not None:
+        return "has an accelerometer"
+    if os.path.isfile(recording.name) and (kind := log_format(recording.name)) is not FORMATS[-1]:
+        return f"is a log of a vehicle ({kind.label})"
+    return ""
 
 
 def as_recordings(

@@ -21,19 +21,12 @@ _AXES = ("roll", "pitch", "yaw")
 def opposite_axes(flights: Sequence[Flight], airframe: Airframe) -> list[str]:
     """The axes about which the vehicle turns against the torque that the airframe gives to its rotors.
 
-    The torque is compared with the angular acceleration that follows it, at 2 to 20 Hz. A controller that answers gusts
-    does not change the sign. Axes without clear motion are not judged.
+    Axes without clear motion are not judged.
 
     **Arguments:** usable stretches of flights, each of one vehicle.
     """
-    judged = [flight for flight in flights if np.ptp(np.asarray(flight.time)) > _SLOW * _STEP * 2]
-    pairs: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in _AXES]
-    for flight in judged:
-        torque, acceleration = _response(flight, airframe)
-        for i, axis in enumerate(excitation(flight)):
-            if axis.verdict in ("good", "weak"):
-                pairs[i].append((torque[:, i], acceleration[:, i]))
-    return [axis for axis, found in zip(_AXES, pairs, strict=True) if found and _is_opposite(found)]
+    found = correlations(flights, np.asarray(airframe.mixer, dtype=float)[:3])
+    return [axis for i, axis in enumerate(_AXES) if clear_sign(found[:, i, i]) < 0]
 
 
 def opposite_note(axes: Sequence[str]) -> str:
@@ -51,35 +44,57 @@ def opposite_note(axes: Sequence[str]) -> str:
     )
 
 
-def _response(flight: Flight, airframe: Airframe) -> tuple[np.ndarray, np.ndarray]:
-    """Torque [N m] and angular acceleration [rad/s^2] about the three axes, one sample every 8 ms."""
+def correlations(flights: Sequence[Flight], mixer: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "delays rows 3"]:
+    """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
+
+    A controller that answers gusts does not change the sign. One number for each delay of up to 48 ms, each row of
+    `mixer` (the weight of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion.
+
+    **Arguments:** usable stretches of flights, each of one vehicle.
+    """
+    judged = [flight for flight in flights if np.ptp(np.asarray(flight.time)) > _SLOW * _STEP * 2]
+    pairs = [_response(flight, mixer) for flight in judged]
+    found = np.full((_DELAYS, mixer.shape[0], len(_AXES)), np.nan)
+    for delay in range(_DELAYS if pairs else 0):
+        torque = np.concatenate([a[: a.shape[0] - delay] for a, _ in pairs])
+        acceleration = np.concatenate([b[delay:] for _, b in pairs])
+        for i, along in enumerate(acceleration.T):
+            measured = np.isfinite(torque).all(axis=1) & np.isfinite(along)
+            if np.count_nonzero(measured) * _STEP < _LEAST_SECONDS:
+                continue
+            x, y = torque[measured] - torque[measured].mean(axis=0), along[measured] - along[measured].mean()
+            spreads = x.std(axis=0) * y.std()
+            found[delay, :, i] = np.where(spreads > 0, y @ x / y.size, np.nan) / np.where(spreads > 0, spreads, 1.0)
+    return found
+
+
+def clear_sign(found: Float[np.ndarray, " delays"]) -> float:
+    """The sign of correlations at several delays, if it is clear; 0 if not."""
+    if np.isnan(found).any():
+        return 0.0
+    for sign in (1.0, -1.0):
+        if max(sign * found) > _OPPOSITE and max(sign * found) > _CLEAR * max(-sign * found):
+            return sign
+    return 0.0
+
+
+def _response(flight: Flight, mixer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Torques and angular accelerations [rad/s^2], one sample every 8 ms, between about 2 and 20 Hz."""
     time, omega, states = (np.asarray(x, dtype=float) for x in (flight.time, flight.omega, flight.states))
     step = max(_STEP, float(flight.dt))
     _, omega, rates = average(time, omega, states[:, RATE_COLUMNS], step)
-    torque = (omega**2 @ np.asarray(airframe.mixer, dtype=float).T)[:-1, :3]
-    return torque, np.diff(rates, axis=0) / step
+    acceleration = np.diff(rates, axis=0) / step
+    for i, axis in enumerate(excitation(flight)):
+        if axis.verdict not in ("good", "weak"):
+            acceleration[:, i] = np.nan
+    return _between((omega**2 @ mixer.T)[:-1]), _between(acceleration)
 
 
-def _is_opposite(pairs: list[tuple[np.ndarray, np.ndarray]]) -> bool:
-    found = []
-    for delay in range(_DELAYS):
-        torque, acceleration = (
-            np.concatenate([_between(x) for x in each])
-            for each in zip(*((a[: a.size - delay], b[delay:]) for a, b in pairs), strict=True)
-        )
-        measured = np.isfinite(torque) & np.isfinite(acceleration)
-        if np.count_nonzero(measured) * _STEP < _LEAST_SECONDS:
-            return False
-        spreads = torque[measured].std() * acceleration[measured].std()
-        if spreads <= 0:
-            return False
-        centred = torque[measured] - torque[measured].mean()
-        found.append(float((centred * acceleration[measured]).mean() / spreads))
-    return min(found) < -_OPPOSITE and -min(found) > _CLEAR * max(found)
-
-
-def _between(column: Float[np.ndarray, " samples"]) -> Float[np.ndarray, " shorter"]:
-    """The part of a signal between about 2 and 20 Hz."""
+def _between(columns: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, "shorter columns"]:
+    """The part of each signal between about 2 and 20 Hz."""
     edge = (_SLOW - _SMOOTH) // 2
-    smooth, slow = (np.convolve(column, np.full(n, 1 / n), "valid") for n in (_SMOOTH, _SLOW))
-    return smooth[edge : smooth.size - edge] - slow
+    return np.column_stack([_mean(x, _SMOOTH)[edge : x.size - _SMOOTH + 1 - edge] - _mean(x, _SLOW) for x in columns.T])
+
+
+def _mean(column: np.ndarray, samples: int) -> np.ndarray:
+    return np.convolve(column, np.full(samples, 1 / samples), "valid")

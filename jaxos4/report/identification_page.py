@@ -122,6 +122,8 @@ def _validation(validation: Validation) -> str:
 
 
 def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Listing]:
+    for doubt in found.doubts:
+        yield f"not to be trusted because {doubt}."
     yield _parameters(found, digits=4, with_bound=False)
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():
@@ -134,11 +136,10 @@ def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Listing]:
     ]
     if inertias:
         yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}."
-    noise = ", ".join(f"{name} {sigma:.2g}" for name, sigma in found.noise.items())
-    yield (
-        f"residuals in a window [rad/s, m/s^2]: {noise}; the intervals allow for their correlation. "
-        f"Outliers cut: {100 * found.cut:.0f} % (18 % is normal for Gaussian noise)."
-    )
+    yield from _disturbances(found) if found.disturbances else _residual_levels(found)
+    if found.widened:
+        factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
+        yield f"intervals widened, because parts of the flights disagree, by the factor: {factors}."
     if found.skill is not None:
         yield (
             "Predictions of data that were not fitted: 1 is perfect, 0 as good as constant rates; +- one standard "
@@ -146,10 +147,26 @@ def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Listing]:
         )
         yield _skill(found.skill)
     used = found.provenance
+    windows = "" if found.disturbances else f" in windows of {used['window']:g} s"
     yield (
-        f"{found.estimator}, flight model ({', '.join(used['terms'])}), {used['fitted_seconds']:.0f} s in windows of "
-        f"{used['window']:g} s, a sample every {1e3 * used['sample_time']:g} ms: {found.result}, {found.rollouts} "
-        f"rollouts, {found.seconds:.0f} s"
+        f"{found.estimator}, flight model ({', '.join(used['terms'])}), {used['fitted_seconds']:.0f} s{windows}, "
+        f"a sample every {1e3 * used['sample_time']:g} ms: {found.result}, {found.rollouts} rollouts, "
+        f"{found.seconds:.0f} s"
+    )
+
+
+def _disturbances(found: VehicleIdentification) -> Iterator[str]:
+    rows = (f"{name} {x.strength:.2g} {x.unit} over {x.time_constant:.2g} s" for name, x in found.disturbances.items())
+    yield f"disturbances that the model lacks, and their correlation time: {', '.join(rows)}."
+    sensors = ", ".join(f"{name} {row.sensor:.2g}" for name, row in found.disturbances.items())
+    yield f"white noise of the sensors [rad/s; m/s^2, of means over 0.25 s]: {sensors}."
+
+
+def _residual_levels(found: VehicleIdentification) -> Iterator[str]:
+    noise = ", ".join(f"{name} {sigma:.2g}" for name, sigma in found.noise.items())
+    yield (
+        f"residuals in a window [rad/s, m/s^2]: {noise}; the intervals allow for their correlation. "
+        f"Outliers cut: {100 * found.cut:.0f} % (18 % is normal for Gaussian noise)."
     )
 
 

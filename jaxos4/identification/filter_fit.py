@@ -1,0 +1,138 @@
+"""The fit of a real vehicle by filter error, which treats what the model lacks as a disturbance."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._custom_types import as_float
+from ..bracket import GAUSSIAN_PRIOR, Bracket, is_identifiable
+from ..estimate import REACH, Estimate
+from ..estimators import FilterError, FilterFit
+from ..flight import CHANNEL_NAMES
+from ..results import RESULTS
+from ..shooting import ShootingProblem
+from ..shooting.filtering import Noise
+from .jackknife import disagreement, parts_of
+from .results import Disturbance
+from .vehicle import Held, VehicleFit, holding, negative_damping
+
+_PRIOR_NOTE = "not identifiable from these flights; the intervals of the others allow for its bracket"
+
+
+class Filtered(NamedTuple):
+    """A fit by filter error.
+
+    - `fit`: the fit itself.
+    - `disturbances`: by channel. `noise`: the same as logarithms.
+    - `widened`: by which factor an interval was widened, by parameter.
+    """
+
+    fit: VehicleFit
+    disturbances: dict[str, Disturbance]
+    widened: dict[str, float]
+    noise: Noise
+
+
+def fit_by_filter(
+    problem: ShootingProblem,
+    bracket: Bracket,
+    *,
+    estimator: FilterError,
+    recording: np.ndarray,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> Filtered:
+    """Fit a `FlightModel` to flights by filter error.
+
+    The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket has no
+    estimate. Intervals widen if parts of the flights disagree.
+
+    **Arguments:** `recording`: the number of the recording of each sample. Others as of `fit_vehicle`.
+    """
+    model, names = problem.model, problem.model.parameter_names
+    progress("compiling, and fitting parameters and disturbances")
+    found = jax.block_until_ready(estimator.fit(problem, bracket))
+    steps, negative = int(found.steps), negative_damping(names, *_mean_and_std(found))
+    if negative:
+        progress("fitting again without negative damping")
+        bracket = _around_zero(bracket, names, negative)
+        held_at_zero = np.array([name in negative for name in names])
+        found = jax.block_until_ready(estimator.fit(problem, bracket, held=held_at_zero, start=found))
+        steps += int(found.steps)
+    progress("computing errors")
+    (values, std), covariance = _mean_and_std(found), np.asarray(found.covariance)
+    half_width = np.asarray(bracket.half_width)
+    sound = bool(np.isfinite(values).all() and np.isfinite(std).all() and np.asarray(found.innovations.sound).all())
+    factor = _widening(found, half_width, recording) if sound else np.ones(values.size)
+    identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
+    if not sound or not identifiable.any():
+        identifiable[:] = True
+    held: Held = {name: (float(values[i]), _PRIOR_NOTE) for i, name in enumerate(names) if not identifiable[i]}
+    held |= negative
+    identifiable &= [name not in negative for name in names]
+    free = np.flatnonzero(identifiable)
+    known = holding(_with_noise(problem, found), model, held)
+    spread = np.diag(factor) @ covariance @ np.diag(factor)
+    estimate = Estimate(
+        parameters=as_float(np.where(np.isfinite(values), values, np.asarray(bracket.center))[free]),
+        covariance=as_float(spread[np.ix_(free, free)] if sound else np.full((free.size, free.size), np.inf)),
+        initial_state=as_float(np.nan_to_num(problem.recorded()[0, :3])),
+        cost=jnp.asarray(found.innovations.cost.sum()),
+        rollouts=jnp.asarray(steps * (1 + values.size)),
+        sweeps=found.steps,
+        result=_result(found, bracket, free, sound),
+    )
+    fit = VehicleFit(known, estimate, held, std[free], 0.0, int(estimate.rollouts))
+    widened = {names[i]: float(factor[i]) for i in free if factor[i] > 1}
+    return Filtered(fit, _disturbances(problem, found), widened, found.noise)
+
+
+def _mean_and_std(found: FilterFit) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(found.parameters), np.sqrt(np.maximum(np.diagonal(np.asarray(found.covariance)), 0.0))
+
+
+def _around_zero(bracket: Bracket, names: Sequence[str], some: Held) -> Bracket:
+    """The bracket, centred at 0 for some parameters."""
+    center = np.where([name in some for name in names], 0.0, np.asarray(bracket.center))
+    return Bracket.around(center, np.asarray(bracket.half_width))
+
+
+def _result(found: FilterFit, bracket: Bracket, free: np.ndarray, sound: bool) -> RESULTS:
+    if not sound:
+        return RESULTS.nonfinite_trajectory
+    distance = np.abs(np.asarray(found.parameters) - np.asarray(bracket.center)) / np.asarray(bracket.half_width)
+    if (distance[free] > REACH - 1e-2).any():
+        return RESULTS.at_bound
+    return RESULTS.successful if bool(found.done) else RESULTS.max_sweeps
+
+
+def _widening(found: FilterFit, half_width: np.ndarray, recording: np.ndarray) -> np.ndarray:
+    """The factor by which the interval of each parameter widens."""
+    innovations, count = found.innovations, half_width.size
+    lanes = np.asarray(innovations.cost).size
+    gradient = np.moveaxis(np.asarray(innovations.gradient).sum(axis=0)[:count], -1, 0)
+    information = np.moveaxis(np.asarray(innovations.information).sum(axis=0)[:count, :count], -1, 0)
+    of_lane = recording[np.arange(lanes) * recording.size // lanes]
+    prior = np.diag(1 / np.square(half_width))
+    ways = [disagreement(gradient, information, prior, part) for part in parts_of(lanes, of_lane)]
+    return np.max([np.ones(count), *ways], axis=0)
+
+
+def _with_noise(problem: ShootingProblem, found: FilterFit) -> ShootingProblem:
+    """The problem with the sensors' noise that was found."""
+    sigma = np.array(problem.sigma)
+    sigma[problem.columns] = np.exp(np.asarray(found.noise.sensor))
+    return eqx.tree_at(lambda p: p.sigma, problem, as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0)))
+
+
+def _disturbances(problem: ShootingProblem, found: FilterFit) -> dict[str, Disturbance]:
+    strength, time_constant, sensor = (np.exp(np.asarray(leaf)) for leaf in found.noise)
+    return {
+        CHANNEL_NAMES[column]: Disturbance(
+            float(strength[i]), "rad/s^2" if i < 3 else "m/s^2", float(time_constant[i]), float(sensor[i])
+        )
+        for i, column in enumerate(problem.columns)
+    }

@@ -1,0 +1,209 @@
+"""An airframe's file with everything that a log knows of its vehicle, and with marks at what must be measured."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomlkit
+from tomlkit import TOMLDocument
+
+from ..airframe import GUESS, PRESETS, Airframe, load_airframe
+from ..flight import Flight
+from ..models.terms import has_full_scale
+from .layout import RotorSigns, rotor_signs
+from .reading import Recording
+from .usable import cut, stretches
+
+FULL_SCALE = 1000.0
+"""Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
+
+_GRAVITY = 9.81
+_PLAUSIBLE = (0.5, 2.0)  # [g], the median of the accelerometer in flight
+_ANOTHER = 0.1  # a hover speed that differs by this share is another one
+_CENTIMETRE = 0.01
+
+
+class AirframeDraft(NamedTuple):
+    """The text of an airframe's file, and the keys that must be filled in before it can be used."""
+
+    text: str
+    missing: tuple[str, ...]
+
+
+class _Hover(NamedTuple):
+    """The rotor speed at which a vehicle hovers, in the unit of the flight; and how many seconds show it, and how."""
+
+    speed: float
+    seconds: float
+    felt: bool
+
+
+def airframe_draft(recording: Recording, source: str | None = None) -> AirframeDraft:
+    """Begin the file of an airframe with what a log knows: spins, hover speed, sometimes the rotors' positions.
+
+    What must be weighed or measured is a comment, so that `load_airframe` names the first of these keys as missing.
+
+    **Arguments:**
+
+    - `recording`: read with the airframe of `source`, if that is given, and with `full_scale=1.0`.
+    - `source`: the name of a preset or a file to start from. Its values and comments stay. Where the log says something
+      else, a comment at the end says so.
+    """
+    facts, airframe = recording.facts, None if source is None else load_airframe(source)
+    found = stretches(recording.flight, airframe, landed=facts.landed)
+    parts = [cut(recording.flight, part) for part in found if not part.reason]
+    signs = None if facts.too_slow else rotor_signs(parts)
+    hover = _hover(parts)
+    spins = facts.rotor_spins or (None if signs is None else signs.spins)
+    if source is not None and airframe is not None:
+        return AirframeDraft(_continued(recording, source, airframe, spins, hover), ())
+    return _begun(recording, signs, spins, hover)
+
+
+def _hover(parts: Sequence[Flight]) -> _Hover | None:
+    """The speed at which thrust is as large as the weight, by the accelerometer if it is plausible.
+
+    Without accelerometer, the median thrust in flight counts as the weight.
+    """
+    if not parts:
+        return None
+    squares = np.concatenate([(np.asarray(part.omega, dtype=float) ** 2).mean(axis=1) for part in parts])
+    seconds = sum(float(np.ptp(np.asarray(part.time))) for part in parts)
+    force = [np.asarray(part.specific_force)[:, 2] for part in parts if part.specific_force is not None]
+    vertical = np.concatenate(force) if len(force) == len(parts) else np.full(1, np.nan)
+    share = float(np.median(vertical[np.isfinite(vertical)])) / _GRAVITY if np.isfinite(vertical).any() else np.nan
+    felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
+    return _Hover(float(np.sqrt(np.median(squares) / (share if felt else 1.0))), seconds, felt)
+
+
+def _begun(
+    recording: Recording, signs: RotorSigns | None, spins: tuple[float, ...] | None, hover: _Hover | None
+) -> AirframeDraft:
+    """A file from nothing but the log."""
+    flight, facts, document, missing = recording.flight, recording.facts, tomlkit.document(), ["mass"]
+    _say(document, f"The airframe of {Path(recording.name).name}. SI units.", *_battery(recording))
+    _head(document, "Weigh and measure: write the numbers, and remove the # in front.")
+    _say(document, "mass =   # kg, with battery: all inertias are proportional to it")
+    if facts.rotor_positions is None:
+        missing.append("rotor_positions")
+        _say(document, *_positions_to_measure(signs))
+    _head(document, "From the log.")
+    if facts.rotor_positions is not None:
+        _add(document, "rotor_positions", _short(facts.rotor_positions), "m, x forward and y left: check")
+        _say(document, "(settings of the autopilot, which needs only their ratios; inertias need the true distances)")
+    if spins is None:
+        missing.append("rotor_spins")
+        _add(document, "rotor_spins", [], "fill in, such as [1, -1, 1, -1]; 1: counter-clockwise seen from above")
+    else:
+        _add_spins(document, recording, spins)
+    full = FULL_SCALE if flight.commanded else 1.0
+    if hover is None:
+        missing.append("hover_speed")
+        _say(document, "hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
+    else:
+        _add(document, "hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
+        if not hover.felt:
+            _say(document, "Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
+    if flight.commanded:
+        _add(document, "max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
+    _head(document, "Guesses from mass and positions, where the search begins. Numbers are better.")
+    _add(document, "inertia", GUESS, "kg m^2, as [Ix, Iy, Iz]")
+    _add(document, "drag_coefficient", GUESS, "N m s^2/rad^2: Iz is proportional to it")
+    _add(document, "rotor_inertia", GUESS, "kg m^2, of a propeller with its motor's bell")
+    return AirframeDraft(tomlkit.dumps(document), tuple(missing))
+
+
+def _continued(
+    recording: Recording, source: str, airframe: Airframe, spins: tuple[float, ...] | None, hover: _Hover | None
+) -> str:
+    """A file that starts from another: added is what it lacks, and as comments what the log says otherwise."""
+    flight, facts = recording.flight, recording.facts
+    document = _preset(airframe) if source in PRESETS else tomlkit.parse(Path(source).read_text(encoding="utf-8"))
+    begin = tomlkit.dumps(document)
+    given = set(document)
+    _head(document, f"What {Path(recording.name).name} adds.")
+    before = tomlkit.dumps(document)
+    if flight.commanded and not has_full_scale(airframe):
+        full = FULL_SCALE if hover is None else float(airframe.hover_speed) / hover.speed
+        how = "a convention" if hover is None else f"the rotors then carry the weight, {_how(hover)}"
+        _add(document, "max_rotor_speed", _short(full), f"rad/s at command 1; {how}")
+    elif hover is not None and abs(hover.speed / float(airframe.hover_speed) - 1) > _ANOTHER:
+        thrust = float(airframe.mass * airframe.gravity) / (4 * hover.speed**2)
+        name, value = ("hover_speed", hover.speed) if "hover_speed" in given else ("thrust_coefficient", thrust)
+        _otherwise(document, f"{name} = {_short(value)}  # {_how(hover)}")
+    if spins is not None and "rotor_spins" not in given:
+        _add_spins(document, recording, spins)
+    elif facts.rotor_spins is not None and not np.array_equal(facts.rotor_spins, airframe.rotor_spins):
+        _otherwise(document, f"rotor_spins = {[int(spin) for spin in facts.rotor_spins]}")
+    positions = facts.rotor_positions
+    if positions is not None and np.abs(np.subtract(positions, airframe.rotor_positions)).max() > _CENTIMETRE:
+        _otherwise(document, f"rotor_positions = {_short(positions)}")
+    text = tomlkit.dumps(document)
+    return begin if text == before else text
+
+
+def _otherwise(document: TOMLDocument, line: str) -> None:
+    _say(document, f"The log says otherwise: {line}")
+
+
+def _add_spins(document: TOMLDocument, recording: Recording, spins: tuple[float, ...]) -> None:
+    how = "settings of the autopilot" if recording.facts.rotor_spins else "as the vehicle yaws in this flight"
+    _add(document, "rotor_spins", [int(spin) for spin in spins], f"1: counter-clockwise seen from above; {how}")
+
+
+def _preset(airframe: Airframe) -> TOMLDocument:
+    document = tomlkit.document()
+    for name, value in vars(airframe).items():
+        if np.isfinite(value).all():
+            document.add(name, np.asarray(value).tolist())
+    return document
+
+
+def _battery(recording: Recording) -> list[str]:
+    """The cells and the voltage, if the log has them: the model takes the voltage from each log."""
+    cells, voltage = recording.facts.cells, recording.flight.voltage
+    words = [] if cells is None else [f"{cells} cells"]
+    words += [] if voltage is None else [f"{float(np.median(np.asarray(voltage))):.3g} V (median)"]
+    return [f"Battery: {', '.join(words)}."] if words else []
+
+
+def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:
+    if signs is None:
+        return (
+            "rotor_positions = [[x1, y1], [x2, y2], [x3, y3], [x4, y4]]  # m, x forward and y left, in the log's order",
+            "(this flight does not show which rotor is where)",
+        )
+    signed = [("x" if x > 0 else "-x", "y" if y > 0 else "-y") for x, y in zip(signs.forward, signs.left, strict=True)]
+    places = ", ".join(f"[{x}, {y}]" for x, y in signed)
+    words = {"x": "front", "-x": "rear", "y": "left", "-y": "right"}
+    names = ", ".join(f"{i + 1} {words[x]} {words[y]}" for i, (x, y) in enumerate(signed))
+    return (
+        f"rotor_positions = [{places}]  # m: numbers for x (forward) and y (left)",
+        f"(as the vehicle turns in this flight: {names})",
+    )
+
+
+def _how(hover: _Hover) -> str:
+    return f"{'by the accelerometer' if hover.felt else 'the median'} in {hover.seconds:.1f} s of flight"
+
+
+def _short(value: Any) -> Any:
+    """A number or nested numbers with at most four digits."""
+    if isinstance(value, tuple | list):
+        return [_short(each) for each in value]
+    return float(f"{value:.4g}")
+
+
+def _head(document: TOMLDocument, text: str) -> None:
+    document.add(tomlkit.nl())
+    document.add(tomlkit.comment(text))
+
+
+def _say(document: TOMLDocument, *lines: str) -> None:
+    for line in lines:
+        document.add(tomlkit.comment(line))
+
+
+def _add(document: TOMLDocument, key: str, value: Any, comment: str) -> None:
+    document.add(key, tomlkit.item(value).comment(comment))

@@ -1,0 +1,179 @@
+"""`jaxos4 inspect --airframe-out`: what a log knows of its vehicle, and what must be measured."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+import tomlkit
+from helpers import refused
+from hypothesis import given, settings, strategies as st
+from test_flight_csv import CRAZYFLIE
+from test_inspect import LOGS
+from test_signs import flown, turned
+
+import jaxos4
+from jaxos4.flight import Flight
+from jaxos4.logs import LogFacts, write_flight
+from jaxos4.recording import Recording
+from jaxos4.recording.drafting import FULL_SCALE, airframe_draft
+from jaxos4.recording.layout import RotorSigns, rotor_signs
+
+SIGNS = RotorSigns((1, -1, -1, 1), (-1, -1, 1, 1), (1, -1, 1, -1))
+
+
+def with_force(flight, airframe):
+    """The flight with an accelerometer that measures the rotors' thrust."""
+    thrust = float(airframe.thrust_coefficient) * (np.asarray(flight.omega) ** 2).sum(axis=1)
+    force = np.column_stack([np.zeros((thrust.size, 2)), thrust / float(airframe.mass)])
+    return Flight(flight.time, flight.omega, flight.states, force, commanded=flight.commanded)
+
+
+def with_commands(flight, airframe):
+    """The flight as a reader makes it that knows of no airframe: commands are shares of full scale."""
+    return eqx.tree_at(lambda f: f.omega, flight, np.asarray(flight.omega) / float(airframe.max_rotor_speed))
+
+
+def filled(text):
+    """The draft with its marked lines filled in, by the Crazyflie's numbers."""
+    text = text.replace("# mass = ", "mass = 0.027")
+    (line,) = [line for line in text.splitlines() if line.startswith("# rotor_positions = ")]
+    places, comment = line.removeprefix("# ").split("  # ")
+    return text.replace(line, f"{places.replace('x', '0.028').replace('y', '0.028')}  # {comment}")
+
+
+@given(seed=st.integers(0, 999), gust=st.sampled_from([0.0, 5.0, 40.0]), order=st.permutations(range(4)))
+@settings(max_examples=12, deadline=None)
+def test_a_flight_shows_where_its_rotors_are(seed, gust, order):
+    """In any order of the rotors, whatever a controller does against gusts: right, or not said."""
+    flight = flown(CRAZYFLIE, seed, gust=gust)
+    found = rotor_signs([eqx.tree_at(lambda f: f.omega, flight, np.asarray(flight.omega)[:, order])])
+    assert found is not None
+    forward, left, spins = (tuple(np.asarray(each)[order].tolist()) for each in SIGNS)
+    assert found[:2] == (forward, left)
+    assert found.spins in (spins, None)
+    assert found.spins is not None or gust == 40
+
+
+def test_props_in_and_props_out_are_told_apart():
+    found = rotor_signs([flown(turned(CRAZYFLIE, "rotor_spins"), 0)])
+    assert found == SIGNS._replace(spins=(-1, 1, -1, 1))
+
+
+def test_a_flight_that_does_not_show_its_rotors():
+    flight = flown(CRAZYFLIE, 0)
+    still = Flight(flight.time, flight.omega, 0.001 * np.asarray(flight.states), commanded=True)
+    assert rotor_signs([still]) is None
+    assert rotor_signs([]) is None
+    plus = eqx.tree_at(
+        lambda a: a.rotor_positions, CRAZYFLIE, np.array([[0.04, 0.0], [0.0, -0.04], [-0.04, 0.0], [0.0, 0.04]])
+    )
+    assert rotor_signs([flown(plus, 0)]) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "signs"),
+    [
+        ("arpl_crazyflie_rollpitch.csv", SIGNS),
+        ("arpl_crazyflie_hover.csv", SIGNS),
+        # Betaflight's order: rear right, front right, rear left, front left; props out.
+        ("betaflight/fc_btfl_002.bbl", RotorSigns((-1, 1, -1, 1), (-1, -1, 1, 1), (1, -1, -1, 1))),
+    ],
+)
+def test_real_logs_give_airframes(name, signs, shared_flights, run, tmp_path):
+    code, out, err = run("inspect", str(shared_flights / name), "--airframe-out", "mine.toml")
+    assert (code, err) == (0, "")
+    assert "airframe: mine.toml; weigh or measure, and fill in: mass, rotor_positions" in out
+    text = (tmp_path / "mine.toml").read_text()
+    x, y = ([{1: name, -1: f"-{name}"}[sign] for sign in each] for name, each in zip("xy", signs, strict=False))
+    assert f"# rotor_positions = [{', '.join(f'[{a}, {b}]' for a, b in zip(x, y, strict=True))}]" in text
+    refused(run("estimate", str(shared_flights / name), "--airframe", "mine.toml"), "mine.toml: `mass` is missing")
+    (tmp_path / "mine.toml").write_text(filled(text))
+    airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
+    np.testing.assert_array_equal(airframe.rotor_spins, signs.spins)
+    assert 200 < float(airframe.hover_speed) < 700
+    if "crazyflie" in name:  # its data sheet says 0.150 N at full command
+        full_thrust = float(airframe.thrust_coefficient * airframe.max_rotor_speed**2)
+        assert full_thrust == pytest.approx(0.150, rel=0.15)
+
+
+@pytest.mark.parametrize("commanded", [True, False])
+@pytest.mark.parametrize("felt", [True, False])
+def test_the_median_thrust_carries_the_mass(commanded, felt, tmp_path):
+    flight = with_force(flown(CRAZYFLIE, 0), CRAZYFLIE)
+    if not felt:
+        flight = Flight(flight.time, flight.omega, flight.states, commanded=True)
+    if commanded:
+        flight = with_commands(flight, CRAZYFLIE)
+    else:
+        flight = Flight(flight.time, flight.omega, flight.states, flight.specific_force)
+    draft = airframe_draft(Recording(flight, "flight.csv"))
+    assert draft.missing == ("mass", "rotor_positions")
+    assert ("Without an accelerometer this must be right" in draft.text) == (not felt)
+    (tmp_path / "mine.toml").write_text(filled(draft.text))
+    airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
+    assert float(airframe.max_rotor_speed) == (FULL_SCALE if commanded else np.inf)
+    scale = float(CRAZYFLIE.max_rotor_speed) / FULL_SCALE if commanded else 1.0
+    thrust = float(CRAZYFLIE.thrust_coefficient) * scale**2
+    assert float(airframe.thrust_coefficient) == pytest.approx(thrust, rel=1e-3 if felt else 0.05)
+    np.testing.assert_array_equal(airframe.rotor_spins, CRAZYFLIE.rotor_spins)
+
+
+def test_settings_of_the_autopilot_are_taken():
+    positions = ((0.15, -0.2), (-0.15, 0.2), (0.15, 0.2), (-0.15, -0.2))
+    facts = LogFacts(rotor_positions=positions, rotor_spins=(1.0, 1.0, -1.0, -1.0), cells=4)
+    flight = eqx.tree_at(lambda f: f.voltage, flown(CRAZYFLIE, 0), np.full(3750, 15.2), is_leaf=lambda x: x is None)
+    draft = airframe_draft(Recording(flight, "a.ulg", facts=facts))
+    found = tomlkit.parse(draft.text)
+    assert draft.missing == ("mass",)
+    assert found["rotor_positions"] == [list(each) for each in positions]
+    assert found["rotor_spins"] == [1, 1, -1, -1]
+    assert "# Battery: 4 cells, 15.2 V (median)." in draft.text
+
+
+def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
+    rows = [f"{0.01 * k:.2f},0,0,0,0,0" for k in range(200)]
+    (tmp_path / "log").write_text("\n".join(["t,command1,command2,command3,command4,p", *rows]))
+    code, out, err = run("inspect", "log", "--airframe-out", "mine.toml")
+    assert (code, err) == (0, "")
+    assert "fill in: mass, rotor_positions, rotor_spins, hover_speed" in out
+    text = (tmp_path / "mine.toml").read_text()
+    for line, key in (("", "mass"), ("mass = 1", "rotor_positions"), ("arm = 0.1", "thrust_coefficient")):
+        text = f"{line}\n{text}"
+        (tmp_path / "mine.toml").write_text(text)
+        refused(run("inspect", "log", "--airframe", "mine.toml"), f"`{key}` is missing")
+    (tmp_path / "mine.toml").write_text(f"hover_speed = 500\n{text}")
+    refused(run("inspect", "log", "--airframe", "mine.toml"), "`rotor_spins` must be finite numbers of shape [4]")
+
+
+def test_a_draft_starts_from_an_airframe(run, tmp_path):
+    write_flight(with_force(flown(CRAZYFLIE, 0), CRAZYFLIE), tmp_path / "flight.csv", CRAZYFLIE)
+    own = "mass = 0.027  # weighed\narm = 0.04\nhover_speed = 900.0\n" + "".join(
+        f'{key} = "guess"\n' for key in ("inertia", "drag_coefficient", "rotor_inertia")
+    )
+    (tmp_path / "own.toml").write_text(own)
+    code, out, err = run("inspect", "flight.csv", "--airframe", "own.toml", "--airframe-out", "mine.toml")
+    assert (code, err) == (0, "")
+    text = (tmp_path / "mine.toml").read_text()
+    assert text.startswith(own)
+    airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
+    # Full scale is such that the flight hovers at the given speed; the spins come from the flight.
+    hover = float(CRAZYFLIE.hover_speed / CRAZYFLIE.max_rotor_speed)
+    assert float(airframe.max_rotor_speed) == pytest.approx(900.0 / hover, rel=1e-3)
+    np.testing.assert_array_equal(airframe.rotor_spins, CRAZYFLIE.rotor_spins)
+    code, _, _ = run("inspect", "flight.csv", "--airframe", "mine.toml", "--airframe-out", "again.toml")
+    assert code == 0
+    assert (tmp_path / "again.toml").read_text() == text  # nothing to add
+    (tmp_path / "other.toml").write_text(text.replace("900.0", "600.0"))
+    assert run("inspect", "flight.csv", "--airframe", "other.toml", "--airframe-out", "again.toml")[0] == 0
+    assert "# The log says otherwise: hover_speed = 900" in (tmp_path / "again.toml").read_text()
+    assert run("inspect", "flight.csv", "--airframe", "os4", "--airframe-out", "os4.toml")[0] == 0
+    from_preset = jaxos4.load_airframe(tmp_path / "os4.toml")
+    assert float(from_preset.mass) == 0.65
+    assert float(from_preset.hover_speed / from_preset.max_rotor_speed) == pytest.approx(hover, rel=1e-3)
+
+
+def test_an_airframe_overwrites_no_input(run, tmp_path):
+    (tmp_path / "log").write_bytes(LOGS["Crazyflie"])
+    refused(run("inspect", "log", "--airframe-out", "log"), "would overwrite an input")
+    refused(run("inspect", "log", "--out", "a", "--airframe-out", "a"), "--out and --airframe-out name one file")
+    refused(run("inspect", "log", "--airframe-out", "none/mine.toml"), "none/mine.toml")
+    assert (tmp_path / "log").read_bytes() == LOGS["Crazyflie"]
