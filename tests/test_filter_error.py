@@ -1,11 +1,15 @@
 """`FilterError`: its filters and its likelihood against NumPy, and flights in closed loop, for which it is made."""
 
+import dataclasses
+import functools
+import pathlib
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, noisy_states, standard_flight, standard_problem
+from helpers import DT, noisy_states, single_precision, standard_flight, standard_problem
 from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, names
 
 import jaxos4
@@ -13,18 +17,23 @@ from jaxos4.estimators import FilterError
 from jaxos4.estimators.filter_error import _lanes, _observed
 from jaxos4.shooting.filtering import Noise, filter_gains, innovate
 
-MODEL = jaxos4.PublishedOS4()
+MODEL, TESTS = jaxos4.PublishedOS4(), pathlib.Path(__file__).parent
 RATES = jaxos4.models.state.CASCADE_ORDER[:3]
 # Without gyroscopic torques a disturbed rate changes no other channel.
 UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 NOISE = Noise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 1.0], [0.02, 0.01, 0.03])))
 
 
+def one_lane(samples=501):
+    return np.arange(samples)[None]
+
+
 @eqx.filter_jit
-def likelihood(problem, parameters, noise, lane=10**6):
-    """The innovations of a problem whose forcing depends on no parameter; by default in one lane."""
-    index = _lanes(problem.flight.time.shape[0], lane)
-    observed, place = _observed(problem, index), np.minimum(index, problem.flight.time.shape[0] - 1)
+def likelihood(problem, parameters, noise, *, cut=False):
+    """The innovations of a problem whose forcing depends on no parameter; in one lane, unless the flight is `cut`."""
+    samples = problem.flight.time.shape[0]
+    index = _lanes(samples) if cut else one_lane(samples)
+    observed, place = _observed(problem, index), np.minimum(index, samples - 1)
     forcing = jax.tree.map(lambda leaf: leaf[place].T, problem.forcing(parameters))
     step, observe, dt = problem.step, problem.model.observe, problem.flight.dt
     nothing = {"forcing_tangents": None, "forcing_parameters": ()}
@@ -39,7 +48,7 @@ def uncoupled_rates(flight):
 
 
 def disturbed(seed=0):
-    """The standard problem from an unknown start, with disturbances, noise, and gaps: long, short and in one channel."""
+    """The standard problem from an unknown start, with disturbances, noise, and gaps, one of them in one channel."""
     rng, states = np.random.default_rng(seed), np.array(noisy_states(1, seed=seed)[0])
     strength, tau = np.exp(NOISE.strength), np.exp(NOISE.time_constant)
     kept, disturbance = np.exp(-DT / tau), np.zeros((len(states), 3))
@@ -88,7 +97,7 @@ def textbook(noise, measured, restart):
 
 
 def test_the_gains_are_those_of_a_textbook_filter():
-    observed = _observed(disturbed(), _lanes(501))
+    observed = _observed(disturbed(), one_lane())
     (gains, _), measured = filter_gains(observed, NOISE, jnp.asarray(DT)), ~np.isnan(observed.measured)
     assert observed.restart[:, 0].nonzero()[0].tolist() == [0, *range(210, 231)]
     assert observed.counts[:, 0].nonzero()[0].tolist() == [*range(210), *range(230 + 128, 501)]
@@ -108,7 +117,7 @@ def test_the_variance_that_a_disturbance_adds_is_exact(tau):
     noise = Noise(*(jnp.log(jnp.array([x, 1.0, 1.0])) for x in (3.0, tau, 1e-9)))
     measured = jnp.array([0.0, 0.0])[:, None, None] * jnp.ones((1, 3, 1))
     first = jnp.zeros((2, 1), dtype=bool)
-    observed = _observed(standard_problem(channels="rates", duration=0.1), _lanes(11))
+    observed = _observed(standard_problem(channels="rates", duration=0.1), one_lane(11))
     observed = observed._replace(measured=measured, restart=first)
     gains, _ = filter_gains(observed, noise, jnp.asarray(DT))
     moved, added = transition(3.0, tau)
@@ -203,7 +212,7 @@ def test_the_information_is_the_covariance_of_the_gradient():
 def test_the_likelihood_does_not_depend_on_the_lanes():
     problem = disturbed()
     alone = likelihood(problem, MODEL.alpha, NOISE)
-    cut = likelihood(problem, MODEL.alpha, NOISE, 90)
+    cut = likelihood(problem, MODEL.alpha, NOISE, cut=True)
     assert (alone.cost.shape, cut.cost.shape) == ((1,), (4,))
     np.testing.assert_allclose(cut.cost.sum(), alone.cost.sum(), atol=0.2)
     np.testing.assert_allclose(cut.gradient.sum(axis=(0, 2)), alone.gradient.sum(axis=(0, 2)), rtol=0.05, atol=1.0)
@@ -246,7 +255,7 @@ def test_a_known_start_is_used_in_flights_of_several_lanes():
     start = np.array(long.flight.states[0])
     start[RATES] = 0.3, -0.2, 0.1
     problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
-    observed = _observed(problem, _lanes(501, 90))
+    observed = _observed(problem, _lanes(501))
     assert observed.restart[0].tolist() == [False, True, True, True]
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
     gains, _ = filter_gains(observed, NOISE, jnp.asarray(DT))
@@ -262,3 +271,185 @@ def test_each_sample_counts_once(samples, lane):
     own = np.concatenate([index[0], index[1:, 128:].ravel()])
     np.testing.assert_array_equal(own[own < samples], np.arange(samples))
     assert (index[:, 0] >= 0).all()
+
+
+# Gaps, recordings, failures.
+
+
+def joined(flight):
+    """The second half of a flight as one recording, and then its first half as another."""
+    order = np.concatenate([np.arange(250, 501), np.arange(250)])
+    stretch = jnp.asarray(np.arange(501) > 250, dtype=int)
+    return dataclasses.replace(flight, omega=flight.omega[order], states=flight.states[order], stretch=stretch)
+
+
+def test_another_recording_restarts_the_filter():
+    problem = standard_problem(channels="rates", free=True, states=noisy_states(1, seed=4)[0])
+    problem = eqx.tree_at(lambda p: p.flight, problem, joined(problem.flight))
+    observed = _observed(problem, one_lane())
+    assert observed.restart[:, 0].nonzero()[0].tolist() == [0, 251]
+    assert (~observed.counts[:, 0]).nonzero()[0].tolist() == list(range(251, 251 + 128))
+    found = FilterError()(problem, jaxos4.Bracket.default(MODEL))
+    assert jaxos4.result_names(found.result) == "successful"
+    assert (np.abs(found.parameters - MODEL.alpha) < 4 * found.std).all()
+
+
+def test_no_trajectory_runs_away_in_a_long_gap():
+    """Nothing was measured for 3 s, in which this model would turn faster and faster."""
+    problem = disturbed()
+    problem = eqx.tree_at(lambda p: p.flight.states, problem, problem.flight.states.at[150:450].set(jnp.nan))
+    wild = MODEL.alpha.at[1].set(-50.0)
+    found = likelihood(problem, wild, NOISE)
+    assert bool(found.sound.all())
+    assert all(np.isfinite(leaf).all() for leaf in found)
+
+
+def test_a_lane_that_fails_changes_no_other():
+    problem, *arrays = lanes(noisy_states(LANES, seed=50))
+    states, omega, lower, upper = (np.array(x)[:4] for x in arrays)
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def each(states, omega, lower, upper):
+        data = eqx.tree_at(lambda p: (p.flight.states, p.flight.omega), problem, (states, omega))
+        return FilterError().fit(data, jaxos4.Bracket(lower, upper))
+
+    whole = each(*map(jnp.asarray, (states, omega, lower, upper)))
+    omega[1, 100, 0], states[2, 50], omega[3, 500] = np.nan, np.inf, np.nan
+    broken = each(*map(jnp.asarray, (states, omega, lower, upper)))
+    assert broken.innovations.sound.all(axis=1).tolist() == [True, False, False, True]
+    assert np.isfinite(broken.parameters).all()
+    assert broken.done.tolist() == [True, False, False, True]
+    for lane in (0, 3):  # the last row of rotor speeds drives nothing
+        for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(whole), strict=True):
+            np.testing.assert_array_equal(np.asarray(kept)[lane], np.asarray(was)[lane])
+
+
+@pytest.mark.parametrize("samples", [2, 12])
+def test_a_flight_too_short_to_say_anything_leaves_the_bracket(samples):
+    duration = (samples - 1) * DT
+    states = noisy_states(1, duration=duration)[0]
+    problem = standard_problem(channels="rates", free=True, states=states, duration=duration)
+    bracket = jaxos4.Bracket.default(MODEL)
+    found = FilterError()(problem, bracket)
+    assert jaxos4.result_names(found.result) == "unidentifiable"
+    assert (np.abs(found.parameters - bracket.center) < 4 * bracket.half_width).all()
+    assert (found.std <= bracket.half_width * 1.001).all()
+
+
+SCRIPT = """
+import json, sys
+import numpy as np
+sys.path.insert(0, "tests")
+from helpers import standard_problem
+import jaxos4
+problem = standard_problem(channels="rates", states=np.load(PATH).astype("float32"))
+found = jaxos4.FilterError()(problem, jaxos4.Bracket.default(problem.model))
+result = str(jaxos4.result_names(found.result))
+print(json.dumps([found.parameters.tolist(), found.std.tolist(), str(found.parameters.dtype), result]))
+"""
+
+
+def test_single_precision_gives_the_same(tmp_path):
+    states = noisy_states(1, seed=2)[0]
+    np.save(tmp_path / "states.npy", states)
+    code = SCRIPT.replace("PATH", repr(str(tmp_path / "states.npy")))
+    parameters, std, dtype, result = single_precision(code.replace('"tests"', repr(str(TESTS))))
+    assert (dtype, result) == ("float32", "successful")
+    double = FilterError()(standard_problem(channels="rates", states=states), jaxos4.Bracket.default(MODEL))
+    assert (np.abs(np.array(parameters) - double.parameters) < 0.1 * double.std).all()
+    np.testing.assert_allclose(std, double.std, rtol=0.05)
+
+
+# Vehicles in closed loop.
+
+THRUST, FULL_SPEED = 0.15, 2500.0
+CRAZYFLIE = jaxos4.Airframe(
+    mass=0.027,
+    inertia=(1.66e-5, 1.7e-5, 2.9e-5),
+    rotor_positions=[(0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028)],
+    rotor_spins=(1.0, -1.0, 1.0, -1.0),
+    thrust_coefficient=THRUST / FULL_SPEED**2,
+    drag_coefficient=0.005 * THRUST / FULL_SPEED**2,
+    rotor_inertia=2e-8,
+    max_rotor_speed=FULL_SPEED,
+)
+TERMS = ("offset", "damping", "lag", "delay", "reaction", "accelerometer")
+FLIGHTS, SAMPLES, PERIOD = 8, 2501, 0.004
+LAG, DELAY = 0.05, 0.01
+
+
+def stacked(modules):
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *modules)
+
+
+@functools.cache
+def flown():
+    """Eight flights of 10 s in gusts of 5 to 10 rad/s^2, and their airframes with inertias that are 25 % off."""
+    wrong = [eqx.tree_at(lambda a: a.inertia, CRAZYFLIE, CRAZYFLIE.inertia * (1 + 0.25 * (-1) ** i)) for i in range(8)]
+    loops = [
+        jaxos4.ClosedLoop(CRAZYFLIE, gust=gust, rotor_lag=LAG, rotor_delay=DELAY, controller_inertia=airframe.inertia)
+        for gust, airframe in zip(np.linspace(5, 10, FLIGHTS), wrong, strict=True)
+    ]
+    keys = [jax.random.split(jax.random.key(i)) for i in range(FLIGHTS)]
+    references = [jaxos4.random_references(duration=10.0, dt=PERIOD, key=key[0]) for key in keys]
+    fly = eqx.filter_jit(eqx.filter_vmap(lambda v, r, key: jaxos4.fly_closed_loop(v, r, dt=PERIOD, key=key)))
+    flights = fly(stacked(loops), jnp.stack(references), jnp.stack([key[1] for key in keys]))
+    assert set(jaxos4.result_names(flights.result)) == {"successful"}
+    return flights, stacked(wrong)
+
+
+def vehicle_problem(flight, model):
+    return jaxos4.ShootingProblem(model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4")
+
+
+@eqx.filter_jit
+def fits(flights, airframes):
+    @eqx.filter_vmap
+    def one(flight, airframe):
+        model = jaxos4.FlightModel(airframe, terms=TERMS)
+        return FilterError().fit(vehicle_problem(flight, model), jaxos4.Bracket.default(model))
+
+    return one(flights, airframes)
+
+
+@eqx.filter_jit
+def regressions(flights, airframes):
+    """Equation error, which knows the lag and the delay."""
+
+    @eqx.filter_vmap
+    def one(flight, airframe):
+        model = jaxos4.FlightModel(airframe, terms=("offset", "damping", "lag", "delay", "reaction"))
+        model = jaxos4.hold(model, {"rotor_lag": LAG, "rotor_delay": DELAY})
+        windows = SAMPLES // 62
+        flight = jax.tree.map(lambda x: x[: windows * 62] if x.ndim else x, flight)
+        problem = dataclasses.replace(vehicle_problem(flight, model), windows=windows)
+        return jaxos4.EquationError(memory=0.9)(problem, jaxos4.Bracket.default(model))
+
+    return one(flights, airframes)
+
+
+def of_inertias(parameters, std):
+    """The errors of 1/Ix and 1/Iy, as shares of the truth and in standard deviations."""
+    truth = 1 / np.asarray(CRAZYFLIE.inertia)[:2]
+    error = np.asarray(parameters)[:, [2, 5]] - truth
+    return error / truth, error / np.asarray(std)[:, [2, 5]]
+
+
+def test_inertias_of_flights_in_closed_loop_lie_in_their_intervals():
+    """The squared errors are chi-square with 16 degrees of freedom: between its 0.05 % and 99.95 % points."""
+    found = fits(*flown())
+    assert bool(found.done.all())
+    assert bool(found.innovations.sound.all())
+    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    relative, scaled = of_inertias(found.parameters, std)
+    gusts = np.linspace(5, 10, FLIGHTS)[:, None]
+    np.testing.assert_allclose(np.exp(found.noise.strength[:, :2]) / gusts, 1, atol=0.5)
+    np.testing.assert_allclose(np.exp(found.noise.sensor[:, :2]), 0.02, rtol=0.1)
+    assert 3.54 < np.square(scaled).sum() < 40.8, scaled
+    assert (np.abs(relative / scaled) < 0.15).all()
+    # Regression sees the same flights, and is wrong by more than filter error ever is.
+    found = regressions(*flown())
+    relative, scaled = of_inertias(found.parameters, found.std)
+    assert np.square(scaled).sum() > 200
+    assert np.abs(relative.mean()) > 0.1
