@@ -235,7 +235,7 @@ def innovate(
     scalars, positions, unknowns = tuple(parameters), np.asarray(forcing_parameters, dtype=int), count + 3
     basis = tuple(np.eye(unknowns, count, dtype=parameters.dtype).T)
     gains, gain_slopes = filter_gains(observed, noise, dt)
-    move, observe = (jax.vmap(function, in_axes=(0, 0, None)) for function in (move, observe))
+    move, observe = jax.vmap(move, in_axes=(0, 0, None)), jax.vmap(observe, in_axes=(0, 0, None))
 
     def transition(noise: Noise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
         step = _step_of(noise, dt)
