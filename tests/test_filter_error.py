@@ -15,10 +15,11 @@ from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, name
 import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.estimators.filter_error import _lanes, _observed
+from jaxos4.models.state import CASCADE_ORDER
 from jaxos4.shooting.filtering import Noise, filter_gains, innovate
 
 MODEL, TESTS = jaxos4.PublishedOS4(), pathlib.Path(__file__).parent
-RATES = jaxos4.models.state.CASCADE_ORDER[:3]
+RATES = CASCADE_ORDER[:3]
 # Without gyroscopic torques a disturbed rate changes no other channel.
 UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 NOISE = Noise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 1.0], [0.02, 0.01, 0.03])))
@@ -258,6 +259,7 @@ def test_a_known_start_is_used_in_flights_of_several_lanes():
     problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
     observed = _observed(problem, _lanes(501))
     assert observed.restart[0].tolist() == [False, True, True, True]
+    assert observed.known is not None
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
     gains, _ = filter_gains(observed, NOISE, jnp.asarray(DT))
     # After one sample only the disturbance is unknown.
