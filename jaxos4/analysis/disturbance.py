@@ -34,7 +34,7 @@ def disturbances(problem: ShootingProblem, parameters: Parameters, noise: Noise)
     rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
     modelled = np.zeros(rates.shape)
     modelled[:-1] = modelled_acceleration(problem, parameters)
-    own = Noise(*(np.asarray(leaf)[:3] for leaf in noise))
+    own = Noise(*(as_float(np.asarray(leaf)[:3]) for leaf in noise))
     begins = np.arange(rates.shape[0]) == 0
     if problem.flight.stretch is not None:
         begins = np.diff(np.asarray(problem.flight.stretch), prepend=-1) != 0

@@ -129,7 +129,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     return FrequencyResponse(*axes)
 
 
-def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[np.ndarray, "samples-1 3"]:
+def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[np.ndarray, "steps 3"]:
     """The model's angular acceleration from each sample to the next at the measured rates [rad/s^2].
 
     A rate that was not measured counts as 0.
@@ -142,7 +142,7 @@ def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> F
 @eqx.filter_jit
 def _modelled(
     problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
-) -> Float[Array, "samples-1 3"]:
+) -> Float[Array, "steps 3"]:
     """The model's angular acceleration from each sample to the next, at the mean of their rates [rad/s^2]."""
     forcing = jax.tree.map(lambda leaf: leaf[:-1], problem.forcing(parameters))
     middle = Rates(*((rates[1:] + rates[:-1]) / 2).T)

@@ -52,14 +52,14 @@ class Observed(NamedTuple):
     - `measured`: body rates, then the means of specific force over blocks of samples. NaN: not measured.
     - `restart`: whether a lane forgets what it knew before this sample.
     - `counts`: whether the innovations at a sample count.
-    - `count`: the number of samples in the block so far. `closes`: whether the block ends with this sample.
+    - `in_block`: the number of samples in the block so far. `closes`: whether the block ends with this sample.
     - `known`: the rates at the first sample. `None`: unknown.
     """
 
     measured: Series
     restart: Bool[Array, "time lanes"]
     counts: Bool[Array, "time lanes"]
-    count: Int[Array, "time lanes"]
+    in_block: Int[Array, "time lanes"]
     closes: Bool[Array, "time lanes"]
     known: Float[Array, "3 lanes"] | None = None
 
@@ -235,7 +235,7 @@ def innovate(
     scalars, positions, unknowns = tuple(parameters), np.asarray(forcing_parameters, dtype=int), count + 3
     basis = tuple(np.eye(unknowns, count, dtype=parameters.dtype).T)
     gains, gain_slopes = filter_gains(observed, noise, dt)
-    move, observe = jax.vmap(move, in_axes=(0, 0, None)), jax.vmap(observe, in_axes=(0, 0, None))
+    move_all, observe_all = jax.vmap(move, in_axes=(0, 0, None)), jax.vmap(observe, in_axes=(0, 0, None))
 
     def transition(noise: Noise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
         step = _step_of(noise, dt)
@@ -248,7 +248,7 @@ def innovate(
     def advance(known: _Known, forcing: Forcing, scalars, feedback: _Feedback, row):
         y, restart, count, closes = row
         known = jax.tree.map(lambda leaf: jnp.where(restart, 0.0, leaf), known)
-        outputs = observe(State(known.rates), forcing, scalars)
+        outputs = observe_all(State(known.rates), forcing, scalars)
         force = tuple(total + h for total, h in zip(known.force, outputs[_RATES:], strict=True))
         means = (total / count + d for total, d in zip(force, known.disturbance[_RATES:], strict=True))
         expected = (*outputs[:_RATES], *means)
@@ -257,7 +257,7 @@ def innovate(
             d + gain * e for d, gain, e in zip(known.disturbance, feedback.disturbance, errors, strict=True)
         )
         rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors[:_RATES], strict=True))
-        following = move(State(Rates(*rates)), forcing, scalars).rates
+        following = move_all(State(Rates(*rates)), forcing, scalars).rates
         pushed = (x + a * d for x, a, d in zip(following, feedback.reach, disturbance[:_RATES], strict=True))
         faded = tuple(share * d for share, d in zip(feedback.kept, disturbance, strict=True))
         return _Known(Rates(*pushed), faded, tuple(jnp.where(closes, 0.0, total) for total in force)), errors
@@ -296,7 +296,7 @@ def innovate(
     start = _start(observed, jnp.zeros((channels, lanes), dtype=float))
     first = _Known(Rates(*start[:_RATES]), (zero,) * channels, (zero,) * (channels - _RATES))
     slopes = jax.tree.map(lambda leaf: jnp.zeros((unknowns, *leaf.shape), dtype=float), first)
-    row = observed.measured, observed.restart, observed.count, observed.closes
+    row = observed.measured, observed.restart, observed.in_block, observed.closes
     rows = forcing, forcing_tangents, gains, gain_slopes, row
     (_, _, sound), (errors, slopes) = jax.lax.scan(body, (first, slopes, jnp.ones(lanes, dtype=bool)), rows)
 
