@@ -26,8 +26,9 @@ hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("experiments", "experiment_studies", "network", "equation_error", "multiple_shooting", "ibss", "kalman"),
-    *("vehicle", "identify", "estimators", "cli", "study_resume", "cli_vehicle", "svsf", "study_cluster"),
+    *("filter_error", "experiments", "experiment_studies", "network", "equation_error", "multiple_shooting"),
+    *("ibss", "kalman", "vehicle", "identify", "estimators", "cli", "study_resume", "cli_vehicle", "svsf"),
+    "study_cluster",
 )
 
 

@@ -34,8 +34,6 @@ from ..shooting.rows import windowed
 # The number of samples in a lane. Specific force is compared as means over this time [s]: accelerometers feel
 # vibrations, and their low-pass filters differ.
 _LANE, _BLOCK = 384, 0.25
-# A flight has at least so many lanes, whose disagreement shows errors of the model, unless they would be too short.
-_FEWEST_LANES, _SHORTEST_LANE = 8, 80
 # After so many samples a filter has settled.
 _SETTLING = 128
 # The least share of a block that must be measured.
@@ -108,6 +106,8 @@ class FilterError(AbstractEstimator):
 
     - `tolerance`: the search ends once a step is shorter, in standard deviations of the estimate.
     - `max_steps`: of the search from one time constant of the disturbance.
+    - `lane`: about how many samples are filtered in a row; lanes are filtered in parallel. A short lane loses
+      information if the disturbance is weak, because its filter begins without memory.
     """
 
     looks_at: ClassVar[str] = "rates"
@@ -117,12 +117,14 @@ class FilterError(AbstractEstimator):
 
     tolerance: float = eqx.field(static=True, default=0.05)
     max_steps: int = eqx.field(static=True, default=100)
+    lane: int = eqx.field(static=True, default=_LANE)
 
     def __check_init__(self):
         if not self.tolerance > 0:
             raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
-        if not isinstance(self.max_steps, int) or self.max_steps < 1:
-            raise ValueError(f"`max_steps` must be an integer of at least 1, got {self.max_steps!r}.")
+        for name, value in (("max_steps", self.max_steps), ("lane", self.lane)):
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"`{name}` must be an integer of at least 1, got {value!r}.")
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
@@ -177,7 +179,7 @@ class FilterError(AbstractEstimator):
     ) -> FilterFit:
         """`fit` with a `start` that counts only if it is `given`: one program for both."""
         problem, bracket = problem.restrict("rates"), bracket.usable
-        index = _lanes(problem.flight.time.shape[0])
+        index = _lanes(problem.flight.time.shape[0], self.lane)
         observed, dt, model = _observed(problem, index), problem.flight.dt, problem.model
         inputs, count = problem.flight.inputs, bracket.center.shape[0]
         samples = np.minimum(index, problem.flight.time.shape[0] - 1)
@@ -317,7 +319,7 @@ def _lanes(samples: int, wanted: int = _LANE) -> Int[np.ndarray, "lanes time"]:
     A lane begins with the end of the lane before it, which its filter needs to settle. The first lane begins with the
     flight. Samples beyond the last do not exist.
     """
-    lanes = max(round((samples - _SETTLING) / wanted), min((samples - _SETTLING) // _SHORTEST_LANE, _FEWEST_LANES), 1)
+    lanes = max(round((samples - _SETTLING) / wanted), 1)
     settling = _SETTLING if lanes > 1 else 0
     length = -(-(samples - settling) // lanes)
     return length * np.arange(lanes)[:, None] + np.arange(settling + length)

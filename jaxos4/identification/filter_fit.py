@@ -1,5 +1,6 @@
 """The fit of a real vehicle by filter error, which treats what the model lacks as a disturbance."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ from .jackknife import disagreement, parts_of
 from .results import Disturbance
 from .vehicle import Held, VehicleFit, holding, negative_damping
 
+# A flight has at least so many lanes, whose disagreement shows errors of the model, unless they would be too short.
+_FEWEST_LANES, _SHORTEST_LANE = 8, 80
 _PRIOR_NOTE = "not identifiable from these flights; the intervals of the others allow for its bracket"
 
 
@@ -53,6 +56,9 @@ def fit_by_filter(
     **Arguments:** `recording`: the number of the recording of each sample. Others as of `fit_vehicle`.
     """
     model, names = problem.model, problem.model.parameter_names
+    samples = problem.flight.time.shape[0]
+    lane = min(estimator.lane, max(samples // _FEWEST_LANES, _SHORTEST_LANE))
+    estimator = dataclasses.replace(estimator, lane=lane)
     progress("compiling, and fitting parameters and disturbances")
     found = jax.block_until_ready(estimator.fit(problem, bracket))
     steps, negative = int(found.steps), negative_damping(names, *_mean_and_std(found))
