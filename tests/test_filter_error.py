@@ -33,7 +33,7 @@ def one_lane(samples=501):
 def likelihood(problem, parameters, noise, *, cut=False):
     """The innovations of a problem whose forcing depends on no parameter; in one lane, unless the flight is `cut`."""
     samples = problem.flight.time.shape[0]
-    index = _lanes(samples) if cut else one_lane(samples)
+    index = _lanes(samples, 93) if cut else one_lane(samples)
     observed, place = _observed(problem, index), np.minimum(index, samples - 1)
     forcing = jax.tree.map(lambda leaf: leaf[place].T, problem.forcing(parameters))
     step, observe, dt = problem.step, problem.model.observe, problem.flight.dt
@@ -225,14 +225,14 @@ def test_the_likelihood_does_not_depend_on_the_lanes():
 def test_it_finds_the_truth_at_nearly_the_bound():
     """White noise and nothing else. The noise is estimated too, and a weak disturbance can never be ruled out.
 
-    So the standard deviations lie above the bound, which knows that there is none: by at most 10 % for torques. Effects
-    that act slowly lose up to a factor of 3, because each lane of the flight begins with unknown rates.
+    So the standard deviations lie above the bound, which knows that there is none: by little for torques, and by up to
+    40 % for parameters that act slowly.
     """
     found = identify(FilterError(), *lanes(noisy_states(LANES, seed=50)))
     assert set(names(found)) == {"successful"}
     ratio = np.median(found.std, axis=0) / bound()
     assert (ratio > 0.95).all(), ratio
-    assert (ratio < np.array([1.4, 3.0, 1.1, 1.4, 3.0, 1.1, 1.4, 1.1])).all(), ratio
+    assert (ratio < np.array([1.2, 1.4, 1.1, 1.2, 1.4, 1.1, 1.2, 1.1])).all(), ratio
     assert_chi_square(errors(found), np.linalg.inv(found.covariance))
 
 
@@ -257,7 +257,7 @@ def test_a_known_start_is_used_in_flights_of_several_lanes():
     start = np.array(long.flight.states[0])
     start[RATES] = 0.3, -0.2, 0.1
     problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
-    observed = _observed(problem, _lanes(501))
+    observed = _observed(problem, _lanes(501, 93))
     assert observed.restart[0].tolist() == [False, True, True, True]
     assert observed.known is not None
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])

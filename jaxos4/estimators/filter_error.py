@@ -47,6 +47,7 @@ _NOISE_REACH = 1e8  # factor to either side: simulated flights have no disturban
 _NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
 _LONGEST_STEP = 1.0  # of a logarithm
 _NOISE_TOLERANCE = 0.1  # of the log-likelihood
+_STALLED, _FLAT = 1e4, 0.1  # a damping, and the log-likelihood that is then left to gain
 _DAMPING, _FACTOR, _LEAST, _MOST = 1e-2, 10.0, 1e-9, 1e8
 # Added to the information about each logarithm of the noise: without it, steps along a flat likelihood are too long.
 _NOISE_DAMPING = 1.0
@@ -259,7 +260,9 @@ class FilterError(AbstractEstimator):
             # What the step promises to gain: of the parameters, and of the noise, which matters less.
             promised, of_noise = -(gradient * step)[:count].sum(), -(gradient * step)[count:].sum()
             done = (promised < self.tolerance**2) & (of_noise < _NOISE_TOLERANCE) & (damping <= 1)
-            return search._replace(trial=trial, done=done)
+            # No step helps any more. The gradient, which leaves out how channels share noise, is as small as its error.
+            stalled = (damping > _STALLED) & (damping * promised < _FLAT) & (damping * of_noise < 10 * _FLAT)
+            return search._replace(trial=trial, done=done | stalled)
 
         return jax.lax.while_loop(
             lambda s: ~s.done & (s.steps < self.max_steps) & (s.damping < _MOST), move, self._nothing(evaluate, first)
@@ -313,7 +316,7 @@ def joint(
     return total, whole
 
 
-def _lanes(samples: int, wanted: int = _LANE) -> Int[np.ndarray, "lanes time"]:
+def _lanes(samples: int, wanted: int) -> Int[np.ndarray, "lanes time"]:
     """The samples of each lane, of which there are about `wanted` after those that settle its filter.
 
     A lane begins with the end of the lane before it, which its filter needs to settle. The first lane begins with the
