@@ -23,7 +23,7 @@ from .vehicle import Held, VehicleFit, holding, negative_damping
 
 # A flight has at least so many lanes, whose disagreement shows errors of the model, unless they would be too short.
 _FEWEST_LANES, _SHORTEST_LANE = 8, 80
-_PRIOR_NOTE = "not identifiable from these flights; the intervals of the others allow for its bracket"
+_PRIOR_NOTE = "not identifiable from these flights; all intervals allow for any value in the bracket"
 
 
 class Filtered(NamedTuple):

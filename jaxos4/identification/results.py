@@ -161,7 +161,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
     - `rollouts`: simulated flights of all searches together.
-    - `cost`: 1/2 |W (y - x)|^2 at the estimate; `None` without one.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate, by filter error the negative log-likelihood; `None` without one.
     - `seconds`: computing time [s].
     - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
@@ -212,7 +212,7 @@ class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False)
     """A real vehicle identified from its recordings.
 
     - `held`: parameters that were not estimated.
-    - `cut`: the share of the measurements that Huber's loss cut.
+    - `cut`: the share of the measurements that Huber's loss cut; filter error cuts none.
     - `noise`: standard deviation of the residuals by channel.
     - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
     - `disturbances`: by channel, from filter error; empty for other estimators.

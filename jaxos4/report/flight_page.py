@@ -53,6 +53,12 @@ def _page(found: VehicleIdentification, title: str) -> str:
         .render(
             title=title,
             about=_about(found),
+            doubts=[str(doubt) for doubt in found.doubts],
+            disturbances=[
+                (name, row.unit, _number(row.strength, 2), _number(row.time_constant, 2), _number(row.sensor, 2))
+                for name, row in found.disturbances.items()
+            ],
+            widened=", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items()),
             parameters=_parameters(found),
             constants=[_constant(name, row) for name, row in body.constants.items()],
             consistency="" if body.consistency_p is None else plain(body.consistency_p, 2),
