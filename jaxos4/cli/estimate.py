@@ -69,9 +69,7 @@ def estimate(
     holdout: Annotated[
         float | None, typer.Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
     ] = None,
-    loss: Annotated[
-        Loss | None, typer.Option(help="Real vehicle: huber (default) cuts outliers; not for filter-error.")
-    ] = None,
+    loss: Annotated[Loss | None, typer.Option(help="Real vehicle: huber cuts outliers; not for filter-error.")] = None,
     report: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")
     ] = None,
