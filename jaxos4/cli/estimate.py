@@ -153,8 +153,6 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
     console = Console()
     if out is not None:
         write_json(found.to_dict(), out)
-    for note in found.provenance["notes"]:
-        console.print(f"note: {note}", markup=False, highlight=False)
     print_identification(console, found)
     if report is not None and isinstance(found, VehicleIdentification):
         with stages("drawing"):

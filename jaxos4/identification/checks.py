@@ -82,14 +82,16 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
 
 
 def _contradictions(found: Found, airframe: Airframe) -> Iterator[Doubt]:
+    negative = False
     for name, axis in (("alpha3", "roll"), ("alpha6", "pitch"), ("alpha8", "yaw")):
         value, std = found.get(name, (0.0, 0.0))
         if value + _SURE * std < 0:
+            negative = True
             yield _implausible(
                 f"{name} = {value:.3g} is negative: {axis} answers the rotors with the opposite sign",
                 "check `rotor_positions` and `rotor_spins`, and the axes of the log",
             )
-    if not all(name in found for name in ("alpha1", "alpha3", "alpha4", "alpha6", "alpha7", "alpha8")):
+    if negative or not all(name in found for name in ("alpha1", "alpha3", "alpha4", "alpha6", "alpha7", "alpha8")):
         return
     model = CorrectedOS4(airframe)
     alpha, variance = np.array(model.alpha, dtype=float), np.full(8, np.inf)

@@ -22,7 +22,7 @@ _SIGNIFICANCE = 0.01
 
 
 def print_identification(console: Console, found: Identification) -> None:
-    """Prints parameters, moments of inertia and the quality of the fit. Without an answer it prints why."""
+    """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; without an answer, why."""
     for part in _parts(found):
         if isinstance(part, Listing):
             part.print_on(console)
@@ -31,6 +31,9 @@ def print_identification(console: Console, found: Identification) -> None:
 
 
 def _parts(found: Identification) -> Iterator[str | Listing]:
+    if isinstance(found, VehicleIdentification):
+        yield from (f"not to be trusted because {doubt}." for doubt in found.doubts)
+    yield from (f"note: {note}" for note in found.provenance.get("notes", ()))
     if found.result == "nonfinite_trajectory" and isinstance(found, FlightIdentification):
         shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
         yield (
@@ -122,8 +125,6 @@ def _validation(validation: Validation) -> str:
 
 
 def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Listing]:
-    for doubt in found.doubts:
-        yield f"not to be trusted because {doubt}."
     yield _parameters(found, digits=4, with_bound=False)
     reasons: dict[str, list[str]] = {}
     for name, row in found.held.items():

@@ -1,0 +1,181 @@
+"""Checks before an estimate of a vehicle is believed, and the jackknife that widens intervals."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import chdtri
+
+import jaxos4
+from jaxos4.airframe import OS4
+from jaxos4.identification.checks import doubts_of
+from jaxos4.identification.jackknife import disagreement, parts_of
+from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
+from jaxos4.models.corrected import CorrectedOS4
+from jaxos4.recording import read_recording
+
+AIRFRAME = Path(__file__).parents[1] / "experiments" / "real_flight" / "crazyflie.toml"
+
+
+def parameter(value, std):
+    return ParameterEstimate(value, std, std, (value - 2 * std, value + 2 * std), "1", "")
+
+
+def believable():
+    """Parameters and inertias of the OS4, each known to 2 %."""
+    alpha = np.asarray(CorrectedOS4(OS4).alpha)
+    parameters = {f"alpha{i + 1}": parameter(x, 0.02 * abs(x) + 1e-3) for i, x in enumerate(alpha.tolist())}
+    parameters |= {"rotor_lag": parameter(0.05, 0.001), "rotor_delay": parameter(0.01, 0.001)}
+    parameters["thrust_gain"] = parameter(1.0, 0.01)
+    table = zip(("Ix", "Iy", "Iz"), np.asarray(OS4.inertia).tolist(), strict=True)
+    return parameters, {name: Constant(x, 0.02 * x, "kg m^2") for name, x in table}
+
+
+def skill(**rates):
+    """Skills at 0.25 s; 0.8 for rates that are not given."""
+    nothing = [None, None, None]
+
+    def rate(value):
+        return RateSkill([0.9, value, 0.1], [0.1] * 3, nothing, nothing, nothing)
+
+    return PredictionSkill([0.1, 0.248, 0.5], 100, **{name: rate(rates.get(name, 0.8)) for name in "pqr"})
+
+
+def test_nothing_speaks_against_a_good_estimate():
+    assert doubts_of(*believable(), skill(), OS4) == ()
+    assert doubts_of(*believable(), None, OS4) == ()
+    assert doubts_of({}, {}, None, OS4) == ()
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"alpha3": (-100.0, 5.0)}, ("alpha3", "roll", "opposite sign")),
+        ({"alpha8": (-70.0, 5.0)}, ("alpha8", "yaw", "rotor_spins")),
+        ({"alpha1": (4.0, 0.1)}, ("alpha1", "contradict", "gyro")),
+        ({"alpha7": (-3.0, 0.1)}, ("alpha7", "contradict")),
+        ({"rotor_lag": (-0.02, 0.003)}, ("rotor_lag", "-20 ms", "omega1..4")),
+        ({"rotor_delay": (-0.02, 0.003)}, ("rotor_delay", "time stamps")),
+        ({"thrust_gain": (0.02, 0.01)}, ("accelerometer", "does not follow")),
+        ({"thrust_gain": (9.8, 0.2)}, ("9.8 times", "mass")),
+        ({"thrust_gain": (0.3, 0.02)}, ("0.3 times", "thrust_coefficient")),
+    ],
+)
+def test_a_parameter_that_contradicts_physics_is_named_with_its_cause(changed, words):
+    parameters, constants = believable()
+    parameters |= {name: parameter(*values) for name, values in changed.items()}
+    (doubt,) = doubts_of(parameters, constants, None, OS4)
+    assert doubt.result == "implausible"
+    for word in words:
+        assert word in str(doubt)
+
+
+@pytest.mark.parametrize("name", ["rotor_lag", "rotor_delay", "thrust_gain", "alpha1"])
+def test_an_uncertain_parameter_is_no_contradiction(name):
+    parameters, constants = believable()
+    parameters[name] = parameter(-0.5, 1.0)
+    assert doubts_of(parameters, constants, None, OS4) == ()
+
+
+@pytest.mark.parametrize(
+    ("inertia", "words"),
+    [
+        ({"Iz": 0.03}, ("Iz", "exceeds Ix + Iy", "drag_coefficient")),
+        ({"Ix": 0.03}, ("Ix", "exceeds Iy + Iz")),
+        ({"Ix": 0.2, "Iy": 0.2}, ("Ix", "more than", "mass")),
+        ({"Ix": 7.5e-5, "Iy": 7.5e-5, "Iz": 1.3e-4}, ("Ix", "less than", "rotor_positions")),
+    ],
+)
+def test_inertias_that_no_body_has_are_named(inertia, words):
+    parameters, constants = believable()
+    constants |= {name: Constant(x, 0.02 * x, "kg m^2") for name, x in inertia.items()}
+    doubts = doubts_of({}, constants, None, OS4)
+    assert doubts
+    assert {doubt.result for doubt in doubts} == {"implausible"}
+    for word in words:
+        assert word in str(doubts[0])
+
+
+@pytest.mark.parametrize(("rates", "axes"), [({"p": 0.0}, "roll"), ({"q": -1.0, "r": -0.1}, "pitch and yaw")])
+def test_a_fit_without_skill_is_not_believed(rates, axes):
+    (doubt,) = doubts_of(*believable(), skill(**rates), OS4)
+    assert doubt.result == "no_skill"
+    assert axes in str(doubt)
+    assert doubts_of(*believable(), skill(**dict.fromkeys(rates)), OS4) == ()  # not measured
+
+
+# The jackknife of a straight line, for which one Gauss-Newton step is exact.
+
+
+def lanes_of_a_line(rng, lanes=40, samples=50, *, spread=0.0):
+    """Gradient and information of y = a x + b + noise in each lane, at the joint least-squares estimate.
+
+    `spread`: standard deviation of the slope between lanes. Also the data.
+    """
+    x = rng.standard_normal((lanes, samples))
+    y = (1.0 + spread * rng.standard_normal((lanes, 1))) * x + 0.5 + rng.standard_normal((lanes, samples))
+    regressors = np.stack([x, np.ones_like(x)], axis=-1)
+    information = np.einsum("lsi,lsj->lij", regressors, regressors)
+    estimate = np.linalg.solve(information.sum(axis=0), np.einsum("lsi,ls->i", regressors, y))
+    gradient = -np.einsum("lsi,ls->li", regressors, y - regressors @ estimate)
+    return gradient, information, regressors, y
+
+
+def test_the_jackknife_is_that_of_repeated_fits():
+    gradient, information, regressors, y = lanes_of_a_line(np.random.default_rng(3), spread=0.5)
+    (part,) = parts_of(40, np.zeros(40, dtype=int))
+    factor = disagreement(gradient, information, np.zeros((2, 2)), part)
+    fits = []
+    for number in range(20):
+        kept = part != number
+        flat, values = regressors[kept].reshape(-1, 2), y[kept].ravel()
+        fits.append(np.linalg.lstsq(flat, values, rcond=None)[0])
+    variance = 19 / 20 * np.square(np.array(fits) - np.mean(fits, axis=0)).sum(axis=0)
+    ratio = np.sqrt(variance / np.diagonal(np.linalg.inv(information.sum(axis=0))))
+    assert ratio[0] > 2
+    np.testing.assert_allclose(factor[0], ratio[0], rtol=1e-6)
+    assert factor[1] == 1 or ratio[1] ** 2 > chdtri(19, 0.05) / 19
+
+
+def test_parts_that_agree_widen_one_interval_in_twenty():
+    rng, part = np.random.default_rng(4), parts_of(40, np.zeros(40, dtype=int))[0]
+    trials = 400
+    factors = [disagreement(*lanes_of_a_line(rng)[:2], np.zeros((2, 2)), part) for _ in range(trials)]
+    widened = np.mean(np.array(factors) > 1)
+    assert abs(widened - 0.05) < 4 * np.sqrt(0.05 * 0.95 / (2 * trials))
+    assert np.max(factors) < 2
+
+
+def test_recordings_are_parts_of_their_own_if_there_are_enough():
+    lanes = np.arange(12)
+    assert len(parts_of(12, lanes // 6)) == 1
+    blocks, recordings = parts_of(12, lanes // 3)
+    assert np.unique(blocks).size == 12
+    assert recordings.tolist() == (lanes // 3).tolist()
+    assert parts_of(3, np.zeros(3, dtype=int)) == []
+
+
+def test_recordings_that_differ_widen_more_than_their_blocks():
+    """A slope that differs from recording to recording, and not within one."""
+    rng = np.random.default_rng(5)
+    gradient, information, regressors, y = lanes_of_a_line(rng)
+    recording = np.arange(40) // 8
+    y = y + np.repeat(rng.standard_normal(5), 8)[:, None] * regressors[..., 0]
+    estimate = np.linalg.solve(information.sum(axis=0), np.einsum("lsi,ls->i", regressors, y))
+    gradient = -np.einsum("lsi,ls->li", regressors, y - regressors @ estimate)
+    by_block, by_recording = (
+        disagreement(gradient, information, np.zeros((2, 2)), part)[0] for part in parts_of(40, recording)
+    )
+    assert by_recording > 1.3 * by_block > 1.3
+
+
+def test_no_recorded_flight_ends_successful_without_skill_or_against_physics(shared_flights):
+    vehicle = jaxos4.load_airframe(AIRFRAME)
+    for name in ("yaw_a", "yaw_b"):
+        recording = read_recording(shared_flights / f"arpl_crazyflie_{name}.csv", vehicle)
+        found = jaxos4.identify(recording, vehicle)
+        poor = found.skill is not None and any(
+            (value := getattr(found.skill, rate).skill[1]) is not None and value <= 0 for rate in "pqr"
+        )
+        assert not (found.successful and poor)
+        assert found.successful == (not found.doubts) or found.result in ("at_bound", "max_sweeps")
