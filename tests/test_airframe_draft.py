@@ -163,8 +163,12 @@ def test_a_draft_starts_from_an_airframe(run, tmp_path):
     assert code == 0
     assert (tmp_path / "again.toml").read_text() == text  # nothing to add
     (tmp_path / "other.toml").write_text(text.replace("900.0", "600.0"))
-    assert run("inspect", "flight.csv", "--airframe", "other.toml", "--airframe-out", "again.toml")[0] == 0
-    assert "# The log says otherwise: hover_speed = 900" in (tmp_path / "again.toml").read_text()
+    code, _, err = run("inspect", "flight.csv", "--airframe", "other.toml", "--airframe-out", "again.toml")
+    assert code == 2  # what somebody measured is not overwritten
+    assert "again.toml: exists" in err
+    assert (tmp_path / "again.toml").read_text() == text
+    assert run("inspect", "flight.csv", "--airframe", "other.toml", "--airframe-out", "third.toml")[0] == 0
+    assert "# The log says otherwise: hover_speed = 900" in (tmp_path / "third.toml").read_text()
     assert run("inspect", "flight.csv", "--airframe", "os4", "--airframe-out", "os4.toml")[0] == 0
     from_preset = jaxos4.load_airframe(tmp_path / "os4.toml")
     assert float(from_preset.mass) == 0.65

@@ -44,7 +44,6 @@ def skill(**rates):
 def test_nothing_speaks_against_a_good_estimate():
     assert doubts_of(*believable(), skill(), OS4) == ()
     assert doubts_of(*believable(), None, OS4) == ()
-    assert doubts_of({}, {}, None, OS4) == ()
 
 
 @pytest.mark.parametrize(
@@ -68,6 +67,21 @@ def test_a_parameter_that_contradicts_physics_is_named_with_its_cause(changed, w
     assert doubt.result == "implausible"
     for word in words:
         assert word in str(doubt)
+
+
+def test_an_answer_without_roll_and_pitch_is_none():
+    parameters, constants = believable()
+    del parameters["alpha3"]
+    parameters["alpha6"] = parameter(10.0, 5.0)
+    doubts = doubts_of(parameters, {"Iz": constants["Iz"]}, None, OS4)
+    assert [str(doubt).split()[0] for doubt in doubts] == ["roll", "pitch"]
+
+
+def test_an_accelerometer_upside_down_is_named():
+    parameters, constants = believable()
+    parameters["thrust_gain"] = parameter(-1.0, 0.05)
+    (doubt,) = doubts_of(parameters, constants, None, OS4)
+    assert "z axis points down" in str(doubt)
 
 
 @pytest.mark.parametrize("name", ["rotor_lag", "rotor_delay", "thrust_gain", "alpha1"])

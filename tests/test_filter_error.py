@@ -14,7 +14,7 @@ from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, name
 
 import jaxos4
 from jaxos4.estimators import FilterError
-from jaxos4.estimators.filter_error import _lanes, _observed
+from jaxos4.estimators.filter_error import _observed, lanes_of
 from jaxos4.models.state import CASCADE_ORDER
 from jaxos4.shooting.filtering import Noise, filter_gains, innovate
 
@@ -33,7 +33,7 @@ def one_lane(samples=501):
 def likelihood(problem, parameters, noise, *, cut=False):
     """The innovations of a problem whose forcing depends on no parameter; in one lane, unless the flight is `cut`."""
     samples = problem.flight.time.shape[0]
-    index = _lanes(samples, 93) if cut else one_lane(samples)
+    index = lanes_of(samples, 93) if cut else one_lane(samples)
     observed, place = _observed(problem, index), np.minimum(index, samples - 1)
     forcing = jax.tree.map(lambda leaf: leaf[place].T, problem.forcing(parameters))
     step, observe, dt = problem.step, problem.model.observe, problem.flight.dt
@@ -257,7 +257,7 @@ def test_a_known_start_is_used_in_flights_of_several_lanes():
     start = np.array(long.flight.states[0])
     start[RATES] = 0.3, -0.2, 0.1
     problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
-    observed = _observed(problem, _lanes(501, 93))
+    observed = _observed(problem, lanes_of(501, 93))
     assert observed.restart[0].tolist() == [False, True, True, True]
     assert observed.known is not None
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
@@ -270,7 +270,7 @@ def test_a_known_start_is_used_in_flights_of_several_lanes():
 
 @pytest.mark.parametrize(("samples", "lane"), [(2, 384), (50, 384), (501, 90), (501, 384), (1500, 384), (153_601, 384)])
 def test_each_sample_counts_once(samples, lane):
-    index = _lanes(samples, lane)
+    index = lanes_of(samples, lane)
     own = np.concatenate([index[0], index[1:, 128:].ravel()])
     np.testing.assert_array_equal(own[own < samples], np.arange(samples))
     assert (index[:, 0] >= 0).all()

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..errors import InputError
 from ._choices import OutOption
 from ._output import check_different, check_output, write_json, write_text
 from ._progress import stages
@@ -42,6 +43,11 @@ def inspect(
         if target is not None:
             check_output(target, log, None if airframe is None else Path(airframe))
     check_different(out=out, airframe_out=airframe_out)
+    if airframe_out is not None and airframe_out.exists():
+        raise InputError(
+            f"{airframe_out}: exists, and may hold what you measured; give another name, and --airframe {airframe_out} "
+            "to keep its values."
+        )
     with stages("loading the library") as progress:
         from rich.console import Console
 

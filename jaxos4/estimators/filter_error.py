@@ -57,8 +57,7 @@ Unknowns = Float[Array, " unknowns"]
 class FilterFit(NamedTuple):
     """What filter error finds.
 
-    - `parameters`, `covariance`: the estimate, and the part of it in the inverse of the innovations' Fisher information
-      about parameters and noise, with the prior.
+    - `parameters`, `covariance`: the estimate, and its covariance, which allows for the unknown noise and the prior.
     - `noise`: disturbances and sensors. `innovations`: at the estimate, for each lane.
     - `steps`: evaluations. `done`: whether the search ended by itself.
     """
@@ -109,6 +108,7 @@ class FilterError(AbstractEstimator):
     - `max_steps`: of the search from one time constant of the disturbance.
     - `lane`: about how many samples are filtered in a row; lanes are filtered in parallel. A short lane loses
       information if the disturbance is weak, because its filter begins without memory.
+    - `settling`: after so many samples a filter has settled.
     """
 
     looks_at: ClassVar[str] = "rates"
@@ -119,11 +119,12 @@ class FilterError(AbstractEstimator):
     tolerance: float = eqx.field(static=True, default=0.05)
     max_steps: int = eqx.field(static=True, default=100)
     lane: int = eqx.field(static=True, default=_LANE)
+    settling: int = eqx.field(static=True, default=_SETTLING)
 
     def __check_init__(self):
         if not self.tolerance > 0:
             raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
-        for name, value in (("max_steps", self.max_steps), ("lane", self.lane)):
+        for name, value in (("max_steps", self.max_steps), ("lane", self.lane), ("settling", self.settling)):
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"`{name}` must be an integer of at least 1, got {value!r}.")
 
@@ -180,8 +181,8 @@ class FilterError(AbstractEstimator):
     ) -> FilterFit:
         """`fit` with a `start` that counts only if it is `given`: one program for both."""
         problem, bracket = problem.restrict("rates"), bracket.usable
-        index = _lanes(problem.flight.time.shape[0], self.lane)
-        observed, dt, model = _observed(problem, index), problem.flight.dt, problem.model
+        index = lanes_of(problem.flight.time.shape[0], self.lane, self.settling)
+        observed, dt, model = _observed(problem, index, self.settling), problem.flight.dt, problem.model
         inputs, count = problem.flight.inputs, bracket.center.shape[0]
         samples = np.minimum(index, problem.flight.time.shape[0] - 1)
         rows = Rows(windowed(problem.forcing(bracket.center), samples), ())
@@ -316,14 +317,14 @@ def joint(
     return total, whole
 
 
-def _lanes(samples: int, wanted: int) -> Int[np.ndarray, "lanes time"]:
+def lanes_of(samples: int, wanted: int, settling: int = _SETTLING) -> Int[np.ndarray, "lanes time"]:
     """The samples of each lane, of which there are about `wanted` after those that settle its filter.
 
     A lane begins with the end of the lane before it, which its filter needs to settle. The first lane begins with the
     flight. Samples beyond the last do not exist.
     """
-    lanes = max(round((samples - _SETTLING) / wanted), 1)
-    settling = _SETTLING if lanes > 1 else 0
+    lanes = max(round((samples - settling) / wanted), 1)
+    settling = settling if lanes > 1 else 0
     length = -(-(samples - settling) // lanes)
     return length * np.arange(lanes)[:, None] + np.arange(settling + length)
 
@@ -332,17 +333,18 @@ def _lanes_last(forcing: Forcing) -> Forcing:
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
 
 
-def _observed(problem: ShootingProblem, index: Int[np.ndarray, "lanes time"]) -> Observed:
+def _observed(problem: ShootingProblem, index: Int[np.ndarray, "lanes time"], settling: int = _SETTLING) -> Observed:
     """The measurements in lanes, where filters restart, and which innovations count.
 
     A filter restarts in a gap, and where another stretch begins. Until it has settled its innovations do not count: the
-    controller knew the disturbance then, and the filter does not. At the beginning of the flight they count.
+    controller knew the disturbance then, and the filter does not. At the beginning of a flight in one piece they count:
+    a simulation begins at rest.
     """
     flight, samples, lanes = problem.flight, problem.flight.time.shape[0], index.shape[0]
     row = np.arange(index.shape[1])
     exists, place = (index < samples).T, np.minimum(index, samples - 1)
     # Each sample counts in one lane.
-    own = ((row >= _SETTLING) | (index[:, :1] == 0)).T
+    own = ((row >= settling) | (index[:, :1] == 0)).T
     measured = problem.measured()
     missing = jnp.isnan(measured[:, :3]).all(axis=1)
     stretch = jnp.zeros(samples, dtype=int) if flight.stretch is None else flight.stretch
@@ -353,10 +355,10 @@ def _observed(problem: ShootingProblem, index: Int[np.ndarray, "lanes time"]) ->
         # In a long gap each sample restarts, so that no trajectory runs away there.
         restart = another | (gap * flight.dt >= _GAP)
         since = jnp.where(restart, 0, since + 1)
-        return (jnp.where(is_missing, gap + 1, 0), since), (restart, since >= _SETTLING)
+        return (jnp.where(is_missing, gap + 1, 0), since), (restart, since >= settling)
 
     another = jnp.concatenate([jnp.zeros(1, dtype=bool), jnp.diff(stretch) != 0])
-    first = jnp.zeros((), dtype=int), jnp.full((), _SETTLING, dtype=int)
+    first = jnp.zeros((), dtype=int), jnp.full((), settling if flight.stretch is None else 0, dtype=int)
     _, (restart, settled) = jax.lax.scan(follow, first, (missing, another))
 
     def in_lanes(series: Array) -> Array:

@@ -34,17 +34,23 @@ def doubts_of(
     skill: PredictionSkill | None,
     airframe: Airframe,
 ) -> tuple[Doubt, ...]:
-    """The reasons not to trust the estimate of a vehicle; empty if there are none."""
+    """The reasons not to trust the estimate of a vehicle; empty if there are none.
+
+    The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
+    """
     found = {
-        name: (row.estimate, row.std)
+        name: (row.estimate, row.std if row.bound is None else row.bound)
         for name, row in parameters.items()
         if row.estimate is not None and row.std is not None
     }
+    wide = {name: row for name, row in parameters.items() if row.estimate is not None and row.std is not None}
+    thrust = tuple(_thrust(found))
     return (
-        *_impossible_inertias(constants, airframe),
-        *_contradictions(found, airframe),
+        *thrust,
+        *(() if thrust else _impossible_inertias(constants, airframe)),
+        *_contradictions(found, {name: row.std or 0.0 for name, row in wide.items()}, airframe),
+        *_no_answer(found),
         *_times(found),
-        *_thrust(found),
         *_skill(skill),
     )
 
@@ -81,7 +87,18 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
             )
 
 
-def _contradictions(found: Found, airframe: Airframe) -> Iterator[Doubt]:
+def _no_answer(found: Found) -> Iterator[Doubt]:
+    """Roll and pitch must answer the rotors: otherwise nothing was identified."""
+    for name, axis in (("alpha3", "roll"), ("alpha6", "pitch")):
+        value, std = found.get(name, (0.0, np.inf))
+        if -_SURE * std <= value <= _SURE * std:
+            yield _implausible(
+                f"{axis} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
+                f"fly more {axis}, or check `rotor_positions` in the airframe, and which rotor is which",
+            )
+
+
+def _contradictions(found: Found, wide: dict[str, float], airframe: Airframe) -> Iterator[Doubt]:
     negative = False
     for name, axis in (("alpha3", "roll"), ("alpha6", "pitch"), ("alpha8", "yaw")):
         value, std = found.get(name, (0.0, 0.0))
@@ -97,8 +114,8 @@ def _contradictions(found: Found, airframe: Airframe) -> Iterator[Doubt]:
     alpha, variance = np.array(model.alpha, dtype=float), np.full(8, np.inf)
     for i in range(8):
         if f"alpha{i + 1}" in found:
-            alpha[i], std = found[f"alpha{i + 1}"]
-            variance[i] = std**2
+            alpha[i] = found[f"alpha{i + 1}"][0]
+            variance[i] = wide[f"alpha{i + 1}"] ** 2
     variance[[0, 3, 6]] += _COUPLING**2
     variance[[1, 4]] = np.inf  # they need the inertia of the rotors too
     variance = np.where(np.isfinite(variance), variance, (1e3 * np.asarray(model.half_width)) ** 2)
@@ -131,7 +148,12 @@ def _times(found: Found) -> Iterator[Doubt]:
 def _thrust(found: Found) -> Iterator[Doubt]:
     gain, std = found.get("thrust_gain", (1.0, 0.0))
     error = _SURE * std
-    if gain + error < _DEAD:
+    if gain + error < 0:
+        yield _implausible(
+            f"the accelerometer answers thrust with the opposite sign (thrust_gain = {gain:.2g})",
+            "its z axis points down: change its sign",
+        )
+    elif gain + error < _DEAD:
         yield _implausible(
             f"the accelerometer does not follow the thrust (thrust_gain = {gain:.2g})",
             "check that it is switched on and in m/s^2, or leave out the term `accelerometer`",
@@ -144,9 +166,9 @@ def _thrust(found: Found) -> Iterator[Doubt]:
 
 
 def _skill(skill: PredictionSkill | None) -> Iterator[Doubt]:
-    if skill is None or _HORIZON not in [round(horizon, 2) for horizon in skill.horizons]:
+    if skill is None:
         return
-    place = [round(horizon, 2) for horizon in skill.horizons].index(_HORIZON)
+    place = int(np.argmin(np.abs(np.array(skill.horizons) - _HORIZON)))
     values = {rate: getattr(skill, rate).skill[place] for rate in _PLACES}
     poor = [rate for rate, value in values.items() if value is not None and value <= 0]
     if poor:

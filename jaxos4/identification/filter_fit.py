@@ -13,6 +13,7 @@ from .._custom_types import as_float
 from ..bracket import GAUSSIAN_PRIOR, Bracket, is_identifiable
 from ..estimate import REACH, Estimate
 from ..estimators import FilterError, FilterFit
+from ..estimators.filter_error import lanes_of
 from ..flight import CHANNEL_NAMES
 from ..results import RESULTS
 from ..shooting import ShootingProblem
@@ -23,7 +24,9 @@ from .vehicle import Held, VehicleFit, holding, negative_damping
 
 # A flight has at least so many lanes, whose disagreement shows errors of the model, unless they would be too short.
 _FEWEST_LANES, _SHORTEST_LANE = 8, 80
-_PRIOR_NOTE = "not identifiable from these flights; all intervals allow for any value in the bracket"
+# A filter has settled after this time [s].
+_SETTLED = 0.512
+_PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
 
 
 class Filtered(NamedTuple):
@@ -58,7 +61,8 @@ def fit_by_filter(
     model, names = problem.model, problem.model.parameter_names
     samples = problem.flight.time.shape[0]
     lane = min(estimator.lane, max(samples // _FEWEST_LANES, _SHORTEST_LANE))
-    estimator = dataclasses.replace(estimator, lane=lane)
+    settling = min(estimator.settling, max(round(_SETTLED / float(problem.flight.dt)), 1))
+    estimator = dataclasses.replace(estimator, lane=lane, settling=settling)
     progress("compiling, and fitting parameters and disturbances")
     found = jax.block_until_ready(estimator.fit(problem, bracket))
     steps, negative = int(found.steps), negative_damping(names, *_mean_and_std(found))
@@ -72,7 +76,13 @@ def fit_by_filter(
     (values, std), covariance = _mean_and_std(found), np.asarray(found.covariance)
     half_width = np.asarray(bracket.half_width)
     sound = bool(np.isfinite(values).all() and np.isfinite(std).all() and np.asarray(found.innovations.sound).all())
-    factor = _widening(found, half_width, recording) if sound else np.ones(values.size)
+    factor = np.ones(values.size)
+    if sound:
+        fitted = np.array([name not in negative for name in names])
+        # The middle of the samples of each lane that count.
+        index = lanes_of(samples, lane, settling)
+        middle = index[:, (settling + index.shape[1]) // 2 if index.shape[0] > 1 else 0]
+        factor[fitted] = _widening(found, half_width, fitted, recording[np.minimum(middle, samples - 1)])
     identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
     if not sound or not identifiable.any():
         identifiable[:] = True
@@ -115,16 +125,14 @@ def _result(found: FilterFit, bracket: Bracket, free: np.ndarray, sound: bool) -
     return RESULTS.successful if bool(found.done) else RESULTS.max_sweeps
 
 
-def _widening(found: FilterFit, half_width: np.ndarray, recording: np.ndarray) -> np.ndarray:
-    """The factor by which the interval of each parameter widens."""
-    innovations, count = found.innovations, half_width.size
-    lanes = np.asarray(innovations.cost).size
-    gradient = np.moveaxis(np.asarray(innovations.gradient).sum(axis=0)[:count], -1, 0)
-    information = np.moveaxis(np.asarray(innovations.information).sum(axis=0)[:count, :count], -1, 0)
-    of_lane = recording[np.arange(lanes) * recording.size // lanes]
-    prior = np.diag(1 / np.square(half_width))
-    ways = [disagreement(gradient, information, prior, part) for part in parts_of(lanes, of_lane)]
-    return np.max([np.ones(count), *ways], axis=0)
+def _widening(found: FilterFit, half_width: np.ndarray, fitted: np.ndarray, recording: np.ndarray) -> np.ndarray:
+    """The factor by which the interval of each fitted parameter widens. `recording`: of each lane."""
+    some, innovations = np.flatnonzero(fitted), found.innovations
+    gradient = np.moveaxis(np.asarray(innovations.gradient).sum(axis=0)[some], -1, 0)
+    information = np.moveaxis(np.asarray(innovations.information).sum(axis=0)[np.ix_(some, some)], -1, 0)
+    prior = np.diag(1 / np.square(half_width[some]))
+    ways = [disagreement(gradient, information, prior, part) for part in parts_of(recording.size, recording)]
+    return np.max([np.ones(some.size), *ways], axis=0)
 
 
 def _with_noise(problem: ShootingProblem, found: FilterFit) -> ShootingProblem:

@@ -33,6 +33,8 @@ from .vehicle import Search, VehicleFit, fit_vehicle, free_bracket
 _FIRST_SIGMA = 0.5
 # The largest Jacobian of output error [GiB]; a search needs a few of them.
 _LARGEST_JACOBIAN = 1.0
+# Results with an answer: a doubt says more than they do.
+_ANSWERS = ("successful", "at_bound", "max_sweeps")
 # The estimator of a vehicle, which flies in closed loop.
 DEFAULT = "filter-error"
 
@@ -100,7 +102,7 @@ def identify_vehicle(
     return VehicleIdentification(
         estimator=name,
         model="flight",
-        result=doubts[0].result if doubts and result == "successful" else result,
+        result=doubts[0].result if doubts and result in _ANSWERS else result,
         rollouts=fit.rollouts,
         cost=finite_or_none(estimate.cost),
         seconds=time.perf_counter() - started,

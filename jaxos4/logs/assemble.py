@@ -160,6 +160,12 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
             channels[:, i], jumps = unwrap(table.columns[name])
             if jumps:
                 notes.append(f"{name}: {jumps} {'jump' if jumps == 1 else 'jumps'} of 2 pi removed")
+    force = channels[:, 12:]
+    measured = force[:, np.isfinite(force).any(axis=0)]
+    # No accelerometer lies still to the last bit.
+    if table.columns["t"].size > 2 and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
+        notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
+        channels[:, 12:] = np.nan
     notes.extend(force_note(channels[:, 12:]))
     return channels
 

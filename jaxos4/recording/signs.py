@@ -38,9 +38,11 @@ def opposite_note(axes: Sequence[str]) -> str:
             "yaw answers the rotors with the opposite sign: the rotors turn the other way than `rotor_spins` of the "
             "airframe say (props in or out); change all four signs"
         )
+    verb = "answers" if len(axes) == 1 else "answer"
     return (
-        f"{' and '.join(axes)} answer the rotors with the opposite sign: `rotor_positions` and `rotor_spins` of the "
-        "airframe are not in the order of the log; correct them"
+        f"{' and '.join(axes)} {verb} the rotors with the opposite sign: the rotors of the log are in another order "
+        "than `rotor_positions` and `rotor_spins` of the airframe, or the gyro has other axes than x forward, y left, "
+        "z up (with z down, q and r have the opposite sign); correct one of them"
     )
 
 

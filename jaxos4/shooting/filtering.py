@@ -1,4 +1,4 @@
-"""Kalman filters for disturbances that a model does not contain: the inner loops of filter error.
+"""The Kalman filters of filter error. Each estimates a disturbance that the model lacks.
 
 A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a
 force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
