@@ -69,6 +69,9 @@ def identified_vehicle(**changes) -> VehicleIdentification:
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
         "predictions": synthetic_predictions(),
         "response": synthetic_response(),
+        "doubts": (),
+        "disturbances": {},
+        "widened": {},
         "provenance": settings | changes.pop("provenance", {}),
     }
     return VehicleIdentification(**COMMON | given | changes)

@@ -169,7 +169,7 @@ def test_without_an_answer_the_text_says_why():
     assert "(try --window" in lost
     assert "--window" not in printed(identified_flight(result="nonfinite_trajectory", estimator="rls"))
     assert printed(identified_flight(result="bracket_invalid")) == ""
-    assert printed(identified_vehicle(result="nonfinite_trajectory")) == ""
+    assert printed(identified_vehicle(result="nonfinite_trajectory")) == "note: t is not uniform"
 
 
 def test_the_text_of_a_vehicle():

@@ -126,7 +126,7 @@ def test_monte_carlo_intervals_hold_the_truth_as_often_as_they_say():
             "result": (("scale", "flight"), np.zeros(ratio.shape, dtype=np.int8)),
         }
     )
-    study["result"].attrs = {"flag_values": np.arange(10), "flag_meanings": " ".join(RESULTS)}
+    study["result"].attrs = {"flag_values": np.arange(len(RESULTS)), "flag_meanings": " ".join(RESULTS)}
     found = metrics.efficiency(study)
     exact = [math.sqrt(15 / scipy.stats.chi2.ppf(q, 15)) for q in (0.975, 0.025)]
     assert np.allclose(found["low"] / found["efficiency"], exact[0], rtol=2e-3)

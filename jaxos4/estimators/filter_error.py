@@ -116,7 +116,7 @@ class FilterError(AbstractEstimator):
     prior: ClassVar[float] = GAUSSIAN_PRIOR
     needs_network: ClassVar[bool] = False
 
-    tolerance: float = eqx.field(static=True, default=0.05)
+    tolerance: float = eqx.field(static=True, default=0.1)
     max_steps: int = eqx.field(static=True, default=100)
     lane: int = eqx.field(static=True, default=_LANE)
     settling: int = eqx.field(static=True, default=_SETTLING)
@@ -358,7 +358,7 @@ def _observed(problem: ShootingProblem, index: Int[np.ndarray, "lanes time"], se
         return (jnp.where(is_missing, gap + 1, 0), since), (restart, since >= settling)
 
     another = jnp.concatenate([jnp.zeros(1, dtype=bool), jnp.diff(stretch) != 0])
-    first = jnp.zeros((), dtype=int), jnp.full((), settling if flight.stretch is None else 0, dtype=int)
+    first = jnp.zeros((), dtype=int), jnp.full((), settling if flight.stretch is None else -1, dtype=int)
     _, (restart, settled) = jax.lax.scan(follow, first, (missing, another))
 
     def in_lanes(series: Array) -> Array:
