@@ -696,3 +696,14 @@ def test_the_docstring_names_every_column():
     documented = jaxos4.logs.csv.__doc__ or ""
     for name in COLUMN_NAMES:
         assert name in documented or f"{name[:-1]}1..4" in documented
+
+
+def test_an_accelerometer_that_never_changes_is_off(save):
+    rows = [f"{0.01 * k:.2f},{','.join(['200'] * 4)},0,0,9.81" for k in range(200)]
+    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,ax,ay,az", rows)))
+    assert any("is off" in note for note in notes)
+    assert flight.specific_force is None or np.isnan(flight.specific_force).all()
+    rows[100] = rows[100].replace("9.81", "9.80")
+    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,ax,ay,az", rows)))
+    assert not any("is off" in note for note in notes)
+    assert np.isfinite(flight.specific_force).all()

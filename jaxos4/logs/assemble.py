@@ -26,6 +26,10 @@ _OTHER_NAMES = {  # names that other loggers use, for the question "should 'time
 MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
 
 
+# So many samples of an accelerometer that never change: it is off.
+_STILL = 100
+
+
 def flight_of(
     table: Table, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
@@ -163,7 +167,7 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
     force = channels[:, 12:]
     measured = force[:, np.isfinite(force).any(axis=0)]
     # No accelerometer lies still to the last bit.
-    if table.columns["t"].size > 2 and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
+    if len(measured) >= _STILL and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
         notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
         channels[:, 12:] = np.nan
     notes.extend(force_note(channels[:, 12:]))
