@@ -699,11 +699,11 @@ def test_the_docstring_names_every_column():
 
 
 def test_an_accelerometer_that_never_changes_is_off(save):
-    rows = [f"{0.01 * k:.2f},{','.join(['200'] * 4)},0,0,9.81" for k in range(200)]
-    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,ax,ay,az", rows)))
+    rows = [f"{0.01 * k:.2f},{','.join(['200'] * 4)},0.1,0,0,9.81" for k in range(200)]
+    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows)))
     assert any("is off" in note for note in notes)
     assert flight.specific_force is None or np.isnan(flight.specific_force).all()
     rows[100] = rows[100].replace("9.81", "9.80")
-    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,ax,ay,az", rows)))
+    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows)))
     assert not any("is off" in note for note in notes)
     assert np.isfinite(flight.specific_force).all()
