@@ -99,9 +99,10 @@ def root_mean_square(t: np.ndarray, omega: np.ndarray, grid: np.ndarray, dt: flo
     """Root mean square of held rotor speeds over each interval of a uniform grid. The last value is the held speed."""
     held = np.minimum(np.searchsorted(t, grid, side="right") - 1, t.size - 1)
     speeds = omega[held]
-    squares = np.vstack([np.zeros(4), np.cumsum(omega[:-1] ** 2 * np.diff(t)[:, None], axis=0)])
+    until = np.append(t, max(t[-1], grid[-1]) + dt)  # the last row is held to the end of the grid
+    squares = np.vstack([np.zeros(4), np.cumsum(omega**2 * np.diff(until)[:, None], axis=0)])
     for rotor in range(4):
-        impulse = np.diff(np.interp(grid, t, squares[:, rotor]))
+        impulse = np.diff(np.interp(grid, until, squares[:, rotor]))
         speeds[:-1, rotor] = np.sqrt(np.maximum(impulse, 0) / dt)
     return speeds
 
