@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Parameters, Scalar, as_float
 from ..models.state import CASCADE_ORDER
 from ..shooting import ShootingProblem
-from ..shooting.filtering import Noise, Observed, filter_gains
+from ..shooting.filtering import Noise, Observed, gains_of, transition
 from .frequency_response import modelled_acceleration
 
 
@@ -42,11 +42,6 @@ def disturbances(problem: ShootingProblem, parameters: Parameters, noise: Noise)
     return Disturbances(np.asarray(value), np.exp(np.asarray(own.time_constant)))
 
 
-def transition(time_constant: Float[Array, "3"], dt: Scalar) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """The share of a disturbance that remains after one sample, and what a unit of it adds to the rate [s]."""
-    return jnp.exp(-dt / time_constant), -time_constant * jnp.expm1(-dt / time_constant)
-
-
 @eqx.filter_jit
 def _filtered(
     noise: Noise,
@@ -58,7 +53,7 @@ def _filtered(
     measured = ~jnp.isnan(rates)
     nothing = jnp.zeros(begins.shape, dtype=int)[:, None]
     observed = Observed(rates[:, :, None], begins[:, None], begins[:, None], nothing, begins[:, None])
-    gains, _ = filter_gains(observed, noise, dt)
+    gains = gains_of(observed, noise, dt)
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
 
     def step(known: tuple[Array, Array], row) -> tuple[tuple[Array, Array], Array]:

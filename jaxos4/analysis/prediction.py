@@ -12,7 +12,8 @@ from .._custom_types import Parameters, as_float
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
-from .disturbance import Disturbances, transition
+from ..shooting.filtering import transition
+from .disturbance import Disturbances
 
 HORIZONS = (0.1, 0.25, 0.5)
 RATES = CASCADE_ORDER[:3]

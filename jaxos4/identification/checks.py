@@ -38,17 +38,16 @@ def doubts_of(
 
     The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
     """
-    found = {
-        name: (row.estimate, row.std if row.bound is None else row.bound)
-        for name, row in parameters.items()
-        if row.estimate is not None and row.std is not None
-    }
-    wide = {name: row for name, row in parameters.items() if row.estimate is not None and row.std is not None}
+    found: Found = {}
+    stds: dict[str, float] = {}
+    for name, row in parameters.items():
+        if row.estimate is not None and row.std is not None:
+            found[name], stds[name] = (row.estimate, row.std if row.bound is None else row.bound), row.std
     thrust = tuple(_thrust(found))
     return (
         *thrust,
         *(() if thrust else _impossible_inertias(constants, airframe)),
-        *_contradictions(found, {name: row.std or 0.0 for name, row in wide.items()}, airframe),
+        *_contradictions(found, stds, airframe),
         *_no_answer(found),
         *_times(found),
         *_skill(skill),
@@ -98,7 +97,7 @@ def _no_answer(found: Found) -> Iterator[Doubt]:
             )
 
 
-def _contradictions(found: Found, wide: dict[str, float], airframe: Airframe) -> Iterator[Doubt]:
+def _contradictions(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator[Doubt]:
     negative = False
     for name, axis in (("alpha3", "roll"), ("alpha6", "pitch"), ("alpha8", "yaw")):
         value, std = found.get(name, (0.0, 0.0))
@@ -115,7 +114,7 @@ def _contradictions(found: Found, wide: dict[str, float], airframe: Airframe) ->
     for i in range(8):
         if f"alpha{i + 1}" in found:
             alpha[i] = found[f"alpha{i + 1}"][0]
-            variance[i] = wide[f"alpha{i + 1}"] ** 2
+            variance[i] = stds[f"alpha{i + 1}"] ** 2
     variance[[0, 3, 6]] += _COUPLING**2
     variance[[1, 4]] = np.inf  # they need the inertia of the rotors too
     variance = np.where(np.isfinite(variance), variance, (1e3 * np.asarray(model.half_width)) ** 2)

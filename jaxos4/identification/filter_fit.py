@@ -1,7 +1,7 @@
 """The fit of a real vehicle by filter error, which treats what the model lacks as a disturbance."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -66,11 +66,11 @@ def fit_by_filter(
     progress("compiling, and fitting parameters and disturbances")
     found = jax.block_until_ready(estimator.fit(problem, bracket))
     steps, negative = int(found.steps), negative_damping(names, *_mean_and_std(found))
+    at_zero = np.array([name in negative for name in names])
     if negative:
         progress("fitting again without negative damping")
-        bracket = _around_zero(bracket, names, negative)
-        held_at_zero = np.array([name in negative for name in names])
-        found = jax.block_until_ready(estimator.fit(problem, bracket, held=held_at_zero, start=found))
+        bracket = Bracket.around(np.where(at_zero, 0.0, np.asarray(bracket.center)), np.asarray(bracket.half_width))
+        found = jax.block_until_ready(estimator.fit(problem, bracket, held=at_zero, start=found))
         steps += int(found.steps)
     progress("computing errors")
     (values, std), covariance = _mean_and_std(found), np.asarray(found.covariance)
@@ -78,17 +78,16 @@ def fit_by_filter(
     sound = bool(np.isfinite(values).all() and np.isfinite(std).all() and np.asarray(found.innovations.sound).all())
     factor = np.ones(values.size)
     if sound:
-        fitted = np.array([name not in negative for name in names])
         # The middle of the samples of each lane that count.
         index = lanes_of(samples, lane, settling)
         middle = index[:, (settling + index.shape[1]) // 2 if index.shape[0] > 1 else 0]
-        factor[fitted] = _widening(found, half_width, fitted, recording[np.minimum(middle, samples - 1)])
+        factor[~at_zero] = _widening(found, half_width, ~at_zero, recording[np.minimum(middle, samples - 1)])
     identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
     if not sound or not identifiable.any():
         identifiable[:] = True
     held: Held = {name: (float(values[i]), _PRIOR_NOTE) for i, name in enumerate(names) if not identifiable[i]}
     held |= negative
-    identifiable &= [name not in negative for name in names]
+    identifiable &= ~at_zero
     free = np.flatnonzero(identifiable)
     known = holding(_with_noise(problem, found), model, held)
     spread = np.diag(factor) @ covariance @ np.diag(factor)
@@ -108,12 +107,6 @@ def fit_by_filter(
 
 def _mean_and_std(found: FilterFit) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(found.parameters), np.sqrt(np.maximum(np.diagonal(np.asarray(found.covariance)), 0.0))
-
-
-def _around_zero(bracket: Bracket, names: Sequence[str], some: Held) -> Bracket:
-    """The bracket, centred at 0 for some parameters."""
-    center = np.where([name in some for name in names], 0.0, np.asarray(bracket.center))
-    return Bracket.around(center, np.asarray(bracket.half_width))
 
 
 def _result(found: FilterFit, bracket: Bracket, free: np.ndarray, sound: bool) -> RESULTS:

@@ -110,24 +110,35 @@ class _Step(NamedTuple):
     sensor: Channels
 
 
+def transition(time_constant: Float[Array, "*channels"], dt: Scalar) -> tuple[Array, Array]:
+    """The share of a disturbance that remains after one sample, and what a unit of it adds to the rate [s]."""
+    share = dt / time_constant
+    return jnp.exp(-share), -time_constant * jnp.expm1(-share)
+
+
+def _is_rate(channels: int) -> Bool[np.ndarray, "channels 1"]:
+    """Which channels are body rates; the others are specific force."""
+    return np.arange(channels)[:, None] < _RATES
+
+
 def _step_of(noise: Noise, dt: Scalar) -> _Step:
     """Exact for an Ornstein-Uhlenbeck process."""
     strength, time_constant, sensor = (leaf[:, None] for leaf in noise)
     variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
-    share = dt / tau
+    share, (kept, reach) = dt / tau, transition(tau, dt)
     lost, lost_twice = -jnp.expm1(-share), -jnp.expm1(-2 * share)
-    is_rate = np.arange(strength.shape[0])[:, None] < _RATES
+    is_rate = _is_rate(strength.shape[0])
     # For long time constants a difference of nearly equal numbers, and so its Taylor series.
     series = share**3 / 3 * (1 - share * (3 / 4 - share * (7 / 20 - share * (1 / 8 - share * (31 / 840)))))
     spread = jnp.where(share < _SHORT, series, share - 2 * lost + lost_twice / 2)
     rate = jnp.where(is_rate, 2 * variance * tau**2 * spread, 0.0)
     cross = jnp.where(is_rate, variance * tau * lost**2, 0.0)
-    reach = jnp.where(is_rate, tau * lost, 0.0)
-    return _Step(jnp.exp(-share), reach, _Covariance(rate, cross, variance * lost_twice), variance, jnp.exp(2 * sensor))
+    reach = jnp.where(is_rate, reach, 0.0)
+    return _Step(kept, reach, _Covariance(rate, cross, variance * lost_twice), variance, jnp.exp(2 * sensor))
 
 
 def _restart(p: _Covariance, restart: Bool[Array, " lanes"], step: _Step) -> _Covariance:
-    is_rate = np.arange(p.rate.shape[0])[:, None] < _RATES
+    is_rate = _is_rate(p.rate.shape[0])
     return _Covariance(
         jnp.where(restart, jnp.where(is_rate, _UNKNOWN_RATE**2, 0.0), p.rate),
         jnp.where(restart, 0.0, p.cross),
@@ -137,7 +148,7 @@ def _restart(p: _Covariance, restart: Bool[Array, " lanes"], step: _Step) -> _Co
 
 def _measure(p: _Covariance, is_measured: Bool[Array, "channels lanes"], step: _Step) -> tuple[_Covariance, "Gains"]:
     """The covariance after a measurement, and the gains that belong to it."""
-    is_rate = np.arange(p.rate.shape[0])[:, None] < _RATES
+    is_rate = _is_rate(p.rate.shape[0])
     variance = jnp.where(is_rate, p.rate, p.disturbance) + step.sensor
     weight = jnp.where(is_measured, 1 / variance, 0.0)
     # The share that remains, without a difference of large numbers.
@@ -161,23 +172,23 @@ def _predict(p: _Covariance, step: _Step) -> _Covariance:
     )
 
 
+def gains_of(observed: Observed, noise: Noise, dt: Scalar) -> Gains:
+    """The gains of the filters of all channels."""
+    is_measured, step = ~jnp.isnan(observed.measured), _step_of(noise, dt)
+
+    def body(p: _Covariance, row):
+        is_measured, restart = row
+        p, gain = _measure(_restart(p, restart, step), is_measured, step)
+        return _predict(p, step), gain
+
+    zero = jnp.zeros(is_measured.shape[1:], dtype=float)
+    first = _Covariance(zero, zero, zero + step.variance)
+    return jax.lax.scan(body, first, (is_measured, observed.restart))[1]
+
+
 def filter_gains(observed: Observed, noise: Noise, dt: Scalar) -> tuple[Gains, Gains]:
-    """The gains of the filters of all channels, and their derivatives in the three logarithms, on the second axis."""
-    is_measured = ~jnp.isnan(observed.measured)
-
-    def gains(noise: Noise) -> Gains:
-        step = _step_of(noise, dt)
-
-        def body(p: _Covariance, row):
-            is_measured, restart = row
-            p, gain = _measure(_restart(p, restart, step), is_measured, step)
-            return _predict(p, step), gain
-
-        zero = jnp.zeros(is_measured.shape[1:], dtype=float)
-        first = _Covariance(zero, zero, zero + step.variance)
-        return jax.lax.scan(body, first, (is_measured, observed.restart))[1]
-
-    found, push = jax.linearize(gains, noise)
+    """`gains_of`, and its derivatives in the three logarithms, on the second axis."""
+    found, push = jax.linearize(lambda noise: gains_of(observed, noise, dt), noise)
     return found, jax.vmap(push, out_axes=1)(_basis(noise))
 
 
@@ -237,20 +248,20 @@ def innovate(
     gains, gain_slopes = filter_gains(observed, noise, dt)
     move_all, observe_all = jax.vmap(move, in_axes=(0, 0, None)), jax.vmap(observe, in_axes=(0, 0, None))
 
-    def transition(noise: Noise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
-        step = _step_of(noise, dt)
-        return tuple(step.reach[:_RATES, 0]), tuple(step.kept[:, 0])
+    def over_a_sample(noise: Noise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
+        kept, reach = transition(jnp.exp(noise.time_constant), dt)
+        return tuple(reach[:_RATES]), tuple(kept)
 
-    (reach, kept), push = jax.linearize(transition, noise)
+    (reach, kept), push = jax.linearize(over_a_sample, noise)
     by_noise = jax.vmap(push)(_basis(noise))
     by_noise = jax.tree.map(lambda slope: jnp.concatenate([jnp.zeros(count), slope]), by_noise)
 
     def advance(known: _Known, forcing: Forcing, scalars, feedback: _Feedback, row):
-        y, restart, count, closes = row
+        y, restart, in_block, closes = row
         known = jax.tree.map(lambda leaf: jnp.where(restart, 0.0, leaf), known)
         outputs = observe_all(State(known.rates), forcing, scalars)
         force = tuple(total + h for total, h in zip(known.force, outputs[_RATES:], strict=True))
-        means = (total / count + d for total, d in zip(force, known.disturbance[_RATES:], strict=True))
+        means = (total / in_block + d for total, d in zip(force, known.disturbance[_RATES:], strict=True))
         expected = (*outputs[:_RATES], *means)
         errors = tuple(jnp.where(jnp.isnan(z), 0.0, jnp.nan_to_num(z) - h) for z, h in zip(y, expected, strict=True))
         disturbance = tuple(
@@ -272,24 +283,16 @@ def innovate(
         nothing = jnp.zeros((count, lanes), dtype=float)
         by_gain = (tuple(jnp.concatenate([nothing, slope]) for slope in each) for each in by_gain)
         direction = _Feedback(*by_gain, *by_noise)
-        if tangents is None:
-            (known, errors), push = jax.linearize(
-                lambda known, scalars, feedback: advance(known, forcing, scalars, feedback, row),
-                known,
-                scalars,
-                feedback,
-            )
-            slopes, by_errors = jax.vmap(push)(slopes, basis, direction)
-        else:
-            (known, errors), push = jax.linearize(
-                lambda known, forcing, scalars, feedback: advance(known, forcing, scalars, feedback, row),
-                known,
-                forcing,
-                scalars,
-                feedback,
-            )
+        at, directions = (known, scalars, feedback), (slopes, basis, direction)
+        if tangents is not None:
             wide = jax.tree.map(lambda t: jnp.zeros((unknowns, lanes), dtype=float).at[positions].set(t), tangents)
-            slopes, by_errors = jax.vmap(push)(slopes, wide, basis, direction)
+            at, directions = (*at, forcing), (*directions, wide)
+
+        def step(known: _Known, scalars, feedback: _Feedback, forcing: Forcing = forcing):
+            return advance(known, forcing, scalars, feedback, row)
+
+        (known, errors), push = jax.linearize(step, *at)
+        slopes, by_errors = jax.vmap(push)(*directions)
         return (known, slopes, sound), (jnp.stack(errors), jnp.stack(by_errors))
 
     zero = jnp.zeros(lanes, dtype=float)
