@@ -8,9 +8,9 @@ from scipy.special import chdtri
 
 import jaxos4
 from jaxos4.airframe import OS4
-from jaxos4.identification.checks import doubts_of
+from jaxos4.identification.checks import answered_gusts, doubts_of, vibration
 from jaxos4.identification.jackknife import disagreement, parts_of
-from jaxos4.identification.results import Constant, ParameterEstimate, PredictionSkill, RateSkill
+from jaxos4.identification.results import Constant, Disturbance, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.models.corrected import CorrectedOS4
 from jaxos4.recording import read_recording
 
@@ -108,6 +108,23 @@ def test_inertias_that_no_body_has_are_named(inertia, words):
     assert {doubt.result for doubt in doubts} == {"implausible"}
     for word in words:
         assert word in str(doubts[0])
+
+
+def test_inertias_that_filter_error_contradicts_are_named():
+    _, shot = believable()
+    allowed = shot | {"Ix": Constant(0.5 * shot["Ix"].estimate, shot["Ix"].std, "kg m^2")}
+    (doubt,) = answered_gusts(shot, allowed)
+    assert doubt.result == "implausible"
+    assert all(word in str(doubt) for word in ("Ix", "gusts", "filter-error"))
+    assert not list(answered_gusts(shot, shot))
+    assert not list(answered_gusts(shot, {}))
+
+
+def test_a_gyro_that_vibrates_is_named():
+    quiet, loud = (Disturbance(5.0, "rad/s^2", 0.25, 0.02, correlation) for correlation in (0.1, -0.6))
+    assert not list(vibration({"p": quiet, "q": quiet, "r": quiet, "az": loud}))
+    (doubt,) = vibration({"p": quiet, "q": loud, "r": quiet})
+    assert all(word in str(doubt) for word in ("q", "-0.6", "sample_time"))
 
 
 @pytest.mark.parametrize(("rates", "axes"), [({"p": 0.0}, "roll"), ({"q": -1.0, "r": -0.1}, "pitch and yaw")])

@@ -85,36 +85,27 @@ def test_long_flight(tmp_path):
 
 
 def test_real_flight(shared_flights, tmp_path):
-    load("real_flight").main(
-        flights=shared_flights,
-        out=tmp_path / "out",
-        seconds=11.0,
-        names=["ibss without flapping"],
-        lags=[0.03, 0.06],
-        sections=["lag"],
-    )
-    plot("real_flight", tmp_path / "out", tmp_path / "figures")
-    report = json.loads((tmp_path / "out" / "results.json").read_text())
-    shot = report["estimators"]["ibss"]
-    # 5 s are fitted, the next 5 s predicted. 0.25 s ahead the skill of roll and pitch is positive, and better than
-    # without the `flapping` moment.
-    at = int(np.argmin(np.abs(np.array(shot["skill"]["horizons"]) - 0.25)))
-    without = report["estimators"]["ibss without flapping"]["skill"]
-    for rate in "pq":
-        assert shot["skill"][rate]["skill"][at] > 0
-        assert shot["skill"][rate]["skill"][at] > without[rate]["skill"][at]
-    # The inertias are between the authors' values and twice those of regression, and depend on the lag.
-    for name, value in report["authors"].items():
-        assert value < shot["inertias"][name]["estimate"] < 4.4e-5
-        low, high = (row["inertias"][name] for row in report["lag"])
-        assert abs(low["estimate"] - high["estimate"]) > np.ptp(low["ci95"]) / 4
+    out = tmp_path / "out.json"
+    cases = {"names": ["rollpitch"], "estimators": ["filter-error"], "end": 12.0}
+    load("real_flight").main(flights=shared_flights, out=out, **cases)
+    plot("real_flight", out, tmp_path / "figures")
+    (row,) = json.loads(out.read_text())["estimators"]["filter-error"]["flights"].values()
+    assert all(0.8e-5 < row["constants"][name]["estimate"] < 2.2e-5 for name in ("Ix", "Iy"))
+    assert all(value > 0 for value, _ in row["ahead"].values())
+
+
+def test_flights_that_disagree_are_found():
+    rows = {name: {"constants": {"Ix": {"estimate": x, "std": 3.0}}} for name, x in (("one", 1.0), ("two", 11.0))}
+    rows |= {"three": {"constants": {}}}
+    found = load("real_flight").disagreements(rows)
+    assert found == {"Ix": {"one, two": pytest.approx(10 / np.sqrt(18))}}
 
 
 def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
-    with pytest.raises(SystemExit, match="--flights: no arpl_crazyflie_rollpitch.csv in None: give"):
+    with pytest.raises(SystemExit, match="--flights: no flights in None: give"):
         load("real_flight").main(out=tmp_path / "out")
-    with pytest.raises(SystemExit, match="--flights"):
+    with pytest.raises(SystemExit, match="--flights: no arpl_crazyflie_rollpitch.csv in"):
         load("real_flight").main(flights=tmp_path, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -131,14 +131,20 @@ def _evidence(recordings: "list[Recording]") -> str:
 
 
 def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "Identification":
-    """The identification with the command in its provenance, and all notes in the words of the command line."""
+    """The identification with the command in its provenance, all notes and doubts in the words of the command line."""
     import msgspec
+
+    from ..identification import VehicleIdentification
+    from ..identification.results import Doubt
 
     asked = {
         "airframe": airframe,
         "notes": [*notes, *(in_options(note) for note in found.provenance["notes"])],
         "command": shlex.join(["jaxos4", *sys.argv[1:]]),
     }
+    if isinstance(found, VehicleIdentification):
+        doubts = (Doubt(doubt.result, doubt.cause, in_options(doubt.remedy)) for doubt in found.doubts)
+        found = msgspec.structs.replace(found, doubts=tuple(doubts))
     return msgspec.structs.replace(found, provenance=found.provenance | asked)
 
 

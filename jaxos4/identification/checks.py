@@ -7,7 +7,7 @@ import numpy as np
 from ..airframe import Airframe
 from ..analysis.inertia import fit_inertia
 from ..models.corrected import CorrectedOS4
-from .results import Constant, Doubt, ParameterEstimate, PredictionSkill
+from .results import Constant, Disturbance, Doubt, ParameterEstimate, PredictionSkill
 
 # Doubts need this many standard deviations.
 _SURE = 3.0
@@ -22,6 +22,8 @@ _COUPLING = 0.25
 _CONSISTENT = 1e-3
 # A time constant or delay this far below 0 is not chance and not rounding [s].
 _EARLY = 0.002
+# Innovations that correlate more than this bias filter error more than its intervals say.
+_COLOURED = 0.4
 _HORIZON = 0.25  # [s]
 # Value and standard deviation of each parameter that has an estimate.
 Found = dict[str, tuple[float, float]]
@@ -83,6 +85,30 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
                 f"{axis} = {one.estimate:.3g} exceeds {names[1]} + {names[2]} = {two.estimate + three.estimate:.3g} "
                 "kg m^2, which no rigid body allows",
                 remedy,
+            )
+
+
+def answered_gusts(constants: dict[str, Constant], allowed: dict[str, Constant]) -> Iterator[Doubt]:
+    """Moments of inertia that differ because the controller answered gusts, which shooting does not know.
+
+    `allowed`: those of filter error, which allows for gusts.
+    """
+    for name in sorted(constants.keys() & allowed.keys()):
+        one, other = constants[name], allowed[name]
+        if abs(one.estimate - other.estimate) > _SURE * np.hypot(one.std, other.std):
+            yield _implausible(
+                f"{name} = {one.estimate:.3g} kg m^2, but {other.estimate:.3g} if the controller answered gusts",
+                "use `estimator` filter-error, which allows for gusts",
+            )
+
+
+def vibration(disturbances: dict[str, Disturbance]) -> Iterator[Doubt]:
+    """A gyro whose noise is not white, usually by vibration: the controller answers it, and filter error is biased."""
+    for name, row in disturbances.items():
+        if name in _PLACES and abs(row.correlation) > _COLOURED:
+            yield _implausible(
+                f"the noise of {name} is not white (innovations correlate by {row.correlation:.2g}): the gyro vibrates",
+                "average to longer samples by `sample_time`, for example 0.008 s, or log faster",
             )
 
 

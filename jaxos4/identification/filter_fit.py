@@ -137,9 +137,16 @@ def _with_noise(problem: ShootingProblem, found: FilterFit) -> ShootingProblem:
 
 def _disturbances(problem: ShootingProblem, found: FilterFit) -> dict[str, Disturbance]:
     strength, time_constant, sensor = (np.exp(np.asarray(leaf)) for leaf in found.noise)
+    products = np.asarray(found.innovations.products).sum(axis=-1)
+    correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)
+    largest = np.take_along_axis(correlation, np.abs(correlation).argmax(axis=1)[:, None], axis=1)[:, 0]
     return {
         CHANNEL_NAMES[column]: Disturbance(
-            float(strength[i]), "rad/s^2" if i < 3 else "m/s^2", float(time_constant[i]), float(sensor[i])
+            strength=float(strength[i]),
+            unit="rad/s^2" if i < 3 else "m/s^2",
+            time_constant=float(time_constant[i]),
+            sensor=float(sensor[i]),
+            correlation=float(largest[i]),
         )
         for i, column in enumerate(problem.columns)
     }

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ..recording.preparation import HOLDOUT, WINDOW, Prepared, prepare
 from ..recording.reading import Recording
 from ..results import result_names
 from ..shooting import ShootingProblem
-from .checks import doubts_of
+from .checks import answered_gusts, doubts_of, vibration
 from .constants import vehicle_constants
 from .filter_fit import fit_by_filter
 from .held_out import HeldOut, check_starts, predict_held_out
@@ -78,16 +79,16 @@ def identify_vehicle(
     where = bracket_of(bracket, model)
     held_out, notes = _held_out(recordings, validate, prepared, model, window)
     problem = _problem(prepared, model, recordings[0].name, window)
-    disturbances, widened, process = {}, {}, None
-    if by_filter:
-        settings = estimator if isinstance(estimator, FilterError) else FilterError()
-        number = np.asarray(prepared.recordings)[_stretches(prepared)]
-        filtered = fit_by_filter(problem, where, estimator=settings, recording=number, progress=progress)
-        fit, disturbances, widened, process = filtered
-    else:
-        _check_memory(problem, name)
+    _check_memory(problem, name)
+    number = np.asarray(prepared.recordings)[_stretches(prepared)]
+    # Filter error is fitted in any case: it shows whether the controller answered gusts.
+    settings = estimator if isinstance(estimator, FilterError) else FilterError()
+    filtered = fit_by_filter(problem, where, estimator=settings, recording=number, progress=progress)
+    fit, process = filtered.fit, filtered.noise
+    if not by_filter:
         last = _last_search(estimator, kind, recordings[0].name, seed)
         fit = fit_vehicle(problem, where, estimator=last, huber=loss != "squares", progress=progress)
+        process = None
     estimate, free, noise = fit.estimate, fit.problem.model, np.asarray(fit.problem.sigma)
     predicted = skill = None
     if fit.answered and held_out is not None:
@@ -98,6 +99,12 @@ def identify_vehicle(
     table = parameter_table(free, estimate, fit.bound, some, prior=prior) if fit.answered else {}
     body = vehicle_constants(free.parameter_names, estimate, where, airframe) if fit.answered else RigidBody()
     doubts = doubts_of(table, body.constants, skill, airframe) if fit.answered else ()
+    if by_filter:
+        doubts += tuple(vibration(filtered.disturbances))
+    elif fit.answered and filtered.fit.answered:
+        other = filtered.fit
+        allowed = vehicle_constants(other.problem.model.parameter_names, other.estimate, where, airframe)
+        doubts += tuple(answered_gusts(body.constants, allowed.constants))
     result = str(result_names(estimate.result))
     return VehicleIdentification(
         estimator=name,
@@ -112,28 +119,38 @@ def identify_vehicle(
         cut=fit.cut,
         noise={CHANNEL_NAMES[i]: float(noise[i]) for i in fit.problem.columns},
         doubts=doubts,
-        disturbances=disturbances,
-        widened=widened,
+        disturbances=filtered.disturbances if by_filter else {},
+        widened=filtered.widened if by_filter else {},
         skill=skill,
         predictions=predicted,
         response=frequency_response(fit.problem, estimate.parameters) if fit.answered else None,
-        provenance={
-            "flights": [recording.name for recording in recordings],
-            "validate": None if validate is None else validate.name,
-            "airframe": airframe_name(airframe),
-            "terms": list(model.terms),
-            "window": window,
-            "sample_time": float(prepared.fitted.dt),
-            "fitted_seconds": prepared.seconds[0],
-            "tested_seconds": 0.0 if held_out is None else held_out.seconds,
-            "loss": "likelihood" if by_filter else loss or "huber",
-            **({"battery_voltage": voltage} if "voltage" in model.terms else {}),
-            "notes": list(notes),
-            **versions(problem),
-        },
+        provenance=_provenance(recordings, validate, prepared, fit.problem, model, held_out)
+        | {"window": window, "loss": "likelihood" if by_filter else loss or "huber", "notes": list(notes)},
         estimate=estimate,
         problem=fit.problem,
     )
+
+
+def _provenance(
+    recordings: Sequence[Recording],
+    validate: Recording | None,
+    prepared: Prepared,
+    problem: ShootingProblem,
+    model: FlightModel,
+    held_out: HeldOut | None,
+) -> dict[str, Any]:
+    """The data, the vehicle and the versions."""
+    return {
+        "flights": [recording.name for recording in recordings],
+        "validate": None if validate is None else validate.name,
+        "airframe": airframe_name(model.airframe),
+        "terms": list(model.terms),
+        "sample_time": float(prepared.fitted.dt),
+        "fitted_seconds": prepared.seconds[0],
+        "tested_seconds": 0.0 if held_out is None else held_out.seconds,
+        **({"battery_voltage": prepared.battery_voltage} if "voltage" in model.terms else {}),
+        **versions(problem),
+    }
 
 
 def _stretches(prepared: Prepared) -> np.ndarray:
@@ -152,8 +169,9 @@ def _held_out(
         held_out, notes = HeldOut(other.fitted, other.seconds[0], validate.name, False), notes + other.notes
     elif prepared.tested is not None:
         held_out = HeldOut(prepared.tested, prepared.seconds[1], recordings[0].name, True)
-    if held_out is not None:
-        check_starts(held_out)
+    if held_out is None:
+        return None, (*notes, "nothing was held out, so no prediction checks the fit")
+    check_starts(held_out)
     return held_out, notes
 
 

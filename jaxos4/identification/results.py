@@ -126,12 +126,14 @@ class Disturbance(msgspec.Struct, frozen=True):
     - `strength`: standard deviation of the disturbance, in `unit`. `time_constant`: of its correlation [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel; of specific force: of means
       over 0.25 s.
+    - `correlation`: the largest correlation of innovations up to 8 samples apart; near 0 if the noise is as modelled.
     """
 
     strength: float
     unit: str
     time_constant: float
     sensor: float
+    correlation: float
 
 
 class Doubt(msgspec.Struct, frozen=True):

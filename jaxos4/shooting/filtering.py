@@ -25,6 +25,9 @@ Lanes = Float[Array, " lanes"]
 Channels = Float[Array, "channels lanes"]
 Series = Float[Array, "time channels lanes"]
 
+LAGS = 8
+"""The largest lag at which innovations are compared, in samples."""
+
 # The number of body rates, which come first among the channels.
 _RATES = 3
 # Standard deviation of the rates before the first measurement of a lane [rad/s]: as good as unknown.
@@ -79,12 +82,14 @@ class Innovations(NamedTuple):
 
     - `sound`: whether the rates stay below `FASTEST`.
     - `information`: the Fisher information.
+    - `products`: sums of the products of standardised innovations 0 to `LAGS` samples apart.
     """
 
     cost: Lanes
     sound: Bool[Array, " lanes"]
     gradient: Float[Array, "channels unknowns lanes"]
     information: Float[Array, "channels unknowns unknowns lanes"]
+    products: Float[Array, "channels lags lanes"]
 
 
 class _Covariance(NamedTuple):
@@ -313,4 +318,6 @@ def innovate(
     information = jnp.einsum("tcul,tcvl->cuvl", slopes * weight[:, :, None], slopes)
     information = information.at[:, count:, count:].add(jnp.einsum("tcul,tcvl->cuvl", relative, relative) / 2)
     cost = (weight * errors**2 + logarithm).sum(axis=(0, 1)) / 2
-    return Innovations(cost, sound, gradient, information)
+    standard = jnp.sqrt(weight) * errors
+    products = [(standard[lag:] * standard[: standard.shape[0] - lag]).sum(axis=0) for lag in range(LAGS + 1)]
+    return Innovations(cost, sound, gradient, information, jnp.stack(products, axis=1))
