@@ -9,6 +9,7 @@ from . import (
     estimate as estimate,
     estimators as estimators,
     excitation as excitation,
+    export as export,
     flight as flight,
     identification as identification,
     linalg as linalg,

@@ -200,6 +200,12 @@ def airframe_from_table(table: dict[str, Any]) -> Airframe:
     return airframe
 
 
+def airframe_table(airframe: Airframe) -> dict[str, Any]:
+    """The constants of an airframe as numbers and lists: the inverse of `airframe_from_table`."""
+    table = {name: np.asarray(getattr(airframe, name)) for name in _SHAPES}
+    return {name: value.tolist() for name, value in table.items() if np.isfinite(value).all()}
+
+
 def _thrust_coefficient(hover_speed: Any, constants: dict[str, np.ndarray]) -> np.ndarray:
     """With which four rotors at `hover_speed` carry the weight."""
     speed = _numbers("hover_speed", hover_speed, ()).item()

@@ -12,6 +12,7 @@ from ..errors import InputError, TrainingError
 from ._jax import NO_CACHE, prepare
 from .compare import compare
 from .estimate import estimate
+from .export import export
 from .identifiability import identifiability
 from .inspect import inspect
 from .report import report
@@ -35,7 +36,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-for command in (simulate, estimate, train, inspect, identifiability, compare, study, report):
+for command in (simulate, estimate, export, train, inspect, identifiability, compare, study, report):
     app.command()(_prepared(command))
 
 

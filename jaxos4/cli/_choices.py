@@ -17,6 +17,7 @@ Sensors = StrEnum("Sensors", list(("commands", "speeds")))
 Channels = StrEnum("Channels", list(("rates", "attitude", "all")))
 InitialState = StrEnum("InitialState", ["free", "known"])
 Estimator = StrEnum("Estimator", list(ESTIMATORS))
+Simulator = StrEnum("Simulator", list(("mujoco", "rotorpy", "sdf")))
 Features = StrEnum("Features", list(("score", "raw")))
 Approximator = StrEnum("Approximator", list(("mlp", "cmac")))
 

@@ -13,7 +13,9 @@ _PHRASES = {
     "`begin`": "--from",
     "`end`": "--to",
 }
-_OPTIONS = "bracket|channels|estimator|holdout|initial_state|loss|network|sample_time|seed|terms|validate|window"
+_OPTIONS = (
+    "bracket|channels|estimator|holdout|initial_state|loss|network|sample_time|samples|seed|terms|validate|window"
+)
 
 
 def in_options(text: str, **files: Path | None) -> str:

@@ -1,6 +1,8 @@
 """Output files: checked before the work that fills them, never one of the inputs, and written whole or not at all."""
 
 import json
+import secrets
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,27 @@ def write_text(text: str, out: Path) -> None:
     """Writes a text file."""
     with write_atomically(out) as beside:
         beside.write_text(text, encoding="utf-8")
+
+
+def check_new_folder(folder: Path) -> None:
+    """Refuses a folder that exists, or that cannot be made."""
+    if folder.exists():
+        raise InputError(f"{folder}: exists; remove it, or give the output another name.")
+    check_writable(folder)
+
+
+def write_folder(texts: dict[str, str], folder: Path) -> None:
+    """Writes text files, by name, into a new folder. It appears when all files are in it."""
+    beside = folder.with_name(f".{folder.name[:40]}.{secrets.token_hex(4)}.part")
+    try:
+        beside.mkdir()
+        for name, text in texts.items():
+            (beside / name).write_text(text, encoding="utf-8")
+        beside.rename(folder)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 def write_json(report: dict[str, Any], out: Path) -> None:

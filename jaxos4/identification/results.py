@@ -4,7 +4,9 @@ import math
 from typing import Any, SupportsFloat
 
 import msgspec
+import numpy as np
 
+from ..airframe import airframe_table
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.identifiability import Identifiability
 from ..analysis.prediction import Predictions
@@ -194,9 +196,19 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return self.result not in NO_ANSWER
 
     def to_dict(self) -> dict[str, Any]:
-        """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON."""
+        """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON.
+
+        `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`; `None`
+        without an answer.
+        """
         fields = _fields(self, "rigid_body", "estimate", "problem", "predictions", "response")
-        return msgspec.to_builtins(fields | {"constants": self.rigid_body.to_dict()})
+        covariance = np.asarray(self.estimate.covariance)
+        computed = {
+            "constants": self.rigid_body.to_dict(),
+            "airframe": airframe_table(self.problem.model.airframe),
+            "covariance": covariance.tolist() if np.isfinite(covariance).all() else None,
+        }
+        return msgspec.to_builtins(fields | computed)
 
 
 class FlightIdentification(Identification, frozen=True, kw_only=True, eq=False):

@@ -1,0 +1,59 @@
+"""`jaxos4 export`: an identified vehicle as a model for a simulator."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import InputError
+from ._choices import Simulator
+from ._messages import option_names
+from ._output import check_new_folder, check_output, write_folder, write_text
+from ._progress import stages
+
+MOST_SAMPLES = 100_000
+
+
+def export(
+    result: Annotated[Path, typer.Argument(metavar="RESULT.json", help="A file of `jaxos4 estimate --out`.")],
+    to: Annotated[Simulator, typer.Option(help="MuJoCo (MJCF), RotorPy (Python) or SDF (Gazebo).")],
+    out: Annotated[Path | None, typer.Option(help="The file to write. Default: standard output.")] = None,
+    samples: Annotated[
+        int, typer.Option(help="Also draw N vehicles from the covariance, into the folder OUT-samples.", metavar="N")
+    ] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of the samples.")] = 0,
+) -> None:
+    """Write an identified vehicle as a model for a simulator, and vehicles drawn from its uncertainty."""
+    if not 0 <= samples <= MOST_SAMPLES:
+        raise InputError(f"--samples: must lie in 0 to {MOST_SAMPLES}, got {samples}.")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
+    if samples and out is None:
+        raise InputError("--samples: are written into a folder beside --out; give that too.")
+    folder = out.with_name(f"{out.stem}-samples") if out is not None and samples else None
+    if out is not None:
+        check_output(out, result)
+    if folder is not None:
+        check_new_folder(folder)
+    with stages("loading the library") as progress, option_names():
+        from ..export import TARGETS, export_vehicle, read_result
+
+        progress("reading")
+        found, target = read_result(result), TARGETS[to.value]
+        progress("drawing and writing")
+        written = export_vehicle(found, to.value, samples=samples, seed=seed)
+    if folder is not None:
+        files = {f"{number:06}{target.suffix}": text for number, text in enumerate(written.samples, start=1)}
+        write_folder(files, folder)
+        again = f"; {written.impossible} impossible draws were repeated" if written.impossible else ""
+        typer.echo(f"{folder}: {samples} vehicles, drawn with seed {seed}{again}")
+    if out is None:
+        typer.echo(written.text, nl=False)
+    else:
+        write_text(written.text, out)
+        typer.echo(f"{out}: {target.label}")
+    for note in written.notes:
+        typer.echo(f"note: {note}", err=True)
+    if not found.successful:
+        typer.echo(f"jaxos4: {found.result}: {found.reason}", err=True)
+        raise typer.Exit(1)

@@ -1,0 +1,240 @@
+"""Result files of `jaxos4 estimate`, and vehicles drawn from the uncertainty of a result."""
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from ..airframe import Airframe, airframe_from_table, alpha_from_inertia
+from ..analysis.inertia import fit_inertia
+from ..errors import InputError
+from ..models import MODELS
+from ..models.abstract import PARAMETER_NAMES
+from ..results import NAMES, RESULTS
+from .vehicle import RigidVehicle, rigid_vehicle
+
+_VEHICLE = "flight"
+_SUCCESSFUL = "successful"
+# An inertia of the rotors is exported if it differs from 0 by this many standard deviations.
+_SURE = 3.0
+# Numbers that no vehicle has below 0, although an estimate can be.
+_NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping", "x_drag", "y_drag")
+# Parameters without a place in a simulator's vehicle, and why.
+_APART = {
+    ("roll_velocity", "pitch_velocity"): "no simulator has a moment proportional to the body velocity",
+    ("roll_flapping", "pitch_flapping"): "no simulator has a moment proportional to the lateral specific force",
+    ("voltage_exponent",): "no simulator has the battery's voltage",
+    ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
+    ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7"): "a rigid body has those that follow from its inertias",
+}
+# Inertias are `thrust_gain` divided by these alphas.
+_INVERSES = {"alpha3": "Ix", "alpha6": "Iy", "alpha8": "Iz"}
+# Draws for one sample before the uncertainty counts as too large.
+_MOST_DRAWS = 1000
+
+
+class _Row(msgspec.Struct):
+    estimate: float | None
+    std: float | None
+
+
+class _Constant(msgspec.Struct):
+    estimate: float
+
+
+class _Held(msgspec.Struct):
+    value: float
+
+
+class _File(msgspec.Struct):
+    """The parts of a result file that an export needs."""
+
+    estimator: str
+    model: str
+    result: str
+    parameters: dict[str, _Row]
+    constants: dict[str, Any]
+    provenance: dict[str, Any]
+    airframe: dict[str, Any] | None | msgspec.UnsetType = msgspec.UNSET
+    covariance: list[list[float]] | None | msgspec.UnsetType = msgspec.UNSET
+    held: dict[str, _Held] = {}
+
+
+class Identified(NamedTuple):
+    """What a result file says of a vehicle.
+
+    - `source`: names the file, the estimator, the model and the result.
+    - `result`: the name of the result code. If it is not `"successful"`, the estimate cannot be trusted.
+    - `airframe`: the constants that were not estimated.
+    - `values`: of all parameters by name, estimated or held.
+    - `drawn`, `covariance`: the names of the parameters that are uncertain, and their covariance.
+    - `notes`: differences between the result and the vehicle that simulators get; one line each.
+    """
+
+    source: str
+    result: str
+    airframe: Airframe
+    values: dict[str, float]
+    drawn: tuple[str, ...]
+    covariance: Float[np.ndarray, "drawn drawn"]
+    notes: tuple[str, ...]
+
+    @property
+    def successful(self) -> bool:
+        """Whether the estimate can be trusted."""
+        return self.result == _SUCCESSFUL
+
+    @property
+    def reason(self) -> str:
+        """What the result code says."""
+        return str(RESULTS[getattr(RESULTS, self.result)])
+
+    @property
+    def vehicle(self) -> RigidVehicle:
+        """The vehicle with the estimated parameters."""
+        return rigid_vehicle(self.airframe, self.values)
+
+    def draw(self, number: int, *, seed: int) -> tuple[RigidVehicle, int]:
+        """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
+
+        Vehicle `number` does not depend on how many are drawn.
+
+        **Raises:** `InputError` if hardly any draw is possible.
+        """
+        generator = np.random.default_rng([seed, number])
+        std = np.sqrt(np.diagonal(self.covariance))
+        scale = np.where(std > 0, std, 1.0)
+        spread, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        root = scale[:, None] * axes * np.sqrt(np.maximum(spread, 0.0))
+        for impossible in range(_MOST_DRAWS):
+            errors = root @ generator.standard_normal(std.size)
+            changed = {name: self.values[name] + float(error) for name, error in zip(self.drawn, errors, strict=True)}
+            vehicle = rigid_vehicle(self.airframe, self.values | changed)
+            if not vehicle.impossible:
+                return vehicle, impossible
+        raise InputError(
+            f"`samples`: the estimate is too uncertain: {_MOST_DRAWS} draws gave no possible vehicle; export without "
+            "samples, or fly with more excitation."
+        )
+
+
+def read_result(path: str | os.PathLike[str]) -> Identified:
+    """Read a file that `jaxos4 estimate --out` wrote.
+
+    **Raises:** `InputError`, one line, if the file is no result, was written by an older version, has no estimate, or
+    describes an impossible vehicle; `OSError` if it cannot be read.
+    """
+    try:
+        return _identified(Path(path).name, msgspec.json.decode(Path(path).read_bytes(), type=_File))
+    except msgspec.MsgspecError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: not a result ({reason}); give a file of `jaxos4 estimate --out`.") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _identified(name: str, file: _File) -> Identified:
+    if file.result not in NAMES:
+        raise InputError(
+            f"`result` {file.result[:40]}: is no result code of this version; run `jaxos4 estimate` again."
+        )
+    if file.airframe is msgspec.UNSET or file.covariance is msgspec.UNSET:
+        version = file.provenance.get("version", "an older version")
+        raise InputError(f"from jaxos4 {version}, without airframe and covariance; run `jaxos4 estimate` again.")
+    if not file.covariance or file.airframe is None:
+        raise InputError(f"{file.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
+    count = len(file.parameters)
+    if [len(row) for row in file.covariance] != count * [count]:
+        raise InputError(
+            f"`covariance`: must have one row and column for each of {count} parameters; run `jaxos4 estimate` again."
+        )
+    airframe, covariance = airframe_from_table(file.airframe), np.array(file.covariance)
+    if file.model == _VEHICLE:
+        parts = _of_vehicle(file, covariance)
+    elif file.model in MODELS:
+        parts = _of_flight(file, airframe, covariance)
+    else:
+        raise InputError(f"`model` {file.model[:40]}: must be one of {', '.join((*MODELS, _VEHICLE))}.")
+    values, drawn, covariance, notes = parts
+    if not (np.isfinite(covariance).all() and (np.diagonal(covariance) >= 0).all()):
+        raise InputError("`covariance`: is not that of an estimate; run `jaxos4 estimate` again.")
+    negative = [each for each in _NOT_NEGATIVE if values.get(each, 0.0) < 0]
+    values |= dict.fromkeys(negative, 0.0)
+    kept = [place for place, each in enumerate(drawn) if each not in negative]
+    notes += [f"{each}: came out negative, which is impossible; it is 0 here" for each in negative]
+    if not np.isfinite(airframe.max_rotor_speed):
+        notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
+    source = f"{name} ({file.estimator}, {file.model} model, {file.result})"
+    found = Identified(
+        source=source,
+        result=file.result,
+        airframe=airframe,
+        values=values,
+        drawn=tuple(drawn[place] for place in kept),
+        covariance=covariance[np.ix_(kept, kept)],
+        notes=tuple(notes),
+    )
+    if found.vehicle.impossible:
+        raise InputError(
+            f"no vehicle is like this: {found.vehicle.impossible}; correct the airframe, or fly with more excitation."
+        )
+    return found
+
+
+# Values by name, the names that are drawn, their covariance, and notes.
+_Parts = tuple[dict[str, float], tuple[str, ...], np.ndarray, list[str]]
+
+
+def _of_flight(file: _File, airframe: Airframe, covariance: np.ndarray) -> _Parts:
+    """Ix, Iy, Iz and J_R: the rigid body that explains the alphas of a flight best."""
+    names = ("Ix", "Iy", "Iz", "J_R")
+    if not file.constants.keys() >= set(names) or tuple(file.parameters) != PARAMETER_NAMES:
+        raise InputError("no moments of inertia were identified; fly with more excitation.")
+    values = {name: msgspec.convert(file.constants[name], _Constant).estimate for name in names}
+    model = MODELS[file.model](airframe)
+    *inertia, rotor = values.values()
+    factor = float(model.gyroscopic_factor)
+    alpha = np.asarray(alpha_from_inertia(np.array(inertia), np.asarray(rotor * factor)))
+    spread = fit_inertia(model, alpha, covariance).covariance
+    known = 4 if rotor > _SURE * np.sqrt(spread[3, 3]) else 3
+    notes = []
+    if known == 3:
+        del values["J_R"]
+        notes.append("J_R: below noise; the inertia of the rotors is the airframe's")
+    if file.model == "published":
+        notes.append("the printed equations of translation are not those of a rigid body; a simulator has the latter")
+    return values, names[:known], spread[:known, :known], notes
+
+
+def _of_vehicle(file: _File, covariance: np.ndarray) -> _Parts:
+    """The parameters of a `FlightModel`."""
+    rows, notes = file.parameters, []
+    found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
+    if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SURE * found["rotor_reaction"][1]:
+        del found["rotor_reaction"]
+        notes.append("rotor_reaction: below noise; the inertia of the rotors is the airframe's")
+    values = {name: value for name, (value, _) in found.items()}
+    values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values
+    for name, moment in _INVERSES.items():
+        if name not in found:
+            notes.append(f"{moment}: not identified; it follows from the airframe, or from the bracket")
+    for apart, why in _APART.items():
+        some = [name for name in found if name.startswith(apart)]
+        if some:
+            notes.append(f"{', '.join(some)}: {why}")
+    if values.get("thrust_curve", 1.0) != 1.0:
+        curve = values["thrust_curve"]
+        notes.append(
+            f"thrust_curve: a rotor speed here is the one that makes the thrust: for the command u of full scale, "
+            f"max_rotor_speed sqrt({curve:.4g} u^2 {1 - curve:+.4g} u)"
+        )
+    if any(name.startswith("roll_offset_") for name in values):
+        notes.append("offsets: the mean of the recordings")
+    zero = [name for name in (*_INVERSES, "thrust_gain") if values.get(name) == 0]
+    if zero:
+        raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")
+    places = [place for place, name in enumerate(rows) if name in found]
+    return values, tuple(found), covariance[np.ix_(places, places)], notes

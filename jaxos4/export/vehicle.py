@@ -1,0 +1,144 @@
+"""The vehicle that simulators get: a rigid body with four rotors, with what was identified of it."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..airframe import Airframe
+from ..analysis.center_of_mass import center_of_mass
+
+AXES = ("roll", "pitch", "yaw")
+_INERTIAS = (("Ix", "alpha3"), ("Iy", "alpha6"), ("Iz", "alpha8"))
+# At this specific thrust, the term `center_of_mass` adds no torque (`FlightModel`) [m/s^2].
+_HOVER = 9.81
+# The full-scale rotor speed if nobody knows it, in hover speeds.
+_FULL_SCALE = 2.0
+
+
+class RigidVehicle(NamedTuple):
+    """A rigid body with four rotors, in a frame with x forward, y left, z up and the centre of mass at its origin.
+
+    A rotor speed is the speed that makes the thrust b omega^2: see `thrust_curve`.
+
+    - `mass` [kg], `gravity` [m/s^2], `inertia`: Ix, Iy, Iz [kg m^2].
+    - `rotor_positions`: x and y of each rotor [m]. `rotor_spins`: 1 is counter-clockwise seen from above.
+    - `thrust_coefficient`: b [N s^2/rad^2]. `drag_coefficient`: d, yaw torque = -spin d omega^2 [N m s^2/rad^2].
+    - `rotor_inertia`: J_R [kg m^2].
+    - `max_rotor_speed`: full scale [rad/s].
+    - `lag`, `delay`: of the rotors behind their commands [s].
+    - `torque`: constant, about each axis [N m].
+    - `damping`: torque against the body rate about each axis [N m s].
+    - `drag`: force against the body velocity along x and y [N s/m].
+    - `thrust_curve`: c. A command u of full scale makes the speed sqrt(c u^2 + (1 - c) u) `max_rotor_speed`.
+    """
+
+    mass: float
+    gravity: float
+    inertia: Float[np.ndarray, "3"]
+    rotor_positions: Float[np.ndarray, "4 2"]
+    rotor_spins: Float[np.ndarray, "4"]
+    thrust_coefficient: float
+    drag_coefficient: float
+    rotor_inertia: float
+    max_rotor_speed: float
+    lag: float
+    delay: float
+    torque: Float[np.ndarray, "3"]
+    damping: Float[np.ndarray, "3"]
+    drag: Float[np.ndarray, "2"]
+    thrust_curve: float
+
+    @property
+    def hover_speed(self) -> float:
+        """The rotor speed [rad/s] at which four equal rotors carry the weight."""
+        return float(np.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient)))
+
+    @property
+    def hover_thrust(self) -> Float[np.ndarray, "4"]:
+        """The thrust of each rotor [N] that carries the weight and balances the constant torque."""
+        x, y = self.rotor_positions.T
+        yaw = -self.rotor_spins * self.drag_coefficient / self.thrust_coefficient
+        return np.linalg.solve(np.stack([y, -x, yaw, np.ones(4)]), np.append(-self.torque, self.mass * self.gravity))
+
+    @property
+    def rotor_drag(self) -> float:
+        """The in-plane drag of one rotor over its speed and velocity [N s^2/(rad m)].
+
+        It makes the mean of `drag` along x and y when the rotors turn at the hover speed.
+        """
+        return float(self.drag.mean() / (4 * self.hover_speed))
+
+    @property
+    def impossible(self) -> str:
+        """Why no vehicle is like this; empty if nothing speaks against it."""
+        for (name, _), moment in zip(_INERTIAS, self.inertia, strict=True):
+            if not moment > 0:
+                return f"{name} = {moment:.3g} kg m^2 is not positive"
+            if 2 * moment > self.inertia.sum():
+                return f"{name} = {moment:.3g} kg m^2 exceeds the sum of the other two moments of inertia"
+        if not self.thrust_coefficient > 0:
+            return "the thrust is not positive"
+        if not 0 <= 4 * self.rotor_inertia < self.inertia[2]:
+            return "the rotors have no inertia that a part of the vehicle can have"
+        if min(self.lag, self.delay, self.damping.min(), self.drag.min()) < 0:
+            return "a lag, delay, damping or drag is negative"
+        return ""
+
+
+def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
+    """The vehicle with an airframe and the parameters that were identified.
+
+    **Arguments:** `values`: by name, `Ix`, `Iy`, `Iz`, `J_R`, or the parameters of a `FlightModel`. The airframe gives
+    the constants that are missing. Offsets of several recordings are averaged.
+    """
+    mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
+    inertia = np.array(airframe.inertia, dtype=float)
+    for axis, (name, inverse) in enumerate(_INERTIAS):
+        if name in values:
+            inertia[axis] = values[name]
+        elif inverse in values:
+            # Torques exceed the airframe's by the same factor as thrust.
+            inertia[axis] = gain / values[inverse]
+    slopes = {"roll_thrust": values.get("roll_thrust", 0.0), "pitch_thrust": values.get("pitch_thrust", 0.0)}
+    offset = np.array([_mean_offset(values, axis) for axis in AXES])
+    offset[:2] -= _HOVER * np.array(list(slopes.values()))
+    speed = float(airframe.max_rotor_speed)
+    vehicle = RigidVehicle(
+        mass=mass,
+        gravity=float(airframe.gravity),
+        inertia=inertia,
+        rotor_positions=np.asarray(airframe.rotor_positions, dtype=float) - _center(slopes, gain / inertia, airframe),
+        rotor_spins=np.asarray(airframe.rotor_spins, dtype=float),
+        thrust_coefficient=gain * float(airframe.thrust_coefficient),
+        drag_coefficient=gain * float(airframe.drag_coefficient),
+        rotor_inertia=_rotor_inertia(values, inertia[2], airframe),
+        max_rotor_speed=speed,
+        lag=values.get("rotor_lag", 0.0),
+        delay=values.get("rotor_delay", 0.0),
+        torque=inertia * offset,
+        damping=inertia * np.array([values.get(f"{axis}_damping", 0.0) for axis in AXES]),
+        drag=mass * np.array([values.get("x_drag", 0.0), values.get("y_drag", 0.0)]),
+        thrust_curve=values.get("thrust_curve", 1.0),
+    )
+    unknown = not np.isfinite(speed) and gain > 0
+    return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed) if unknown else vehicle
+
+
+def _mean_offset(values: Mapping[str, float], axis: str) -> float:
+    each = [value for name, value in values.items() if name.startswith(f"{axis}_offset")]
+    return float(np.mean(each)) if each else 0.0
+
+
+def _center(slopes: dict[str, float], alphas: np.ndarray, airframe: Airframe) -> np.ndarray:
+    """The centre of mass, x and y, in the frame of the airframe's rotor positions [m]."""
+    named = slopes | {"alpha3": alphas[0], "alpha6": alphas[1]}
+    found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)
+    return np.array([coordinate.value for coordinate in found])
+
+
+def _rotor_inertia(values: Mapping[str, float], yaw_inertia: float, airframe: Airframe) -> float:
+    if "rotor_reaction" in values:
+        return values["rotor_reaction"] * yaw_inertia
+    return values.get("J_R", float(airframe.rotor_inertia))

@@ -1,0 +1,65 @@
+"""From a result to the texts of files for a simulator."""
+
+from typing import NamedTuple
+
+from .._version import __version__
+from ..errors import InputError
+from .result import Identified
+from .targets import TARGETS
+from .vehicle import RigidVehicle
+
+_FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. Rotor 1 is the airframe's first."
+
+
+class Exported(NamedTuple):
+    """Files for a simulator, as texts.
+
+    - `text`: the estimated vehicle.
+    - `samples`: vehicles drawn from the uncertainty of the estimate.
+    - `impossible`: how many draws were impossible, and were repeated.
+    - `notes`: what the simulator cannot have, or has differently; one line each. They stand in each file too.
+    """
+
+    text: str
+    samples: tuple[str, ...]
+    impossible: int
+    notes: tuple[str, ...]
+
+
+def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 0) -> Exported:
+    """Write the texts of files for a simulator.
+
+        found = jaxos4.export.read_result("found.json")
+        jaxos4.export.export_vehicle(found, "mujoco").text
+
+    **Arguments:**
+
+    - `found`: what `read_result` returns.
+    - `to`: the simulator, a name in `TARGETS`.
+    - `samples`: how many vehicles to draw from the covariance of the estimate. What was not estimated, such as the
+      mass, does not change. `seed`: of the draws. Sample i does not depend on the number of samples.
+
+    **Raises:** `InputError` for an unknown simulator, or if hardly any draw is a possible vehicle.
+    """
+    if to not in TARGETS:
+        raise InputError(f"`to`: must be one of {', '.join(TARGETS)}, got {to!r}.")
+    target = TARGETS[to]
+    notes = (*_warning(found), *found.notes, *target.limits(found.vehicle))
+
+    def text(vehicle: RigidVehicle, *lines: str) -> str:
+        made = f"Made by jaxos4 {__version__} from {found.source}."
+        comments = (made, *lines, _FRAME, *(f"Note: {note}" for note in notes))
+        # A file's name can have line breaks.
+        return target.text(vehicle, [" ".join(line.split()) for line in comments])
+
+    draws = [found.draw(number, seed=seed) for number in range(samples)]
+    return Exported(
+        text=text(found.vehicle),
+        samples=tuple(text(vehicle, f"Sample {i}, seed {seed}.") for i, (vehicle, _) in enumerate(draws, start=1)),
+        impossible=sum(impossible for _, impossible in draws),
+        notes=notes,
+    )
+
+
+def _warning(found: Identified) -> tuple[str, ...]:
+    return () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {found.reason}",)

@@ -1,0 +1,280 @@
+"""`jaxos4 export`: result files, SDF, samples from the covariance, and wrong input."""
+
+import json
+import runpy
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from helpers import refused
+from synthetic_results import AIRFRAME, INERTIA, VALUES, os4_result, vehicle_result
+
+import jaxos4
+from jaxos4.airframe import airframe_from_table, airframe_table
+from jaxos4.cli._choices import Simulator
+from jaxos4.export import TARGETS, export_vehicle, read_result
+
+SUFFIXES = {"mujoco": "xml", "rotorpy": "py", "sdf": "sdf"}
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a result file."""
+
+    def call(result, name="found.json"):
+        path = tmp_path / name
+        path.write_text(result if isinstance(result, str) else json.dumps(result), encoding="utf-8")
+        return path
+
+    return call
+
+
+def test_the_table_and_the_choices_agree():
+    assert list(Simulator) == list(TARGETS) == list(SUFFIXES)
+
+
+def test_the_table_of_an_airframe_can_be_read_again():
+    for airframe in (jaxos4.OS4, airframe_from_table(AIRFRAME)):
+        table = airframe_table(airframe)
+        assert json.loads(json.dumps(table, allow_nan=False)) == table
+        assert airframe_table(airframe_from_table(table)) == table
+
+
+def test_an_estimate_is_exported_to_each_simulator(run, tmp_path):
+    code, _, err = run("simulate", "--duration", "2", "--noise", "1", "--out", "flight.csv")
+    assert code == 0, err
+    code, _, err = run("estimate", "flight.csv", "--channels", "rates", "--out", "found.json")
+    assert code == 0, err
+    written = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
+    found = read_result(tmp_path / "found.json")
+    assert found.successful
+    assert found.drawn == ("Ix", "Iy", "Iz")
+    np.testing.assert_allclose(found.vehicle.inertia, [written["constants"][name]["estimate"] for name in found.drawn])
+    std = np.sqrt(np.diagonal(found.covariance))
+    # `constants` are fitted to the estimate, and the export to alphas that one rigid body has: the slopes differ a bit.
+    np.testing.assert_allclose(std, [written["constants"][name]["std"] for name in found.drawn], rtol=0.02)
+    for target, suffix in SUFFIXES.items():
+        code, out, err = run("export", "found.json", "--to", target, "--out", f"vehicle.{suffix}", "--samples", "2")
+        assert code == 0, err
+        assert out.splitlines()[1].startswith(f"vehicle.{suffix}: ")
+        text = (tmp_path / f"vehicle.{suffix}").read_text(encoding="utf-8")
+        assert text.isascii()
+        notes = [line.removeprefix("note: ") for line in err.splitlines()]
+        assert notes
+        assert all(f"Note: {note}" in text for note in notes)
+        assert sorted(path.name for path in (tmp_path / "vehicle-samples").iterdir()) == [
+            f"00000{i}.{suffix}" for i in (1, 2)
+        ]
+        for path in (tmp_path / "vehicle-samples").iterdir():
+            path.unlink()
+        (tmp_path / "vehicle-samples").rmdir()
+        # Without --out: the same text on standard output.
+        assert run("export", "found.json", "--to", target)[:2] == (0, text)
+
+
+def test_what_is_exported_of_a_vehicle(write):
+    vehicle = read_result(write(vehicle_result())).vehicle
+    np.testing.assert_allclose(vehicle.inertia, [1.1 / VALUES[name] for name in ("alpha3", "alpha6", "alpha8")])
+    assert vehicle.thrust_coefficient == pytest.approx(1.1 * 2.4e-8)
+    assert (vehicle.lag, vehicle.delay, vehicle.thrust_curve) == (0.05, 0.01, 0.8)
+    assert vehicle.rotor_inertia == pytest.approx(7e-4 * 1.1 / 3.5e4)
+    np.testing.assert_allclose(vehicle.drag, 0.027 * np.array([0.3, 0.4]))
+
+
+def test_recordings_share_the_mean_offset_and_negative_damping_is_0(write):
+    values = {"roll_offset_1": 2.0, "roll_offset_2": 1.0, "roll_damping": -0.1, "roll_flapping": 0.2}
+    values = {name: VALUES[name] for name in ("alpha3", "alpha6", "alpha8")} | values
+    found = read_result(write(vehicle_result(values)))
+    assert found.vehicle.torque[0] == pytest.approx(1.5 / 6.1e4)
+    assert found.vehicle.damping[0] == 0
+    assert "roll_damping" not in found.drawn
+    for note in ("mean of the recordings", "roll_damping: came out negative", "roll_flapping: no simulator"):
+        assert any(note in line for line in found.notes), note
+
+
+def test_what_was_not_identified_is_the_airframes(write):
+    result = vehicle_result({"alpha3": 6.1e4, "alpha6": 5.9e4, "rotor_reaction": 7e-4})
+    result["parameters"]["rotor_reaction"]["std"] = 1e-3
+    found = read_result(write(result))
+    assert found.vehicle.inertia[2] == pytest.approx(2.9e-5)
+    assert found.vehicle.rotor_inertia == pytest.approx(2e-8)
+    assert (found.vehicle.lag, found.vehicle.thrust_curve) == (0, 1)
+    assert any(note.startswith("Iz: not identified") for note in found.notes)
+
+
+def test_an_sdf_is_valid_and_has_the_inertia(write):
+    """The rules of the SDF 1.9 schema for the elements that are written."""
+    found = read_result(write(vehicle_result()))
+    root = ElementTree.fromstring(export_vehicle(found, "sdf").text)
+    assert (root.tag, root.get("version")) == ("sdf", "1.9")
+    (model,) = root
+    assert (model.tag, model.get("name")) == ("model", "vehicle")
+    links, joints, plugins = (model.findall(tag) for tag in ("link", "joint", "plugin"))
+    assert len(links) + len(joints) + len(plugins) == len(model)
+    names = [element.get("name") for element in (*links, *joints)]
+    assert len(set(names)) == len(names) == 9
+    masses, centers, tensors = zip(*map(inertial, links), strict=True)
+    for joint, link in zip(joints, links[1:], strict=True):
+        assert joint.get("type") == "revolute"
+        assert (joint.findtext("parent"), joint.findtext("child")) == ("body", link.get("name"))
+        assert vector(joint, "axis/xyz").tolist() == [0, 0, 1]
+        assert vector(joint, "axis/limit/lower") < 0 < vector(joint, "axis/limit/upper")
+    for number, plugin in enumerate(plugins):
+        assert plugin.get("name") == "gz::sim::systems::MulticopterMotorModel"
+        assert plugin.get("filename") == "gz-sim-multicopter-motor-model-system"
+        assert plugin.findtext("jointName") == joints[number].get("name")
+        assert plugin.findtext("linkName") == links[number + 1].get("name")
+        assert plugin.findtext("turningDirection") == ("ccw", "cw")[number % 2]
+        assert int(plugin.findtext("motorNumber") or -1) == number
+        moment = vector(plugin, "momentConstant") * vector(plugin, "motorConstant")
+        assert moment == pytest.approx(1.1 * 1.2e-10)
+        assert vector(plugin, "timeConstantUp") == vector(plugin, "timeConstantDown") == 0.05
+    # All links together are the vehicle.
+    mass = np.array(masses)
+    np.testing.assert_allclose(mass.sum(), found.vehicle.mass, rtol=1e-12)
+    np.testing.assert_allclose(mass @ np.array(centers), 0, atol=1e-15)
+    apart = [m * (c @ c * np.eye(3) - np.outer(c, c)) for m, c in zip(masses, centers, strict=True)]
+    np.testing.assert_allclose(sum(tensors) + sum(apart), np.diag(found.vehicle.inertia), rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(np.array(centers)[1:, :2], found.vehicle.rotor_positions, rtol=1e-15)
+
+
+def vector(element, path):
+    """The numbers in an element; a number if it is one."""
+    found = np.array((element.findtext(path) or "").split(), dtype=float)
+    return found if found.size > 1 else found[0]
+
+
+def inertial(link):
+    """Mass, centre of mass in the frame of the model, and inertia of a link that a rigid body can be."""
+    mass, center = vector(link, "inertial/mass"), vector(link, "inertial/pose")
+    pose = np.zeros(6) if link.find("pose") is None else vector(link, "pose")
+    assert center.shape == pose.shape == (6,)
+    assert not pose[3:].any()
+    assert not center[3:].any()
+    assert link.find("visual/geometry") is not None
+    terms = {name: vector(link, f"inertial/inertia/{name}") for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
+    tensor = np.array([[terms["".join(("i", *sorted((a, b))))] for a in "xyz"] for b in "xyz"])
+    moments = np.linalg.eigvalsh(tensor)
+    assert mass > 0
+    assert moments.min() > 0
+    assert 2 * moments.max() <= moments.sum() * (1 + 1e-12)
+    return mass, (pose + center)[:3], tensor
+
+
+def test_samples_have_the_covariance_of_the_estimate(write):
+    found = read_result(write(os4_result()))
+    assert found.drawn == ("Ix", "Iy", "Iz", "J_R")
+    count = 2000
+    draws = [found.draw(number, seed=3)[0] for number in range(count)]
+    drawn = np.array([[*vehicle.inertia, vehicle.rotor_inertia] for vehicle in draws])
+    error = np.sqrt(np.diagonal(found.covariance))
+    np.testing.assert_array_less(np.abs(drawn.mean(axis=0) - list(INERTIA.values())), 4 * error / np.sqrt(count))
+    deviation = (drawn - drawn.mean(axis=0)) / error
+    wanted = found.covariance / np.outer(error, error)
+    np.testing.assert_array_less(np.abs(deviation.T @ deviation / count - wanted), 4 * np.sqrt(2 / count))
+    assert all(vehicle.mass == 0.65 for vehicle in draws)
+
+
+def test_a_sample_depends_on_its_number_and_on_the_seed_alone(write):
+    found = read_result(write(vehicle_result()))
+    few, many = (export_vehicle(found, "mujoco", samples=count, seed=5) for count in (2, 4))
+    assert few.samples == many.samples[:2]
+    assert len({few.text, *many.samples}) == 5
+    assert export_vehicle(found, "mujoco", samples=2, seed=6).samples[0] != few.samples[0]
+
+
+def test_impossible_draws_are_repeated_and_counted(write):
+    result = vehicle_result()
+    place = list(VALUES).index("yaw_damping")
+    # The damping is 0 at one standard deviation: 15.9 % of the draws are negative.
+    result["covariance"][place][place] = VALUES["yaw_damping"] ** 2
+    found = read_result(write(result))
+    draws = [found.draw(number, seed=0) for number in range(1000)]
+    assert all(not vehicle.impossible for vehicle, _ in draws)
+    repeated = sum(count for _, count in draws)
+    share = 0.1587
+    # The number of failures before 1,000 successes is negative binomial.
+    assert abs(repeated - 1000 * share / (1 - share)) < 4 * np.sqrt(1000 * share) / (1 - share)
+    result["covariance"][0][0] = 1e20  # alpha3
+    result["parameters"]["alpha3"]["std"] = 1e10
+    with pytest.raises(jaxos4.InputError, match="too uncertain"):
+        export_vehicle(read_result(write(result)), "mujoco", samples=1)
+
+
+def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tmp_path, write):
+    write(vehicle_result(result="no_skill"))
+    code, out, err = run("export", "found.json", "--to", "rotorpy", "--out", "vehicle.py")
+    assert (code, out) == (1, "vehicle.py: parameters for RotorPy\n")
+    assert err.splitlines()[-1].startswith("jaxos4: no_skill: the fit predicts")
+    assert "# Note: NOT TO BE TRUSTED: no_skill: " in (tmp_path / "vehicle.py").read_text(encoding="utf-8")
+    assert runpy.run_path(str(tmp_path / "vehicle.py"))["quad_params"]["mass"] == 0.027
+
+
+def older(result):
+    return {name: value for name, value in result.items() if name not in ("airframe", "covariance")}
+
+
+@pytest.mark.parametrize(
+    ("result", "fragments"),
+    [
+        ("not JSON", ("found.json: not a result", "jaxos4 estimate --out")),
+        ("[]", ("found.json: not a result",)),
+        ({"log": "flight.csv"}, ("found.json: not a result", "estimator")),
+        (older(os4_result(provenance={"version": "0.4.0"})), ("jaxos4 0.4.0", "run `jaxos4 estimate` again")),
+        (os4_result(result="nonfinite_trajectory", covariance=None), ("nonfinite_trajectory", "no estimate")),
+        (os4_result(result="unheard"), ("`result` unheard",)),
+        (os4_result(model="other"), ("`model` other", "published, corrected, flight")),
+        (os4_result(constants={}), ("no moments of inertia", "more excitation")),
+        (os4_result(constants={name: {} for name in INERTIA}), ("found.json: not a result", "estimate")),
+        (os4_result(covariance=[[1.0]]), ("`covariance`", "8 parameters")),
+        (os4_result(covariance=8 * [[1.0], []]), ("`covariance`",)),
+        (os4_result(covariance=(-np.eye(8)).tolist()), ("`covariance`", "run `jaxos4 estimate` again")),
+        (vehicle_result({}), ("holds no estimate",)),
+        (vehicle_result(VALUES | {"alpha6": 0.0}), ("alpha6 is 0",)),
+        (os4_result(airframe={"mass": 1.0}), ("found.json", "`inertia` is missing")),
+        (vehicle_result(VALUES | {"alpha8": 1e4}), ("Iz = 0.00011 kg m^2 exceeds", "correct the airframe")),
+        (vehicle_result(VALUES | {"alpha3": -6e4}), ("Ix", "not positive")),
+        (vehicle_result(VALUES | {"thrust_gain": -1.0}), ("found.json: no vehicle is like this",)),
+    ],
+)
+def test_results_that_cannot_be_exported_are_refused(run, tmp_path, write, result, fragments):
+    write(result)
+    refused(run("export", "found.json", "--to", "mujoco", "--out", "vehicle.xml", "--samples", "2"), *fragments)
+    assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
+
+
+@pytest.mark.parametrize(
+    ("options", "fragments"),
+    [
+        (("--samples", "2"), ("--samples", "--out")),
+        (("--samples", "-1", "--out", "vehicle.xml"), ("--samples", "-1")),
+        (("--seed", "-1"), ("--seed", "-1")),
+        (("--out", "found.json"), ("would overwrite an input",)),
+        (("--out", "nowhere/vehicle.xml"), ("nowhere/vehicle.xml", "no such folder")),
+        (("--out", "taken.xml", "--samples", "2"), ("taken-samples: exists", "remove it")),
+    ],
+)
+def test_wrong_options_are_refused(run, tmp_path, write, options, fragments):
+    before = write(os4_result()).read_bytes()
+    (tmp_path / "taken-samples").mkdir()
+    refused(run("export", "found.json", "--to", "mujoco", *options), *fragments)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "taken-samples"]
+    assert (tmp_path / "found.json").read_bytes() == before
+
+
+def test_other_wrong_requests_are_refused(run, write):
+    refused(run("export", "none.json", "--to", "sdf"), "none.json", "give a path")
+    write(os4_result())
+    code, _, err = run("export", "found.json", "--to", "gazebo")
+    assert code == 2
+    assert "mujoco" in err
+    with pytest.raises(jaxos4.InputError, match="`to`"):
+        export_vehicle(read_result("found.json"), "gazebo")
+
+
+def test_names_of_files_cannot_break_a_file(write):
+    name = "a--b\n'''-->.json"
+    found = read_result(write(os4_result(), name))
+    for target in ("mujoco", "sdf"):
+        ElementTree.fromstring(export_vehicle(found, target).text)
+    compile(export_vehicle(found, "rotorpy").text, "vehicle.py", "exec")

@@ -1,0 +1,232 @@
+"""Exported vehicles in MuJoCo and RotorPy: they accelerate as the model does."""
+
+import json
+import pathlib
+import re
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic_results import AIRFRAME, VALUES, os4_result, vehicle_result
+
+import jaxos4
+from jaxos4.airframe import airframe_from_table, airframe_table, alpha_from_inertia
+
+PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "into_your_simulator.md"
+# The simulators of the programs of the page, in their order.
+PROGRAMS = ("mujoco", "mujoco", "rotorpy")
+STATES = 1000
+# Terms that make a torque or a force.
+TERMS = ("offset", "center_of_mass", "damping", "curve", "accelerometer", "drag")
+# RotorPy has neither.
+NOT_ROTORPY = ("roll_offset", "pitch_offset", "yaw_offset", "roll_damping", "pitch_damping", "yaw_damping")
+DRAG = ("x_drag", "y_drag")
+
+
+@pytest.fixture(scope="module")
+def mujoco():
+    return pytest.importorskip("mujoco", reason="pip install mujoco")
+
+
+@pytest.fixture(scope="module")
+def multirotor():
+    return pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy").Multirotor
+
+
+def read(tmp_path, result):
+    path = tmp_path / "found.json"
+    path.write_text(json.dumps(result), encoding="utf-8")
+    return jaxos4.export.read_result(path)
+
+
+def random_states(slowest, fastest):
+    """States in the paper's order, and rotor speeds."""
+    generator = np.random.default_rng(1)
+    scale = np.array([3, 4, 3, 4, 3, 4, 1.5, 6, 1.3, 6, 3, 4])
+    return scale * generator.uniform(-1, 1, (STATES, 12)), generator.uniform(slowest, fastest, (STATES, 4))
+
+
+def rotation(states):
+    """R_z(psi) R_y(theta) R_x(phi) of each state."""
+    (c, b, a) = (np.cos(states[:, [6, 8, 10]]).T, np.sin(states[:, [6, 8, 10]]).T, np.ones(len(states)))
+    zero = 0 * a
+    x = np.array([[a, zero, zero], [zero, c[0], -b[0]], [zero, b[0], c[0]]])
+    y = np.array([[c[1], zero, b[1]], [zero, a, zero], [-b[1], zero, c[1]]])
+    z = np.array([[c[2], -b[2], zero], [b[2], c[2], zero], [zero, zero, a]])
+    return np.einsum("ijn,jkn,kln->nil", z, y, x)
+
+
+def quaternions(states):
+    """w, x, y, z of each state."""
+    from scipy.spatial.transform import Rotation
+
+    return np.roll(Rotation.from_matrix(rotation(states)).as_quat(), 1, axis=1)
+
+
+def modelled(model, parameters, states, omega):
+    """Linear acceleration along the earth's axes and angular acceleration along the body's, by the model."""
+    derivative = eqx.filter_jit(eqx.filter_vmap(model.derivative, in_axes=(0, 0, None)))
+    return np.asarray(derivative(jnp.asarray(states), jnp.asarray(omega), parameters))[:, [1, 3, 5, 7, 9, 11]]
+
+
+def os4_acceleration(states, omega):
+    """Of the corrected OS4 with the identified inertias; MuJoCo and RotorPy have no gyroscopic torque of rotors."""
+    inertia = np.array([row["estimate"] for row in list(os4_result()["constants"].values())[:3]])
+    model = jaxos4.CorrectedOS4(jaxos4.OS4)
+    return modelled(model, alpha_from_inertia(inertia, np.zeros(())), states, omega)
+
+
+def vehicle_acceleration(values, states, omega):
+    """Of the vehicle model with all terms, its alphas those of a rigid body without inertia of the rotors."""
+    airframe = airframe_from_table(AIRFRAME)
+    model = jaxos4.FlightModel(airframe, terms=TERMS)
+    inertia = [values["thrust_gain"] / values[name] for name in ("alpha3", "alpha6", "alpha8")]
+    rigid = dict(zip([f"alpha{i}" for i in range(1, 9)], alpha_from_inertia(np.array(inertia), 0.0), strict=True))
+    given = rigid | values
+    return modelled(model, jnp.array([given.get(name, 0.0) for name in model.parameter_names]), states, omega)
+
+
+def mujoco_acceleration(mujoco, text, thrusts, states):
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    found = []
+    for state, quaternion, thrust in zip(states, quaternions(states), thrusts, strict=True):
+        data.qpos[:] = np.append(state[[0, 2, 4]], quaternion)
+        data.qvel[:] = state[[1, 3, 5, 7, 9, 11]]
+        data.ctrl[:4] = thrust
+        if model.na:
+            data.act[:] = thrust
+        mujoco.mj_forward(model, data)
+        found.append(data.qacc.copy())
+    return np.array(found)
+
+
+def rotorpy_acceleration(multirotor, text, states, speeds):
+    defined = {}
+    exec(text, defined)  # noqa: S102
+    vehicle = multirotor(defined["quad_params"])
+    found = []
+    for state, quaternion, speed in zip(states, quaternions(states), speeds, strict=True):
+        now = {
+            "x": state[[0, 2, 4]],
+            "v": state[[1, 3, 5]],
+            "q": np.roll(quaternion, -1),
+            "w": state[[7, 9, 11]],
+            "wind": np.zeros(3),
+            "rotor_speeds": speed,
+        }
+        derivative = vehicle.statedot(now, {"cmd_motor_speeds": speed}, 0.01)
+        found.append(np.append(derivative["vdot"], derivative["wdot"]))
+    return np.array(found)
+
+
+def agree(found, expected):
+    """Whether each acceleration agrees to 1e-9 of the usual size of its component."""
+    return bool((np.abs(found - expected) <= 1e-9 * np.sqrt(np.square(expected).mean(axis=0))).all())
+
+
+def effective(speeds, values):
+    """The rotor speeds that make the thrust of the curve."""
+    full, curve = AIRFRAME["max_rotor_speed"], values["thrust_curve"]
+    return np.sqrt(curve * speeds**2 + (1 - curve) * full * speeds)
+
+
+def test_an_os4_accelerates_in_mujoco_as_the_model(mujoco, tmp_path):
+    found = read(tmp_path, os4_result())
+    states, omega = random_states(100, 300)
+    text, thrusts = jaxos4.export.export_vehicle(found, "mujoco").text, found.vehicle.thrust_coefficient * omega**2
+    expected = os4_acceleration(states, omega)
+    assert agree(mujoco_acceleration(mujoco, text, thrusts, states), expected)
+    # The comparison can fail: rotors that turn the other way, or a heavier vehicle.
+    for change in ({"rotor_spins": [-1, 1, -1, 1]}, {"mass": 0.6501}):
+        other = read(tmp_path, os4_result(airframe=airframe_table(jaxos4.OS4) | change))
+        text = jaxos4.export.export_vehicle(other, "mujoco").text
+        assert not agree(mujoco_acceleration(mujoco, text, thrusts, states), expected)
+
+
+def test_an_os4_accelerates_in_rotorpy_as_the_model(multirotor, tmp_path):
+    text = jaxos4.export.export_vehicle(read(tmp_path, os4_result()), "rotorpy").text
+    states, omega = random_states(100, 300)
+    assert agree(rotorpy_acceleration(multirotor, text, states, omega), os4_acceleration(states, omega))
+
+
+def test_a_vehicle_accelerates_in_mujoco_as_the_model(mujoco, tmp_path):
+    """With offsets, centre of mass, damping, drag, thrust gain and thrust curve."""
+    found = read(tmp_path, vehicle_result())
+    states, omega = random_states(500, 2500)
+    thrusts = found.vehicle.thrust_coefficient * effective(omega, VALUES) ** 2
+    simulated = mujoco_acceleration(mujoco, jaxos4.export.export_vehicle(found, "mujoco").text, thrusts, states)
+    assert agree(simulated, vehicle_acceleration(VALUES, states, omega))
+
+
+def test_a_vehicle_accelerates_in_rotorpy_as_the_model(multirotor, tmp_path):
+    """With centre of mass, thrust gain and thrust curve: RotorPy has no offsets and no damping."""
+    # An offset that cancels the constant part of the torque of the centre of mass.
+    values = VALUES | dict.fromkeys((*NOT_ROTORPY, *DRAG), 0.0)
+    values |= {f"{axis}_offset": 9.81 * VALUES[f"{axis}_thrust"] for axis in ("roll", "pitch")}
+    text = jaxos4.export.export_vehicle(read(tmp_path, vehicle_result(values)), "rotorpy").text
+    states, omega = random_states(500, 2500)
+    simulated = rotorpy_acceleration(multirotor, text, states, effective(omega, values))
+    assert agree(simulated, vehicle_acceleration(values, states, omega))
+
+
+def test_the_drag_of_rotorpy_is_right_at_the_hover_speed(multirotor, tmp_path):
+    values = VALUES | dict.fromkeys(NOT_ROTORPY, 0.0) | {"x_drag": 0.3, "y_drag": 0.3, "thrust_curve": 1.0}
+    found = read(tmp_path, vehicle_result(values))
+    states, _ = random_states(0, 1)
+    states[:, [7, 9, 11]] = 0.0
+    hover = np.full((STATES, 4), found.vehicle.hover_speed)
+    text = jaxos4.export.export_vehicle(found, "rotorpy").text
+    simulated = rotorpy_acceleration(multirotor, text, states, hover)[:, :3]
+    assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
+
+
+def test_the_rotors_lag_and_are_late(mujoco, multirotor, tmp_path):
+    found = read(tmp_path, vehicle_result())
+    model = mujoco.MjModel.from_xml_string(jaxos4.export.export_vehicle(found, "mujoco").text)
+    data = mujoco.MjData(model)
+    data.ctrl[:4] = 0.1
+    thrust = []
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+        thrust.append(data.act[0])
+    time = 0.002 * np.arange(1, 101)
+    late = np.maximum(time - VALUES["rotor_delay"], 0.0)
+    # A delay of five time steps: exact.
+    np.testing.assert_allclose(thrust, 0.1 * -np.expm1(-late / VALUES["rotor_lag"]), atol=1e-12)
+    defined = {}
+    exec(jaxos4.export.export_vehicle(found, "rotorpy").text, defined)  # noqa: S102
+    vehicle = multirotor(defined["quad_params"])
+    rest = {"x": np.zeros(3), "v": np.zeros(3), "q": np.array([0, 0, 0, 1.0]), "w": np.zeros(3), "wind": np.zeros(3)}
+    state = vehicle.step(rest | {"rotor_speeds": np.zeros(4)}, {"cmd_motor_speeds": np.full(4, 1000.0)}, 0.05)
+    np.testing.assert_allclose(state["rotor_speeds"], -1000 * np.expm1(-1.0), rtol=1e-3)
+
+
+def test_the_vehicle_rests_in_the_hover_of_mujoco(mujoco, tmp_path):
+    """The thrusts of the keyframe balance the weight and the constant torques."""
+    model = mujoco.MjModel.from_xml_string(
+        jaxos4.export.export_vehicle(read(tmp_path, vehicle_result()), "mujoco").text
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.qacc, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("target", "suffix"), [("mujoco", "xml"), ("rotorpy", "py")])
+def test_the_programs_of_the_page_run(run, mujoco, multirotor, monkeypatch, tmp_path, target, suffix):
+    """The vehicle hovers in each simulator, and every sample of it too, by the programs that the page prints."""
+    del multirotor
+    read(tmp_path, vehicle_result())
+    code, _, err = run("export", "found.json", "--to", target, "--out", f"vehicle.{suffix}", "--samples", "3")
+    assert code == 0, err
+    programs = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    mine = [program for name, program in zip(PROGRAMS, programs, strict=True) if name == target]
+    monkeypatch.syspath_prepend(tmp_path)
+    defined = {}
+    for program in mine:
+        exec(program, defined)  # noqa: S102
+    flown = [(defined["height"], defined["tilt"]), *defined.get("drawn", [])]
+    assert len(flown) == {"mujoco": 4, "rotorpy": 1}[target]
+    assert all(abs(height - 1) < 0.05 and tilt < 0.05 for height, tilt in flown)
