@@ -152,6 +152,8 @@ def _identified(name: str, file: _File) -> Identified:
             f"`covariance`: must have one row and column for each of {count} parameters; run `jaxos4 estimate` again."
         )
     airframe, covariance = airframe_from_table(file.airframe), np.array(file.covariance)
+    if (np.diagonal(covariance) < 0).any():
+        raise InputError("`covariance`: has a negative variance; run `jaxos4 estimate` again.")
     if file.model == _VEHICLE:
         parts = _of_vehicle(file, covariance)
     elif file.model in MODELS:
@@ -159,8 +161,6 @@ def _identified(name: str, file: _File) -> Identified:
     else:
         raise InputError(f"`model` {file.model[:40]}: must be one of {', '.join((*MODELS, _VEHICLE))}.")
     values, drawn, covariance, notes = parts
-    if not (np.isfinite(covariance).all() and (np.diagonal(covariance) >= 0).all()):
-        raise InputError("`covariance`: is not that of an estimate; run `jaxos4 estimate` again.")
     negative = [each for each in _NOT_NEGATIVE if values.get(each, 0.0) < 0]
     values |= dict.fromkeys(negative, 0.0)
     kept = [place for place, each in enumerate(drawn) if each not in negative]
@@ -199,6 +199,8 @@ def _of_flight(file: _File, airframe: Airframe, covariance: np.ndarray) -> _Part
     factor = float(model.gyroscopic_factor)
     alpha = np.asarray(alpha_from_inertia(np.array(inertia), np.asarray(rotor * factor)))
     spread = fit_inertia(model, alpha, covariance).covariance
+    if not np.isfinite(spread).all():
+        raise InputError("no moments of inertia explain the estimate; fly with more excitation.")
     known = 4 if rotor > _SURE * np.sqrt(spread[3, 3]) else 3
     notes = []
     if known == 3:
