@@ -8,7 +8,7 @@ import numpy as np
 from .._custom_types import as_float
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES, Flight
-from .facts import LogFacts, Sampling, logged_rate
+from .facts import LogFacts, Sampling, held_regularly, logged_rate
 from .resample import UNIFORM, resample, uniform_grid, unwrap, widest_gap
 from .table import MAX_ROWS, Table, quoted
 from .units import check_time, check_units, force_note, thrust_note
@@ -68,12 +68,18 @@ def facts_of(table: Table) -> LogFacts:
 
 
 def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
-    """The column that was logged most rarely, of those that were logged at all."""
+    """The column that was logged most rarely, of those that were logged at all.
+
+    Rows that repeat the values of the row before were not logged: programs that join topics fill them in.
+    """
     t, found = table.columns["t"], []
-    for name in names:
-        logged = np.isfinite(table.columns.get(name, np.full(t.size, np.nan)))
-        if logged.any():
-            found.append(Sampling(table.names.get(name, name), logged_rate(t[logged])))
+    columns = {name: table.columns[name] for name in names if np.isfinite(table.columns.get(name, np.nan)).any()}
+    for name, values in columns.items():
+        found.append(Sampling(table.names.get(name, name), logged_rate(t[np.isfinite(values)])))
+    if columns:
+        changes = np.any([np.diff(values) != 0 for values in columns.values()], axis=0)
+        if held_regularly(t[1:][changes]):
+            found.append(Sampling(f"the values of {found[0].source} change so often", logged_rate(t[1:][changes])))
     return min(found, key=lambda each: each.rate, default=None)
 
 

@@ -15,6 +15,7 @@ large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 
 _JITTER = 0.95  # a log at a nominal rate may be this much slower
 _PAUSE = 1.0  # [s]; a longer time between samples is a pause of the log, and not its rate
+_FEWEST_CHANGES, _REGULAR = 20, 0.3  # so many steps, of which most are equal up to this share, are a rate
 _FASTER = "log motors and gyro at 100 Hz or more, and fly again"
 
 
@@ -78,3 +79,12 @@ def logged_rate(t: Float[np.ndarray, " samples"]) -> float:
     if total.size == 0 or total[-1] <= 0:
         return 0.0
     return 1.0 / float(steps[np.searchsorted(total, total[-1] / 2)])
+
+
+def held_regularly(t: Float[np.ndarray, " changes"]) -> bool:
+    """Whether values that change at the times `t` [s] were written at a fixed rate and held in between."""
+    steps = np.diff(t)
+    if steps.size < _FEWEST_CHANGES:
+        return False
+    low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
+    return bool(high - low <= _REGULAR * middle)
