@@ -17,6 +17,17 @@ from jaxos4.models.state import CASCADE_ORDER
 # The constants of the OS4 thesis, typed again instead of imported.
 OS4 = {"m": 0.650, "L": 0.23, "b": 3.13e-5, "d": 7.5e-7, "g": 9.81}
 DT = 0.01
+FULL_THRUST, FULL_SPEED = 0.15, 2500.0  # of one rotor of the Crazyflie [N, rad/s]
+CRAZYFLIE = jaxos4.Airframe(
+    mass=0.027,
+    inertia=(1.66e-5, 1.7e-5, 2.9e-5),
+    rotor_positions=[(0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028)],
+    rotor_spins=(1.0, -1.0, 1.0, -1.0),
+    thrust_coefficient=FULL_THRUST / FULL_SPEED**2,
+    drag_coefficient=0.005 * FULL_THRUST / FULL_SPEED**2,
+    rotor_inertia=2e-8,
+    max_rotor_speed=FULL_SPEED,
+)
 
 
 @functools.cache

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refused
+from helpers import CRAZYFLIE, FULL_SPEED, refused
 
 import jaxos4
 from jaxos4.closed_loop import fly_standard, ornstein_uhlenbeck
@@ -19,18 +19,6 @@ RATES, ANGLES = [7, 9, 11], [6, 8, 10]
 SUCCESS = jaxos4.RESULTS.successful
 QUIET = {"gyro_noise": 0.0, "attitude_noise": 0.0, "force_noise": 0.0}
 NO_GAINS = {"attitude_gain": 0.0, "rate_gain": 0.0, "integral_gain": 0.0}
-FULL_THRUST, FULL_SPEED = 0.15, 2500.0
-THRUST = FULL_THRUST / FULL_SPEED**2
-CRAZYFLIE = jaxos4.Airframe(
-    mass=0.027,
-    inertia=(1.66e-5, 1.7e-5, 2.9e-5),
-    rotor_positions=[(0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028)],
-    rotor_spins=(1.0, -1.0, 1.0, -1.0),
-    thrust_coefficient=THRUST,
-    drag_coefficient=0.005 * THRUST,
-    rotor_inertia=2e-8,
-    max_rotor_speed=FULL_SPEED,
-)
 VEHICLES = {"crazyflie": CRAZYFLIE, "os4": jaxos4.OS4}
 every_vehicle = pytest.mark.parametrize("airframe", VEHICLES.values(), ids=VEHICLES)
 LEVEL = np.zeros((SAMPLES, 4))
@@ -129,7 +117,7 @@ def test_the_motion_follows_from_the_commands(rough):
 
 def test_measured_speeds_are_means_over_the_samples(rough):
     commanded, samples = fly(rough, references()), 350
-    speeds = fly(eqx.tree_at(lambda v: v.rotor_lag, loop_of(logged="speeds"), 0.04), references())
+    speeds = fly(loop_of(rotor_lag=0.04, logged="speeds"), references())
     assert (commanded.commanded, speeds.commanded) == (True, False)
     same = loop_of(rotor_lag=0.04)
     _, means = reference_motion(same, np.asarray(fly(same, references()).omega), samples)
@@ -195,7 +183,7 @@ def test_commands_can_act_at_once():
     flight = fly(loop_of(rotor_lag=0.0, rotor_delay=0.0), references())
     assert flight.result == SUCCESS
     # The specific force at a sample is the thrust of the command before it.
-    thrust = THRUST * np.square(np.asarray(flight.omega)).sum(axis=1) / 0.027
+    thrust = float(CRAZYFLIE.thrust_coefficient) * np.square(np.asarray(flight.omega)).sum(axis=1) / 0.027
     np.testing.assert_allclose(np.asarray(flight.specific_force)[1:, 2], thrust[:-1], rtol=1e-12)
 
 

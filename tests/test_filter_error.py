@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, noisy_states, single_precision, standard_flight, standard_problem
+from helpers import CRAZYFLIE, DT, noisy_states, single_precision, standard_flight, standard_problem
 from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, names
 
 import jaxos4
@@ -367,17 +367,6 @@ def test_single_precision_gives_the_same(tmp_path):
 
 # Vehicles in closed loop.
 
-THRUST, FULL_SPEED = 0.15, 2500.0
-CRAZYFLIE = jaxos4.Airframe(
-    mass=0.027,
-    inertia=(1.66e-5, 1.7e-5, 2.9e-5),
-    rotor_positions=[(0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028)],
-    rotor_spins=(1.0, -1.0, 1.0, -1.0),
-    thrust_coefficient=THRUST / FULL_SPEED**2,
-    drag_coefficient=0.005 * THRUST / FULL_SPEED**2,
-    rotor_inertia=2e-8,
-    max_rotor_speed=FULL_SPEED,
-)
 TERMS = ("offset", "damping", "lag", "delay", "reaction", "accelerometer")
 FLIGHTS, SAMPLES, PERIOD = 8, 2501, 0.004
 LAG, DELAY = 0.05, 0.01
