@@ -424,19 +424,6 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "rows", "sessions"), [("btfl_001.bbl", 24991, 2), ("btfl_002.bbl", 66640, 1), ("LOG00037.BFL", 16774, 1)]
-)
-def test_real_logs(name, rows, sessions, shared_flights):
-    """The number of frames is that of another decoder."""
-    flight, notes = read_log(shared_flights / "betaflight" / f"fc_{name}", full_scale=1.0)
-    assert any(f"{rows} rows were resampled" in note for note in notes)
-    assert any(f"{sessions} sessions" in note for note in notes) == (sessions > 1)
-    size = np.linalg.norm(np.asarray(flight.specific_force), axis=1)
-    assert np.nanmedian(size) == pytest.approx(GRAVITY, rel=0.1)
-    assert 3 * 3.5 < float(np.median(flight.voltage)) < 6 * 4.3
-
-
 def test_commands_need_a_full_scale(save):
     with pytest.raises(InputError, match=r"column motor\[0\]: the rotor speed of full command is not known"):
         read_log(save(blackbox_csv(without(recorded(T), "eRPM"))))

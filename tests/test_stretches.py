@@ -314,13 +314,3 @@ def test_real_flights(name, usable, axes, shared_flights):
     assert tuple(each.verdict for each in found) == axes
     bare, _ = read_log(shared_flights / f"arpl_crazyflie_{name}.csv", full_scale=1.0)
     assert len(usable_stretches(bare)) == len(kept)
-
-
-@pytest.mark.parametrize(("name", "usable"), [("001.bbl", 0.0), ("002.bbl", 0.7), ("LOG00037.BFL", 0.9)])
-def test_real_flights_of_betaflight(name, usable, shared_flights):
-    """The second session of the first was carried by hand, with idle throttle."""
-    path = shared_flights / "betaflight" / f"fc_{name if name[0] == 'L' else 'btfl_' + name}"
-    flight, _ = read_log(path, full_scale=1.0)
-    kept = sum(part.length for part in usable_stretches(flight))
-    duration = float(flight.time[-1] - flight.time[0])
-    assert kept == 0 if usable == 0 else kept > usable * duration
