@@ -3,12 +3,11 @@
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import DT, OS4, noisy_states, single_precision, standard_flight, standard_problem
-from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors, names
+from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors, lost, names
 
 import jaxos4
 from jaxos4.estimators.equation_error import EquationError
@@ -283,8 +282,7 @@ def test_a_gap_in_one_rate_leaves_the_equations_without_it_alone():
 
 
 def test_a_gap_that_is_not_bridged_costs_more():
-    lost = jax.random.bernoulli(jax.random.key(8), 0.3, (501, 12))
-    states = jnp.where(lost, jnp.nan, noisy_states(1, seed=7)[0])
+    states = lost(noisy_states(1, seed=7)[0])
     problem, bracket = standard_problem(channels="rates", free=True, states=states), bracket_of(PUBLISHED)
     bridged, split = (EquationError(bridge=bridge)(problem, bracket) for bridge in (4, 0))
     assert (split.std > 5 * bridged.std).all()

@@ -284,6 +284,7 @@ def test_a_lag_below_the_shortest_is_the_shortest():
         assert np.abs(found.thrust - plain.thrust)[5:].max() < 0.1 * np.ptp(np.asarray(plain.thrust))
 
 
+@jax.jit
 def delayed(omega, delay, dt=0.01, stretch=None):
     model = jaxos4.FlightModel(terms=("delay",))
     inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretches=None if stretch is None else Stretches.of(stretch))
@@ -315,7 +316,7 @@ def test_parabolas_are_delayed_exactly():
 
 def test_the_delay_has_a_continuous_derivative():
     omega = np.random.default_rng(0).uniform(100, 400, (40, 4))
-    slope = jax.jacfwd(lambda delay: delayed(omega, delay))
+    slope = jax.jit(jax.jacfwd(lambda delay: delayed(omega, delay)))
     size = np.abs(slope(0.0123)).max()
     for whole in (0.0, 0.01, 0.02, -0.01):
         below, above = slope(whole - 1e-9), slope(whole + 1e-9)
@@ -412,9 +413,9 @@ def test_gradient_and_information_are_the_residuals_derivatives(recordings):
     def residuals(u):
         return problem.residuals(u[:count], u[count:])
 
-    jacobian, errors = np.asarray(jax.jacfwd(residuals)(unknowns)), np.asarray(residuals(unknowns))
+    jacobian, errors = (np.asarray(jax.jit(f)(unknowns)) for f in (jax.jacfwd(residuals), residuals))
     scale = np.linalg.norm(jacobian, axis=0)
-    found = problem.curvatures(parameters, unknowns[count:])
+    found = eqx.filter_jit(lambda p, *at: p.curvatures(*at))(problem, parameters, unknowns[count:])
     own = problem.size
     for w in range(4):
         columns = np.r_[:count, count + w * own : count + (w + 1) * own]

@@ -62,12 +62,17 @@ def test_a_held_model_is_the_inner_one_with_its_values(model, values):
     np.testing.assert_allclose(*flights, rtol=1e-12, atol=1e-13)
 
 
+@eqx.filter_jit
+def curvatures(problem, parameters, start):
+    return problem.curvatures(parameters, start)
+
+
 @pytest.mark.parametrize(("model", "values"), [CASES[0], CASES[3]])
 def test_derivatives_are_those_of_the_inner_model(model, values):
     held, whole = jaxos4.hold(model, values), whole_of(model, values)
     part, all_of_it = problem_of(held), problem_of(model)
     start = part.first_state()[0]
-    some, everything = part.curvatures(held.without(whole), start), all_of_it.curvatures(whole, start)
+    some, everything = curvatures(part, held.without(whole), start), curvatures(all_of_it, whole, start)
     remaining = np.append(held.free, len(whole) + np.arange(part.size))
     information = np.asarray(everything.information)[:, remaining][:, :, remaining]
     gradient = everything.gradient[:, remaining]

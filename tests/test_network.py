@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers import DT, standard_flight
 from hypothesis import given, settings, strategies as st
+from lanes import LANES, lost
 
 import jaxos4
 from jaxos4.estimators.hybrid import search_from_seed
@@ -25,7 +26,7 @@ SMALL = {"width": 32, "depth": 2, "steps": 500, "batch": 64, "held_out": 4000}
 SHORT = SMALL | {"steps": 5, "held_out": 1000}
 BRACKET = jaxos4.Bracket.default(PUBLISHED())
 OMEGA = standard_flight(duration=DURATION).omega
-MANY, LANES = 2000, 64  # flights of a statistical test, and of a hybrid: tests with equal numbers share programs
+MANY = 2000  # flights of a statistical test
 
 
 def problem_of(states=None, *, noise=1.0, channels="rates", free=False, model=None, omega=OMEGA, dt=DT, **kwargs):
@@ -45,7 +46,9 @@ def trained(free=False, seed=0, **changes):
 def flights(count, *, seed=0, noise=1.0, start_width=(0.0, 0.0, 0.0)):
     """Parameters drawn over the bracket, initial rates over +-`start_width`, and the noisy states of their flights."""
     width = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(jnp.asarray(start_width))
-    return fly(jnp.arange(count), jax.random.key(seed), jnp.asarray(noise), width)
+    rest = jax.random.key(seed), jnp.asarray(noise), width
+    blocks = [fly(first + np.arange(LANES), *rest) for first in range(0, count, LANES)]  # one program for all numbers
+    return tuple(jnp.asarray(np.concatenate(part)[:count]) for part in zip(*blocks, strict=True))
 
 
 @eqx.filter_jit
@@ -315,8 +318,7 @@ def test_in_a_batch_each_lane_has_its_own_result_and_leaves_the_others_alone():
 
 def test_missing_samples_widen_the_intervals_and_no_more():
     network, (alpha, states) = trained(), flights(MANY, seed=15)
-    missing = jax.random.bernoulli(jax.random.key(16), 0.4, states.shape)
-    complete, fewer = identify(network, states), identify(network, jnp.where(missing, jnp.nan, states))
+    complete, fewer = identify(network, states), identify(network, lost(states, share=0.4, seed=16))
     assert (np.asarray(fewer.std / complete.std) > 1.1).mean() > 0.9
     successful = np.array(names(fewer)) == "successful"
     assert successful.mean() > 0.9

@@ -2,12 +2,11 @@
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import DT, noisy_states, published_derivative, random_starts, standard_problem
-from lanes import HALF, LANES, bound, errors, identify, lanes, names
+from lanes import HALF, LANES, bound, errors, identify, lanes, lost, names
 
 import jaxos4
 from jaxos4.estimators.svsf import SVSF
@@ -140,9 +139,7 @@ def test_other_channels_do_not_matter():
 
 
 def test_missing_samples_only_cost_precision():
-    states = noisy_states(LANES, seed=7)
-    states = jnp.where(jax.random.bernoulli(jax.random.key(8), 0.3, states.shape), jnp.nan, states)
-    estimates = identify(SVSF(), *lanes(states))
+    estimates = identify(SVSF(), *lanes(lost(noisy_states(LANES, seed=7))))
     good = names(estimates) == "successful"
     assert good.mean() > 0.9
     error = errors(estimates)
