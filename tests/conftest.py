@@ -3,7 +3,6 @@
 import collections
 import os
 import pathlib
-import subprocess
 import sys
 from collections.abc import Iterator
 
@@ -11,18 +10,6 @@ import hypothesis
 import jax
 import jaxtyping
 import pytest
-
-
-def starts(flags: str) -> bool:
-    """Whether JAX starts with these flags of XLA. A flag that XLA does not know ends the process."""
-    command, environment = [sys.executable, "-c", "import jax; jax.devices()"], os.environ | {"XLA_FLAGS": flags}
-    return subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0
-
-
-# XLA's older way to write loops compiles in half the time. Your own flags go first. Workers inherit the environment.
-QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false"
-if "XLA_FLAGS" not in os.environ and starts(QUICK_TO_COMPILE):
-    os.environ["XLA_FLAGS"] = QUICK_TO_COMPILE
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_platforms", os.environ.get("JAX_PLATFORMS") or "cpu")
@@ -33,6 +20,10 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 # Before the first import of jaxos4: all its annotated functions and modules are checked.
 jaxtyping.install_import_hook("jaxos4", "typechecker.check")
+
+from jaxos4.cli._jax import compile_quickly  # noqa: E402
+
+compile_quickly()  # before JAX starts to compute: the programs of the command line
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")

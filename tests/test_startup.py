@@ -251,3 +251,16 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
         assert done.returncode == code, done.stderr
         assert expected in done.stdout + done.stderr
     assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52
+
+
+@pytest.mark.parametrize(
+    ("version", "own", "flags"),
+    [("0.10.2", None, _jax.QUICK_TO_COMPILE), ("0.10.2", "--own=1", "--own=1"), ("1.0.0", None, None)],
+)
+def test_flags_of_xla_are_set_for_versions_that_know_them_and_never_replaced(version, own, flags, monkeypatch):
+    monkeypatch.setattr("jaxlib.version.__version__", version)
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    if own is not None:
+        monkeypatch.setenv("XLA_FLAGS", own)
+    _jax.compile_quickly()
+    assert os.environ.get("XLA_FLAGS") == flags
