@@ -39,7 +39,7 @@ def draw(report: dict[str, Any]) -> Figure:
     for panel, name in zip(panels[:2], INERTIAS, strict=True):
         panel.axhline(1e5 * report["authors"][name], color=INK, linestyle=BOUND_DASHES[2], label="the flights' authors")
         panel.set_title(f"{name} [1e-5 kg m²], 95 %")
-        panel.set_ylim(bottom=0)
+        panel.set_yscale("log")
     for panel, rate in zip(panels[2:], RATES, strict=True):
         panel.axhline(0, color=INK, linewidth=0.8)
         panel.set_title(f"skill in {rate}, 0.25 s ahead; 0: as good as no change")

@@ -38,7 +38,8 @@ def skill_ahead(skill: dict[str, Any] | None) -> dict[str, tuple[float, float]]:
     if skill is None:
         return {}
     place = min(range(len(skill["horizons"])), key=lambda place: abs(skill["horizons"][place] - AHEAD))
-    return {rate: (skill[rate]["skill"][place], skill[rate]["std"][place]) for rate in "pq"}
+    table = {rate: (skill[rate]["skill"][place], skill[rate]["std"][place]) for rate in "pq"}
+    return {rate: (value, std) for rate, (value, std) in table.items() if value is not None and std is not None}
 
 
 def identified(recordings: list[Recording], estimator: str, *, end: float | None) -> dict[str, Any]:
