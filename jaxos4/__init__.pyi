@@ -5,6 +5,7 @@ from . import (
     analysis as analysis,
     bracket as bracket,
     closed_loop as closed_loop,
+    design as design,
     errors as errors,
     estimate as estimate,
     estimators as estimators,
@@ -56,6 +57,7 @@ from .closed_loop import (
     fly_closed_loop as fly_closed_loop,
     random_references as random_references,
 )
+from .design import DesignedInput as DesignedInput, Envelope as Envelope, design_input as design_input
 from .errors import InputError as InputError, TrainingError as TrainingError
 from .estimate import AbstractEstimator as AbstractEstimator, Estimate as Estimate
 from .estimators import (

@@ -22,6 +22,7 @@ ROOMS = {
     "study": "many flights: specification, storage, resume",
     "identification": "one answer: noise, intervals, notes, checks",
     "recording": "usable stretches, excitation, held-out parts",
+    "design": "what to fly",
     "logs": "file formats to Flight",
     "estimators": "one algorithm a file",
     "networks": "features, training, network file",

@@ -11,6 +11,7 @@ import typer
 from ..errors import InputError, TrainingError
 from ._jax import NO_CACHE, prepare
 from .compare import compare
+from .design import design
 from .estimate import estimate
 from .export import export
 from .identifiability import identifiability
@@ -36,7 +37,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-for command in (simulate, estimate, export, train, inspect, identifiability, compare, study, report):
+for command in (simulate, design, estimate, export, train, inspect, identifiability, compare, study, report):
     app.command()(_prepared(command))
 
 

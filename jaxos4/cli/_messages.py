@@ -14,7 +14,8 @@ _PHRASES = {
     "`end`": "--to",
 }
 _OPTIONS = (
-    "bracket|channels|estimator|holdout|initial_state|loss|network|sample_time|samples|seed|terms|validate|window"
+    "bandwidth|bracket|channels|criterion|dt|duration|estimator|holdout|initial_state|loss|network|sample_time|samples|"
+    "seed|terms|validate|window"
 )
 
 

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from ..analysis.fisher import cramer_rao_bound
 from ..bracket import Bracket
-from ..excitation import EXCITATIONS
 from ..flight import Flight
 from ..models import MODELS
 from ..models.abstract import AbstractModel
@@ -47,7 +46,7 @@ def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
     """Model, bracket and rotor speeds of a scenario or of a network's job."""
     airframe = study.vehicle(scenario.airframe)
     model = MODELS[scenario.model](airframe)
-    omega = EXCITATIONS[scenario.excitation](airframe, duration=scenario.duration, dt=study.dt)
+    omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)
     return Fleet(model, _bracket(study, model, scenario.width), omega, as_float(study.dt))
 
 

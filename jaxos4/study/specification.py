@@ -13,8 +13,10 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 import msgspec
 import numpy as np
 
+from .._custom_types import RotorSpeeds, as_float
 from .._files import read_toml
 from ..airframe import PRESETS, Airframe, airframe_from_table
+from ..design import read_input
 from ..errors import InputError
 from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
@@ -27,6 +29,7 @@ from ..simulation import METHODS
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+Speeds = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 _CHOICES: dict[str, Collection[str]] = {
@@ -123,6 +126,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     - `models`, `excitations`, `channels`, `estimators`: names as on the command line.
     - `airframes`: names of presets, or of tables `[airframe.NAME]` with the keys of an airframe file.
+    - `input`: rotor speeds of each sample, by a name that `excitations` can use. In the file: a table of paths of CSV
+      files with `t` and `omega1..4`, as `jaxos4 design` writes them, relative to the folder of the specification.
     - `durations` [s], at a sample time of `dt` [s].
     - `methods`: the integration method of true flights; estimators simulate by `fit_method`. If both are the same, the
       model has no discretisation error (the inverse crime).
@@ -161,6 +166,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     precision: Literal["float64", "float32"] = "float64"
     network: Training = Training()
     airframe: dict[str, dict[str, Any]] = {}
+    input: dict[str, tuple[Speeds, ...]] = {}
 
     def __post_init__(self):
         for axis in AXES:
@@ -170,8 +176,9 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             if len(set(values)) < len(values):
                 raise InputError(f"`{axis}` names a value twice: {', '.join(map(str, values))}; remove one.")
             for value in values if axis in _CHOICES else ():
-                if value not in _CHOICES[axis]:
-                    raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(_CHOICES[axis])}.")
+                choices = [*_CHOICES[axis], *(self.input if axis == "excitations" else ())]
+                if value not in choices:
+                    raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(choices)}.")
             if any(isinstance(value, float) and not math.isfinite(value) for value in values):
                 raise InputError(f"`{axis}` must be finite numbers, got {', '.join(map(str, values))}; correct them.")
         if not math.isfinite(self.dt):
@@ -202,7 +209,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         """Raises `InputError` for an excitation that an airframe cannot fly, or a network that cannot be trained."""
         for name, excitation, duration in itertools.product(self.airframes, self.excitations, self.durations):
             try:
-                EXCITATIONS[excitation](self.vehicle(name), duration=duration, dt=self.dt)
+                self.omega(excitation, name, duration)
             except ValueError as error:
                 raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
         try:
@@ -221,6 +228,17 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             presets = ", ".join(PRESETS)
             raise InputError(f"`airframes`: unknown {name!r}; choose from {presets}, or add [airframe.{name}].")
         return PRESETS[name]
+
+    def omega(self, excitation: str, airframe: str, duration: float) -> RotorSpeeds:
+        """The rotor speeds of an excitation [rad/s]. Raises `ValueError` if it cannot be flown."""
+        if excitation not in self.input:
+            return EXCITATIONS[excitation](self.vehicle(airframe), duration=duration, dt=self.dt)
+        speeds, fastest = np.asarray(self.input[excitation]), float(self.vehicle(airframe).max_rotor_speed)
+        if len(speeds) != round(duration / self.dt) + 1:
+            raise ValueError(f"its file lasts {(len(speeds) - 1) * self.dt:g} s; correct `durations`.")
+        if speeds.max() > fastest:
+            raise ValueError(f"a rotor would exceed the `max_rotor_speed` of {fastest:g} rad/s; design another input.")
+        return as_float(speeds)
 
     @property
     def double(self) -> bool:
@@ -262,6 +280,7 @@ def load_study(path: Path) -> Study:
     """
     table = read_toml(path)
     try:
+        table = table | _inputs(table, Path(path).parent)
         study = msgspec.convert(table, Study)
         study.check_computable()
     except (InputError, msgspec.ValidationError, RecursionError) as error:
@@ -269,6 +288,22 @@ def load_study(path: Path) -> Study:
         what = " ".join(str(error).split())[:300]
         raise InputError(f"{path}: {what}" if in_our_words else f"{path}: {_in_words(what)}; correct it.") from None
     return study
+
+
+def _inputs(table: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The key `input` of a specification with the content of the files. What is no table of paths is left as it is."""
+    files, dt = table.get("input"), table.get("dt", 0.01)
+    if not isinstance(files, dict) or not isinstance(dt, int | float) or not dt > 0:
+        return {}
+    taken = next((name for name in files if name in EXCITATIONS), None)
+    if taken is not None:
+        raise InputError(f"`input`: {taken} is a standard excitation; give the file another name.")
+    return {
+        "input": {
+            name: read_input(folder / file, dt).tolist() if isinstance(file, str) else file
+            for name, file in files.items()
+        }
+    }
 
 
 def _in_words(message: str) -> str:

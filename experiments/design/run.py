@@ -1,0 +1,122 @@
+"""What does a designed input gain, and do estimates reach the bounds that the design promises?
+
+For each model and each choice of channels: an input of 5 s is designed within the envelope of the standard multisine,
+for all vehicles of the default bracket and for the airframe's vehicle alone. Its bounds are compared with those of the
+standard inputs. Then IBSS identifies simulated flights of the designed input. The initial state is known.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import typer
+from rich.console import Console
+
+import jaxos4
+from jaxos4.design import Envelope, InputDesign, design_and_compare
+from jaxos4.design.fitting import VEHICLES, drawn, fly_finely
+from jaxos4.models import MODELS
+from jaxos4.report.design_page import geometric_mean
+from jaxos4.report.experiment import brackets_around, count_results, identify, in_words, measure, table_of
+
+jax.config.update("jax_enable_x64", True)
+
+DT = 0.01
+# Widths of the bracket, in multiples of the default: that of all vehicles, and almost none.
+WIDTHS = {"default": 1.0, "airframe": 1e-3}
+# In the default bracket of this model some vehicles turn over in the standard multisine.
+ONLY_AIRFRAME = ("corrected",)
+
+
+def designed(model: jaxos4.AbstractModel, channels: str, width: float, duration: float, seed: int) -> InputDesign:
+    """The input, and the standard inputs in the same envelope."""
+    return design_and_compare(
+        model,
+        limits={},
+        bracket=jaxos4.Bracket.around(model.alpha, width * np.asarray(model.half_width)),
+        duration=duration,
+        dt=DT,
+        channels=channels,
+        start_is_known=True,
+        criterion="D",
+        bandwidth=4.0,
+        seed=seed,
+    )
+
+
+def excess(model: jaxos4.AbstractModel, found: InputDesign, width: float, seed: int) -> float:
+    """The largest share of a limit that other vehicles from the bracket use, at a tenth of the step."""
+    bracket = jaxos4.Bracket.around(model.alpha, width * np.asarray(model.half_width))
+    others = drawn(bracket, jax.random.key(seed + 1000), VEHICLES)
+    states = fly_finely(model, others, jnp.asarray(found.designed.omega), jnp.asarray(DT))
+    needed, limits = Envelope.of(found.designed.omega, states, DT), found.envelope
+    shares = [np.max(np.asarray(getattr(needed, name)) / getattr(limits, name)) for name in Envelope.__annotations__]
+    shares[0] = 1 / shares[0]  # the slowest rotor
+    return float(max(shares))
+
+
+def efficiency(model: jaxos4.AbstractModel, found: InputDesign, channels: str, flights: int, seed: int) -> dict:
+    """RMSE / bound of each parameter over simulated flights, by IBSS."""
+    exact = jaxos4.simulate(model, model.alpha, jnp.asarray(found.designed.omega), dt=DT)
+    keys = jax.random.split(jax.random.key(seed), (2, flights))
+    problem = jaxos4.ShootingProblem(
+        model, exact, channels=channels, sigma=jaxos4.SENSOR_SIGMA, initial_state=exact.states[0]
+    )
+    states = measure(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), exact, keys[0])
+    estimates = identify(jaxos4.IBSS(), problem, brackets_around(model, keys[1]), states)
+    errors = np.asarray(estimates.parameters) - np.asarray(model.alpha)
+    rmse = np.sqrt(np.square(errors).mean(axis=0))
+    results = count_results(jaxos4.result_names(estimates.result))
+    return {"efficiency": (rmse / found.designed.bounds[-1]).tolist(), "results": results, "flights": flights}
+
+
+def main(
+    models: Annotated[list[str], typer.Option(help="Names of the models.")] = ("published", "corrected"),
+    channels: Annotated[list[str], typer.Option(help="Choices of channels.")] = ("all", "rates"),
+    widths: Annotated[list[str], typer.Option(help="Names of the brackets.")] = tuple(WIDTHS),
+    flights: Annotated[int, typer.Option(help="Number of flights of each designed input.")] = 256,
+    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 5.0,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results.")] = None,
+) -> None:
+    """Measure what designed inputs gain."""
+    cases = []
+    for name in models:
+        model = MODELS[name](jaxos4.OS4)
+        for some in channels:
+            for vehicles in (one for one in widths if name not in ONLY_AIRFRAME or one == "airframe"):
+                found = designed(model, some, WIDTHS[vehicles], duration, seed)
+                own = geometric_mean(found.designed.bounds[-1])
+                cases.append(
+                    {
+                        "model": name,
+                        "channels": some,
+                        "vehicles": vehicles,
+                        "ratios": {key: own / geometric_mean(one.bounds[-1]) for key, one in found.standard.items()},
+                        "bounds": found.designed.bounds[-1].tolist(),
+                        "uses": found.designed.uses,
+                        "others": excess(model, found, WIDTHS[vehicles], seed),
+                        **efficiency(model, found, some, flights, seed),
+                    }
+                )
+                if out is not None:
+                    report = {"seed": seed, "duration": duration, "version": jaxos4.__version__, "cases": cases}
+                    out.write_text(json.dumps(report, indent=2) + "\n")
+    headings = ("model", "channels", "vehicles", "/ multisine", "/ doublet", "largest use", "RMSE / bound", "results")
+    table = table_of(f"geometric mean of the bounds, of {duration:g} s", headings)
+    for case in cases:
+        table.add_row(
+            *(case["model"], case["channels"], case["vehicles"]),
+            *(f"{case['ratios'][name]:.3g}" if name in case["ratios"] else "-" for name in ("multisine", "doublet")),
+            f"{case['others']:.3f}",
+            f"{min(case['efficiency']):.2f} to {max(case['efficiency']):.2f}",
+            in_words(case["results"]),
+        )
+    Console(width=140).print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,109 @@
+"""What a vehicle may do: limits of rotor speeds, angles, rates, velocity and distance."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from .._custom_types import Numeric, RotorSpeeds, Scalar, as_float
+from ..flight import STATE_NAMES
+
+ANGLES, RATES, POSITION, VELOCITY = (
+    np.array([STATE_NAMES.index(name) for name in names])
+    for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
+)
+# Shares of the limits by the name of the limit, for each sample.
+Uses = dict[str, Float[Array, "..."]]
+
+
+def _limit(name: str, *, axes: bool = False) -> Callable:
+    """A field's converter: one positive number, or one for each of three `axes`."""
+    shape = (3,) if axes else ()
+
+    def convert(value) -> Array:
+        array = as_float(np.asarray(value, dtype=float) if isinstance(value, list | tuple) else value)
+        if array.shape not in ((), shape):
+            raise ValueError(f"`{name}` must be one number{' or three' * axes}, got shape {array.shape}.")
+        if not isinstance(array, Tracer) and not np.all((np.asarray(array) > 0) & np.isfinite(array)):
+            raise ValueError(f"`{name}` must be positive and finite, got {np.asarray(array).tolist()}.")
+        return jnp.broadcast_to(array, shape)
+
+    return convert
+
+
+class Envelope(eqx.Module):
+    """The limits of a flight. Each holds at all times, so they bound what an input may do.
+
+    - `slowest`, `fastest`: rotor speed [rad/s].
+    - `slew`: the change of a rotor's speed from sample to sample, divided by the sample time [rad/s^2].
+    - `angle`: of phi, theta and psi, to either side [rad]; one number or three.
+    - `rate`: of p, q and r, to either side [rad/s]; one number or three.
+    - `velocity`: the speed of flight [m/s].
+    - `distance`: from the start [m].
+
+    **Raises:** `ValueError` for a limit that is not positive and finite, or `slowest` not below `fastest`.
+    """
+
+    slowest: Scalar = eqx.field(converter=_limit("slowest"))
+    fastest: Scalar = eqx.field(converter=_limit("fastest"))
+    slew: Scalar = eqx.field(converter=_limit("slew"))
+    angle: Float[Array, "3"] = eqx.field(converter=_limit("angle", axes=True))
+    rate: Float[Array, "3"] = eqx.field(converter=_limit("rate", axes=True))
+    velocity: Scalar = eqx.field(converter=_limit("velocity"))
+    distance: Scalar = eqx.field(converter=_limit("distance"))
+
+    def __check_init__(self):
+        ends = self.slowest, self.fastest
+        if not any(isinstance(end, Tracer) for end in ends) and not float(ends[0]) < float(ends[1]):
+            raise ValueError(f"`slowest` must be below `fastest`, got {float(ends[0]):g} and {float(ends[1]):g} rad/s.")
+
+    @classmethod
+    def of(
+        cls, omega: Float[Numeric, "samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
+    ) -> "Envelope":
+        """The limits that flights with these rotor speeds just keep.
+
+        `dt` is the sample time of the rotor speeds. The states may be sampled more often.
+        """
+        held, states = np.asarray(omega)[:-1], np.asarray(states)  # the last row drives nothing
+        return cls(
+            slowest=held.min(),
+            fastest=held.max(),
+            slew=np.abs(np.diff(held, axis=0)).max() / dt,
+            angle=np.abs(states[..., ANGLES]).reshape(-1, 3).max(axis=0),
+            rate=np.abs(states[..., RATES]).reshape(-1, 3).max(axis=0),
+            velocity=np.linalg.norm(states[..., VELOCITY], axis=-1).max(),
+            distance=np.linalg.norm((states - states[..., :1, :])[..., POSITION], axis=-1).max(),
+        )
+
+    def uses_of_rotors(self, omega: RotorSpeeds, dt: Scalar) -> Uses:
+        """Which share of each limit of the rotors is used at each sample: 1 is the limit."""
+        held = omega[:-1]
+        return {
+            "slowest": self.slowest / held,
+            "fastest": held / self.fastest,
+            "slew": jnp.diff(held, axis=0) / (self.slew * dt),
+        }
+
+    def uses_of_states(self, states: Float[Array, "times 12"]) -> Uses:
+        """Which share of each limit of the states is used at each time, with one column for each axis."""
+        return {
+            "angle": states[:, ANGLES] / self.angle,
+            "rate": states[:, RATES] / self.rate,
+            "velocity": _norm(states[:, VELOCITY]) / self.velocity,
+            "distance": _norm(states[:, POSITION] - states[0, POSITION]) / self.distance,
+        }
+
+
+def largest(uses: Uses) -> dict[str, Float[Array, " columns"]]:
+    """The largest share of each limit, for each column; infinite for a flight that failed."""
+    return jax.tree.map(lambda share: jnp.where(jnp.isnan(share), jnp.inf, jnp.abs(share)).max(axis=0), uses)
+
+
+def _norm(vectors: Float[Numeric, "times 3"]) -> Float[Array, "times 1"]:
+    """The length of each vector, with a derivative at 0."""
+    return jnp.sqrt(jnp.square(vectors).sum(axis=-1, keepdims=True) + 1e-12)
