@@ -19,7 +19,6 @@ import jaxos4
 from jaxos4.design import Envelope, InputDesign, design_and_compare
 from jaxos4.design.fitting import VEHICLES, drawn, fly_finely
 from jaxos4.models import MODELS
-from jaxos4.report.design_page import geometric_mean
 from jaxos4.report.experiment import brackets_around, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
@@ -89,13 +88,12 @@ def main(
         for some in channels:
             for vehicles in (one for one in widths if name not in ONLY_AIRFRAME or one == "airframe"):
                 found = designed(model, some, WIDTHS[vehicles], duration, seed)
-                own = geometric_mean(found.designed.bounds[-1])
                 cases.append(
                     {
                         "model": name,
                         "channels": some,
                         "vehicles": vehicles,
-                        "ratios": {key: own / geometric_mean(one.bounds[-1]) for key, one in found.standard.items()},
+                        "gains": {key: found.gain(key) for key in found.standard},
                         "bounds": found.designed.bounds[-1].tolist(),
                         "uses": found.designed.uses,
                         "others": excess(model, found, WIDTHS[vehicles], seed),
@@ -110,7 +108,7 @@ def main(
     for case in cases:
         table.add_row(
             *(case["model"], case["channels"], case["vehicles"]),
-            *(f"{case['ratios'][name]:.3g}" if name in case["ratios"] else "-" for name in ("multisine", "doublet")),
+            *("{:.3g} ({})".format(*case["gains"][name]) for name in ("multisine", "doublet")),
             f"{case['others']:.3f}",
             f"{min(case['efficiency']):.2f} to {max(case['efficiency']):.2f}",
             in_words(case["results"]),

@@ -14,8 +14,8 @@ _PHRASES = {
     "`end`": "--to",
 }
 _OPTIONS = (
-    "bandwidth|bracket|channels|criterion|dt|duration|estimator|holdout|initial_state|loss|network|sample_time|samples|"
-    "seed|terms|validate|window"
+    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|holdout|initial_state|loss|"
+    "network|rate|sample_time|samples|seed|slew|slowest|terms|validate|velocity|window"
 )
 
 

@@ -1,5 +1,6 @@
 """A designed input beside the standard inputs, in the same envelope and time."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ class InputDesign(NamedTuple):
 
     - `standard`: the standard inputs with the largest amplitude that the envelope allows, by name. One that does not
       fit into the time is missing.
-    - `names`, `units`, `half_width`: of the parameters and their bracket.
+    - `names`, `units`, `half_width`: of the parameters and their bracket. `usual`: the half-width of the model's default.
     - `vehicles`: the number of vehicles that stayed within the envelope.
     """
 
@@ -32,7 +33,19 @@ class InputDesign(NamedTuple):
     names: tuple[str, ...]
     units: tuple[str, ...]
     half_width: Float[np.ndarray, " parameters"]
+    usual: Float[np.ndarray, " parameters"]
     vehicles: int
+
+    def gain(self, name: str) -> tuple[float, int]:
+        """The designed bounds over those of a standard input.
+
+        **Returns:** the geometric mean over the parameters that the standard input tells anything about, NaN without
+        any; and their number.
+        """
+        own, other = self.designed.bounds[-1], self.standard[name].bounds[-1]
+        excited = other < self.usual
+        mean = float(np.exp(np.log(own / other)[excited].mean())) if excited.any() else math.nan
+        return mean, int(excited.sum())
 
 
 def design_and_compare(
@@ -80,5 +93,13 @@ def design_and_compare(
         except ValueError:  # too short
             continue
         standard[name] = fitted(plan, omega)
-    half_width = np.asarray(bracket.half_width)
-    return InputDesign(envelope, designed, standard, model.parameter_names, model.parameter_units, half_width, VEHICLES)
+    return InputDesign(
+        envelope=envelope,
+        designed=designed,
+        standard=standard,
+        names=model.parameter_names,
+        units=model.parameter_units,
+        half_width=np.asarray(bracket.half_width),
+        usual=np.asarray(model.half_width),
+        vehicles=VEHICLES,
+    )

@@ -154,7 +154,9 @@ def plan_of(
 
 def _check(model: AbstractModel, duration: float, dt: float, channels: str, criterion: str, bandwidth: float) -> None:
     if model.forcing_parameters or model.force_axes:
-        raise InputError("`model` must be an OS4 model: design references for a real vehicle (`design_references`).")
+        raise InputError(
+            "`model` must be an OS4 model: a real vehicle needs its controller, and a design of references."
+        )
     if not 1 / duration <= bandwidth <= 0.25 / dt:
         raise InputError(
             f"`bandwidth` must lie between 1 / `duration` and a quarter of the sample rate, {1 / duration:.3g} to "

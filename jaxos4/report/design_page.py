@@ -23,22 +23,22 @@ def print_design(console: Console, found: InputDesign, accuracy: float) -> None:
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
     columns = [found.designed.bounds[-1], *(one.bounds[-1] for one in found.standard.values())]
     for i, (name, unit) in enumerate(zip(found.names, found.units, strict=True)):
-        half_width = found.half_width[i]
-        cells = (plain(column[i], 2) if column[i] < half_width else "-" for column in columns)
+        cells = (plain(column[i], 2) if column[i] < found.usual[i] else "-" for column in columns)
         table.add_row(name, unit, *cells)
     console.print(table, markup=False)
-    console.print("the smallest possible standard deviation; -: no better than the bracket, not excited.")
-    own = geometric_mean(found.designed.bounds[-1])
-    gains = (f"{plain(own / geometric_mean(one.bounds[-1]), 2)} x {name}" for name, one in found.standard.items())
-    console.print(f"geometric mean of the bounds: {', '.join(gains)}; all in the same envelope and time.")
+    console.print("the smallest possible standard deviation; -: no better than the default bracket, not excited.")
+    gains = "; ".join(_gain(found, name) for name in found.standard)
+    console.print(f"geometric mean of the bounds that both have: {gains}; in the same envelope and time.")
     uses = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.designed.uses.items())
     console.print(f"largest share of each limit, of {found.vehicles} vehicles from the bracket: {uses}.")
     console.print(_duration(found, accuracy))
 
 
-def geometric_mean(bounds: np.ndarray) -> float:
-    """Of the bounds of all parameters."""
-    return float(np.exp(np.log(bounds).mean()))
+def _gain(found: InputDesign, name: str) -> str:
+    ratio, excited = found.gain(name)
+    if not excited:
+        return f"{name} excites nothing"
+    return f"{plain(ratio, 2)} x {name}{'' if excited == len(found.names) else f' ({excited} of {len(found.names)})'}"
 
 
 def _duration(found: InputDesign, accuracy: float) -> str:
