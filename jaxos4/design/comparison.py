@@ -23,7 +23,8 @@ class InputDesign(NamedTuple):
 
     - `standard`: the standard inputs with the largest amplitude that the envelope allows, by name. One that does not
       fit into the time is missing.
-    - `names`, `units`, `half_width`: of the parameters and their bracket. `usual`: the half-width of the model's default.
+    - `names`, `units`, `half_width`: of the parameters and their bracket.
+    - `usual`: the half-width of the model's default bracket.
     - `vehicles`: the number of vehicles that stayed within the envelope.
     """
 
