@@ -116,15 +116,19 @@ def test_inertias_that_filter_error_contradicts_are_named():
     (doubt,) = answered_gusts(shot, allowed)
     assert doubt.result == "implausible"
     assert all(word in str(doubt) for word in ("Ix", "gusts", "filter-error"))
+    assert "Iy" not in str(doubt)
     assert not list(answered_gusts(shot, shot))
     assert not list(answered_gusts(shot, {}))
 
 
 def test_a_gyro_that_vibrates_is_named():
     quiet, loud = (Disturbance(5.0, "rad/s^2", 0.25, 0.02, correlation) for correlation in (0.1, -0.6))
-    assert not list(vibration({"p": quiet, "q": quiet, "r": quiet, "az": loud}))
-    (doubt,) = vibration({"p": quiet, "q": loud, "r": quiet})
-    assert all(word in str(doubt) for word in ("q", "-0.6", "sample_time"))
+    assert not list(vibration({"p": quiet, "q": quiet, "r": quiet, "az": loud}, 0.004))
+    (doubt,) = vibration({"p": quiet, "q": loud, "r": quiet}, 0.004)
+    assert all(word in str(doubt) for word in ("noise of q", "-0.6", "`sample_time` 0.008", "log faster"))
+    # Longer samples would hide the motion too.
+    (doubt,) = vibration({"q": loud}, 0.008)
+    assert "sample_time" not in str(doubt)
 
 
 @pytest.mark.parametrize(("rates", "axes"), [({"p": 0.0}, "roll"), ({"q": -1.0, "r": -0.1}, "pitch and yaw")])

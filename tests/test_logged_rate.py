@@ -10,13 +10,16 @@ from jaxos4.recording import read_recording
 ROWS = 1000
 
 
-def log(tmp_path, held):
-    """250 rows a second, with commands that are held for so many rows."""
+def log(tmp_path, held, *, stagger=0, lost=0.0):
+    """250 rows a second, with commands that are held for so many rows: each motor `stagger` rows after the last."""
     rng = np.random.default_rng(0)
-    commands = np.repeat(rng.uniform(0.4, 0.6, (-(-ROWS // held), 4)), held, axis=0)[:ROWS]
+    commands = np.repeat(rng.uniform(0.4, 0.6, (ROWS // held + 9, 4)), held, axis=0)
+    commands = np.stack([commands[stagger * i :, i][:ROWS] for i in range(4)], axis=1)
+    commands[1:][rng.uniform(size=ROWS - 1) < lost] = np.nan
     table = np.column_stack([0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3))])
     path = tmp_path / "log.csv"
     np.savetxt(path, table, delimiter=",", header="t,command1,command2,command3,command4,p,q,r", comments="")
+    path.write_text(path.read_text().replace("nan", ""))
     return read_recording(path, full_scale=1.0)
 
 
@@ -28,6 +31,11 @@ def test_values_that_repeat_were_not_logged(tmp_path, held, rate):
     assert bool(facts.too_slow) == (rate < 40)
     if facts.too_slow:
         assert "the motors were logged at 10 Hz (the values of command1 change so often)" in facts.too_slow
+
+
+@pytest.mark.parametrize("kind", [{"stagger": 6}, {"lost": 0.2}])
+def test_motors_that_are_held_one_after_the_other_or_with_empty_cells(tmp_path, kind):
+    assert log(tmp_path, 25, **kind).facts.motors.rate == pytest.approx(10.0, rel=0.05)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -22,8 +22,9 @@ _COUPLING = 0.25
 _CONSISTENT = 1e-3
 # A time constant or delay this far below 0 is not chance and not rounding [s].
 _EARLY = 0.002
-# Innovations that correlate more than this bias filter error more than its intervals say.
-_COLOURED = 0.4
+# Innovations that correlate more than this bias filter error more than its intervals say. Samples longer than the second
+# figure [s] would hide the motion with the vibration.
+_VIBRATION, _LONGEST_SAMPLE = 0.4, 0.008
 _HORIZON = 0.25  # [s]
 # Value and standard deviation of each parameter that has an estimate.
 Found = dict[str, tuple[float, float]]
@@ -93,22 +94,32 @@ def answered_gusts(constants: dict[str, Constant], allowed: dict[str, Constant])
 
     `allowed`: those of filter error, which allows for gusts.
     """
-    for name in sorted(constants.keys() & allowed.keys()):
-        one, other = constants[name], allowed[name]
-        if abs(one.estimate - other.estimate) > _SURE * np.hypot(one.std, other.std):
-            yield _implausible(
-                f"{name} = {one.estimate:.3g} kg m^2, but {other.estimate:.3g} if the controller answered gusts",
-                "use `estimator` filter-error, which allows for gusts",
-            )
+    pairs = {name: (constants[name], allowed[name]) for name in sorted(constants.keys() & allowed.keys())}
+    apart = {
+        name: f"{name} {other.estimate:.3g} instead of {one.estimate:.3g} kg m^2"
+        for name, (one, other) in pairs.items()
+        if abs(one.estimate - other.estimate) > _SURE * np.hypot(one.std, other.std)
+    }
+    if apart:
+        yield _implausible(
+            f"filter error, which allows for a controller that answers gusts, finds {', '.join(apart.values())}",
+            "use `estimator` filter-error",
+        )
 
 
-def vibration(disturbances: dict[str, Disturbance]) -> Iterator[Doubt]:
-    """A gyro whose noise is not white, usually by vibration: the controller answers it, and filter error is biased."""
+def vibration(disturbances: dict[str, Disturbance], sample_time: float) -> Iterator[Doubt]:
+    """A gyro whose noise is not white, usually by vibration: the controller answers it, and filter error is biased.
+
+    `sample_time`: of the fitted data [s].
+    """
+    longer = f"average to longer samples by `sample_time` {2 * sample_time:g}, or " * (
+        2 * sample_time <= _LONGEST_SAMPLE
+    )
     for name, row in disturbances.items():
-        if name in _PLACES and abs(row.correlation) > _COLOURED:
+        if name in _PLACES and abs(row.correlation) > _VIBRATION:
             yield _implausible(
                 f"the noise of {name} is not white (innovations correlate by {row.correlation:.2g}): the gyro vibrates",
-                "average to longer samples by `sample_time`, for example 0.008 s, or log faster",
+                f"{longer}damp the vibration, or log faster",
             )
 
 

@@ -27,7 +27,7 @@ from .network import vehicle_network_for
 from .parameters import parameter_table
 from .problem import Intervals, bracket_of
 from .provenance import airframe_name, name_and_class, shooting_names, versions
-from .results import HeldParameter, RigidBody, VehicleIdentification, finite_or_none
+from .results import Doubt, HeldParameter, RigidBody, VehicleIdentification, finite_or_none
 from .vehicle import Search, VehicleFit, fit_vehicle, free_bracket
 
 # The first guess of the noise levels [rad/s]: errors of the model rather than of the sensor.
@@ -100,11 +100,10 @@ def identify_vehicle(
     body = vehicle_constants(free.parameter_names, estimate, where, airframe) if fit.answered else RigidBody()
     doubts = doubts_of(table, body.constants, skill, airframe) if fit.answered else ()
     if by_filter:
-        doubts += tuple(vibration(filtered.disturbances))
-    elif fit.answered and filtered.fit.answered:
-        other = filtered.fit
-        allowed = vehicle_constants(other.problem.model.parameter_names, other.estimate, where, airframe)
-        doubts += tuple(answered_gusts(body.constants, allowed.constants))
+        doubts += tuple(vibration(filtered.disturbances, float(prepared.fitted.dt)))
+    else:
+        contradictions, not_compared = _compared(body, filtered.fit, where, airframe)
+        doubts, notes = doubts + contradictions, notes + not_compared
     result = str(result_names(estimate.result))
     return VehicleIdentification(
         estimator=name,
@@ -129,6 +128,18 @@ def identify_vehicle(
         estimate=estimate,
         problem=fit.problem,
     )
+
+
+def _compared(
+    body: RigidBody, other: VehicleFit, bracket: Bracket, airframe: Airframe
+) -> tuple[tuple[Doubt, ...], tuple[str, ...]]:
+    """What the fit `other` by filter error says against moments of inertia, and a note on those it does not know."""
+    allowed = RigidBody()
+    if other.answered:
+        allowed = vehicle_constants(other.problem.model.parameter_names, other.estimate, bracket, airframe)
+    unknown = [name for name in body.constants if name not in allowed.constants]
+    notes = (f"not compared with filter error, which does not know them: {', '.join(unknown)}",) if unknown else ()
+    return tuple(answered_gusts(body.constants, allowed.constants)), notes
 
 
 def _provenance(

@@ -73,13 +73,15 @@ def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
     Rows that repeat the values of the row before were not logged: programs that join topics fill them in.
     """
     t, found = table.columns["t"], []
-    columns = {name: table.columns[name] for name in names if np.isfinite(table.columns.get(name, np.nan)).any()}
-    for name, values in columns.items():
-        found.append(Sampling(table.names.get(name, name), logged_rate(t[np.isfinite(values)])))
-    if columns:
-        changes = np.any([np.diff(values) != 0 for values in columns.values()], axis=0)
-        if held_regularly(t[1:][changes]):
-            found.append(Sampling(f"the values of {found[0].source} change so often", logged_rate(t[1:][changes])))
+    for name in names:
+        logged = np.isfinite(table.columns.get(name, np.full(t.size, np.nan)))
+        if not logged.any():
+            continue
+        source, at = table.names.get(name, name), t[logged]
+        found.append(Sampling(source, logged_rate(at)))
+        changes = at[1:][np.diff(table.columns[name][logged]) != 0]
+        if held_regularly(changes):
+            found.append(Sampling(f"the values of {source} change so often", logged_rate(changes)))
     return min(found, key=lambda each: each.rate, default=None)
 
 

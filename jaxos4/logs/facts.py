@@ -15,7 +15,7 @@ large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 
 _JITTER = 0.95  # a log at a nominal rate may be this much slower
 _PAUSE = 1.0  # [s]; a longer time between samples is a pause of the log, and not its rate
-_FEWEST_CHANGES, _REGULAR = 20, 0.3  # so many steps, of which most are equal up to this share, are a rate
+_FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up to this share, are a rate
 _FASTER = "log motors and gyro at 100 Hz or more, and fly again"
 
 
