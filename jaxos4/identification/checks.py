@@ -22,8 +22,8 @@ _COUPLING = 0.25
 _CONSISTENT = 1e-3
 # A time constant or delay this far below 0 is not chance and not rounding [s].
 _EARLY = 0.002
-# Innovations that correlate more than this bias filter error more than its intervals say. Samples longer than the second
-# figure [s] would hide the motion with the vibration.
+# Innovations that correlate more than this bias filter error more than its intervals say. Longer samples [s] than the
+# second figure would hide the motion with the vibration.
 _VIBRATION, _LONGEST_SAMPLE = 0.4, 0.008
 _HORIZON = 0.25  # [s]
 # Value and standard deviation of each parameter that has an estimate.
