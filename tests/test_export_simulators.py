@@ -182,19 +182,28 @@ def test_the_drag_of_rotorpy_is_right_at_the_hover_speed(multirotor, tmp_path):
     assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
 
 
-def test_the_rotors_lag_and_are_late(mujoco, multirotor, tmp_path):
-    found = read(tmp_path, vehicle_result())
+@pytest.mark.parametrize(
+    ("step", "delay", "error"),
+    # Whole time steps are exact. Between them, the command rises during one time step.
+    [(0.002, 0.01, 1e-12), (0.0005, 0.01, 1e-12), (0.0002, 0.01, 1e-12), (0.002, 0.0102, 1e-5)],
+)
+def test_the_rotors_of_mujoco_lag_and_are_late(mujoco, tmp_path, step, delay, error):
+    """Also in a scene with another time step, and with a delay of 5.1 time steps."""
+    found = read(tmp_path, vehicle_result(VALUES | {"rotor_delay": delay}))
     model = mujoco.MjModel.from_xml_string(jaxos4.export.export_vehicle(found, "mujoco").text)
+    model.opt.timestep = step
     data = mujoco.MjData(model)
     data.ctrl[:4] = 0.1
     thrust = []
-    for _ in range(100):
+    for _ in range(round(0.2 / step)):
         mujoco.mj_step(model, data)
         thrust.append(data.act[0])
-    time = 0.002 * np.arange(1, 101)
-    late = np.maximum(time - VALUES["rotor_delay"], 0.0)
-    # A delay of five time steps: exact.
-    np.testing.assert_allclose(thrust, 0.1 * -np.expm1(-late / VALUES["rotor_lag"]), atol=1e-12)
+    late = np.maximum(step * np.arange(1, len(thrust) + 1) - delay, 0.0)
+    np.testing.assert_allclose(thrust, 0.1 * -np.expm1(-late / VALUES["rotor_lag"]), atol=error)
+
+
+def test_the_rotors_of_rotorpy_lag(multirotor, tmp_path):
+    found = read(tmp_path, vehicle_result())
     defined = {}
     exec(jaxos4.export.export_vehicle(found, "rotorpy").text, defined)  # noqa: S102
     vehicle = multirotor(defined["quad_params"])

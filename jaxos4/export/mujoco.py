@@ -10,6 +10,8 @@ from .vehicle import AXES, RigidVehicle
 from .xml_text import add, document, numbers
 
 _TIMESTEP = 0.002  # [s]
+# The delayed controls of the past are enough for a scene with time steps down to this [s].
+_SHORTEST_TIMESTEP = 0.0002
 # Height of the keyframe "hover" [m], and the sizes of the drawn parts in arms.
 _HEIGHT, _ARM, _ROTOR, _FLAT = 1.0, 0.05, 0.5, 0.02
 _DIRECTIONS = ("1 0 0 0 0 0", "0 1 0 0 0 0", "0 0 0 1 0 0", "0 0 0 0 1 0", "0 0 0 0 0 1")
@@ -23,7 +25,10 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
     if vehicle.lag:
         lines.append("rotor_lag: acts on the thrust and not on the rotor speed; the same for small changes")
     if vehicle.delay:
-        lines.append("rotor_delay: needs MuJoCo 3.5 or newer; older versions refuse `delay` and `nsample`: remove them")
+        lines.append(
+            f"rotor_delay: right for time steps of {_SHORTEST_TIMESTEP:g} s or longer; it needs MuJoCo 3.5 or newer: "
+            "older versions refuse `delay`, `nsample` and `interp`: remove them"
+        )
     return tuple(lines)
 
 
@@ -62,7 +67,9 @@ def _add_rotors(actuators: ElementTree.Element, vehicle: RigidVehicle) -> None:
     if vehicle.lag:
         dynamics |= {"dyntype": "filterexact", "dynprm": numbers(vehicle.lag)}
     if vehicle.delay:
-        dynamics |= {"delay": numbers(vehicle.delay), "nsample": str(math.ceil(vehicle.delay / _TIMESTEP) + 1)}
+        samples = math.ceil(vehicle.delay / _SHORTEST_TIMESTEP) + 1
+        # Without interpolation, MuJoCo rounds the delay up to whole time steps.
+        dynamics |= {"delay": numbers(vehicle.delay), "nsample": str(samples), "interp": "linear"}
     most = vehicle.thrust_coefficient * vehicle.max_rotor_speed**2
     ratio = vehicle.drag_coefficient / vehicle.thrust_coefficient
     for number, spin in enumerate(vehicle.rotor_spins, start=1):
