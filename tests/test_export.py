@@ -251,6 +251,8 @@ def test_results_that_cannot_be_exported_are_refused(run, tmp_path, write, resul
         (("--seed", "-1"), ("--seed", "-1")),
         (("--out", "found.json"), ("would overwrite an input",)),
         (("--out", "nowhere/vehicle.xml"), ("nowhere/vehicle.xml", "no such folder")),
+        (("--out", ".", "--samples", "2"), (".: is a folder",)),
+        (("--out", "/", "--samples", "2"), ("/: is a folder",)),
         (("--out", "taken.xml", "--samples", "2"), ("taken-samples: exists", "remove it")),
     ],
 )

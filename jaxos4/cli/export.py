@@ -30,11 +30,12 @@ def export(
         raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
     if samples and out is None:
         raise InputError("--samples: are written into a folder beside --out; give that too.")
-    folder = out.with_name(f"{out.stem}-samples") if out is not None and samples else None
+    folder = None
     if out is not None:
         check_output(out, result)
-    if folder is not None:
-        check_new_folder(folder)
+        if samples:
+            folder = out.with_name(f"{out.stem}-samples")
+            check_new_folder(folder)
     with stages("loading the library") as progress, option_names():
         from ..export import TARGETS, export_vehicle, read_result
 
