@@ -183,6 +183,14 @@ def test_a_sample_depends_on_its_number_and_on_the_seed_alone(write):
     assert export_vehicle(found, "mujoco", samples=2, seed=6).samples[0] != few.samples[0]
 
 
+def test_the_notes_of_a_sample_have_its_own_numbers(write):
+    found = read_result(write(vehicle_result()))
+    written = export_vehicle(found, "rotorpy", samples=1)
+    late = f"give commands {found.draw(0, seed=0)[0].delay:.4g} s late"
+    assert late in written.samples[0]
+    assert late not in written.text
+
+
 def test_impossible_draws_are_repeated_and_counted(write):
     result = vehicle_result()
     place = list(VALUES).index("yaw_damping")
@@ -202,11 +210,17 @@ def test_impossible_draws_are_repeated_and_counted(write):
 
 
 def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tmp_path, write):
-    write(vehicle_result(result="no_skill"))
+    doubt = {"result": "no_skill", "cause": "yaw is not predicted", "remedy": "fly more yaw"}
+    write(vehicle_result(result="no_skill", doubts=[doubt]))
     code, out, err = run("export", "found.json", "--to", "rotorpy", "--out", "vehicle.py")
     assert (code, out) == (1, "vehicle.py: parameters for RotorPy\n")
+    assert err.splitlines()[0] == "not to be trusted because yaw is not predicted; fly more yaw"
     assert err.splitlines()[-1].startswith("jaxos4: no_skill: the fit predicts")
-    assert "# Note: NOT TO BE TRUSTED: no_skill: " in (tmp_path / "vehicle.py").read_text(encoding="utf-8")
+    # Each sentence once.
+    assert err.count("not to be trusted") == err.count("the fit predicts") == 1
+    text = (tmp_path / "vehicle.py").read_text(encoding="utf-8")
+    assert "# NOT TO BE TRUSTED: no_skill: " in text
+    assert f"\n# {err.splitlines()[0]}\n" in text
     assert runpy.run_path(str(tmp_path / "vehicle.py"))["quad_params"]["mass"] == 0.027
 
 

@@ -53,6 +53,8 @@ def export(
     else:
         write_text(written.text, out)
         typer.echo(f"{out}: {target.label}")
+    for doubt in found.doubts:
+        typer.echo(doubt, err=True)
     for note in written.notes:
         typer.echo(f"note: {note}", err=True)
     if not found.successful:

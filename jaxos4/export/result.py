@@ -49,6 +49,11 @@ class _Held(msgspec.Struct):
     value: float
 
 
+class _Doubt(msgspec.Struct):
+    cause: str
+    remedy: str
+
+
 class _File(msgspec.Struct):
     """The parts of a result file that an export needs."""
 
@@ -61,6 +66,7 @@ class _File(msgspec.Struct):
     airframe: dict[str, Any] | None | msgspec.UnsetType = msgspec.UNSET
     covariance: list[list[float]] | None | msgspec.UnsetType = msgspec.UNSET
     held: dict[str, _Held] = {}
+    doubts: list[_Doubt] = []
 
 
 class Identified(NamedTuple):
@@ -71,6 +77,7 @@ class Identified(NamedTuple):
     - `airframe`: the constants that were not estimated.
     - `values`: of all parameters by name, estimated or held.
     - `drawn`, `covariance`: the names of the parameters that are uncertain, and their covariance.
+    - `doubts`: why the estimate cannot be trusted, and what to do; one line each. Empty if the result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.
     """
 
@@ -80,6 +87,7 @@ class Identified(NamedTuple):
     values: dict[str, float]
     drawn: tuple[str, ...]
     covariance: Float[np.ndarray, "drawn drawn"]
+    doubts: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
@@ -175,6 +183,7 @@ def _identified(name: str, file: _File) -> Identified:
         values=values,
         drawn=tuple(drawn[place] for place in kept),
         covariance=covariance[np.ix_(kept, kept)],
+        doubts=tuple(f"not to be trusted because {doubt.cause}; {doubt.remedy}" for doubt in file.doubts),
         notes=tuple(notes),
     )
     if found.vehicle.impossible:

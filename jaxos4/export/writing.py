@@ -17,7 +17,8 @@ class Exported(NamedTuple):
     - `text`: the estimated vehicle.
     - `samples`: vehicles drawn from the uncertainty of the estimate.
     - `impossible`: how many draws were impossible, and were repeated.
-    - `notes`: what the simulator cannot have, or has differently; one line each. They stand in each file too.
+    - `notes`: what the simulator cannot have, or has differently; one line each. They stand in the file too, and each
+      sample has its own.
     """
 
     text: str
@@ -44,11 +45,11 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
     if to not in TARGETS:
         raise InputError(f"`to`: must be one of {', '.join(TARGETS)}, got {to!r}.")
     target = TARGETS[to]
-    notes = (*_warning(found), *found.notes, *target.limits(found.vehicle))
 
     def text(vehicle: RigidVehicle, *lines: str) -> str:
         made = f"Made by jaxos4 {__version__} from {found.source}."
-        comments = (made, *lines, _FRAME, *(f"Note: {note}" for note in notes))
+        notes = (f"Note: {note}" for note in (*found.notes, *target.limits(vehicle)))
+        comments = (made, *lines, *_warning(found), _FRAME, *notes)
         # A file's name can have line breaks.
         return target.text(vehicle, [" ".join(line.split()) for line in comments])
 
@@ -57,9 +58,9 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
         text=text(found.vehicle),
         samples=tuple(text(vehicle, f"Sample {i}, seed {seed}.") for i, (vehicle, _) in enumerate(draws, start=1)),
         impossible=sum(impossible for _, impossible in draws),
-        notes=notes,
+        notes=(*found.notes, *target.limits(found.vehicle)),
     )
 
 
 def _warning(found: Identified) -> tuple[str, ...]:
-    return () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {found.reason}",)
+    return () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {found.reason}.", *found.doubts)
