@@ -47,12 +47,14 @@ def text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
     mass, center, tensor = _body(vehicle)
     body = add(model, "link", name="body")
     _add_inertial(body, mass, center, tensor)
-    add(add(_drawn(body), "box"), "size", numbers(_BODY * arm, _BODY * arm, _BODY * arm / 2))
+    for part in ("visual", "collision"):
+        add(add(_geometry(body, part), "box"), "size", numbers(_BODY * arm, _BODY * arm, _BODY * arm / 2))
     for number, (x, y) in enumerate(vehicle.rotor_positions):
         link = add(model, "link", name=f"rotor_{number}")
         add(link, "pose", numbers(x, y, 0, 0, 0, 0))
         _add_inertial(link, _ROTOR_MASS * vehicle.mass, np.zeros(3), _rotor(vehicle))
-        add_texts(add(_drawn(link), "cylinder"), (("radius", numbers(_ROTOR * arm)), ("length", numbers(_FLAT * arm))))
+        disc = add(_geometry(link, "visual"), "cylinder")
+        add_texts(disc, (("radius", numbers(_ROTOR * arm)), ("length", numbers(_FLAT * arm))))
         joint = add(model, "joint", name=f"rotor_{number}_joint", type="revolute")
         add_texts(joint, (("parent", "body"), ("child", f"rotor_{number}")))
         axis = add(joint, "axis")
@@ -91,9 +93,9 @@ def _add_inertial(link: ElementTree.Element, mass: float, center: np.ndarray, te
     add_texts(add(inertial, "inertia"), ((name, numbers(tensor[place])) for name, place in _TENSOR.items()))
 
 
-def _drawn(link: ElementTree.Element) -> ElementTree.Element:
-    """The geometry of a visual of a link."""
-    return add(add(link, "visual", name="drawn"), "geometry")
+def _geometry(link: ElementTree.Element, part: str) -> ElementTree.Element:
+    """The geometry of a link: what is drawn (`visual`), or what touches the ground (`collision`)."""
+    return add(add(link, part, name=part), "geometry")
 
 
 def _add_motor(model: ElementTree.Element, vehicle: RigidVehicle, number: int, spin: float) -> None:
