@@ -129,6 +129,10 @@ def test_an_sdf_is_valid_and_has_the_inertia(write):
         moment = vector(plugin, "momentConstant") * vector(plugin, "motorConstant")
         assert moment == pytest.approx(1.1 * 1.2e-10)
         assert vector(plugin, "timeConstantUp") == vector(plugin, "timeConstantDown") == 0.05
+    # The body can stand on the ground.
+    sizes = [vector(links[0], f"{part}/geometry/box/size") for part in ("collision", "visual")]
+    np.testing.assert_array_equal(*sizes)
+    assert sizes[0].min() > 0
     # All links together are the vehicle.
     mass = np.array(masses)
     np.testing.assert_allclose(mass.sum(), found.vehicle.mass, rtol=1e-12)
@@ -191,20 +195,36 @@ def test_the_notes_of_a_sample_have_its_own_numbers(write):
     assert late not in written.text
 
 
-def test_impossible_draws_are_repeated_and_counted(write):
+# The chance to be more than one standard deviation below the mean.
+BELOW = 0.1587
+
+
+def test_negative_draws_are_0(write):
     result = vehicle_result()
     place = list(VALUES).index("yaw_damping")
-    # The damping is 0 at one standard deviation: 15.9 % of the draws are negative.
+    # The damping is 0 at one standard deviation.
     result["covariance"][place][place] = VALUES["yaw_damping"] ** 2
+    found = read_result(write(result))
+    draws = [found.draw(number, seed=0) for number in range(1000)]
+    damping = np.array([vehicle.damping[2] for vehicle, _ in draws])
+    assert damping.min() == sum(repeated for _, repeated in draws) == 0
+    assert abs(np.sum(damping == 0) - 1000 * BELOW) < 4 * np.sqrt(1000 * BELOW * (1 - BELOW))
+
+
+def test_impossible_draws_are_repeated_and_counted(write):
+    result = vehicle_result()
+    for alpha, place in (("alpha3", 0), ("alpha6", 1)):
+        result["parameters"][alpha]["std"] = result["covariance"][place][place] = 0.0
+    # At one standard deviation below the estimate of alpha8, Iz is the sum of Ix and Iy.
+    least = 1 / (1 / VALUES["alpha3"] + 1 / VALUES["alpha6"])
+    result["covariance"][2][2] = (VALUES["alpha8"] - least) ** 2
     found = read_result(write(result))
     draws = [found.draw(number, seed=0) for number in range(1000)]
     assert all(not vehicle.impossible for vehicle, _ in draws)
     repeated = sum(count for _, count in draws)
-    share = 0.1587
     # The number of failures before 1,000 successes is negative binomial.
-    assert abs(repeated - 1000 * share / (1 - share)) < 4 * np.sqrt(1000 * share) / (1 - share)
+    assert abs(repeated - 1000 * BELOW / (1 - BELOW)) < 4 * np.sqrt(1000 * BELOW) / (1 - BELOW)
     result["covariance"][0][0] = 1e20  # alpha3
-    result["parameters"]["alpha3"]["std"] = 1e10
     with pytest.raises(jaxos4.InputError, match="too uncertain"):
         export_vehicle(read_result(write(result)), "mujoco", samples=1)
 
@@ -249,6 +269,9 @@ def older(result):
         (vehicle_result(VALUES | {"alpha8": 1e4}), ("Iz = 0.00011 kg m^2 exceeds", "correct the airframe")),
         (vehicle_result(VALUES | {"alpha3": -6e4}), ("Ix", "not positive")),
         (vehicle_result(VALUES | {"thrust_gain": -1.0}), ("found.json: no vehicle is like this",)),
+        (vehicle_result(VALUES | {"thrust_gain": 0.4}), ("rotor 1 can make 0 to 0.06 N", "correct the airframe")),
+        (vehicle_result(VALUES | {"yaw_offset": 50.0}), ("hover needs -0.012 N",)),
+        (vehicle_result(VALUES | {"thrust_curve": -1.1}), ("thrust_curve = -1.1",)),
     ],
 )
 def test_results_that_cannot_be_exported_are_refused(run, tmp_path, write, result, fragments):
@@ -262,6 +285,7 @@ def test_results_that_cannot_be_exported_are_refused(run, tmp_path, write, resul
     [
         (("--samples", "2"), ("--samples", "--out")),
         (("--samples", "-1", "--out", "vehicle.xml"), ("--samples", "-1")),
+        (("--samples", "100001", "--out", "vehicle.xml"), ("--samples", "at most 100000")),
         (("--seed", "-1"), ("--seed", "-1")),
         (("--out", "found.json"), ("would overwrite an input",)),
         (("--out", "nowhere/vehicle.xml"), ("nowhere/vehicle.xml", "no such folder")),
@@ -284,8 +308,12 @@ def test_other_wrong_requests_are_refused(run, write):
     code, _, err = run("export", "found.json", "--to", "gazebo")
     assert code == 2
     assert "mujoco" in err
+    found = read_result("found.json")
     with pytest.raises(jaxos4.InputError, match="`to`"):
-        export_vehicle(read_result("found.json"), "gazebo")
+        export_vehicle(found, "gazebo")
+    for wrong in ("samples", "seed"):
+        with pytest.raises(jaxos4.InputError, match=f"`{wrong}`: must be an integer of at least 0, got -1"):
+            export_vehicle(found, "mujoco", **{wrong: -1})
 
 
 def test_names_of_files_cannot_break_a_file(write):

@@ -70,7 +70,6 @@ def _add_rotors(actuators: ElementTree.Element, vehicle: RigidVehicle) -> None:
         samples = math.ceil(vehicle.delay / _SHORTEST_TIMESTEP) + 1
         # Without interpolation, MuJoCo rounds the delay up to whole time steps.
         dynamics |= {"delay": numbers(vehicle.delay), "nsample": str(samples), "interp": "linear"}
-    most = vehicle.thrust_coefficient * vehicle.max_rotor_speed**2
     ratio = vehicle.drag_coefficient / vehicle.thrust_coefficient
     for number, spin in enumerate(vehicle.rotor_spins, start=1):
         add(
@@ -80,7 +79,7 @@ def _add_rotors(actuators: ElementTree.Element, vehicle: RigidVehicle) -> None:
             site=f"rotor{number}",
             gear=numbers(0, 0, 1, 0, 0, -spin * ratio),
             ctrllimited="true",
-            ctrlrange=numbers(0, most),
+            ctrlrange=numbers(0, vehicle.full_thrust),
             **dynamics,
         )
 

@@ -108,7 +108,8 @@ class Identified(NamedTuple):
     def draw(self, number: int, *, seed: int) -> tuple[RigidVehicle, int]:
         """A vehicle drawn from the uncertainty of the estimate, and how many impossible ones were drawn before it.
 
-        Vehicle `number` does not depend on how many are drawn.
+        Vehicle `number` does not depend on how many are drawn. A damping, drag, lag or delay that is drawn negative
+        is 0.
 
         **Raises:** `InputError` if hardly any draw is possible.
         """
@@ -120,7 +121,7 @@ class Identified(NamedTuple):
         for impossible in range(_MOST_DRAWS):
             errors = root @ generator.standard_normal(std.size)
             changed = {name: self.values[name] + float(error) for name, error in zip(self.drawn, errors, strict=True)}
-            vehicle = rigid_vehicle(self.airframe, self.values | changed)
+            vehicle = rigid_vehicle(self.airframe, _clipped(self.values | changed))
             if not vehicle.impossible:
                 return vehicle, impossible
         raise InputError(
@@ -170,7 +171,6 @@ def _identified(name: str, file: _File) -> Identified:
         raise InputError(f"`model` {file.model[:40]}: must be one of {', '.join((*MODELS, _VEHICLE))}.")
     values, drawn, covariance, notes = parts
     negative = [each for each in _NOT_NEGATIVE if values.get(each, 0.0) < 0]
-    values |= dict.fromkeys(negative, 0.0)
     kept = [place for place, each in enumerate(drawn) if each not in negative]
     notes += [f"{each}: came out negative, which is impossible; it is 0 here" for each in negative]
     if not np.isfinite(airframe.max_rotor_speed):
@@ -180,7 +180,7 @@ def _identified(name: str, file: _File) -> Identified:
         source=source,
         result=file.result,
         airframe=airframe,
-        values=values,
+        values=_clipped(values),
         drawn=tuple(drawn[place] for place in kept),
         covariance=covariance[np.ix_(kept, kept)],
         doubts=tuple(f"not to be trusted because {doubt.cause}; {doubt.remedy}" for doubt in file.doubts),
@@ -191,6 +191,11 @@ def _identified(name: str, file: _File) -> Identified:
             f"no vehicle is like this: {found.vehicle.impossible}; correct the airframe, or fly with more excitation."
         )
     return found
+
+
+def _clipped(values: dict[str, float]) -> dict[str, float]:
+    """`values` with 0 for what is negative, and cannot be."""
+    return {name: max(value, 0.0) if name in _NOT_NEGATIVE else value for name, value in values.items()}
 
 
 # Values by name, the names that are drawn, their covariance, and notes.

@@ -63,6 +63,11 @@ class RigidVehicle(NamedTuple):
         return np.linalg.solve(np.stack([y, -x, yaw, np.ones(4)]), np.append(-self.torque, self.mass * self.gravity))
 
     @property
+    def full_thrust(self) -> float:
+        """The thrust of one rotor at full scale [N]."""
+        return self.thrust_coefficient * self.max_rotor_speed**2
+
+    @property
     def rotor_drag(self) -> float:
         """The in-plane drag of one rotor over its speed and velocity [N s^2/(rad m)].
 
@@ -82,8 +87,15 @@ class RigidVehicle(NamedTuple):
             return "the thrust is not positive"
         if not 0 <= 4 * self.rotor_inertia < self.inertia[2]:
             return "the rotors have no inertia that a part of the vehicle can have"
-        if min(self.lag, self.delay, self.damping.min(), self.drag.min()) < 0:
-            return "a lag, delay, damping or drag is negative"
+        return self._cannot_hover
+
+    @property
+    def _cannot_hover(self) -> str:
+        if not self.thrust_curve >= -1:
+            return f"thrust_curve = {self.thrust_curve:.3g} makes thrust fall before full scale"
+        for number, thrust in enumerate(self.hover_thrust, start=1):
+            if not 0 <= thrust <= self.full_thrust:
+                return f"rotor {number} can make 0 to {self.full_thrust:.3g} N, and hover needs {thrust:.3g} N of it"
         return ""
 
 

@@ -40,10 +40,14 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
     - `samples`: how many vehicles to draw from the covariance of the estimate. What was not estimated, such as the
       mass, does not change. `seed`: of the draws. Sample i does not depend on the number of samples.
 
-    **Raises:** `InputError` for an unknown simulator, or if hardly any draw is a possible vehicle.
+    **Raises:** `InputError` for an unknown simulator, if `samples` or `seed` is not an integer of at least 0, or if
+    hardly any draw is a possible vehicle.
     """
     if to not in TARGETS:
         raise InputError(f"`to`: must be one of {', '.join(TARGETS)}, got {to!r}.")
+    for name, value in (("samples", samples), ("seed", seed)):
+        if not isinstance(value, int) or value < 0:
+            raise InputError(f"`{name}`: must be an integer of at least 0, got {value!r}.")
     target = TARGETS[to]
 
     def text(vehicle: RigidVehicle, *lines: str) -> str:
