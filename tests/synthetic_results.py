@@ -1,19 +1,14 @@
 """Result files of `jaxos4 estimate` that nobody computed: an OS4's and a vehicle's, as dictionaries."""
 
 import numpy as np
+from helpers import CRAZYFLIE
 
 from jaxos4.airframe import OS4, airframe_table, alpha_from_inertia
 
 INERTIA = {"Ix": 7.7e-3, "Iy": 7.4e-3, "Iz": 1.29e-2, "J_R": 6.2e-5}
-AIRFRAME = airframe_table(OS4) | {
-    "mass": 0.027,
-    "inertia": [1.66e-5, 1.7e-5, 2.9e-5],
-    "rotor_positions": [[0.028, -0.03], [-0.026, -0.03], [-0.028, 0.03], [0.028, 0.029]],
-    "thrust_coefficient": 2.4e-8,
-    "drag_coefficient": 1.2e-10,
-    "rotor_inertia": 2e-8,
-    "max_rotor_speed": 2500.0,
-}
+# A Crazyflie whose rotors do not stand symmetrically.
+POSITIONS = [[0.028, -0.03], [-0.026, -0.03], [-0.028, 0.03], [0.028, 0.029]]
+AIRFRAME = airframe_table(CRAZYFLIE) | {"rotor_positions": POSITIONS}
 # Of the vehicle: the parameters, and their standard deviations as a share.
 VALUES = {
     "alpha3": 6.1e4,
