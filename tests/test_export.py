@@ -102,6 +102,40 @@ def test_what_was_not_identified_is_the_airframes(write):
     assert any(note.startswith("Iz: not identified") for note in found.notes)
 
 
+@pytest.mark.parametrize(
+    ("target", "note"),
+    [
+        ("mujoco", "control = ctrlrange x (0.8 u^2 + 0.2 u)"),
+        ("rotorpy", "rotor speed = rotor_speed_max x sqrt(0.8 u^2 + 0.2 u)"),
+        ("sdf", "rotor speed = maxRotVelocity x sqrt(0.8 u^2 + 0.2 u)"),
+    ],
+)
+def test_the_thrust_curve_is_noted_in_the_words_of_the_file(write, target, note):
+    result = vehicle_result()
+    written = export_vehicle(read_result(write(result)), target)
+    assert f"thrust_curve: for the u-th part of a full command, {note}" in written.notes
+    # No thrust below a sixth of a full command.
+    dead = read_result(write(vehicle_result(VALUES | {"thrust_curve": 1.2})))
+    assert "(max(0, 1.2 u^2 - 0.2 u))" in " ".join(export_vehicle(dead, target).notes)
+    # It cannot be distinguished from 1: three standard deviations are 0.21.
+    result["parameters"]["thrust_curve"]["std"] = 0.07
+    found = read_result(write(result))
+    assert "thrust_curve" not in " ".join(export_vehicle(found, target).notes)
+    assert found.vehicle.thrust_curve == 1
+    assert "thrust_curve" not in found.drawn
+
+
+def test_what_is_replaced_and_what_does_not_vary_is_noted(write):
+    values = VALUES | {"alpha2": 1e-3, "alpha5": 1e-3, "alpha4": 0.5}
+    del values["alpha8"], values["yaw_damping"]
+    held = {"alpha1": {"value": -0.7}, "alpha8": {"value": 3.5e4}, "yaw_damping": {"value": 0.0}}
+    notes = export_vehicle(read_result(write(vehicle_result(values, held=held))), "mujoco").notes
+    assert "alpha4: replaced by the values that follow from Ix, Iy, Iz" in notes
+    assert "do not vary in samples, because the flights do not tell them: alpha8, yaw_damping" in notes
+    (of_rotors,) = [note for note in notes if "alpha2" in note]
+    assert of_rotors.startswith("rotor inertia: not carried")
+
+
 def test_an_sdf_is_valid_and_has_the_inertia(write):
     """The rules of the SDF 1.9 schema for the elements that are written."""
     found = read_result(write(vehicle_result()))
@@ -130,9 +164,9 @@ def test_an_sdf_is_valid_and_has_the_inertia(write):
         assert moment == pytest.approx(1.1 * 1.2e-10)
         assert vector(plugin, "timeConstantUp") == vector(plugin, "timeConstantDown") == 0.05
     # The body can stand on the ground.
-    sizes = [vector(links[0], f"{part}/geometry/box/size") for part in ("collision", "visual")]
-    np.testing.assert_array_equal(*sizes)
-    assert sizes[0].min() > 0
+    touching, drawn = (vector(links[0], f"{part}/geometry/box/size") for part in ("collision", "visual"))
+    np.testing.assert_array_equal(touching, drawn)
+    assert drawn.min() > 0
     # All links together are the vehicle.
     mass = np.array(masses)
     np.testing.assert_allclose(mass.sum(), found.vehicle.mass, rtol=1e-12)

@@ -21,7 +21,13 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
     """What MuJoCo cannot have, or has differently."""
     lines = []
     if vehicle.rotor_inertia:
-        lines.append("rotor inertia: not carried: no gyroscopic torque, and no yaw torque of rotors that accelerate")
+        lines.append(
+            "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
+        )
+    if vehicle.thrust_share:
+        lines.append(
+            f"thrust_curve: for the u-th part of a full command, control = ctrlrange x ({vehicle.thrust_share})"
+        )
     if vehicle.lag:
         lines.append("rotor_lag: acts on the thrust and not on the rotor speed; the same for small changes")
     if vehicle.delay:

@@ -1,5 +1,6 @@
 """Result files of `jaxos4 estimate`, and vehicles drawn from the uncertainty of a result."""
 
+import itertools
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from .vehicle import RigidVehicle, rigid_vehicle
 
 _VEHICLE = "flight"
 _SUCCESSFUL = "successful"
-# An inertia of the rotors is exported if it differs from 0 by this many standard deviations.
+# An inertia of the rotors counts if it differs from 0 by this many standard deviations, a thrust curve if from 1.
 _SURE = 3.0
 # Numbers that no vehicle has below 0, although an estimate can be.
 _NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping", "x_drag", "y_drag")
@@ -28,8 +29,10 @@ _APART = {
     ("roll_flapping", "pitch_flapping"): "no simulator has a moment proportional to the lateral specific force",
     ("voltage_exponent",): "no simulator has the battery's voltage",
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
-    ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7"): "a rigid body has those that follow from its inertias",
+    ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
+# Simulators name these in their notes on the rotors' inertia.
+_GYROSCOPIC = ("alpha2", "alpha5")
 # Inertias are `thrust_gain` divided by these alphas.
 _INVERSES = {"alpha3": "Ix", "alpha6": "Iy", "alpha8": "Iz"}
 # Draws for one sample before the uncertainty counts as too large.
@@ -232,23 +235,24 @@ def _of_vehicle(file: _File, covariance: np.ndarray) -> _Parts:
     if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SURE * found["rotor_reaction"][1]:
         del found["rotor_reaction"]
         notes.append("rotor_reaction: below noise; the inertia of the rotors is the airframe's")
+    curve, error = found.get("thrust_curve", (1.0, 0.0))
+    if abs(curve - 1) < _SURE * error:
+        del found["thrust_curve"]
     values = {name: value for name, (value, _) in found.items()}
     values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values
     for name, moment in _INVERSES.items():
         if name not in found:
             notes.append(f"{moment}: not identified; it follows from the airframe, or from the bracket")
-    for apart, why in _APART.items():
-        some = [name for name in found if name.startswith(apart)]
+    for names, why in _APART.items():
+        some = [name for name in found if name.startswith(names)]
         if some:
             notes.append(f"{', '.join(some)}: {why}")
-    if values.get("thrust_curve", 1.0) != 1.0:
-        curve = values["thrust_curve"]
-        notes.append(
-            f"thrust_curve: a rotor speed here is the one that makes the thrust: for the command u of full scale, "
-            f"max_rotor_speed sqrt({curve:.4g} u^2 {1 - curve:+.4g} u)"
-        )
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
+    apart = tuple(itertools.chain(_GYROSCOPIC, *_APART))
+    fixed = [name for name in values.keys() - found.keys() if not name.startswith(apart)]
+    if fixed:
+        notes.append(f"do not vary in samples, because the flights do not tell them: {', '.join(sorted(fixed))}")
     zero = [name for name in (*_INVERSES, "thrust_gain") if values.get(name) == 0]
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")

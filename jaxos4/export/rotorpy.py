@@ -16,7 +16,14 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
     """What RotorPy cannot have, or has differently."""
     lines = []
     if vehicle.rotor_inertia:
-        lines.append("rotor inertia: not carried: no gyroscopic torque, and no yaw torque of rotors that accelerate")
+        lines.append(
+            "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
+        )
+    if vehicle.thrust_share:
+        lines.append(
+            "thrust_curve: for the u-th part of a full command, rotor speed = "
+            f"rotor_speed_max x sqrt({vehicle.thrust_share})"
+        )
     if vehicle.torque.any():
         lines.append("offsets: not carried: RotorPy has no constant torque")
     if vehicle.damping.any():

@@ -26,7 +26,12 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
     if vehicle.rotor_inertia:
         lines.append(
             f"rotor inertia: the links of the rotors have it, and turn {_SLOWDOWN:g} times slower than the rotors, so "
-            "that their gyroscopic torque is too small by this factor"
+            "that their gyroscopic torque (alpha2, alpha5) is too small by this factor"
+        )
+    if vehicle.thrust_share:
+        lines.append(
+            "thrust_curve: for the u-th part of a full command, rotor speed = "
+            f"maxRotVelocity x sqrt({vehicle.thrust_share})"
         )
     if vehicle.torque.any():
         lines.append("offsets: not carried: SDF has no constant torque")

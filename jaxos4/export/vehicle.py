@@ -68,6 +68,14 @@ class RigidVehicle(NamedTuple):
         return self.thrust_coefficient * self.max_rotor_speed**2
 
     @property
+    def thrust_share(self) -> str:
+        """The share of `full_thrust` that the command u of full scale makes, as a formula; empty if it is u^2."""
+        curve = self.thrust_curve
+        if curve > 1:
+            return f"max(0, {curve:.4g} u^2 - {curve - 1:.4g} u)"
+        return "" if curve == 1 else f"{curve:.4g} u^2 + {1 - curve:.4g} u"
+
+    @property
     def rotor_drag(self) -> float:
         """The in-plane drag of one rotor over its speed and velocity [N s^2/(rad m)].
 
