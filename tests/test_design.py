@@ -110,7 +110,7 @@ def test_the_command_writes_an_input_that_a_study_flies(found, run, tmp_path):
         ("--duration 1000", ("--duration", "50 to 2500 samples")),
         ("--fastest 150", ("cannot hover", "225.7")),
         ("--slowest 230", ("cannot hover",)),
-        ("--rate -1", ("`rate` must be positive",)),
+        ("--rate -1", ("--rate must be positive",)),
         ("--accuracy 0", ("--accuracy",)),
         ("--bandwidth 100", ("--bandwidth",)),
         ("--airframe none", ("none",)),
