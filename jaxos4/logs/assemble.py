@@ -28,6 +28,8 @@ MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of ga
 
 # So many samples of an accelerometer that never change: it is off.
 _STILL = 100
+# Values that change at less than this share of the rate of their rows were repeated.
+_REPEATED = 0.9
 
 
 def flight_of(
@@ -78,10 +80,11 @@ def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
         if not logged.any():
             continue
         source, at = table.names.get(name, name), t[logged]
-        found.append(Sampling(source, logged_rate(at)))
         changes = at[1:][np.diff(table.columns[name][logged]) != 0]
-        if held_regularly(changes):
-            found.append(Sampling(f"the values of {source} change so often", logged_rate(changes)))
+        rate, of_changes = logged_rate(at), logged_rate(changes)
+        if held_regularly(changes) and of_changes < _REPEATED * rate:
+            source, rate = f"the values of {source} change so often", of_changes
+        found.append(Sampling(source, rate))
     return min(found, key=lambda each: each.rate, default=None)
 
 
