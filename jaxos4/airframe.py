@@ -63,6 +63,11 @@ class Airframe(eqx.Module):
         """The rotor speed [rad/s] at which four equal rotors carry the weight."""
         return jnp.sqrt(jnp.asarray(self.mass * self.gravity / (4 * self.thrust_coefficient)))
 
+    @property
+    def hover_squares(self) -> Float[np.ndarray, "4"]:
+        """The squared rotor speeds [rad^2/s^2] that carry the weight without torque; negative if none do."""
+        return np.linalg.solve(np.asarray(self.mixer), [0.0, 0.0, 0.0, float(self.mass) * float(self.gravity)])
+
 
 def plus_layout(arm: float) -> list[tuple[float, float]]:
     """Rotor positions of the paper's cross: 1 front, 2 right, 3 rear, 4 left, each `arm` [m] from the centre."""

@@ -187,8 +187,7 @@ def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> Ro
     """Rotor speeds [rad/s] that produce these angular accelerations [rad/s^2] and carry the weight."""
     mixer = np.asarray(airframe.mixer, dtype=np.float64)
     torque = np.asarray(airframe.inertia, dtype=np.float64) * acceleration
-    weight = float(airframe.mass) * float(airframe.gravity)
-    hover = np.linalg.solve(mixer, np.array([0.0, 0.0, 0.0, weight]))
+    hover = airframe.hover_squares
     change = np.linalg.solve(mixer, np.pad(torque, ((0, 0), (0, 1))).T).T
     _check_flyable(hover, change, float(airframe.max_rotor_speed), dt)
     return as_float(np.sqrt(hover + change))

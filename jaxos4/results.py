@@ -50,6 +50,11 @@ NAMES = (
 )
 
 
+def meaning(name: str) -> str:
+    """What the result of this name says; empty if it is `"successful"`."""
+    return str(RESULTS[getattr(RESULTS, name)])
+
+
 def result_names(result: RESULTS) -> np.ndarray:
     """The name of each result in a batch, as an array of strings of the batch's shape."""
     conditions = [np.asarray(result == getattr(RESULTS, name)) for name in NAMES]

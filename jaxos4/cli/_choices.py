@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from ..errors import InputError
 from ..estimators import ESTIMATORS
 
 # The names in the library's tables, written out because an import of these tables takes seconds; a test compares them.
@@ -37,3 +38,9 @@ WindowOption = Annotated[
     typer.Option(metavar="SECONDS", help="Multiple shooting: windows of this length, each with its own initial state."),
 ]
 OutOption = Annotated[Path | None, typer.Option(help="JSON file to write.")]
+
+
+def check_seed(seed: int) -> None:
+    """Refuses a random seed that JAX cannot use."""
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")

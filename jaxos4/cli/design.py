@@ -17,6 +17,7 @@ from ._choices import (
     InitialStateOption,
     Model,
     ModelOption,
+    check_seed,
 )
 from ._messages import option_names
 from ._output import check_different, check_output
@@ -62,8 +63,7 @@ def design(
     check_different(out=out, figure=figure)
     if figure is not None:
         check_output(figure, Path(airframe), bracket)
-    if not 0 <= seed < 2**63:
-        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
+    check_seed(seed)
     if not 0 < accuracy < 1e6:
         raise InputError(f"--accuracy: must be positive and finite, got {accuracy:g}.")
     limits = {

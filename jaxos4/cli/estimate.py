@@ -154,7 +154,7 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
 
     from ..identification import VehicleIdentification
     from ..report import print_identification
-    from ..results import RESULTS
+    from ..results import meaning
 
     console = Console()
     if out is not None:
@@ -167,5 +167,5 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
             write_flight_page(report, found, title=title)
         console.print(f"report: {report}", markup=False, highlight=False)
     if not found.successful:
-        typer.echo(f"jaxos4: {found.result}: {RESULTS[getattr(RESULTS, found.result)]}", err=True)
+        typer.echo(f"jaxos4: {found.result}: {meaning(found.result)}", err=True)
         raise typer.Exit(1)

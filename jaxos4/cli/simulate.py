@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
-from ._choices import AirframeOption, Excitation, Method, Model, Sensors
+from ._choices import AirframeOption, Excitation, Method, Model, Sensors, check_seed
 from ._output import check_output
 from ._progress import stages
 
@@ -76,8 +76,7 @@ def simulate(
     for name, value, most in (("noise", noise, 1e6), ("gust", gust, 1e6), ("lag", lag, 1), ("delay", delay, 1)):
         if not 0 <= value <= most:
             raise InputError(f"--{name}: must lie in 0 to {most:g}, got {value}.")
-    if not 0 <= seed < 2**63:
-        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
+    check_seed(seed)
     if dt > 0 and duration / dt > MOST_SAMPLES:
         raise InputError(f"--duration {duration:g}: more than {MOST_SAMPLES} samples of {dt:g} s; ask for fewer.")
     with stages("loading the library") as progress:

@@ -18,6 +18,7 @@ from ._choices import (
     InitialStateOption,
     Model,
     ModelOption,
+    check_seed,
 )
 from ._messages import option_names
 from ._output import check_output
@@ -50,8 +51,7 @@ def train(
     seed: Annotated[int, typer.Option(help="Random seed for training.")] = 0,
 ) -> None:
     """Train a network that identifies any flight with the inputs of this one."""
-    if not 0 <= seed < 2**63:
-        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
+    check_seed(seed)
     with stages("loading the library") as progress:
         from ..airframe import load_airframe
         from ..identification.network import train_network

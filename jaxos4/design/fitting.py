@@ -77,14 +77,15 @@ def fitted(plan: Plan, omega: RotorSpeeds) -> DesignedInput:
         shares = _largest(plan, as_float(amplified(own, hover, factor)), finer)
         return {name: float(np.max(share)) for name, share in shares.items()}
 
-    target, factor, uses = _TARGET, 0.0, used(0.0, FINER)
+    target = _TARGET
     for _ in range(_MOST_CORRECTIONS):
-        trial = _largest_factor(lambda factor: max(used(factor).values()), target)
-        shares = used(trial, FINER)
-        if max(shares.values()) <= 1:
-            factor, uses = trial, shares
+        factor = _largest_factor(lambda factor: max(used(factor).values()), target)
+        uses = used(factor, FINER)
+        if max(uses.values()) <= 1:
             break
-        target *= _TARGET / max(shares.values())
+        target *= _TARGET / max(uses.values())
+    else:
+        factor, uses = 0.0, used(0.0, FINER)
     scaled = amplified(own, hover, factor)
     return DesignedInput(scaled, float(plan.dt), np.asarray(_histories(plan, as_float(scaled))), uses)
 

@@ -92,7 +92,7 @@ def design_input(
     - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
       bound. Bounds are shares of the bracket's half-widths.
     - `bandwidth`: the highest frequency [Hz].
-    - `key`: of the draws and the starts. `progress`: is told each stage.
+    - `key`: of the draws and the starts. `progress`: called with the name of each stage.
 
     **Raises:** `InputError` if an argument is out of range or the vehicle cannot hover within the envelope.
     """

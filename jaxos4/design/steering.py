@@ -64,8 +64,7 @@ class Steering(eqx.Module):
 
 def hover_squares(airframe: Airframe, envelope: Envelope) -> Float[np.ndarray, "4"]:
     """The squared rotor speeds that carry the weight. Raises `InputError` if they lie outside of the envelope."""
-    weight = float(airframe.mass) * float(airframe.gravity)
-    squares = np.linalg.solve(np.asarray(airframe.mixer), [0.0, 0.0, 0.0, weight])
+    squares = airframe.hover_squares
     slowest, fastest = float(envelope.slowest), min(float(envelope.fastest), float(airframe.max_rotor_speed))
     if not np.all((squares > slowest**2) & (squares < fastest**2)):
         speeds = ", ".join(f"{x:.4g}" for x in np.sqrt(np.maximum(squares, 0)))

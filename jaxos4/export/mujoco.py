@@ -4,8 +4,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 
-import numpy as np
-
+from . import notes
 from .vehicle import AXES, RigidVehicle
 from .xml_text import add, document, numbers
 
@@ -21,9 +20,7 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
     """What MuJoCo cannot have, or has differently."""
     lines = []
     if vehicle.rotor_inertia:
-        lines.append(
-            "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
-        )
+        lines.append(notes.NO_ROTOR_INERTIA)
     if vehicle.thrust_share:
         lines.append(
             f"thrust_curve: for the u-th part of a full command, control = ctrlrange x ({vehicle.thrust_share})"
@@ -46,7 +43,7 @@ def text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
     add(body, "freejoint", name="free")
     add(body, "inertial", pos="0 0 0", mass=numbers(vehicle.mass), diaginertia=numbers(*vehicle.inertia))
     add(body, "site", name="center_of_mass")
-    arm = float(np.sqrt(np.square(vehicle.rotor_positions).sum(axis=1).mean()))
+    arm = vehicle.arm
     for number, (x, y) in enumerate(vehicle.rotor_positions, start=1):
         add(body, "site", name=f"rotor{number}", pos=numbers(x, y, 0))
         add(body, "geom", type="capsule", fromto=numbers(0, 0, 0, x, y, 0), size=numbers(_ARM * arm))

@@ -14,7 +14,7 @@ from ..analysis.inertia import fit_inertia
 from ..errors import InputError
 from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES
-from ..results import NAMES, RESULTS
+from ..results import NAMES, meaning
 from .vehicle import RigidVehicle, rigid_vehicle
 
 _VEHICLE = "flight"
@@ -101,7 +101,7 @@ class Identified(NamedTuple):
     @property
     def reason(self) -> str:
         """What the result code says."""
-        return str(RESULTS[getattr(RESULTS, self.result)])
+        return meaning(self.result)
 
     @property
     def vehicle(self) -> RigidVehicle:

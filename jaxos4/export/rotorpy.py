@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
+from . import notes
 from .vehicle import RigidVehicle
 
 # The gravity that RotorPy has [m/s^2].
@@ -16,20 +15,15 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
     """What RotorPy cannot have, or has differently."""
     lines = []
     if vehicle.rotor_inertia:
-        lines.append(
-            "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
-        )
+        lines.append(notes.NO_ROTOR_INERTIA)
     if vehicle.thrust_share:
-        lines.append(
-            "thrust_curve: for the u-th part of a full command, rotor speed = "
-            f"rotor_speed_max x sqrt({vehicle.thrust_share})"
-        )
+        lines.append(notes.curve_of_speed(vehicle, "rotor_speed_max"))
     if vehicle.torque.any():
         lines.append("offsets: not carried: RotorPy has no constant torque")
     if vehicle.damping.any():
         lines.append("damping: not carried: RotorPy has no torque against the body rates")
     if vehicle.drag.any():
-        lines.append("drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw")
+        lines.append(notes.DRAG_OF_ROTORS)
     if vehicle.delay:
         lines.append(f"rotor_delay: not carried: give commands {vehicle.delay:.4g} s late")
     if not vehicle.lag:
@@ -41,7 +35,7 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
 
 def text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
     """The Python file. It defines `quad_params`."""
-    arm = float(np.sqrt(np.square(vehicle.rotor_positions).sum(axis=1).mean()))
+    arm = vehicle.arm
     moments = dict(zip(("Ixx", "Iyy", "Izz"), vehicle.inertia.tolist(), strict=True))
     positions = [
         f'        "r{number}": np.array([{x!r}, {y!r}, 0.0]),'

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from . import notes
 from .vehicle import RigidVehicle
 from .xml_text import add, add_texts, document, numbers
 
@@ -29,16 +30,13 @@ def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
             "that their gyroscopic torque (alpha2, alpha5) is too small by this factor"
         )
     if vehicle.thrust_share:
-        lines.append(
-            "thrust_curve: for the u-th part of a full command, rotor speed = "
-            f"maxRotVelocity x sqrt({vehicle.thrust_share})"
-        )
+        lines.append(notes.curve_of_speed(vehicle, "maxRotVelocity"))
     if vehicle.torque.any():
         lines.append("offsets: not carried: SDF has no constant torque")
     if vehicle.damping.any():
         lines.append("damping: not carried: SDF has no torque against the body rates of one axis")
     if vehicle.drag.any():
-        lines.append("drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw")
+        lines.append(notes.DRAG_OF_ROTORS)
     if vehicle.delay:
         lines.append(f"rotor_delay: not carried: send commands {vehicle.delay:.4g} s late")
     return tuple(lines)
@@ -48,7 +46,7 @@ def text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
     """The SDF. Inertia and mass of all links together are the vehicle's."""
     root = ElementTree.Element("sdf", version=_VERSION)
     model = add(root, "model", name="vehicle")
-    arm = float(np.sqrt(np.square(vehicle.rotor_positions).sum(axis=1).mean()))
+    arm = vehicle.arm
     mass, center, tensor = _body(vehicle)
     body = add(model, "link", name="body")
     _add_inertial(body, mass, center, tensor)
@@ -72,8 +70,7 @@ def text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
 
 def _rotor(vehicle: RigidVehicle) -> np.ndarray:
     """The inertia of a rotor's link about its own centre [kg m^2]: a thin disc."""
-    mean_square = np.square(vehicle.rotor_positions).sum(axis=1).mean()
-    about_axis = vehicle.rotor_inertia or _ROTOR_MASS * vehicle.mass * (_ROTOR**2) * mean_square / 2
+    about_axis = vehicle.rotor_inertia or _ROTOR_MASS * vehicle.mass * (_ROTOR * vehicle.arm) ** 2 / 2
     return np.diag([about_axis / 2, about_axis / 2, about_axis])
 
 

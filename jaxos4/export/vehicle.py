@@ -51,6 +51,11 @@ class RigidVehicle(NamedTuple):
     thrust_curve: float
 
     @property
+    def arm(self) -> float:
+        """The root mean square of the distances from the centre of mass to the rotors [m]."""
+        return float(np.sqrt(np.square(self.rotor_positions).sum(axis=1).mean()))
+
+    @property
     def hover_speed(self) -> float:
         """The rotor speed [rad/s] at which four equal rotors carry the weight."""
         return float(np.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient)))

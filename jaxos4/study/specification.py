@@ -16,7 +16,6 @@ import numpy as np
 from .._custom_types import RotorSpeeds, as_float
 from .._files import read_toml
 from ..airframe import PRESETS, Airframe, airframe_from_table
-from ..design import read_input
 from ..errors import InputError
 from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
@@ -298,6 +297,8 @@ def _inputs(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     taken = next((name for name in files if name in EXCITATIONS), None)
     if taken is not None:
         raise InputError(f"`input`: {taken} is a standard excitation; give the file another name.")
+    from ..design import read_input  # needs the simulator, and most studies have no such files
+
     return {
         "input": {
             name: read_input(folder / file, dt).tolist() if isinstance(file, str) else file
