@@ -15,7 +15,6 @@ from ..recording.reading import Recording, as_recordings
 from .flight import identify_flight
 from .problem import Intervals
 from .provenance import class_name
-from .recordings import identify_vehicle
 from .results import FlightIdentification, VehicleIdentification
 
 Flights = Flight | Recording | Sequence[Flight | Recording]
@@ -90,6 +89,8 @@ def identify(
         _refuse(of_model, "a vehicle is identified from its rates and specific force, and trains its own network")
         if initial_state != "free":
             raise InputError(f"`initial_state` {initial_state}: each window has its own initial state; leave it out.")
+        from .recordings import identify_vehicle  # slow to import
+
         return identify_vehicle(recordings, subject, validate=other, **of_vehicle, **common)
     _check_model(subject, recordings, of_vehicle)
     common["estimator"] = "ibss" if estimator is None else estimator
