@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 from small_experiments import load, plot, report_of
@@ -124,3 +125,45 @@ def test_closed_loop(tmp_path):
     assert report_of("closed_loop", tmp_path, **cases) == report
     with pytest.raises(SystemExit, match="other settings"):
         report_of("closed_loop", tmp_path, **{**cases, "seed": 17})
+
+
+def test_benchmarks(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.values["jax_compilation_cache_dir"]))
+    fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
+    sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
+    growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}
+    report = report_of(
+        "benchmarks", tmp_path, **sizes, contenders=fits, shooters=shots, **growth, network_steps=0, simulations=0
+    )
+    rows = report["fits"]["known"]
+    # Both reach the same optimum, and are timed in turns.
+    assert {name: row["reached"] for name, row in rows.items()} == dict.fromkeys(fits, 1.0)
+    assert all(len(row["laps"]) == 2 and row["min_seconds"] <= row["median_seconds"] for row in rows.values())
+    assert all(row["peak_mib"] > 10 for row in rows.values())
+    assert report["shots"]["jaxos4"]["steps_per_second"] > 0
+    assert 0 < report["roofline"]["share"] < 1
+    plot("benchmarks", tmp_path / "out.json", tmp_path / "figures")
+
+
+def test_a_benchmark_skips_who_is_missing_or_fails():
+    run = load("benchmarks")
+    case = run.make_case(1, 50)
+    failing = run.Contender("scipy_fit:levenberg_marquardt", alone=True, options={"unknown": 1})
+    absent = run.Contender("scipy_fit:levenberg_marquardt", "no_such_package")
+    skipped = []
+    assert run.line_up({"failing": failing, "absent": absent}, case, 1, skipped) == {}
+    assert "failing: failed: TypeError" in skipped[0]
+    assert skipped[1] == "absent: no_such_package is not installed: pip install no_such_package"
+
+
+def test_a_benchmark_times_only_who_reaches_the_least_cost():
+    run = load("benchmarks")
+    case = run.make_case(2, 50)
+    truth, first = np.tile(case.truth, (2, 1)), np.zeros((2, 12))
+    answers = {
+        "both": {"parameters": truth, "first": first},
+        "one of both": {"parameters": np.stack([truth[0], case.starts[1]]), "first": first},
+        "only the first": {"parameters": truth[:1], "first": first[:1]},
+        "diverged": {"parameters": 1e3 * truth, "first": first},
+    }
+    assert list(run.reached(case, answers).values()) == [1.0, 0.5, 1.0, 0.0]

@@ -1,0 +1,98 @@
+"""CasADi: single and multiple shooting with a Gauss-Newton Hessian and IPOPT, after CasADi's example `sysid.py`.
+
+As that example recommends, one step is expanded into scalar operations, `mapaccum` and `map` build the trajectory, the
+decision variables are scaled, and multiple shooting begins at the measured states.
+"""
+
+from collections.abc import Callable
+
+import casadi
+import numpy as np
+from benchmarks.case import Case, step
+
+OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+
+
+def single(case: Case) -> Callable[[], dict]:
+    """The unknowns are the parameters, and the initial state if it is free."""
+    steps = len(case.forcing)
+    start, measured = casadi.MX.sym("start", 8), casadi.MX.sym("measured", 12, steps + 1)
+    scaled, offset = casadi.MX.sym("scaled", 8), casadi.MX.sym("offset", 0 if case.known else 12)
+    alpha = start + scaled * case.half_width
+    first = casadi.DM.zeros(12) if case.known else measured[:, 0] + offset * case.sigma
+    following = _one_step(case).mapaccum("trajectory", steps)(first, case.forcing.T, casadi.repmat(alpha, 1, steps))
+    errors = casadi.vec((casadi.horzcat(first, following) - measured)[:, case.begin :] / _tiled(case, steps + 1))
+    solver = _gauss_newton(errors, casadi.vertcat(scaled, offset), casadi.vertcat(start, casadi.vec(measured)))
+    zero = np.zeros(8 + offset.numel())
+    begin = case.first_states()
+
+    def run() -> dict:
+        found = []
+        for which in range(case.flights):
+            data = np.concatenate([case.starts[which], case.measured[which].ravel()])
+            found.append(np.asarray(solver(x0=zero, p=data)["x"]).ravel())
+        answer = np.array(found)
+        offsets = 0 if case.known else answer[:, 8:] * case.sigma
+        return {"parameters": case.starts + answer[:, :8] * case.half_width, "first": begin + offsets}
+
+    return run
+
+
+def multiple(case: Case) -> Callable[[], dict]:
+    """All states are unknowns as well, and equality constraints close the gaps."""
+    steps = len(case.forcing)
+    start, measured = casadi.MX.sym("start", 8), casadi.MX.sym("measured", 12, steps + 1)
+    scaled, offsets = casadi.MX.sym("scaled", 8), casadi.MX.sym("offsets", 12, steps + 1 - case.begin)
+    alpha = start + scaled * case.half_width
+    states = measured[:, case.begin :] + offsets * _tiled(case, steps + 1)
+    if case.known:
+        states = casadi.horzcat(casadi.DM.zeros(12), states)
+    following = _one_step(case).map(steps)(states[:, :-1], case.forcing.T, casadi.repmat(alpha, 1, steps))
+    gaps = casadi.vec((following - states[:, 1:]) / casadi.repmat(casadi.DM(case.sigma), 1, steps))
+    unknowns, data = casadi.veccat(scaled, offsets), casadi.vertcat(start, casadi.vec(measured))
+    solver = _gauss_newton(casadi.vec(offsets), unknowns, data, gaps)
+    zero = np.zeros(unknowns.numel())
+
+    def run() -> dict:
+        parameters, first = [], []
+        for which in range(case.flights):
+            data = np.concatenate([case.starts[which], case.measured[which].ravel()])
+            found = np.asarray(solver(x0=zero, p=data, lbg=0, ubg=0)["x"]).ravel()
+            parameters.append(case.starts[which] + found[:8] * case.half_width)
+            first.append(np.zeros(12) if case.known else case.measured[which, 0] + found[8:20] * case.sigma)
+        return {"parameters": np.array(parameters), "first": np.array(first)}
+
+    return run
+
+
+def _one_step(case: Case) -> casadi.Function:
+    state, forcing, alpha = (casadi.SX.sym(name, size) for name, size in (("x", 12), ("u", 4), ("a", 8)))
+    pieces = (casadi.vertsplit(part) for part in (state, forcing, alpha))
+    following = casadi.vertcat(*step(casadi, *pieces, case.dt, case.gravity))
+    return casadi.Function("one_step", [state, forcing, alpha], [following])
+
+
+def _tiled(case: Case, samples: int) -> casadi.DM:
+    return casadi.repmat(casadi.DM(case.sigma), 1, samples - case.begin)
+
+
+def _gauss_newton(errors: casadi.MX, unknowns: casadi.MX, data: casadi.MX, gaps: casadi.MX | None = None):
+    """IPOPT with the Hessian J^T J of the residuals."""
+    slope = casadi.jacobian(errors, unknowns)
+    factor, multipliers = casadi.MX.sym("factor"), casadi.MX.sym("multipliers", 0 if gaps is None else gaps.numel())
+    hessian = casadi.Function(
+        "nlp_hess_l",
+        {
+            "x": unknowns,
+            "p": data,
+            "lam_f": factor,
+            "lam_g": multipliers,
+            "triu_hess_gamma_x_x": factor * casadi.triu(slope.T @ slope),
+        },
+        ["x", "p", "lam_f", "lam_g"],
+        ["triu_hess_gamma_x_x"],
+    )
+    problem = {"x": unknowns, "p": data, "f": casadi.dot(errors, errors) / 2}
+    if gaps is not None:
+        problem["g"] = gaps
+    return casadi.nlpsol("solver", "ipopt", problem, {**OPTIONS, "hess_lag": hessian})
