@@ -70,7 +70,7 @@ def identify(study: Study, channels: str, names: list[str], limits: list[int]) -
     found = []
     for name in names:
         for most in limits:
-            hybrid = jaxos4.Hybrid(network, jaxos4.IBSS(halvings=3, max_sweeps=most)) if name == HYBRID else None
+            hybrid = jaxos4.Hybrid(network, jaxos4.IBSS(max_sweeps=most)) if name == HYBRID else None
             found.append(run(hybrid or SEARCHES[name](most), jnp.arange(study.flights)))
     shape = (len(names), len(limits), study.flights)
     errors = np.stack([(parameters - model.alpha) / bound for parameters, _ in found]).reshape(*shape, -1)

@@ -35,7 +35,7 @@ class Hybrid(AbstractEstimator):
     **Arguments:**
 
     - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
-    - `ibss`: how to search. Near a seed, one halving fewer is enough.
+    - `ibss`: how to search.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -44,7 +44,7 @@ class Hybrid(AbstractEstimator):
     needs_network: ClassVar[bool] = True
 
     network: TrainedNetwork
-    ibss: IBSS = eqx.field(default_factory=lambda: IBSS(halvings=3))
+    ibss: IBSS = eqx.field(default_factory=IBSS)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight. Raises as the network does."""

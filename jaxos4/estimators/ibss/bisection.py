@@ -51,7 +51,7 @@ def _move_along(
     stage: Stage, view: View, brackets: Brackets, rows_at: RowsAt, halvings: int, number: Int[Array, ""], moves: Moves
 ) -> Moves:
     """Bisects along one direction, in a bracket around the step that the quadratic model predicts from here."""
-    unknowns, steps, errors, at_end = moves
+    unknowns, steps, errors, ended = moves
     direction, longest = view.basis[:, :, number], brackets.longest[:, number]
     below, above = (jnp.minimum(most, longest) for most in room(unknowns, direction, stage.limits))
     gradient = view.curvature.gradient + jnp.einsum("wuv,wv->wu", view.information, unknowns - view.unknowns)
@@ -59,12 +59,12 @@ def _move_along(
     predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
     lower = jnp.maximum(predicted - brackets.half_width[:, number], -below)
     upper = jnp.minimum(predicted + brackets.half_width[:, number], above)
-    step, at_lower, at_upper = bisect(stage.slope(rows_at, unknowns, direction, number), lower, upper, halvings)
+    step, at_end = bisect(stage.slope(rows_at, unknowns, direction, number), lower, upper, halvings)
     return Moves(
         unknowns + step[:, None] * direction,
         steps.at[:, number].set(step),
         errors.at[:, number].set(step - predicted),
-        at_end.at[:, number].set((at_lower & (lower > -below)) | (at_upper & (upper < above))),
+        ended.at[:, number].set(at_end & (step > -below) & (step < above)),
     )
 
 
@@ -73,17 +73,28 @@ def bisect(
     lower: Float[Array, " windows"],
     upper: Float[Array, " windows"],
     halvings: int,
-) -> tuple[Float[Array, " windows"], Bool[Array, " windows"], Bool[Array, " windows"]]:
-    """Halves each bracket towards the zero of the slope, in all windows in parallel.
+) -> tuple[Float[Array, " windows"], Bool[Array, " windows"]]:
+    """Narrows each bracket towards the zero of the slope, in all windows in parallel.
 
-    Returns the middle of the last bracket, and whether the search ended at the lower or the upper end of the first.
+    The sign of the slope says which side of the trial holds the zero. The first trial is the middle. The next is where
+    a line meets zero: through the last two trials, at first with the slope's rate of change of a direction of unit
+    information. It is the middle again if the line leads out of what is left of the bracket.
+
+    Returns the best guess of the zero, and whether it is an end of the bracket.
     """
 
-    def halve(ends, _):
-        low, high = ends
-        middle = (low + high) / 2
-        value = slope(middle)
-        return (jnp.where(value <= 0, middle, low), jnp.where(value >= 0, middle, high)), None
+    def halve(carry, _):
+        low, high, trial, rate, last = carry
+        value = slope(trial)
+        low, high = jnp.where(value <= 0, trial, low), jnp.where(value >= 0, trial, high)
+        secant = (value - last[1]) / (trial - last[0])
+        rate = jnp.where(secant > 0, secant, rate)
+        zero = trial - value / rate
+        narrowed_there = ((zero <= low) & (low > lower)) | ((zero >= high) & (high < upper))
+        following = jnp.where(narrowed_there, (low + high) / 2, jnp.clip(zero, low, high))
+        return (low, high, following, rate, (trial, value)), None
 
-    (low, high), _ = jax.lax.scan(halve, (lower, upper), length=halvings)
-    return (low + high) / 2, low == lower, high == upper
+    middle = (lower + upper) / 2
+    first = lower, upper, middle, jnp.ones_like(middle), (middle, jnp.zeros_like(middle))
+    (_, _, found, _, _), _ = jax.lax.scan(halve, first, length=halvings)
+    return found, (found == lower) | (found == upper)

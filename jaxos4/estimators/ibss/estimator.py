@@ -47,7 +47,7 @@ class IBSS(AbstractEstimator):
       cost is nearly separable along them. The rates are fitted first, then all channels.
       `"coordinate"`: the parameters themselves, against all of the problem's channels at once, in the manner of the
       paper; good on the rates, slow on more channels.
-    - `halvings`: how often each bracket is halved in a sweep.
+    - `halvings`: the shots along each direction in a sweep, each of which narrows the bracket.
     - `max_sweeps`: the most sweeps of each stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
       direction. The standard deviation follows from the actual residuals, so the fit of noise-free data ends at
@@ -64,7 +64,7 @@ class IBSS(AbstractEstimator):
     needs_network: ClassVar[bool] = False
 
     directions: str = eqx.field(static=True, default="whitened")
-    halvings: int = eqx.field(static=True, default=4)
+    halvings: int = eqx.field(static=True, default=2)
     max_sweeps: int = eqx.field(static=True, default=60)
     tolerance: Scalar = eqx.field(converter=as_float, default=0.02)
     reach: Scalar = eqx.field(converter=as_float, default=REACH)
