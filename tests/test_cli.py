@@ -7,9 +7,10 @@ import sys
 
 import numpy as np
 import pytest
+import typer
 from helpers import refused
 
-from jaxos4.cli import main
+from jaxos4.cli import _app, main
 from jaxos4.estimators import ESTIMATORS
 
 TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alpha6": 133.33333, "alpha8": 76.923077}
@@ -241,11 +242,36 @@ def test_bad_arguments_are_refused_in_one_line(run, tmp_path, arguments, fragmen
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-@pytest.mark.parametrize("arguments", [["estimate", "x.csv", "--model", "none"], ["simulate"], ["none"]])
-def test_bad_usage_exits_with_2(run, arguments):
-    code, _, err = run(*arguments)
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("estimate x.csv --model none", "'published', 'corrected'"),
+        ("simulate", "'--out'; see `jaxos4 simulate --help`"),
+        ("simulate --out x.csv --duration five", "'--duration'"),
+        ("simulate --out x.csv y.csv", "y.csv"),
+        ("export x.json --to none", "'none' is not one of 'mujoco', 'rotorpy', 'sdf'"),
+        ("simulate --frob", "--frob; see `jaxos4 simulate --help`"),
+        ("none", "'none'; see `jaxos4 --help`"),
+    ],
+)
+def test_bad_usage_is_refused_in_one_line(run, line, said):
+    refused(run(*line.split()), said)
+
+
+def test_without_arguments_the_help_is_shown(run):
+    code, out, err = run()
     assert code == 2
-    assert "Traceback" not in err
+    assert "identifiability" in out + err
+
+
+@pytest.mark.parametrize("command", ["simulate", "design", "estimate"])
+def test_the_help_shows_each_text_whole(run, command):
+    """Units stand in brackets, which are easily taken for markup."""
+    code, out, _ = run(command, "--help")
+    assert code == 0
+    texts = [option.help for option in typer.main.get_command(_app.app).commands[command].params]
+    assert len(texts) > 10
+    assert all("".join(text.split()) in "".join(out.split()) for text in texts)
 
 
 def test_a_failing_estimate_keeps_an_older_file(run, tmp_path):

@@ -4,7 +4,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -36,7 +36,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 for command in (simulate, design, estimate, export, train, inspect, identifiability, compare, study, report):
     app.command()(_prepared(command))
 
@@ -65,13 +65,7 @@ def main() -> None:
     Exit code 0: done, 1: the computation failed, 2: unusable arguments or input, 130: interrupted.
     """
     try:
-        app()
-    except SystemExit as stop:
-        if stop.code != _INTERRUPTED:
-            raise
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(_INTERRUPTED)  # do not wait for threads that compile or train: no file is half-written
+        code = app(prog_name="jaxos4", standalone_mode=False) or 0
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()
         raise SystemExit(1) from None
@@ -81,6 +75,16 @@ def main() -> None:
     except TrainingError as error:
         typer.echo(f"jaxos4: {_one_line(error)}", err=True)
         raise SystemExit(1) from None
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # what all errors of the parser have, in every version of typer
+            raise
+        typer.echo(_of_parser(error), err=True)
+        raise SystemExit(2) from None
+    if code == _INTERRUPTED:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)  # do not wait for threads that compile or train: no file is half-written
+    raise SystemExit(code)
 
 
 def console() -> None:
@@ -100,6 +104,14 @@ def console() -> None:
             except (OSError, ValueError):  # the reader has gone, or the disk is full: output is lost
                 code = code or 1
         os._exit(code)
+
+
+def _of_parser(error: Any) -> str:
+    """A mistake in the arguments in one line; or the help, if there are no arguments."""
+    message = error.format_message().removesuffix(".").replace("Value error, ", "")
+    if "\n" in message:
+        return message
+    return f"jaxos4: {message}; see `{error.ctx.command_path if error.ctx else 'jaxos4'} --help`."
 
 
 def _one_line(error: InputError | OSError | TrainingError) -> str:

@@ -28,7 +28,7 @@ Loss = StrEnum("Loss", ["huber", "squares"])
 FlightFile = Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
 ModelOption = Annotated[Model, typer.Option(help="Equations of motion: as published, or corrected.")]
 AirframeOption = Annotated[str, typer.Option(help="os4, os4-simulator, voos, or a TOML file.")]
-BracketOption = Annotated[Path | None, typer.Option(help="TOML file: alpha1 = \\[lower, upper], ...")]
+BracketOption = Annotated[Path | None, typer.Option(help="TOML file: alpha1 = [lower, upper], ...")]
 ChannelsOption = Annotated[Channels | None, typer.Option(help="Channels to fit. Default: all that were measured.")]
 InitialStateOption = Annotated[
     InitialState, typer.Option(help="free: estimated too; known: equal to the first sample.")
