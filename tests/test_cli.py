@@ -269,7 +269,7 @@ def test_the_help_shows_each_text_whole(run, command):
     """Units stand in brackets, which are easily taken for markup."""
     code, out, _ = run(command, "--help")
     assert code == 0
-    texts = [option.help for option in typer.main.get_command(_app.app).commands[command].params]
+    texts = [vars(option)["help"] for option in typer.main.get_group(_app.app).commands[command].params]
     assert len(texts) > 10
     assert all("".join(text.split()) in "".join(out.split()) for text in texts)
 
