@@ -1,6 +1,7 @@
 """Settings and fixtures of all tests: precision, platform, runtime shape checks, property tests, real flights."""
 
 import collections
+import gc
 import os
 import pathlib
 import sys
@@ -101,6 +102,7 @@ def compiled_programs_end_before_the_process_does() -> Iterator[None]:
     maps = pathlib.Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
+        gc.collect()  # programs in reference cycles
 
 
 @pytest.fixture(scope="session")

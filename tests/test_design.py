@@ -1,5 +1,9 @@
 """Designed inputs: what they tell, the limits that they keep, and the command."""
 
+import contextlib
+import io
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +12,7 @@ from helpers import DT, euler_trajectory, published_derivative, refused, standar
 from lanes import LANES, identify, lanes
 
 import jaxos4
+from jaxos4.cli import main
 from jaxos4.cli.design import Criterion
 from jaxos4.design import Envelope, design_and_compare, read_input, write_input
 from jaxos4.design.criterion import CRITERIA, bounds_of, criterion_of
@@ -18,21 +23,43 @@ MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
 
 
+# What `jaxos4 design --initial-state known` asks of the library.
+ASKED = {
+    "limits": {},
+    "duration": 5.0,
+    "dt": 0.01,
+    "channels": "all",
+    "start_is_known": True,
+    "criterion": "D",
+    "bandwidth": 4.0,
+    "seed": 0,
+}
+
+
 @pytest.fixture(scope="module")
-def found():
-    """The input that the command designs with `--initial-state known`."""
-    return design_and_compare(
-        MODEL,
-        limits={},
-        bracket=BRACKET,
-        duration=5.0,
-        dt=0.01,
-        channels="all",
-        start_is_known=True,
-        criterion="D",
-        bandwidth=4.0,
-        seed=0,
-    )
+def commanded(tmp_path_factory):
+    """A run of the command: its folder, what it prints, what it asks of the library, and what the library finds."""
+    folder, printed, calls = tmp_path_factory.mktemp("design"), io.StringIO(), []
+
+    def seen(model, **asked):
+        calls.append((asked, design_and_compare(model, **asked)))
+        return calls[0][1]
+
+    options = ["--initial-state", "known", "--out", "input.csv", "--figure", "input.svg"]
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.chdir(folder)
+        patch.setattr("jaxos4.design.design_and_compare", seen)
+        patch.setattr(sys, "argv", ["jaxos4", "design", *options])
+        with pytest.raises(SystemExit) as stop:
+            main()
+    assert not stop.value.code
+    return folder, printed.getvalue(), *calls[0]
+
+
+@pytest.fixture(scope="module")
+def found(commanded):
+    """The input that the command designs."""
+    return commanded[-1]
 
 
 def numpy_bounds(omega):
@@ -85,22 +112,24 @@ def test_many_flights_reach_the_bounds(found):
     assert np.abs(np.square(error).mean(axis=0) - 1).max() < 4 * np.sqrt(2 / LANES)
 
 
-def test_the_command_writes_an_input_that_a_study_flies(found, run, tmp_path):
-    code, out, err = run("design", "--initial-state", "known", "--out", "input.csv", "--figure", "input.svg")
-    assert (code, err) == (0, "")
-    np.testing.assert_allclose(read_input(tmp_path / "input.csv", 0.01), found.designed.omega, rtol=1e-9)
+def test_the_command_writes_an_input_that_a_study_flies(commanded):
+    folder, out, asked, found = commanded
+    assert {name: asked[name] for name in ASKED} == ASKED
+    np.testing.assert_array_equal(asked["bracket"].lower, BRACKET.lower)
+    np.testing.assert_array_equal(asked["bracket"].upper, BRACKET.upper)
+    np.testing.assert_allclose(read_input(folder / "input.csv", 0.01), found.designed.omega, rtol=1e-9)
     assert "x multisine" in out
     assert "x chirp" in out
-    assert (tmp_path / "input.svg").read_text().count("<svg") == 1
+    assert (folder / "input.svg").read_text().count("<svg") == 1
     from jaxos4.study import load_study
     from jaxos4.study.flights import fleet_of
 
-    (tmp_path / "study.toml").write_text('excitations = ["best"]\n[input]\nbest = "input.csv"\n')
-    study = load_study(tmp_path / "study.toml")
+    (folder / "study.toml").write_text('excitations = ["best"]\n[input]\nbest = "input.csv"\n')
+    study = load_study(folder / "study.toml")
     np.testing.assert_allclose(fleet_of(study, study.cell(0).scenario).omega, found.designed.omega, rtol=1e-9)
-    (tmp_path / "study.toml").write_text('excitations = ["best"]\ndurations = [4]\n[input]\nbest = "input.csv"\n')
+    (folder / "study.toml").write_text('excitations = ["best"]\ndurations = [4]\n[input]\nbest = "input.csv"\n')
     with pytest.raises(jaxos4.InputError, match="its file lasts 5 s; correct `durations`"):
-        load_study(tmp_path / "study.toml")
+        load_study(folder / "study.toml")
 
 
 @pytest.mark.parametrize(

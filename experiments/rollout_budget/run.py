@@ -44,16 +44,21 @@ def identify(study: Study, channels: str, names: list[str], limits: list[int]) -
     def problem(flight: jaxos4.Flight) -> jaxos4.ShootingProblem:
         return jaxos4.ShootingProblem(model, flight, sigma=sigma, initial_state=jnp.zeros(12), channels=channels)
 
+    @jax.jit
+    def draw(number: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The measured states of a flight, and the center of its bracket."""
+        noise_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(study.seed), number))
+        offset = jax.random.uniform(start_key, model.alpha.shape, minval=-0.8, maxval=0.8)
+        return noise(exact, key=noise_key).states, model.alpha + offset * model.half_width
+
     @eqx.filter_jit
-    def run(estimator: jaxos4.AbstractEstimator, numbers: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def one(number: jax.Array) -> tuple[jax.Array, jax.Array]:
-            noise_key, start_key = jax.random.split(jax.random.fold_in(jax.random.key(study.seed), number))
-            offset = jax.random.uniform(start_key, model.alpha.shape, minval=-0.8, maxval=0.8)
-            bracket = jaxos4.Bracket.around(model.alpha + offset * model.half_width, model.half_width)
-            found = estimator(problem(noise(exact, key=noise_key)), bracket)
+    def run(estimator: jaxos4.AbstractEstimator, states: jax.Array, centers: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def one(states: jax.Array, center: jax.Array) -> tuple[jax.Array, jax.Array]:
+            flight = eqx.tree_at(lambda f: f.states, exact, states)
+            found = estimator(problem(flight), jaxos4.Bracket.around(center, model.half_width))
             return found.parameters, found.rollouts
 
-        return jax.vmap(one)(numbers)
+        return jax.vmap(one)(states, centers)
 
     def train() -> jaxos4.TrainedNetwork:
         """A network for twice the default bracket, which contains the brackets of all searches."""
@@ -67,11 +72,11 @@ def identify(study: Study, channels: str, names: list[str], limits: list[int]) -
 
     network = train() if HYBRID in names else None
     bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem(exact), model.alpha)))
-    found = []
+    found, flights = [], jax.lax.map(draw, jnp.arange(study.flights))
     for name in names:
         for most in limits:
             hybrid = jaxos4.Hybrid(network, jaxos4.IBSS(max_sweeps=most)) if name == HYBRID else None
-            found.append(run(hybrid or SEARCHES[name](most), jnp.arange(study.flights)))
+            found.append(run(hybrid or SEARCHES[name](most), *flights))
     shape = (len(names), len(limits), study.flights)
     errors = np.stack([(parameters - model.alpha) / bound for parameters, _ in found]).reshape(*shape, -1)
     return errors, np.stack([rollouts for _, rollouts in found]).reshape(shape)

@@ -162,7 +162,7 @@ def _correlations(
 
     `of_a`, `of_b`: which samples were measured; the others are 0. Columns of `a` and `b` are paired.
     """
-    length = 2 * a.shape[0]
+    length = 1 << (a.shape[0] + lags - 1).bit_length()  # no lag wraps around; a power of two has the fastest transform
 
     def sums(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         spectrum = np.fft.rfft(x, length, axis=0) * np.conj(np.fft.rfft(y, length, axis=0))

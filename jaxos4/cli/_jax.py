@@ -7,8 +7,8 @@ import tempfile
 import warnings
 from pathlib import Path
 
-QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false"
-"""XLA's older way to write loops: compiles in half to two thirds of the time, and the programs are as fast."""
+QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+"""XLA's older way to write loops, and fewer optimisations: compile in half of the time, the programs are as fast."""
 
 _KNOWS_IT = ("0.10.",)  # versions of jaxlib: a flag that XLA does not know would end the process
 
@@ -22,7 +22,6 @@ _JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in le
 
 def prepare() -> None:
     """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off."""
-    gc.set_threshold(100_000, 20, 100)  # JAX makes millions of small objects that stay: rarer searches for garbage
     compile_quickly()
 
     import jax
@@ -43,9 +42,13 @@ def prepare() -> None:
 
 
 def compile_quickly() -> None:
-    """Sets XLA's flags, which JAX reads when it starts to compute. Flags of the user stay as they are."""
+    """Sets XLA's flags, which JAX reads when it starts to compute, unless the user has set some. Tracing is faster too.
+
+    JAX makes millions of small objects that stay: searches for garbage become rarer.
+    """
     import jaxlib.version
 
+    gc.set_threshold(100_000, 20, 100)
     if "XLA_FLAGS" not in os.environ and jaxlib.version.__version__.startswith(_KNOWS_IT):
         os.environ["XLA_FLAGS"] = QUICK_TO_COMPILE
 
