@@ -31,10 +31,12 @@ hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("network", "experiments", "filter_error", "cli", "ibss", "flight_model", "experiment_studies", "estimators"),
-    *("multiple_shooting", "diagnostics", "identifiability", "vehicle", "equation_error", "compare", "study_resume"),
-    *("kalman", "held", "startup", "identify", "cli_vehicle", "checks", "study_cluster", "svsf", "noise", "study"),
-    *("information", "closed_loop", "logs_betaflight"),
+    *("network", "experiment_studies", "experiments", "filter_error", "ibss", "multiple_shooting", "cli"),
+    *("flight_model", "design", "study_resume", "estimators", "equation_error", "study_cluster", "compare"),
+    *("held", "identifiability", "study", "noise", "checks", "kalman", "startup", "report", "diagnostics"),
+    *("programs", "information", "models", "output_error", "closed_loop", "new_estimator", "identify", "svsf"),
+    *("shooting", "vehicle", "join", "logs_betaflight", "logs_blackbox", "inertia", "logs_fuzz"),
+    *("report_browser", "cli_vehicle"),
 )
 
 

@@ -140,6 +140,7 @@ def rows(samples, ratio, seed, *, lost=0.0):
 
 def averaged_slowly(t, y, grid, dt):
     """Each row's interval cut with each sample's, one by one."""
+    t, y = np.asarray(t), np.asarray(y)
     own, out = t[1] - t[0], np.full((grid.size, y.shape[1]), np.nan)
     for k, center in enumerate(grid):
         for column in range(y.shape[1]):

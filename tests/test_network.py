@@ -22,7 +22,7 @@ from jaxos4.networks.training import draw_many
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 DURATION = 3.0
-SMALL = {"width": 32, "depth": 2, "steps": 500, "batch": 64, "held_out": 4000}
+SMALL = {"width": 32, "depth": 2, "steps": 1000, "batch": 64, "held_out": 4000}
 SHORT = SMALL | {"steps": 5, "held_out": 1000}
 BRACKET = jaxos4.Bracket.default(PUBLISHED())
 OMEGA = standard_flight(duration=DURATION).omega
@@ -160,7 +160,7 @@ def test_first_weights_are_uniform_as_those_of_equinox():
 
 
 def test_training_learns_and_comes_near_the_bound():
-    network = trained(steps=1000)
+    network = trained()
     assert network.history.shape == (4, 2)
     alpha, states = flights(MANY, seed=11)
     estimates = identify(network, states)
