@@ -5,14 +5,18 @@ import pytest
 from recorded_logs import GRAVITY
 from test_airframe_draft import drafted
 
-from jaxos4.logs import blackbox_raw, read_log
+from jaxos4.logs import blackbox_frames, blackbox_raw, read_log
+from jaxos4.logs.blackbox_numbers import Numbers
 from jaxos4.recording.layout import RotorSigns
 from jaxos4.recording.usable import usable_stretches
 
 
 @pytest.fixture(scope="module", autouse=True)
 def decoded_once():
-    """The tests of this module read each log again, and decode its frames once."""
+    """The tests of this module read each log again, and decode its frames once.
+
+    The decoder's methods are called millions of times: the tests of `test_logs_blackbox.py` check their types.
+    """
     decode, known = blackbox_raw.decode_frames, {}
 
     def decode_once(settings, data, wanted):
@@ -23,6 +27,10 @@ def decoded_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(blackbox_raw, "decode_frames", decode_once)
+        for kind in (Numbers, blackbox_frames._Predictor, blackbox_frames._Stream):
+            for name, method in list(vars(kind).items()):
+                if hasattr(method, "__wrapped__"):
+                    patch.setattr(kind, name, method.__wrapped__)
         yield
 
 
