@@ -57,7 +57,13 @@ from .closed_loop import (
     fly_closed_loop as fly_closed_loop,
     random_references as random_references,
 )
-from .design import DesignedInput as DesignedInput, Envelope as Envelope, design_input as design_input
+from .design import (
+    DesignedInput as DesignedInput,
+    DesignedReferences as DesignedReferences,
+    Envelope as Envelope,
+    design_input as design_input,
+    design_references as design_references,
+)
 from .errors import InputError as InputError, TrainingError as TrainingError
 from .estimate import AbstractEstimator as AbstractEstimator, Estimate as Estimate
 from .estimators import (

@@ -14,7 +14,7 @@ from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, name
 
 import jaxos4
 from jaxos4.estimators import FilterError
-from jaxos4.estimators.filter_error import _observed, lanes_of
+from jaxos4.estimators.filter_error import lanes_of, observed_of
 from jaxos4.models.state import CASCADE_ORDER
 from jaxos4.shooting.filtering import Noise, filter_gains, innovate
 
@@ -34,7 +34,7 @@ def likelihood(problem, parameters, noise, *, cut=False):
     """The innovations of a problem whose forcing depends on no parameter; in one lane, unless the flight is `cut`."""
     samples = problem.flight.time.shape[0]
     index = lanes_of(samples, 93) if cut else one_lane(samples)
-    observed, place = _observed(problem, index), np.minimum(index, samples - 1)
+    observed, place = observed_of(problem, index), np.minimum(index, samples - 1)
     forcing = jax.tree.map(lambda leaf: leaf[place].T, problem.forcing(parameters))
     step, observe, dt = problem.step, problem.model.observe, problem.flight.dt
     nothing = {"forcing_tangents": None, "forcing_parameters": ()}
@@ -98,7 +98,7 @@ def textbook(noise, measured, restart):
 
 
 def test_the_gains_are_those_of_a_textbook_filter():
-    observed = _observed(disturbed(), one_lane())
+    observed = observed_of(disturbed(), one_lane())
     (gains, _), measured = filter_gains(observed, NOISE, jnp.asarray(DT)), ~np.isnan(observed.measured)
     assert observed.restart[:, 0].nonzero()[0].tolist() == [0, *range(210, 231)]
     assert observed.counts[:, 0].nonzero()[0].tolist() == [*range(210), *range(230 + 128, 501)]
@@ -118,7 +118,7 @@ def test_the_variance_that_a_disturbance_adds_is_exact(tau):
     noise = Noise(*(jnp.log(jnp.array([x, 1.0, 1.0])) for x in (3.0, tau, 1e-9)))
     measured = jnp.array([0.0, 0.0])[:, None, None] * jnp.ones((1, 3, 1))
     first = jnp.zeros((2, 1), dtype=bool)
-    observed = _observed(standard_problem(channels="rates", duration=0.1), one_lane(11))
+    observed = observed_of(standard_problem(channels="rates", duration=0.1), one_lane(11))
     observed = observed._replace(measured=measured, restart=first)
     gains, _ = filter_gains(observed, noise, jnp.asarray(DT))
     moved, added = transition(3.0, tau)
@@ -257,7 +257,7 @@ def test_a_known_start_is_used_in_flights_of_several_lanes():
     start = np.array(long.flight.states[0])
     start[RATES] = 0.3, -0.2, 0.1
     problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
-    observed = _observed(problem, lanes_of(501, 93))
+    observed = observed_of(problem, lanes_of(501, 93))
     assert observed.restart[0].tolist() == [False, True, True, True]
     assert observed.known is not None
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
@@ -289,7 +289,7 @@ def joined(flight):
 def test_another_recording_restarts_the_filter():
     problem = standard_problem(channels="rates", free=True, states=noisy_states(1, seed=4)[0])
     problem = eqx.tree_at(lambda p: p.flight, problem, joined(problem.flight))
-    observed = _observed(problem, one_lane())
+    observed = observed_of(problem, one_lane())
     assert observed.restart[:, 0].nonzero()[0].tolist() == [0, 251]
     # Recordings begin in mid-flight, where the controller has answered the disturbance for some time.
     assert (~observed.counts[:, 0]).nonzero()[0].tolist() == [*range(128), *range(251, 251 + 128)]

@@ -8,8 +8,12 @@ and thrust are right. The controller uses the same wrong moments.
 
 `equation-error` is a regression that knows the lag and the delay. All others are those of `jaxos4.identify`, with its
 default terms and the whole flight fitted.
+
+`--references` says what is flown: random steps, the standard 3-2-1-1 references, or those that
+`jaxos4.design_references` finds for the true airframe. All have the same length and the same largest angle.
 """
 
+import itertools
 import json
 import time
 from pathlib import Path
@@ -22,6 +26,7 @@ import typer
 from rich.console import Console
 
 import jaxos4
+from jaxos4.design import standard_references
 from jaxos4.report.experiment import count_results, in_words, table_of
 from jaxos4.results import NINETY_FIVE
 
@@ -43,6 +48,8 @@ INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 DT, WINDOW = 0.004, 62
 # Flights of one call of the regression, and its memory: the best on real flights.
 CHUNK, MEMORY = 25, 0.9
+# The largest references of all flights: angles [rad] and vertical acceleration [m/s^2].
+LARGEST = np.array([0.3, 0.3, 0.3, 1.5])
 
 
 def known_airframe(i: int) -> jaxos4.Airframe:
@@ -50,12 +57,25 @@ def known_airframe(i: int) -> jaxos4.Airframe:
     return eqx.tree_at(lambda a: a.inertia, VEHICLE, VEHICLE.inertia * (1 + WRONG * (-1) ** i))
 
 
-def fly(gust: float, i: int, duration: float, seed: int) -> jaxos4.Flight:
+def references_of(kind: str, gust: float, duration: float, seed: int) -> np.ndarray | None:
+    """The references of all flights; `None`: random, other ones for each flight."""
+    if kind == "random":
+        return None
+    if kind == "designed":
+        loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=DELAY, gust=gust)
+        settings = {"angle": LARGEST[0], "acceleration": LARGEST[3], "duration": duration, "dt": DT}
+        return jaxos4.design_references(loop, **settings, key=jax.random.key(seed)).references
+    return standard_references(round(duration / DT) + 1, DT, LARGEST)[kind]
+
+
+def fly(gust: float, i: int, duration: float, seed: int, references: np.ndarray | None = None) -> jaxos4.Flight:
     """Flight i at one strength of the gusts [rad/s^2]."""
     key = jax.random.fold_in(jax.random.key(seed), i)
     inertia = known_airframe(i).inertia
     loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=DELAY, gust=gust, controller_inertia=inertia)
-    references = jaxos4.random_references(duration=duration, dt=DT, key=jax.random.fold_in(key, 0))
+    if references is None:
+        of_flight = jax.random.fold_in(key, 0)
+        references = jaxos4.random_references(duration=duration, dt=DT, amplitude=LARGEST.tolist(), key=of_flight)
     return jaxos4.fly_closed_loop(loop, references, dt=DT, key=jax.random.fold_in(key, 1))
 
 
@@ -155,14 +175,25 @@ def summary(rows: list[dict]) -> dict[str, dict]:
 
 def print_table(report: dict, duration: float) -> None:
     """One line for each estimator, strength of gusts and moment of inertia."""
-    headings = "gust", "estimator", "", "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]"
+    headings = (
+        "gust",
+        "references",
+        "estimator",
+        "",
+        "flights",
+        "bias [%]",
+        "RMSE [%]",
+        "std [%]",
+        "RMSE / bound",
+        "covered [%]",
+    )
     table = table_of(f"moments of inertia from flights of {duration:g} s in closed loop", (*headings, "results"))
     for case in report["cases"]:
         results = in_words(count_results(np.array([row["result"] for row in case["flights"]])))
         for name, row in summary(case["flights"]).items():
             error = "" if row["bias_error"] is None else f" +- {100 * row['bias_error']:.2g}"
             table.add_row(
-                *(f"{case['gust']:g}", case["estimator"], name, str(row["flights"])),
+                *(f"{case['gust']:g}", case["references"], case["estimator"], name, str(row["flights"])),
                 *(f"{100 * row['bias']:.3g}{error}", f"{100 * row['rmse']:.3g}", f"{100 * row['std']:.3g}"),
                 f"{row['efficiency']:.2f} +- {row['efficiency_error']:.2f}",
                 f"{100 * row['covered']:.1f} +- {100 * row['covered_error']:.1f}",
@@ -179,6 +210,9 @@ def main(
     seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 16,
     estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = (
         *("equation-error", "output-error", "filter-error"),
+    ),
+    references: Annotated[list[str], typer.Option(help="random, designed, or a standard: 3211, doublet, ...")] = (
+        "random",
     ),
     out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
@@ -197,13 +231,15 @@ def main(
         if out is not None:
             out.write_text(json.dumps(report, indent=2) + "\n")
 
-    for gust in gusts:
-        flown = [(i, fly(gust, i, duration, seed)) for i in range(flights)]
+    for gust, kind in itertools.product(gusts, references):
+        wanted_references = references_of(kind, gust, duration, seed)
+        flown = [(i, fly(gust, i, duration, seed, wanted_references)) for i in range(flights)]
         flown = [(i, flight) for i, flight in flown if not turned_over(flight)]
         for name in estimators:
-            case = next((c for c in report["cases"] if (c["gust"], c["estimator"]) == (gust, name)), None)
+            what = {"gust": gust, "references": kind, "estimator": name}
+            case = next((c for c in report["cases"] if {key: c[key] for key in what} == what), None)
             if case is None:
-                case = {"gust": gust, "estimator": name, "flights": []}
+                case = {**what, "flights": []}
                 report["cases"].append(case)
             done = {row["flight"] for row in case["flights"]}
             wanted = [(i, flight) for i, flight in flown if i not in done and (i < searches or name != "output-error")]

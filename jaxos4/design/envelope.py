@@ -63,22 +63,30 @@ class Envelope(eqx.Module):
 
     @classmethod
     def of(
-        cls, omega: Float[Numeric, "samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
+        cls, omega: Float[Numeric, "*flights samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
     ) -> "Envelope":
         """The limits that flights with these rotor speeds just keep.
 
         `dt` is the sample time of the rotor speeds. The states may be sampled more often.
         """
-        held, states = np.asarray(omega)[:-1], np.asarray(states)  # the last row drives nothing
+        held, states = np.asarray(omega)[..., :-1, :], np.asarray(states)  # the last row drives nothing
         return cls(
             slowest=held.min(),
             fastest=held.max(),
-            slew=np.abs(np.diff(held, axis=0)).max() / dt,
+            slew=np.abs(np.diff(held, axis=-2)).max() / dt,
             angle=np.abs(states[..., ANGLES]).reshape(-1, 3).max(axis=0),
             rate=np.abs(states[..., RATES]).reshape(-1, 3).max(axis=0),
             velocity=np.linalg.norm(states[..., VELOCITY], axis=-1).max(),
             distance=np.linalg.norm((states - states[..., :1, :])[..., POSITION], axis=-1).max(),
         )
+
+    def shares_of(self, needed: "Envelope") -> dict[str, float]:
+        """The largest share of each limit that flights need: 1 is the limit."""
+        shares = {
+            name: float(np.max(np.asarray(getattr(needed, name)) / np.asarray(getattr(self, name))))
+            for name in Envelope.__annotations__
+        }
+        return shares | {"slowest": 1 / shares["slowest"]}
 
     def uses_of_rotors(self, omega: RotorSpeeds, dt: Scalar) -> Uses:
         """Which share of each limit of the rotors is used at each sample: 1 is the limit."""

@@ -33,7 +33,7 @@ from ..shooting.rows import windowed
 
 # The number of samples in a lane. Specific force is compared as means over this time [s]: accelerometers feel
 # vibrations, and their low-pass filters differ.
-_LANE, _BLOCK = 384, 0.25
+_LANE, BLOCK = 384, 0.25
 # After so many samples a filter has settled.
 _SETTLING = 128
 # The least share of a block that must be measured.
@@ -182,26 +182,11 @@ class FilterError(AbstractEstimator):
         """`fit` with a `start` that counts only if it is `given`: one program for both."""
         problem, bracket = problem.restrict("rates"), bracket.usable
         index = lanes_of(problem.flight.time.shape[0], self.lane, self.settling)
-        observed, dt, model = _observed(problem, index, self.settling), problem.flight.dt, problem.model
-        inputs, count = problem.flight.inputs, bracket.center.shape[0]
-        samples = np.minimum(index, problem.flight.time.shape[0] - 1)
-        rows = Rows(windowed(problem.forcing(bracket.center), samples), ())
+        observed, dt, count = observed_of(problem, index, self.settling), problem.flight.dt, bracket.center.shape[0]
+        innovations = innovations_of(problem, observed, index)
 
         def evaluate(unknowns: Unknowns) -> Innovations:
-            parameters, noise = unknowns[:count], Noise(*unknowns[count:].reshape(-1, 3).T)
-            forced = problem.with_forcing(rows, parameters, inputs=inputs, index=samples, tangents=True)
-            tangents = forced.forcing_tangents
-            return innovate(
-                problem.step,
-                model.observe,
-                observed,
-                _lanes_last(forced.forcing),
-                parameters,
-                noise,
-                dt,
-                forcing_tangents=None if tangents is None else _lanes_last(tangents),
-                forcing_parameters=model.forcing_parameters,
-            )
+            return innovations(unknowns[:count], Noise(*unknowns[count:].reshape(-1, 3).T))
 
         noise = jnp.stack(_first_noise(observed, dt), axis=1)
         region = _region(bracket, held, noise, dt)
@@ -329,11 +314,37 @@ def lanes_of(samples: int, wanted: int, settling: int = _SETTLING) -> Int[np.nda
     return length * np.arange(lanes)[:, None] + np.arange(settling + length)
 
 
+def innovations_of(
+    problem: ShootingProblem, observed: Observed, index: Int[np.ndarray, "lanes time"]
+) -> Callable[[Parameters, Noise], Innovations]:
+    """The innovations of a flight in lanes (`lanes_of`, `observed_of`) as a function of the parameters and the noise."""
+    model, inputs, dt = problem.model, problem.flight.inputs, problem.flight.dt
+    samples = np.minimum(index, problem.flight.time.shape[0] - 1)
+    rows = Rows(windowed(problem.forcing(model.alpha), samples), ())
+
+    def evaluate(parameters: Parameters, noise: Noise) -> Innovations:
+        forced = problem.with_forcing(rows, parameters, inputs=inputs, index=samples, tangents=True)
+        tangents = forced.forcing_tangents
+        return innovate(
+            problem.step,
+            model.observe,
+            observed,
+            _lanes_last(forced.forcing),
+            parameters,
+            noise,
+            dt,
+            forcing_tangents=None if tangents is None else _lanes_last(tangents),
+            forcing_parameters=model.forcing_parameters,
+        )
+
+    return evaluate
+
+
 def _lanes_last(forcing: Forcing) -> Forcing:
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
 
 
-def _observed(problem: ShootingProblem, index: Int[np.ndarray, "lanes time"], settling: int = _SETTLING) -> Observed:
+def observed_of(problem: ShootingProblem, index: Int[np.ndarray, "lanes time"], settling: int = _SETTLING) -> Observed:
     """The measurements in lanes, where filters restart, and which innovations count.
 
     A filter restarts in a gap, and where another stretch begins. Until it has settled its innovations do not count: the
@@ -381,7 +392,7 @@ def _block_means(
     forces: Float[Array, "time forces lanes"], restart: Bool[Array, "time lanes"], dt: Scalar
 ) -> tuple[Array, Array, Array]:
     """Means over blocks at the last sample of each block and NaN elsewhere; the samples so far; where blocks end."""
-    block = jnp.floor(np.arange(restart.shape[0] + 1) * dt / _BLOCK + 1e-6)
+    block = jnp.floor(np.arange(restart.shape[0] + 1) * dt / BLOCK + 1e-6)
     closes = jnp.broadcast_to((jnp.diff(block) != 0)[:, None], restart.shape)
 
     def add(carry, row):
@@ -389,7 +400,7 @@ def _block_means(
         total, measured, count = (jnp.where(restart, 0, leaf) for leaf in carry)
         known = ~jnp.isnan(force)
         total, measured, count = total + jnp.where(known, force, 0.0), measured + known, count + 1
-        usable = closes & (measured >= _MEASURED * count) & (count * dt > _BLOCK / 2)
+        usable = closes & (measured >= _MEASURED * count) & (count * dt > BLOCK / 2)
         mean = jnp.where(usable, total / jnp.maximum(measured, 1), jnp.nan)
         return tuple(jnp.where(closes, 0, leaf) for leaf in (total, measured, count)), (mean, count)
 
