@@ -199,10 +199,19 @@ def fly_closed_loop(
     return _fly(loop, as_float(references), as_float(dt), key, substeps)
 
 
-def fly_standard(loop: ClosedLoop, *, duration: float = 20.0, dt: float = 0.004, seed: int) -> Flight:
-    """Fly random references, with all random numbers from `seed`: what `jaxos4 simulate --closed-loop` writes."""
-    references, flight = jax.random.split(jax.random.key(seed))
-    return fly_closed_loop(loop, random_references(duration=duration, dt=dt, key=references), dt=dt, key=flight)
+def fly_standard(
+    loop: ClosedLoop,
+    *,
+    references: Float[Numeric, "samples 4"] | None = None,
+    duration: float = 20.0,
+    dt: float = 0.004,
+    seed: int,
+) -> Flight:
+    """Fly references, by default random ones, with all random numbers from `seed`: `jaxos4 simulate --closed-loop`."""
+    first, flight = jax.random.split(jax.random.key(seed))
+    if references is None:
+        references = random_references(duration=duration, dt=dt, key=first)
+    return fly_closed_loop(loop, as_float(references), dt=dt, key=flight)
 
 
 class _Carry(NamedTuple):

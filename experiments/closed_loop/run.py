@@ -43,7 +43,7 @@ VEHICLE = jaxos4.Airframe(
     rotor_inertia=2e-8,
     max_rotor_speed=FULL,
 )
-LAG, DELAY, WRONG = 0.05, 0.01, 0.25
+LAG, DELAY = 0.05, 0.01
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 DT, WINDOW = 0.004, 62
 # Flights of one call of the regression, and its memory: the best on real flights.
@@ -52,9 +52,9 @@ CHUNK, MEMORY = 25, 0.9
 LARGEST = np.array([0.3, 0.3, 0.3, 1.5])
 
 
-def known_airframe(i: int) -> jaxos4.Airframe:
-    """What the estimator is told of flight i."""
-    return eqx.tree_at(lambda a: a.inertia, VEHICLE, VEHICLE.inertia * (1 + WRONG * (-1) ** i))
+def known_airframe(i: int, wrong: float) -> jaxos4.Airframe:
+    """What the estimator and the controller are told of flight i."""
+    return eqx.tree_at(lambda a: a.inertia, VEHICLE, VEHICLE.inertia * (1 + wrong * (-1) ** i))
 
 
 def references_of(kind: str, gust: float, duration: float, seed: int) -> np.ndarray | None:
@@ -68,10 +68,12 @@ def references_of(kind: str, gust: float, duration: float, seed: int) -> np.ndar
     return standard_references(round(duration / DT) + 1, DT, LARGEST)[kind]
 
 
-def fly(gust: float, i: int, duration: float, seed: int, references: np.ndarray | None = None) -> jaxos4.Flight:
+def fly(
+    gust: float, i: int, duration: float, seed: int, wrong: float, references: np.ndarray | None = None
+) -> jaxos4.Flight:
     """Flight i at one strength of the gusts [rad/s^2]."""
     key = jax.random.fold_in(jax.random.key(seed), i)
-    inertia = known_airframe(i).inertia
+    inertia = known_airframe(i, wrong).inertia
     loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=DELAY, gust=gust, controller_inertia=inertia)
     if references is None:
         of_flight = jax.random.fold_in(key, 0)
@@ -105,14 +107,14 @@ def stacked(modules: list) -> object:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *modules)
 
 
-def regress(flights: list[tuple[int, jaxos4.Flight]]) -> list[dict]:
+def regress(flights: list[tuple[int, jaxos4.Flight]], wrong: float) -> list[dict]:
     """The rows of many flights by equation error. Their standard deviations are those of white gyro noise alone."""
     rows = []
     for first in range(0, len(flights), CHUNK):
         some = flights[first : first + CHUNK]
         padded = some + some[-1:] * (CHUNK - len(some))  # one program
         begin = time.perf_counter()
-        found = _regressions(stacked([f for _, f in padded]), stacked([known_airframe(i) for i, _ in padded]))
+        found = _regressions(stacked([f for _, f in padded]), stacked([known_airframe(i, wrong) for i, _ in padded]))
         results, seconds = jaxos4.result_names(jax.block_until_ready(found).result), time.perf_counter() - begin
         alphas, stds = np.asarray(found.parameters), np.asarray(found.std)
         for k, (i, _) in enumerate(some):
@@ -125,11 +127,11 @@ def regress(flights: list[tuple[int, jaxos4.Flight]]) -> list[dict]:
     return rows
 
 
-def search(estimator: str, flight: jaxos4.Flight, i: int) -> dict:
+def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> dict:
     """The row of one flight by an estimator of `jaxos4.identify`."""
     begin = time.perf_counter()
     whole = {"begin": float(flight.time[0]), "end": float(flight.time[-1])}  # one length of all flights: one program
-    found = jaxos4.identify(flight, known_airframe(i), estimator=estimator, holdout=0.0, **whole)
+    found = jaxos4.identify(flight, known_airframe(i, wrong), estimator=estimator, holdout=0.0, **whole)
     row: dict = {"flight": i, "result": found.result, "seconds": time.perf_counter() - begin}
     constants = {} if found.rigid_body is None else found.rigid_body.constants
     for name, alpha in INERTIAS.items():
@@ -175,19 +177,9 @@ def summary(rows: list[dict]) -> dict[str, dict]:
 
 def print_table(report: dict, duration: float) -> None:
     """One line for each estimator, strength of gusts and moment of inertia."""
-    headings = (
-        "gust",
-        "references",
-        "estimator",
-        "",
-        "flights",
-        "bias [%]",
-        "RMSE [%]",
-        "std [%]",
-        "RMSE / bound",
-        "covered [%]",
-    )
-    table = table_of(f"moments of inertia from flights of {duration:g} s in closed loop", (*headings, "results"))
+    figures = "flights", "bias [%]", "RMSE [%]", "std [%]", "RMSE / bound", "covered [%]", "results"
+    title = f"moments of inertia from flights of {duration:g} s in closed loop"
+    table = table_of(title, ("gust", "references", "estimator", "", *figures))
     for case in report["cases"]:
         results = in_words(count_results(np.array([row["result"] for row in case["flights"]])))
         for name, row in summary(case["flights"]).items():
@@ -214,10 +206,17 @@ def main(
     references: Annotated[list[str], typer.Option(help="random, designed, or a standard: 3211, doublet, ...")] = (
         "random",
     ),
+    wrong: Annotated[float, typer.Option(help="Error of the moments of inertia that are told, as a share.")] = 0.25,
     out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure bias and coverage of moments of inertia over the strength of gusts."""
-    settings = {"duration": duration, "seed": seed, "version": jaxos4.__version__, "precision": "float64"}
+    settings = {
+        "duration": duration,
+        "seed": seed,
+        "wrong": wrong,
+        "version": jaxos4.__version__,
+        "precision": "float64",
+    }
     report: dict = {**settings, "cases": []}
     if out is not None and out.exists():
         earlier = json.loads(out.read_text())
@@ -233,7 +232,7 @@ def main(
 
     for gust, kind in itertools.product(gusts, references):
         wanted_references = references_of(kind, gust, duration, seed)
-        flown = [(i, fly(gust, i, duration, seed, wanted_references)) for i in range(flights)]
+        flown = [(i, fly(gust, i, duration, seed, wrong, wanted_references)) for i in range(flights)]
         flown = [(i, flight) for i, flight in flown if not turned_over(flight)]
         for name in estimators:
             what = {"gust": gust, "references": kind, "estimator": name}
@@ -244,11 +243,11 @@ def main(
             done = {row["flight"] for row in case["flights"]}
             wanted = [(i, flight) for i, flight in flown if i not in done and (i < searches or name != "output-error")]
             if name == "equation-error":
-                case["flights"] += regress(wanted)
+                case["flights"] += regress(wanted, wrong)
                 save()
                 continue
             for i, flight in wanted:
-                case["flights"].append(search(name, flight, i))
+                case["flights"].append(search(name, flight, i, wrong))
                 save()
     print_table(report, duration)
 

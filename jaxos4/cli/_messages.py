@@ -14,7 +14,7 @@ _PHRASES = {
     "`end`": "--to",
 }
 _OPTIONS = (
-    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|holdout|initial_state|loss|"
+    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|gust|holdout|initial_state|loss|"
     "network|rate|sample_time|samples|seed|slew|slowest|terms|validate|velocity|window"
 )
 

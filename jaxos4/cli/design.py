@@ -1,27 +1,25 @@
-"""`jaxos4 design`: the input that tells the most within an envelope."""
+"""`jaxos4 design`: the input, or the references of a controller, that tell the most within an envelope."""
 
 import time
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from .._files import read_toml
 from ..errors import InputError
-from ._choices import (
-    AirframeOption,
-    BracketOption,
-    Channels,
-    InitialState,
-    InitialStateOption,
-    Model,
-    ModelOption,
-    check_seed,
-)
+from ._choices import AirframeOption, BracketOption, Channels, InitialState, Model, check_seed
+from ._loop import DelayOption, GustOption, LagOption, SensorsOption, check_kind, loop_of
 from ._messages import option_names
 from ._output import check_different, check_output
 from ._progress import stages
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ..closed_loop import ClosedLoop
 
 
 class Criterion(StrEnum):
@@ -32,38 +30,73 @@ class Criterion(StrEnum):
     worst = "worst"
 
 
+# What prints the result, and the number of samples that were written.
+Written = tuple[Callable[["Console"], None], int]
+
+
 def design(
-    out: Annotated[Path, typer.Option(help="The rotor speeds to write (CSV: t, omega1..4).")],
+    out: Annotated[Path, typer.Option(help="The CSV to write: rotor speeds; with --closed-loop: references.")],
     airframe: AirframeOption = "os4",
-    model: ModelOption = Model["published"],
-    duration: Annotated[float, typer.Option(help="Duration [s].", metavar="SECONDS")] = 5.0,
-    dt: Annotated[float, typer.Option(help="Sample time [s].", metavar="SECONDS")] = 0.01,
+    closed_loop: Annotated[
+        bool, typer.Option("--closed-loop", help="References for a real vehicle, which flies under its controller.")
+    ] = False,
+    model: Annotated[Model | None, typer.Option(help="Equations of motion. Default: published.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Duration [s]. Default: 5; with --closed-loop: 20.", metavar="SECONDS")
+    ] = None,
+    dt: Annotated[
+        float | None, typer.Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.", metavar="SECONDS")
+    ] = None,
     slowest: Annotated[float | None, typer.Option(help="Slowest rotor speed [rad/s].")] = None,
     fastest: Annotated[float | None, typer.Option(help="Fastest rotor speed [rad/s].")] = None,
     slew: Annotated[float | None, typer.Option(help="Fastest change of a rotor speed [rad/s^2].")] = None,
-    angle: Annotated[float | None, typer.Option(help="Largest roll, pitch and yaw angle [rad].")] = None,
+    angle: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest roll, pitch and yaw angle [rad]; with --closed-loop: that of the references. Default: 0.3."
+        ),
+    ] = None,
     rate: Annotated[float | None, typer.Option(help="Largest body rate [rad/s].")] = None,
     velocity: Annotated[float | None, typer.Option(help="Largest velocity [m/s].")] = None,
     distance: Annotated[float | None, typer.Option(help="Largest distance from the start [m].")] = None,
-    bandwidth: Annotated[float, typer.Option(help="Highest frequency of the input [Hz].", metavar="HERTZ")] = 4.0,
+    bandwidth: Annotated[
+        float | None, typer.Option(help="Highest frequency [Hz]. Default: 4; with --closed-loop: 6.", metavar="HERTZ")
+    ] = None,
     bracket: BracketOption = None,
-    channels: Annotated[Channels, typer.Option(help="Channels that will be measured.")] = Channels["all"],
-    initial_state: InitialStateOption = InitialState["free"],
+    channels: Annotated[Channels | None, typer.Option(help="Channels that will be measured. Default: all.")] = None,
+    initial_state: Annotated[
+        InitialState | None, typer.Option(help="free: estimated too; known: equal to the first sample. Default: free.")
+    ] = None,
     criterion: Annotated[
         Criterion, typer.Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound.")
     ] = Criterion["D"],
     accuracy: Annotated[
-        float, typer.Option(help="Wanted standard deviation [% of the bracket's half-width].", metavar="PERCENT")
-    ] = 1.0,
-    figure: Annotated[Path | None, typer.Option(help="SVG file: the input, and the bounds over time.")] = None,
+        float | None,
+        typer.Option(
+            help="Wanted standard deviation [% of the bracket's half-width]. Default: 1; "
+            "with --closed-loop: 5 % of Ix, Iy and Iz.",
+            metavar="PERCENT",
+        ),
+    ] = None,
+    gust: GustOption = None,
+    lag: LagOption = None,
+    delay: DelayOption = None,
+    sensors: SensorsOption = None,
+    figure: Annotated[Path | None, typer.Option(help="SVG file: what to fly, and the bounds over time.")] = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
 ) -> None:
-    """Design the rotor speeds that tell the most, within the envelope of the standard multisine or the given limits."""
+    """Design what to fly, within limits: the rotor speeds, or the references of a controller, that tell the most."""
     check_output(out, Path(airframe), bracket)
     check_different(out=out, figure=figure)
     if figure is not None:
         check_output(figure, Path(airframe), bracket)
+    check_kind(
+        closed_loop,
+        of_open={"model": model, "slew": slew, "channels": channels, "initial-state": initial_state},
+        of_closed={"gust": gust, "lag": lag, "delay": delay, "sensors": sensors},
+    )
     check_seed(seed)
+    accuracy = (5.0 if closed_loop else 1.0) if accuracy is None else accuracy
     if not 0 < accuracy < 1e6:
         raise InputError(f"--accuracy: must be positive and finite, got {accuracy:g}.")
     limits = {
@@ -75,37 +108,83 @@ def design(
         "velocity": velocity,
         "distance": distance,
     }
+    limits = {name: value for name, value in limits.items() if value is not None}
+    dt = (0.004 if closed_loop else 0.01) if dt is None else dt
     begin = time.perf_counter()
     with stages("loading the library") as progress, option_names(bracket=bracket):
-        from ..airframe import load_airframe
-        from ..design import design_and_compare, write_input
-        from ..identification.problem import bracket_of
-        from ..models import MODELS
-
-        subject = MODELS[model](load_airframe(airframe))
-        found = design_and_compare(
-            subject,
-            limits={name: value for name, value in limits.items() if value is not None},
-            bracket=bracket_of(None if bracket is None else read_toml(bracket), subject),
-            duration=duration,
-            dt=dt,
-            channels=channels.value,
-            start_is_known=initial_state is InitialState["known"],
-            criterion=criterion.value,
-            bandwidth=bandwidth,
-            seed=seed,
-            progress=progress,
-        )
-        progress("writing")
-        write_input(found.designed, out)
-        if figure is not None:
-            from ..report.figures_design import write_design
-
-            write_design(found, figure)
+        settings = {
+            "limits": limits,
+            "duration": (20.0 if closed_loop else 5.0) if duration is None else duration,
+            "dt": dt,
+            "criterion": criterion.value,
+            "bandwidth": (6.0 if closed_loop else 4.0) if bandwidth is None else bandwidth,
+            "seed": seed,
+            "progress": progress,
+        }
+        intervals = None if bracket is None else read_toml(bracket)
+        if closed_loop:
+            loop = loop_of(airframe, gust, lag, delay, sensors)
+            show, samples = _references(loop, intervals, settings, accuracy / 100, out, figure)
+            what = "references"
+        else:
+            settings |= {"start_is_known": initial_state is InitialState["known"]}
+            settings |= {"channels": (channels or Channels["all"]).value}
+            model = model or Model["published"]
+            show, samples = _rotor_speeds(airframe, model, intervals, settings, accuracy / 100, out, figure)
+            what = f"{model.value} model"
     from rich.console import Console
 
+    show(Console(highlight=False))
+    typer.echo(f"{out}: {samples} samples of {dt:g} s, {what}, {time.perf_counter() - begin:.0f} s")
+
+
+def _rotor_speeds(
+    airframe: str,
+    model: Model,
+    intervals: dict[str, Any] | None,
+    settings: dict[str, Any],
+    accuracy: float,
+    out: Path,
+    figure: Path | None,
+) -> Written:
+    """Design rotor speeds, and write them."""
+    from ..airframe import load_airframe
+    from ..design import design_and_compare, write_input
+    from ..identification.problem import bracket_of
+    from ..models import MODELS
     from ..report.design_page import print_design
 
-    print_design(Console(highlight=False), found, accuracy / 100)
-    samples = found.designed.omega.shape[0]
-    typer.echo(f"{out}: {samples} samples of {dt:g} s, {model.value} model, {time.perf_counter() - begin:.0f} s")
+    subject = MODELS[model](load_airframe(airframe))
+    found = design_and_compare(subject, bracket=bracket_of(intervals, subject), **settings)
+    settings["progress"]("writing")
+    write_input(found.designed, out)
+    if figure is not None:
+        from ..report.figures_design import write_design
+
+        write_design(found, figure)
+    return lambda console: print_design(console, found, accuracy), found.designed.omega.shape[0]
+
+
+def _references(
+    loop: "ClosedLoop",
+    intervals: dict[str, Any] | None,
+    settings: dict[str, Any],
+    accuracy: float,
+    out: Path,
+    figure: Path | None,
+) -> Written:
+    """Design references, and write them. The largest angle is that of the references."""
+    from ..design import design_and_compare_references, model_of, write_references
+    from ..identification.problem import bracket_of
+    from ..report.references_page import print_references
+
+    angle = settings["limits"].pop("angle", 0.3)
+    bracket = bracket_of(intervals, model_of(loop))
+    found = design_and_compare_references(loop, angle=angle, bracket=bracket, **settings)
+    settings["progress"]("writing")
+    write_references(found.designed, out)
+    if figure is not None:
+        from ..report.figures_references import write_references_figure
+
+        write_references_figure(found, accuracy, figure)
+    return lambda console: print_references(console, found, accuracy), found.designed.references.shape[0]

@@ -1,13 +1,13 @@
 """`jaxos4 simulate`: a simulated flight as CSV."""
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ..errors import InputError
-from ._choices import AirframeOption, Excitation, Method, Model, Sensors, check_seed
+from ._choices import AirframeOption, Excitation, Method, Model, check_seed
+from ._loop import DelayOption, GustOption, LagOption, SensorsOption, check_kind, loop_of
 from ._output import check_output
 from ._progress import stages
 
@@ -39,31 +39,25 @@ def simulate(
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
     ] = False,
-    gust: Annotated[
-        float | None,
-        typer.Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5."),
-    ] = None,
-    lag: Annotated[
-        float | None,
-        typer.Option(help="With --closed-loop: lag of the rotors. Default: 0.05.", metavar="SECONDS"),
-    ] = None,
-    delay: Annotated[
-        float | None,
-        typer.Option(help="With --closed-loop: delay of the commands. Default: 0.01.", metavar="SECONDS"),
-    ] = None,
-    sensors: Annotated[
-        Sensors | None,
-        typer.Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
+    gust: GustOption = None,
+    lag: LagOption = None,
+    delay: DelayOption = None,
+    sensors: SensorsOption = None,
+    references: Annotated[
+        Path | None,
+        typer.Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
     ] = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
-    check_output(out, Path(airframe))
-    of_open = {"model": model, "excitation": excitation, "method": method, "noise": noise}
-    of_closed = {"gust": gust, "lag": lag, "delay": delay, "sensors": sensors}
-    for name, value in (of_open if closed_loop else of_closed).items():
-        if value is not None:
-            how = "without --closed-loop; leave it out" if closed_loop else "with --closed-loop; add that"
-            raise InputError(f"--{name}: is for flights {how}.")
+    check_output(out, Path(airframe), references)
+    check_kind(
+        closed_loop,
+        of_open={"model": model, "excitation": excitation, "method": method, "noise": noise},
+        of_closed={"gust": gust, "lag": lag, "delay": delay, "sensors": sensors, "references": references},
+    )
+    for name, value in (("duration", duration), ("dt", dt)):
+        if references is not None and value is not None:
+            raise InputError(f"--{name}: {references} has its own; leave it out.")
     model, excitation, method = (
         model or Model["published"],
         excitation or Excitation["multisine"],
@@ -71,11 +65,9 @@ def simulate(
     )
     duration = (20.0 if closed_loop else 5.0) if duration is None else duration
     dt = (0.004 if closed_loop else 0.01) if dt is None else dt
-    noise, gust = 0.0 if noise is None else noise, 5.0 if gust is None else gust
-    lag, delay = 0.05 if lag is None else lag, 0.01 if delay is None else delay
-    for name, value, most in (("noise", noise, 1e6), ("gust", gust, 1e6), ("lag", lag, 1), ("delay", delay, 1)):
-        if not 0 <= value <= most:
-            raise InputError(f"--{name}: must lie in 0 to {most:g}, got {value}.")
+    noise = 0.0 if noise is None else noise
+    if not 0 <= noise <= 1e6:
+        raise InputError(f"--noise: must lie in 0 to 1e+06, got {noise}.")
     check_seed(seed)
     if dt > 0 and duration / dt > MOST_SAMPLES:
         raise InputError(f"--duration {duration:g}: more than {MOST_SAMPLES} samples of {dt:g} s; ask for fewer.")
@@ -87,14 +79,17 @@ def simulate(
 
         progress("compiling and simulating")
         vehicle = load_airframe(airframe)
-        scaled = math.isfinite(float(vehicle.max_rotor_speed))
-        if sensors == "commands" and not scaled:
-            raise InputError(f"--sensors commands: {airframe} has no max_rotor_speed [rad/s]; set it, or log speeds.")
-        logged = sensors.value if sensors else "commands" if scaled else "speeds"
         try:
             if closed_loop:
-                flight = _closed_loop(vehicle, gust, lag, delay, logged, duration, dt, seed)
-                how = f"closed loop, {logged}, gusts of {gust:g} rad/s^2"
+                from ..closed_loop import fly_standard
+
+                loop, flown = loop_of(airframe, gust, lag, delay, sensors), None
+                if references is not None:
+                    from ..design import read_references
+
+                    flown, dt = read_references(references)
+                flight = fly_standard(loop, references=flown, duration=duration, dt=dt, seed=seed)
+                how = f"closed loop, {loop.logged}, gusts of {5.0 if gust is None else gust:g} rad/s^2"
             else:
                 flight = _open_loop(vehicle, model, excitation, method, duration, dt)
                 how = f"{model.value} model, {method.value}, noise {noise:g}"
@@ -122,13 +117,3 @@ def _open_loop(
     vehicle = MODELS[model](airframe)
     omega = EXCITATIONS[excitation](airframe, duration=duration, dt=dt)
     return fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)
-
-
-def _closed_loop(
-    airframe: "Airframe", gust: float, lag: float, delay: float, logged: str, duration: float, dt: float, seed: int
-) -> "Flight":
-    """A standard flight of a controller."""
-    from ..closed_loop import ClosedLoop, fly_standard
-
-    loop = ClosedLoop(airframe, gust=gust, rotor_lag=lag, rotor_delay=delay, logged=logged)
-    return fly_standard(loop, duration=duration, dt=dt, seed=seed)

@@ -32,6 +32,9 @@ _FIRST = 0.3
 # References that need too much are reduced: to about this share of a limit, so often, and by this factor at most.
 _TARGET, _MOST_REDUCTIONS, _LEAST_FACTOR = 0.9, 5, 0.1
 _FEWEST_SAMPLES, _MOST_SAMPLES = 250, 20_000
+ACCELERATION = 1.5
+"""The largest reference of the vertical acceleration by default [m/s^2]."""
+
 _LARGEST_ANGLE, _LARGEST_ACCELERATION = 1.0, 5.0
 
 
@@ -40,7 +43,7 @@ class DesignedReferences(NamedTuple):
 
     - `references`: roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, as
       `fly_closed_loop` takes them. `dt`: the sample time [s].
-    - `period`: after which the references repeat [s].
+    - `period`: after which designed references repeat [s].
     - `names`, `units`, `bounds`: of Ix, Iy, Iz and the other parameters: the smallest standard deviation that filter
       error can reach after this flight through gusts.
     - `uses`: by the name of the limit, the largest share of it that any of the drawn vehicles uses; at most 1.
@@ -73,6 +76,7 @@ class ReferencePlan(NamedTuple):
 
     - `largest`: the largest value of each reference.
     - `standard`: the standard references with these largest values, by name.
+    - `tones`: of which designed references are made. `criterion`: what they minimise.
     """
 
     fleet: Fleet
@@ -80,16 +84,17 @@ class ReferencePlan(NamedTuple):
     envelope: Envelope
     largest: Float[np.ndarray, "4"]
     standard: dict[str, Shape]
+    tones: Tones
+    criterion: str
 
     def judged(
-        self, references: Mapping[str, Shape], periods: Mapping[str, float], uses: Mapping[str, dict[str, float]]
+        self, references: Mapping[str, Shape], uses: Mapping[str, dict[str, float]]
     ) -> dict[str, DesignedReferences]:
-        """Each of several references with its bounds."""
-        filters, dt, bounds = self.filters, self.fleet.dt, self.fleet.bounds(self.filters, references)
+        """Each of several references with its bounds. `uses`: of the limits, by name of those that have been flown."""
+        dt, names, units = self.fleet.dt, self.filters.names, self.filters.units
+        bounds, period = self.fleet.bounds(self.filters, references), self.tones.period * dt
         return {
-            name: DesignedReferences(
-                some, dt, periods.get(name, math.nan), filters.names, filters.units, bounds[name], uses.get(name, {})
-            )
+            name: DesignedReferences(some, dt, period, names, units, bounds[name], uses.get(name, {}))
             for name, some in references.items()
         }
 
@@ -108,7 +113,7 @@ class _References(AbstractTask):
     kind: str = eqx.field(static=True)
 
     @classmethod
-    def of(cls, plan: ReferencePlan, response: Response, tones: Tones, criterion: str) -> "_References":
+    def of(cls, plan: ReferencePlan, response: Response) -> "_References":
         """The task of a plan. Raises `InputError` if gusts leave nothing of a limit."""
         base = plan.filters.about_inertias(np.asarray(plan.filters.prior) + response.hovering)
         each = plan.filters.about_inertias(response.tones) * np.square(plan.largest)[:, None, None, None]
@@ -121,9 +126,8 @@ class _References(AbstractTask):
                 raise _too_gusty(name)
             signals[name] = jnp.asarray(response.signals[name] * (plan.largest[:3] / room)[:, None, None])
         unit = np.outer(scale, scale)
-        return cls(
-            jnp.asarray(base / unit), jnp.asarray(each / unit), as_float(tones.basis(_POINTS)), signals, criterion
-        )
+        basis = as_float(plan.tones.basis(_POINTS))
+        return cls(jnp.asarray(base / unit), jnp.asarray(each / unit), basis, signals, plan.criterion)
 
     def criterion(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
@@ -142,7 +146,7 @@ def design_references(
     loop: ClosedLoop,
     *,
     angle: float = 0.3,
-    acceleration: float = 1.5,
+    acceleration: float = ACCELERATION,
     limits: Mapping[str, float] | None = None,
     bracket: Bracket | None = None,
     duration: float = 20.0,
@@ -173,11 +177,22 @@ def design_references(
 
     **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
     """
-    settings = {"angle": angle, "acceleration": acceleration, "duration": duration, "dt": dt}
-    plan = plan_references(loop, **settings, limits=limits, bracket=bracket, key=key, progress=progress)
-    found, period, uses = search_references(plan, criterion=criterion, bandwidth=bandwidth, key=key, progress=progress)
+    plan = plan_references(
+        loop,
+        angle=angle,
+        acceleration=acceleration,
+        limits={} if limits is None else limits,
+        bracket=Bracket.default(model_of(loop)) if bracket is None else bracket,
+        duration=duration,
+        dt=dt,
+        criterion=criterion,
+        bandwidth=bandwidth,
+        key=key,
+        progress=progress,
+    )
+    found, uses = search_references(plan, key=key, progress=progress)
     progress("bounds")
-    return plan.judged({"designed": found}, {"designed": period}, {"designed": uses})["designed"]
+    return plan.judged({"designed": found}, {"designed": uses})["designed"]
 
 
 def plan_references(
@@ -185,10 +200,12 @@ def plan_references(
     *,
     angle: float,
     acceleration: float,
-    limits: Mapping[str, float] | None,
-    bracket: Bracket | None,
+    limits: Mapping[str, float],
+    bracket: Bracket,
     duration: float,
     dt: float,
+    criterion: str,
+    bandwidth: float,
     key: Key,
     progress: Callable[[str], None],
 ) -> ReferencePlan:
@@ -202,20 +219,6 @@ def plan_references(
     if not _FEWEST_SAMPLES <= duration / dt <= _MOST_SAMPLES:
         allowed = f"{_FEWEST_SAMPLES} to {_MOST_SAMPLES} samples of {dt:g} s (`dt`)"
         raise InputError(f"`duration` must be {allowed}, got {duration:g} s; longer flights repeat the references.")
-    progress("limits")
-    bracket = Bracket.default(model_of(loop)) if bracket is None else bracket
-    fleet, largest = Fleet.of(loop, bracket, dt, key), np.array([angle, angle, angle, acceleration])
-    standard = standard_references(round(duration / dt) + 1, dt, largest)
-    envelope = fleet.envelope(standard["3211"], {} if limits is None else limits)
-    return ReferencePlan(fleet, Filters.of(loop, bracket.half_width, dt), envelope, largest, standard)
-
-
-def search_references(
-    plan: ReferencePlan, *, criterion: str, bandwidth: float, key: Key, progress: Callable[[str], None]
-) -> tuple[Shape, float, dict[str, float]]:
-    """The best references of a plan, their period [s], and what they use of the limits."""
-    samples, dt = plan.standard["3211"].shape[0], plan.fleet.dt
-    duration = (samples - 1) * dt
     if criterion not in CRITERIA:
         raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
     if not 2 / duration <= bandwidth <= 0.1 / dt:
@@ -223,10 +226,22 @@ def search_references(
             f"`bandwidth` must lie between 2 / `duration` and a tenth of the sample rate, {2 / duration:.3g} to "
             f"{0.1 / dt:.3g} Hz, got {bandwidth:g} Hz."
         )
+    progress("limits")
+    samples, largest = round(duration / dt) + 1, np.array([angle, angle, angle, acceleration])
+    fleet, filters = Fleet.of(loop, bracket, dt, key), Filters.of(loop, bracket.half_width, dt)
+    standard, tones = standard_references(samples, dt, largest), Tones.up_to(bandwidth, samples, dt)
+    envelope = fleet.envelope(standard["3211"], limits)
+    return ReferencePlan(fleet, filters, envelope, largest, standard, tones, criterion)
+
+
+def search_references(
+    plan: ReferencePlan, *, key: Key, progress: Callable[[str], None]
+) -> tuple[Shape, dict[str, float]]:
+    """The best references of a plan, and what they use of the limits."""
+    fleet, tones, samples = plan.fleet, plan.tones, plan.standard["3211"].shape[0]
     progress("flying tones")
-    tones = Tones.up_to(bandwidth, samples, dt)
-    response = respond(plan.fleet.loop, plan.filters, tones, samples, dt, _POINTS, jax.random.fold_in(key, 3))
-    task = _References.of(plan, response, tones, criterion)
+    response = respond(fleet.loop, plan.filters, tones, samples, fleet.dt, _POINTS, jax.random.fold_in(key, 3))
+    task = _References.of(plan, response)
     progress("search")
     first = jax.random.normal(jax.random.fold_in(key, 2), (_STARTS, 8 * tones.count), dtype=float)
     searches = begin(_FIRST / math.sqrt(tones.count) * first)
@@ -238,7 +253,7 @@ def search_references(
     references = plan.largest * shape / np.maximum(np.abs(shape).max(axis=0), 1e-9)
     progress("flying vehicles")
     factor, uses = _reduced(plan, references)
-    return factor * references, tones.period * dt, uses | {"reference": factor}
+    return factor * references, uses | {"reference": factor}
 
 
 def _reduced(plan: ReferencePlan, references: Shape) -> tuple[float, dict[str, float]]:

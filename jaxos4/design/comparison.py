@@ -1,4 +1,4 @@
-"""A designed input beside the standard inputs, in the same envelope and time."""
+"""A designed input beside the standard inputs, and designed references beside standard ones, in the same time."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -9,11 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ..bracket import Bracket
+from ..closed_loop import ClosedLoop
 from ..errors import InputError
 from ..excitation import EXCITATIONS
 from ..models.abstract import AbstractModel
 from ..noise import SENSOR_SIGMA
+from .batch import LANES
+from .closed_loop import ACCELERATION, DesignedReferences, plan_references, search_references
 from .envelope import Envelope
+from .filtered import INERTIAS
 from .fitting import VEHICLES, DesignedInput, fitted
 from .open_loop import design_input, envelope_of, plan_of
 
@@ -103,4 +107,65 @@ def design_and_compare(
         half_width=np.asarray(bracket.half_width),
         usual=np.asarray(model.half_width),
         vehicles=VEHICLES,
+    )
+
+
+class ReferenceDesign(NamedTuple):
+    """What `jaxos4 design --closed-loop` shows: designed references, and the standard ones of the same length.
+
+    - `inertia`: Ix, Iy and Iz of the airframe [kg m^2]. `prior`: what the bracket says, as standard deviations.
+    - `vehicles`: the number of vehicles that stayed within the envelope.
+    """
+
+    envelope: Envelope
+    designed: DesignedReferences
+    standard: dict[str, DesignedReferences]
+    inertia: Float[np.ndarray, "3"]
+    prior: Float[np.ndarray, " parameters"]
+    vehicles: int
+
+    def gain(self, name: str) -> float:
+        """The designed bounds of Ix, Iy and Iz over those of standard references, as a geometric mean."""
+        own, other = (one.bounds[: len(INERTIAS)] for one in (self.designed, self.standard[name]))
+        return float(np.exp(np.log(own / other).mean()))
+
+
+def design_and_compare_references(
+    loop: ClosedLoop,
+    *,
+    angle: float,
+    limits: Mapping[str, float],
+    bracket: Bracket,
+    duration: float,
+    dt: float,
+    criterion: str,
+    bandwidth: float,
+    seed: int,
+    progress: Callable[[str], None] = lambda _: None,
+) -> ReferenceDesign:
+    """Design references and compare them with standard ones. Arguments and errors as of `design_references`."""
+    key = jax.random.key(seed)
+    plan = plan_references(
+        loop,
+        angle=angle,
+        acceleration=ACCELERATION,
+        limits=limits,
+        bracket=bracket,
+        duration=duration,
+        dt=dt,
+        criterion=criterion,
+        bandwidth=bandwidth,
+        key=key,
+        progress=progress,
+    )
+    found, uses = search_references(plan, key=key, progress=progress)
+    progress("bounds of designed and standard references")
+    judged = plan.judged({"designed": found, **plan.standard}, {"designed": uses})
+    return ReferenceDesign(
+        envelope=plan.envelope,
+        designed=judged.pop("designed"),
+        standard=judged,
+        inertia=np.asarray(loop.airframe.inertia),
+        prior=plan.filters.bounds(np.zeros_like(plan.filters.prior)),
+        vehicles=LANES,
     )

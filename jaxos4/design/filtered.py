@@ -21,6 +21,8 @@ INERTIAS = ("Ix", "Iy", "Iz")
 INVERSE = [PARAMETER_NAMES.index(name) for name in ("alpha3", "alpha6", "alpha8")]
 # Standard deviations of disturbances below this are as good as none [rad/s^2, m/s^2].
 _LEAST = 1e-3
+# Of several flights, or of several channels.
+Informations = Float[np.ndarray, "*some parameters parameters"]
 
 
 def model_of(loop: ClosedLoop) -> FlightModel:
@@ -73,9 +75,7 @@ class Filters(eqx.Module):
     def _others(self) -> tuple[int, ...]:
         return tuple(i for i in range(self.parameters.shape[0]) if i not in INVERSE)
 
-    def about_inertias(
-        self, information: Float[np.ndarray, "*some parameters parameters"]
-    ) -> Float[np.ndarray, "*some parameters parameters"]:
+    def about_inertias(self, information: Informations) -> Informations:
         """From information about the model's parameters to that about log Ix, log Iy, log Iz, and the others.
 
         The inertia is thrust_gain / alpha, as in the table that `jaxos4 estimate` prints.

@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,12 +47,8 @@ class Fleet(NamedTuple):
         inertia = 1 / np.asarray(drawn(bracket, key, LANES))[:, INVERSE]
         if not (np.isfinite(inertia).all() and (inertia > 0).all()):
             raise InputError("`bracket`: alpha3, alpha6 and alpha8 must be positive.")
-        return cls(
-            loop,
-            batch_of(loop, inertia=inertia, force_noise=np.zeros(LANES), **settings),
-            dt,
-            jax.random.fold_in(key, 1),
-        )
+        loops = batch_of(loop, inertia=inertia, force_noise=np.zeros(LANES), **settings)
+        return cls(loop, loops, dt, jax.random.fold_in(key, 1))
 
     def needs(self, references: Shape) -> Envelope | None:
         """The limits that these flights just keep; `None` if a vehicle turns over."""
@@ -68,27 +63,29 @@ class Fleet(NamedTuple):
     def envelope(self, references: Shape, limits: Mapping[str, float]) -> Envelope:
         """The limits that these references need, with some replaced. Limits of rotors are those of the airframe.
 
-        **Raises:** `InputError` if a vehicle turns over, or cannot hover.
+        **Raises:** `InputError` for a limit that is not positive, or if a vehicle turns over or cannot hover.
         """
-        needed, airframe = self.needs(references), self.loop.airframe
+        airframe = self.loop.airframe
+        hover, fastest = float(airframe.hover_speed), float(airframe.max_rotor_speed)
+        slowest, fastest = _SLOWEST * hover, fastest if math.isfinite(fastest) else _FASTEST * hover
+        rotors = {"slowest": slowest, "fastest": fastest, "slew": (fastest - slowest) / self.dt}
+        unknown = dict.fromkeys(("angle", "rate", "velocity", "distance"), 1.0)
+        try:
+            given = Envelope(**{**rotors, **unknown, **limits})
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        hover_squares(airframe, given)
+        needed = self.needs(references)
         if needed is None:
             raise InputError(
                 "some of the vehicles turn over in 3-2-1-1 references; give weaker gusts or a smaller `angle`, or "
                 "narrow the `bracket`."
             )
-        hover, fastest = float(airframe.hover_speed), float(airframe.max_rotor_speed)
-        slowest, fastest = _SLOWEST * hover, fastest if math.isfinite(fastest) else _FASTEST * hover
-        rotors = {"slowest": slowest, "fastest": fastest, "slew": (fastest - slowest) / self.dt}
         flown = {"velocity": needed.velocity, "distance": needed.distance}
         for name in ("angle", "rate"):  # roll and pitch may do the same
             roll, pitch, yaw = np.asarray(getattr(needed, name)).tolist()
             flown[name] = [max(roll, pitch), max(roll, pitch), yaw]
-        try:
-            envelope = Envelope(**{**rotors, **flown, **limits})
-        except ValueError as error:
-            raise InputError(str(error)) from None
-        hover_squares(airframe, envelope)
-        return envelope
+        return Envelope(**{**rotors, **flown, **limits})
 
     def uses(self, references: Shape, envelope: Envelope) -> dict[str, float]:
         """The largest share of each limit that a vehicle uses. A controller has no limit of slew."""

@@ -15,7 +15,7 @@ from ..logs.table import printable
 from .fitting import DesignedInput
 
 # How far a sample time may be off, as a share of it.
-_PRECISION = 1e-3
+PRECISION = 1e-3
 
 
 def write_input(designed: DesignedInput, path: str | PathLike[str]) -> None:
@@ -38,6 +38,6 @@ def read_input(path: str | PathLike[str], dt: float) -> Float[np.ndarray, "sampl
     omega, time = np.stack([columns[rotor] for rotor in SPEED_NAMES], axis=1), columns["t"]
     if not (np.isfinite(time).all() and (omega >= 0).all()):
         raise InputError(f"{name}: a cell is empty or negative; give every rotor speed of every sample.")
-    if len(time) < 2 or np.abs(np.diff(time) - dt).max() > _PRECISION * dt:
+    if len(time) < 2 or np.abs(np.diff(time) - dt).max() > PRECISION * dt:
         raise InputError(f"{name}: is not sampled every {dt:g} s; design the input with this sample time.")
     return omega

@@ -1,4 +1,4 @@
-"""References for a controller: the standard ones, and the file of references.
+"""The standard references for a controller: multisine, doublet, 3-2-1-1 and chirp.
 
 References are roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, as `fly_closed_loop`
 takes them.
@@ -6,15 +6,12 @@ takes them.
 
 import math
 from collections.abc import Callable, Sequence
-from os import PathLike
 
 import numpy as np
 from jaxtyping import Float
 
-from .._files import write_atomically
 from ..excitation import DOUBLET, STANDARD_TONES, TAPER
 
-COLUMNS = ("t", "roll_reference", "pitch_reference", "yaw_reference", "az_reference")
 # Pulses of a reference last about 0.3 periods of the controlled vehicle's attitude [s].
 WIDTH = 0.3
 # Each pulse of a reference is as high as the others, unlike those of torque in `excitation`.
@@ -66,10 +63,3 @@ def standard_references(samples: int, dt: float, largest: Float[np.ndarray, "4"]
     """The standard references, each with these `largest` values; 0 if a shape does not fit into the time."""
     shapes = {name: make(samples, dt) for name, make in _STANDARD.items()}
     return {name: largest * shape / np.maximum(np.abs(shape).max(axis=0), 1e-9) for name, shape in shapes.items()}
-
-
-def write_references(references: Shape, dt: float, path: str | PathLike[str]) -> None:
-    """Write references as CSV, with the columns t, roll_reference, ... and az_reference."""
-    rows = np.column_stack([dt * np.arange(len(references)), references])
-    with write_atomically(path) as beside:
-        np.savetxt(beside, rows, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.6g")

@@ -317,7 +317,7 @@ def lanes_of(samples: int, wanted: int, settling: int = _SETTLING) -> Int[np.nda
 def innovations_of(
     problem: ShootingProblem, observed: Observed, index: Int[np.ndarray, "lanes time"]
 ) -> Callable[[Parameters, Noise], Innovations]:
-    """The innovations of a flight in lanes (`lanes_of`, `observed_of`) as a function of the parameters and the noise."""
+    """The innovations of a flight in the lanes of `lanes_of`, as a function of the parameters and the noise."""
     model, inputs, dt = problem.model, problem.flight.inputs, problem.flight.dt
     samples = np.minimum(index, problem.flight.time.shape[0] - 1)
     rows = Rows(windowed(problem.forcing(model.alpha), samples), ())
