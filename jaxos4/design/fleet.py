@@ -102,5 +102,5 @@ class Fleet(NamedTuple):
         order = np.arange(LANES) % len(names)
         flown = jnp.asarray(np.stack([references[name] for name in names]))[order]
         flights = fly_batch(batch_of(self.loop), flown, as_float(self.dt), jax.random.fold_in(self.key, 1))
-        found = np.asarray(informations(filters, flights)).sum(axis=1)
+        found = np.asarray(informations(filters, flights).whole)
         return {name: filters.bounds(found[order == i].mean(axis=0)) for i, name in enumerate(names)}

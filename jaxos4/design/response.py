@@ -56,8 +56,8 @@ class Response(NamedTuple):
     - `gusty`: the largest angles and rates in gusts, by the name of their limit.
     """
 
-    tones: Float[np.ndarray, "references count parameters parameters"]
-    hovering: Float[np.ndarray, "parameters parameters"]
+    tones: Float[np.ndarray, "references count unknowns unknowns"]
+    hovering: Float[np.ndarray, "unknowns unknowns"]
     signals: dict[str, Float[np.ndarray, "axes points coefficients"]]
     gusty: dict[str, Float[np.ndarray, "axes"]]
 
@@ -84,10 +84,14 @@ def respond(
     names = ("gust", "thrust_gust", "gyro_noise", "attitude_noise", "force_noise")
     loops = batch_of(loop, **{name: np.multiply.outer(in_gusts, np.asarray(getattr(loop, name))) for name in names})
     flights = fly_batch(loops, jnp.asarray(references), as_float(dt), key)
-    found, states = np.asarray(informations(filters, flights)), np.asarray(flights.states)
-    excess = found - found[2 * count]
+    found, states = informations(filters, flights), np.asarray(flights.states)
+    channels = np.asarray(found.channels)
+    excess = channels - channels[2 * count]
     angular = np.moveaxis(excess[:count, :3], 1, 0) / np.square(_SMALL[:3])[:, None, None, None]
     vertical = excess[None, count : 2 * count].sum(axis=2) / _SMALL[3] ** 2
+    # In still air nothing is learned about the noise.
+    beyond = filters.prior.shape[0] - channels.shape[-1]
+    information = np.pad(np.concatenate([angular, vertical]), ((0, 0), (0, 0), (0, beyond), (0, beyond)))
     # The answers in the last period, in which the beginning is forgotten.
     last = turns[-tones.period :].conj() * 2 / tones.period
     signals = {}
@@ -96,4 +100,4 @@ def respond(
         moving = answers[:, None] * tones.turns(points)
         signals[name] = np.concatenate([moving.real, moving.imag], axis=2)
     gusty = {name: np.abs(states[in_gusts][..., columns]).max(axis=(0, 1)) for name, columns in _LIMITED.items()}
-    return Response(np.concatenate([angular, vertical]), found[in_gusts].sum(axis=1).mean(axis=0), signals, gusty)
+    return Response(information, np.asarray(found.whole)[in_gusts].mean(axis=0), signals, gusty)

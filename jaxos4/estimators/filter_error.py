@@ -44,7 +44,7 @@ _GAP = 0.1
 _STARTS = np.array([0.2, 0.03])
 _SHORTEST, _LONGEST = 0.25, 3.0  # time constants: in samples, in seconds
 _NOISE_REACH = 1e8  # factor to either side: simulated flights have no disturbance
-_NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
+NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
 _LONGEST_STEP = 1.0  # of a logarithm
 _NOISE_TOLERANCE = 0.1  # of the log-likelihood
 _STALLED, _FLAT = 1e4, 0.1  # a damping, and the log-likelihood that is then left to gain
@@ -260,7 +260,7 @@ def _region(bracket: Bracket, held: Bool[Array, " parameters"], noise: Float[Arr
     times = jnp.log(_SHORTEST * dt), np.log(_LONGEST)
     lower, upper = (noise + sign * np.log(_NOISE_REACH) for sign in (-1, 1))
     lower, upper = lower.at[:, 1].set(times[0]), upper.at[:, 1].set(times[1])
-    precision = jnp.concatenate([1 / jnp.square(bracket.half_width), jnp.full(noise.size, _NOISE_PRECISION)])
+    precision = jnp.concatenate([1 / jnp.square(bracket.half_width), jnp.full(noise.size, NOISE_PRECISION)])
     return _Region(
         jnp.concatenate([center - REACH * half_width, lower.ravel()]),
         jnp.concatenate([center + REACH * half_width, upper.ravel()]),
