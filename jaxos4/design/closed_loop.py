@@ -29,8 +29,8 @@ _STAGES = (*PENALTIES, *PENALTIES[-1:] * 10)
 _POINTS = np.arange(200) / 200
 # A search starts at about this share of the largest references.
 _FIRST = 0.3
-# References that need too much are reduced: to about this share of a limit, so often, and by this factor at most.
-_TARGET, _MOST_REDUCTIONS, _LEAST_FACTOR = 0.9, 5, 0.1
+# References that need too much are reduced: to about this share of a limit, so often, and not below this factor at once.
+_TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.97, 8, 0.7
 _FEWEST_SAMPLES, _MOST_SAMPLES = 250, 20_000
 ACCELERATION = 1.5
 """The largest reference of the vertical acceleration by default [m/s^2]."""
@@ -263,12 +263,13 @@ def _reduced(plan: ReferencePlan, references: Shape) -> tuple[float, dict[str, f
         return factor, uses
     still = plan.fleet.uses(0 * references, plan.envelope)
     for _ in range(_MOST_REDUCTIONS):
+        steps = [1.0]
         for name, share in uses.items():
             if still[name] >= 1:
                 raise _too_gusty(name)
-            if share > 1:  # what gusts leave of the limit grows about linearly with the references
-                target = (1 + max(still[name], _TARGET)) / 2
-                factor *= max((target - still[name]) / (share - still[name]), _LEAST_FACTOR)
+            if share > 1:  # what is used beyond the gusts' share grows about linearly with the references
+                steps.append((_TARGET - still[name]) / (share - still[name]))
+        factor *= max(min(steps), _LEAST_STEP)
         uses = plan.fleet.uses(factor * references, plan.envelope)
         if max(uses.values()) <= 1:
             return factor, uses

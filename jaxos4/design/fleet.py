@@ -22,6 +22,8 @@ from .steering import hover_squares
 
 # Rotors turn at least with this share of the speed in hover, and at most with this multiple if no maximum is known.
 _SLOWEST, _FASTEST = 0.1, 2.0
+# Gusts alone use at most this share of a limit that is not given.
+_GUSTS = 0.8
 # So many vehicles fly in still air: gusts carry a vehicle without a position controller away, whatever its references.
 _STILL = 16
 
@@ -75,15 +77,16 @@ class Fleet(NamedTuple):
         except ValueError as error:
             raise InputError(str(error)) from None
         hover_squares(airframe, given)
-        needed = self.needs(references)
-        if needed is None:
+        needed, still = self.needs(references), self.needs(0 * references)
+        if needed is None or still is None:
             raise InputError(
                 "some of the vehicles turn over in 3-2-1-1 references; give weaker gusts or a smaller `angle`, or "
                 "narrow the `bracket`."
             )
         flown = {"velocity": needed.velocity, "distance": needed.distance}
         for name in ("angle", "rate"):  # roll and pitch may do the same
-            roll, pitch, yaw = np.asarray(getattr(needed, name)).tolist()
+            alone = np.asarray(getattr(still, name)) / _GUSTS
+            roll, pitch, yaw = np.maximum(np.asarray(getattr(needed, name)), alone).tolist()
             flown[name] = [max(roll, pitch), max(roll, pitch), yaw]
         return Envelope(**{**rotors, **flown, **limits})
 
