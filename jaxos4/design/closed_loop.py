@@ -29,7 +29,7 @@ _STAGES = (*PENALTIES, *PENALTIES[-1:] * 10)
 _POINTS = np.arange(200) / 200
 # A search starts at about this share of the largest references.
 _FIRST = 0.3
-# References that need too much are reduced: to about this share of a limit, so often, and not below this factor at once.
+# References that need too much are reduced: to about this share of a limit, so often, each time not below this factor.
 _TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.97, 8, 0.7
 _FEWEST_SAMPLES, _MOST_SAMPLES = 250, 20_000
 ACCELERATION = 1.5

@@ -63,7 +63,7 @@ class Envelope(eqx.Module):
 
     @classmethod
     def of(
-        cls, omega: Float[Numeric, "*flights samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
+        cls, omega: Float[Numeric, "*inputs samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
     ) -> "Envelope":
         """The limits that flights with these rotor speeds just keep.
 

@@ -1,6 +1,6 @@
 """What flights in closed loop tell: the Fisher information of the innovations that filter error compares."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -53,7 +53,7 @@ class Filters(eqx.Module):
     def of(cls, loop: ClosedLoop, half_width: Parameters, dt: float) -> "Filters":
         """The filters that know the true gusts and noise."""
         model = model_of(loop)
-        known = {"rotor_lag": loop.rotor_lag, "rotor_delay": loop.rotor_delay}
+        known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": loop.rotor_delay}
         for i, axis in enumerate(("roll", "pitch", "yaw")):
             known |= {f"{axis}_offset": loop.offset[i], f"{axis}_damping": loop.damping[i]}
         names, alpha = model.parameter_names, np.asarray(model.alpha)
@@ -113,7 +113,7 @@ def informations(filters: Filters, flights: Flight) -> Informed:
     """What each of a batch of flights tells."""
     count = filters.parameters.shape[0]
 
-    def one(omega: RotorSpeeds, states: Array, force: Array) -> Informed:
+    def one(omega: RotorSpeeds, states: Array, force: Array | None) -> Informed:
         flight = Flight(flights.time[0], omega, states, specific_force=force, commanded=flights.commanded)
         problem = ShootingProblem(filters.model, flight, sigma=np.ones(12), channels="rates", method="rk4")
         index = np.arange(omega.shape[0])[None]

@@ -86,8 +86,8 @@ class Fleet(NamedTuple):
         flown = {"velocity": needed.velocity, "distance": needed.distance}
         for name in ("angle", "rate"):  # roll and pitch may do the same
             alone = np.asarray(getattr(still, name)) / _GUSTS
-            roll, pitch, yaw = np.maximum(np.asarray(getattr(needed, name)), alone).tolist()
-            flown[name] = [max(roll, pitch), max(roll, pitch), yaw]
+            roll, pitch, yaw = np.maximum(np.asarray(getattr(needed, name)), alone)
+            flown[name] = as_float(np.array([max(roll, pitch), max(roll, pitch), yaw]))
         return Envelope(**{**rotors, **flown, **limits})
 
     def uses(self, references: Shape, envelope: Envelope) -> dict[str, float]:

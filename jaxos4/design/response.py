@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
@@ -20,7 +21,7 @@ _GUSTY = 8
 _LIMITED = {"angle": ANGLES, "rate": RATES}
 
 
-class Tones(NamedTuple):
+class Tones(eqx.Module):
     """Tones of which references are made, each a whole number of cycles in a period of the references.
 
     - `period`: in samples. `count`: the number of tones, which are the multiples of 1 / period.
@@ -43,7 +44,7 @@ class Tones(NamedTuple):
     def basis(self, periods: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points coefficients"]:
         """Cosines of all tones, then their sines, at times in periods."""
         turns = self.turns(periods)
-        return np.concatenate([turns.real, turns.imag], axis=1)
+        return np.concatenate([np.real(turns), np.imag(turns)], axis=1)
 
 
 class Response(NamedTuple):
@@ -78,8 +79,8 @@ def respond(
     """
     count, turns = tones.count, tones.turns(np.arange(samples) / tones.period)
     references = np.zeros((LANES, samples, 4))
-    references[:count, :, :3] = _SMALL[:3] * turns.real.T[:, :, None]
-    references[count : 2 * count, :, 3] = _SMALL[3] * turns.real.T
+    references[:count, :, :3] = _SMALL[:3] * np.real(turns).T[:, :, None]
+    references[count : 2 * count, :, 3] = _SMALL[3] * np.real(turns).T
     in_gusts = np.arange(LANES) > 2 * count  # the one before is in still air, and has no reference
     names = ("gust", "thrust_gust", "gyro_noise", "attitude_noise", "force_noise")
     loops = batch_of(loop, **{name: np.multiply.outer(in_gusts, np.asarray(getattr(loop, name))) for name in names})
@@ -93,11 +94,11 @@ def respond(
     beyond = filters.prior.shape[0] - channels.shape[-1]
     information = np.pad(np.concatenate([angular, vertical]), ((0, 0), (0, 0), (0, beyond), (0, beyond)))
     # The answers in the last period, in which the beginning is forgotten.
-    last = turns[-tones.period :].conj() * 2 / tones.period
+    last = np.conj(turns[-tones.period :]) * 2 / tones.period
     signals = {}
     for name, columns in _LIMITED.items():
         answers = np.einsum("kta,tk->ak", states[:count, -tones.period :, columns], last) / _SMALL[:3, None]
         moving = answers[:, None] * tones.turns(points)
-        signals[name] = np.concatenate([moving.real, moving.imag], axis=2)
+        signals[name] = np.concatenate([np.real(moving), np.imag(moving)], axis=2)
     gusty = {name: np.abs(states[in_gusts][..., columns]).max(axis=(0, 1)) for name, columns in _LIMITED.items()}
     return Response(information, np.asarray(found.whole)[in_gusts].mean(axis=0), signals, gusty)
