@@ -10,7 +10,7 @@ from ..design import ReferenceDesign
 from .style import INK, drawing, grid, log_axis, styles, svg
 
 _COLUMNS = 4
-_TITLES = ("roll [rad]", "pitch [rad]", "yaw [rad]", "vertical acceleration [m/s$^2$]")
+_TITLES = ("roll [rad]", "pitch [rad]", "yaw [rad]", "vertical [m/s^2]")
 # The references are drawn for so many periods, and the bounds up to this multiple of the flight.
 _PERIODS, _LONGER = 2, 10
 
