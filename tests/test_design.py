@@ -112,7 +112,7 @@ def test_many_flights_reach_the_bounds(found):
     assert np.abs(np.square(error).mean(axis=0) - 1).max() < 4 * np.sqrt(2 / LANES)
 
 
-def test_the_command_writes_an_input_that_a_study_flies(commanded):
+def test_the_command_writes_an_input_that_simulate_and_a_study_fly(commanded, run):
     folder, out, asked, found = commanded
     assert {name: asked[name] for name in ASKED} == ASKED
     np.testing.assert_array_equal(asked["bracket"].lower, BRACKET.lower)
@@ -121,6 +121,10 @@ def test_the_command_writes_an_input_that_a_study_flies(commanded):
     assert "x multisine" in out
     assert "x chirp" in out
     assert (folder / "input.svg").read_text().count("<svg") == 1
+    assert run("simulate", "--speeds", str(folder / "input.csv"), "--out", "flight.csv")[0] == 0
+    refused(run("simulate", "--speeds", str(folder / "input.csv"), "--out", "x.csv", "--duration", "5"), "--duration: ")
+    flown = jaxos4.read_flight("flight.csv")
+    np.testing.assert_allclose(np.asarray(flown.omega), found.designed.omega, rtol=1e-6)
     from jaxos4.study import load_study
     from jaxos4.study.flights import fleet_of
 
@@ -144,6 +148,7 @@ def test_the_command_writes_an_input_that_a_study_flies(commanded):
         ("--bandwidth 100", ("--bandwidth",)),
         ("--airframe none", ("none",)),
         ("--figure input.csv", ("--figure", "--out")),
+        ("--figure input.png", ("--figure input.png", ".svg")),
     ],
 )
 def test_mistakes_are_one_line_and_write_nothing(run, tmp_path, line, said):

@@ -90,6 +90,8 @@ def design(
     check_different(out=out, figure=figure)
     if figure is not None:
         check_output(figure, Path(airframe), bracket)
+        if figure.suffix != ".svg":
+            raise InputError(f"--figure {figure}: the figure is an SVG file; give it a name that ends in .svg.")
     check_kind(
         closed_loop,
         of_open={"model": model, "slew": slew, "channels": channels, "initial-state": initial_state},

@@ -30,6 +30,10 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     model: Annotated[Model | None, typer.Option(help="Equations of motion. Default: published.")] = None,
     excitation: Annotated[Excitation | None, typer.Option(help="Shape of the inputs. Default: multisine.")] = None,
+    speeds: Annotated[
+        Path | None,
+        typer.Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation."),
+    ] = None,
     method: Annotated[
         Method | None, typer.Option(help="Integrator of the equations of motion. Default: euler.")
     ] = None,
@@ -49,15 +53,18 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
-    check_output(out, Path(airframe), references)
+    check_output(out, Path(airframe), references, speeds)
     check_kind(
         closed_loop,
-        of_open={"model": model, "excitation": excitation, "method": method, "noise": noise},
+        of_open={"model": model, "excitation": excitation, "speeds": speeds, "method": method, "noise": noise},
         of_closed={"gust": gust, "lag": lag, "delay": delay, "sensors": sensors, "references": references},
     )
     for name, value in (("duration", duration), ("dt", dt)):
         if references is not None and value is not None:
             raise InputError(f"--{name}: {references} has its own; leave it out.")
+    for name, value in (("duration", duration), ("excitation", excitation)):
+        if speeds is not None and value is not None:
+            raise InputError(f"--{name}: {speeds} has its own; leave it out.")
     model, excitation, method = (
         model or Model["published"],
         excitation or Excitation["multisine"],
@@ -91,11 +98,11 @@ def simulate(
                 flight = fly_standard(loop, references=flown, duration=duration, dt=dt, seed=seed)
                 how = f"closed loop, {loop.logged}, gusts of {5.0 if gust is None else gust:g} rad/s^2"
             else:
-                flight = _open_loop(vehicle, model, excitation, method, duration, dt)
+                flight = _open_loop(vehicle, model, excitation, method, duration, dt, speeds)
                 how = f"{model.value} model, {method.value}, noise {noise:g}"
         except ValueError as error:
             kind = "--closed-loop" if closed_loop else f"--excitation {excitation.value}"
-            raise InputError(f"{kind}: {error}") from None
+            raise InputError(str(error) if speeds is not None else f"{kind}: {error}") from None
         if flight.result != RESULTS.successful:
             typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
             raise typer.Exit(1)
@@ -107,13 +114,25 @@ def simulate(
 
 
 def _open_loop(
-    airframe: "Airframe", model: Model, excitation: Excitation, method: Method, duration: float, dt: float
+    airframe: "Airframe",
+    model: Model,
+    excitation: Excitation,
+    method: Method,
+    duration: float,
+    dt: float,
+    speeds: Path | None,
 ) -> "Flight":
-    """A flight with designed rotor speeds, without noise."""
+    """A flight with the rotor speeds of an excitation, or of a file, without noise."""
+    from .._custom_types import as_float
     from ..excitation import EXCITATIONS
     from ..models import MODELS
     from ..simulation import simulate as fly
 
     vehicle = MODELS[model](airframe)
-    omega = EXCITATIONS[excitation](airframe, duration=duration, dt=dt)
+    if speeds is None:
+        omega = EXCITATIONS[excitation](airframe, duration=duration, dt=dt)
+    else:
+        from ..design import read_input
+
+        omega = as_float(read_input(speeds, dt))
     return fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)

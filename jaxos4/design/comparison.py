@@ -90,6 +90,9 @@ def design_and_compare(
         key=key,
         progress=progress,
     )
+    usual = np.asarray(model.half_width)
+    if not (designed.bounds[-1] < usual).any():
+        raise InputError("the limits leave too little room: no input within them tells anything; widen them.")
     progress("the standard inputs")
     plan, standard = plan_of(model, envelope, bracket, dt, channels, SENSOR_SIGMA, start_is_known, key), {}
     for name, make in EXCITATIONS.items():
@@ -105,7 +108,7 @@ def design_and_compare(
         names=model.parameter_names,
         units=model.parameter_units,
         half_width=np.asarray(bracket.half_width),
-        usual=np.asarray(model.half_width),
+        usual=usual,
         vehicles=VEHICLES,
     )
 
