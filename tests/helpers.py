@@ -28,6 +28,15 @@ CRAZYFLIE = jaxos4.Airframe(
     rotor_inertia=2e-8,
     max_rotor_speed=FULL_SPEED,
 )
+CRAZYFLIE_TOML = """
+mass = 0.027
+inertia = [1.66e-5, 1.7e-5, 2.9e-5]
+rotor_positions = [[0.028, -0.028], [-0.028, -0.028], [-0.028, 0.028], [0.028, 0.028]]
+thrust_coefficient = 2.4e-8
+drag_coefficient = 1.2e-10
+rotor_inertia = 2e-8
+max_rotor_speed = 2500.0
+"""
 
 
 @functools.cache

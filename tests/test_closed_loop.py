@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, FULL_SPEED, refused
+from helpers import CRAZYFLIE, CRAZYFLIE_TOML, FULL_SPEED, refused
 
 import jaxos4
 from jaxos4.closed_loop import fly_standard, ornstein_uhlenbeck
@@ -296,19 +296,9 @@ def test_wrong_arguments_are_named():
 
 # The command line.
 
-AIRFRAME = """
-mass = 0.027
-inertia = [1.66e-5, 1.7e-5, 2.9e-5]
-rotor_positions = [[0.028, -0.028], [-0.028, -0.028], [-0.028, 0.028], [0.028, 0.028]]
-thrust_coefficient = 2.4e-8
-drag_coefficient = 1.2e-10
-rotor_inertia = 2e-8
-max_rotor_speed = 2500.0
-"""
-
 
 def test_simulate_writes_what_estimate_reads(run, tmp_path):
-    (tmp_path / "crazyflie.toml").write_text(AIRFRAME)
+    (tmp_path / "crazyflie.toml").write_text(CRAZYFLIE_TOML)
     code, out, err = run("simulate", "--closed-loop", "--airframe", "crazyflie.toml", "--out", "a.csv")
     assert (code, err) == (0, "")
     assert "5001 samples of 0.004 s, closed loop, commands, gusts of 5 rad/s^2" in " ".join(out.split())

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE, refused
+from helpers import CRAZYFLIE, CRAZYFLIE_TOML, refused
 
 import jaxos4
 from jaxos4.design import Envelope, design_and_compare_references, model_of, read_references, standard_references
@@ -18,15 +18,6 @@ DT, SECONDS = 0.004, 10.0
 LOOP = jaxos4.ClosedLoop(CRAZYFLIE, gust=5.0)
 BRACKET = jaxos4.Bracket.default(model_of(LOOP))
 INERTIA = np.asarray(CRAZYFLIE.inertia)
-AIRFRAME = """
-mass = 0.027
-inertia = [1.66e-5, 1.7e-5, 2.9e-5]
-rotor_positions = [[0.028, -0.028], [-0.028, -0.028], [-0.028, 0.028], [0.028, 0.028]]
-thrust_coefficient = 2.4e-8
-drag_coefficient = 1.2e-10
-rotor_inertia = 2e-8
-max_rotor_speed = 2500.0
-"""
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +90,7 @@ def test_repeated_references_add_the_same_information(found):
 
 
 def test_the_command_writes_references_that_simulate_flies(found, run, tmp_path):
-    (tmp_path / "mine.toml").write_text(AIRFRAME)
+    (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
     options = ("--airframe", "mine.toml", "--closed-loop")
     design = ("--duration", "10", "--out", "references.csv", "--figure", "references.svg")
     code, out, err = run("design", *options, *design)
@@ -137,7 +128,7 @@ def test_the_command_writes_references_that_simulate_flies(found, run, tmp_path)
     ],
 )
 def test_mistakes_are_one_line_and_write_nothing(run, tmp_path, line, said):
-    (tmp_path / "mine.toml").write_text(AIRFRAME)
+    (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
     options = ("--closed-loop", "--out", "new.csv", "--airframe", "mine.toml")
     refused(run("design", *options, *line.split()), *said)
     assert not (tmp_path / "new.csv").exists()

@@ -1,4 +1,4 @@
-"""The options of a vehicle in closed loop, which `simulate` and `design` share."""
+"""The options that `simulate` and `design` share: flights in open and in closed loop."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +11,12 @@ from ._choices import Sensors
 if TYPE_CHECKING:
     from ..closed_loop import ClosedLoop
 
+DurationOption = Annotated[
+    float | None, typer.Option(help="Duration [s]. Default: 5; with --closed-loop: 20.", metavar="SECONDS")
+]
+SampleTimeOption = Annotated[
+    float | None, typer.Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.", metavar="SECONDS")
+]
 GustOption = Annotated[
     float | None,
     typer.Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5."),
@@ -26,6 +32,12 @@ SensorsOption = Annotated[
     typer.Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
 ]
 _MOST = {"gust": 1e6, "lag": 1.0, "delay": 1.0}
+
+
+def times_of(closed_loop: bool, duration: float | None, dt: float | None) -> tuple[float, float]:
+    """Duration and sample time [s], by default those of the kind of flight."""
+    usual = (20.0, 0.004) if closed_loop else (5.0, 0.01)
+    return usual[0] if duration is None else duration, usual[1] if dt is None else dt
 
 
 def check_kind(closed_loop: bool, *, of_open: Mapping[str, Any], of_closed: Mapping[str, Any]) -> None:

@@ -11,7 +11,17 @@ import typer
 from .._files import read_toml
 from ..errors import InputError
 from ._choices import AirframeOption, BracketOption, Channels, InitialState, Model, check_seed
-from ._loop import DelayOption, GustOption, LagOption, SensorsOption, check_kind, loop_of
+from ._loop import (
+    DelayOption,
+    DurationOption,
+    GustOption,
+    LagOption,
+    SampleTimeOption,
+    SensorsOption,
+    check_kind,
+    loop_of,
+    times_of,
+)
 from ._messages import option_names
 from ._output import check_different, check_output
 from ._progress import stages
@@ -41,12 +51,8 @@ def design(
         bool, typer.Option("--closed-loop", help="References for a real vehicle, which flies under its controller.")
     ] = False,
     model: Annotated[Model | None, typer.Option(help="Equations of motion. Default: published.")] = None,
-    duration: Annotated[
-        float | None, typer.Option(help="Duration [s]. Default: 5; with --closed-loop: 20.", metavar="SECONDS")
-    ] = None,
-    dt: Annotated[
-        float | None, typer.Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.", metavar="SECONDS")
-    ] = None,
+    duration: DurationOption = None,
+    dt: SampleTimeOption = None,
     slowest: Annotated[float | None, typer.Option(help="Slowest rotor speed [rad/s].")] = None,
     fastest: Annotated[float | None, typer.Option(help="Fastest rotor speed [rad/s].")] = None,
     slew: Annotated[float | None, typer.Option(help="Fastest change of a rotor speed [rad/s^2].")] = None,
@@ -111,12 +117,12 @@ def design(
         "distance": distance,
     }
     limits = {name: value for name, value in limits.items() if value is not None}
-    dt = (0.004 if closed_loop else 0.01) if dt is None else dt
+    duration, dt = times_of(closed_loop, duration, dt)
     begin = time.perf_counter()
     with stages("loading the library") as progress, option_names(bracket=bracket):
         settings = {
             "limits": limits,
-            "duration": (20.0 if closed_loop else 5.0) if duration is None else duration,
+            "duration": duration,
             "dt": dt,
             "criterion": criterion.value,
             "bandwidth": (6.0 if closed_loop else 4.0) if bandwidth is None else bandwidth,

@@ -7,7 +7,17 @@ import typer
 
 from ..errors import InputError
 from ._choices import AirframeOption, Excitation, Method, Model, check_seed
-from ._loop import DelayOption, GustOption, LagOption, SensorsOption, check_kind, loop_of
+from ._loop import (
+    DelayOption,
+    DurationOption,
+    GustOption,
+    LagOption,
+    SampleTimeOption,
+    SensorsOption,
+    check_kind,
+    loop_of,
+    times_of,
+)
 from ._output import check_output
 from ._progress import stages
 
@@ -21,12 +31,8 @@ MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machi
 def simulate(
     out: Annotated[Path, typer.Option(help="The flight file to write (CSV).")],
     airframe: AirframeOption = "os4",
-    duration: Annotated[
-        float | None, typer.Option(help="Duration [s]. Default: 5; with --closed-loop: 20.", metavar="SECONDS")
-    ] = None,
-    dt: Annotated[
-        float | None, typer.Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.", metavar="SECONDS")
-    ] = None,
+    duration: DurationOption = None,
+    dt: SampleTimeOption = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     model: Annotated[Model | None, typer.Option(help="Equations of motion. Default: published.")] = None,
     excitation: Annotated[Excitation | None, typer.Option(help="Shape of the inputs. Default: multisine.")] = None,
@@ -70,8 +76,7 @@ def simulate(
         excitation or Excitation["multisine"],
         method or Method["euler"],
     )
-    duration = (20.0 if closed_loop else 5.0) if duration is None else duration
-    dt = (0.004 if closed_loop else 0.01) if dt is None else dt
+    duration, dt = times_of(closed_loop, duration, dt)
     noise = 0.0 if noise is None else noise
     if not 0 <= noise <= 1e6:
         raise InputError(f"--noise: must lie in 0 to 1e+06, got {noise}.")
