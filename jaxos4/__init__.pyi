@@ -69,6 +69,7 @@ from .estimate import AbstractEstimator as AbstractEstimator, Estimate as Estima
 from .estimators import (
     IBSS as IBSS,
     SVSF as SVSF,
+    AntColony as AntColony,
     EquationError as EquationError,
     FilterError as FilterError,
     Hybrid as Hybrid,

@@ -1,3 +1,4 @@
+from .ant_colony import AntColony as AntColony
 from .equation_error import EquationError as EquationError
 from .filter_error import FilterError as FilterError, FilterFit as FilterFit
 from .hybrid import Hybrid as Hybrid

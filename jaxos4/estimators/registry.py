@@ -49,6 +49,7 @@ ESTIMATORS = Estimators(
         "rls": ".recursive_least_squares:RecursiveLeastSquares",
         "svsf": ".svsf:SVSF",
         "kalman": ".kalman:JointEKF",
+        "ant-colony": ".ant_colony:AntColony",
     }
 )
 """The estimators by name: what the command line, studies and figures offer. A new estimator is one line here."""
