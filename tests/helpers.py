@@ -62,6 +62,19 @@ def standard_problem(
     return jaxos4.ShootingProblem(model_class(jaxos4.OS4), flight, **arguments)
 
 
+# As one program, where each operation would be one.
+
+
+@eqx.filter_jit
+def forcing_of(model, inputs, parameters):
+    return model.forcing(inputs, parameters)
+
+
+@eqx.filter_jit
+def curvatures(problem, parameters, starts):
+    return problem.curvatures(parameters, starts)
+
+
 BLOCK = 64  # draws of one call, whatever the number wanted: one program
 
 
@@ -184,6 +197,15 @@ def numpy_residuals(problem, parameters, starts):
             euler_trajectory(derivative, np.asarray(parameters), flight.omega[first:end], start=whole, dt=flight.dt)
         )
     return ((np.asarray(flight.states) - np.concatenate(states)) / np.asarray(problem.sigma))[:, order]
+
+
+def same(one, other):
+    """Whether two trees of arrays agree: structure, types, and every number, NaN too. Compiles no program."""
+    leaves, others = ([np.asarray(x) for x in jax.tree.leaves(tree)] for tree in (one, other))
+    return jax.tree.structure(one) == jax.tree.structure(other) and all(
+        x.dtype == y.dtype and np.array_equal(x, y, equal_nan=x.dtype.kind == "f")
+        for x, y in zip(leaves, others, strict=True)
+    )
 
 
 def refused(result: tuple[int, str, str], *fragments: str) -> None:

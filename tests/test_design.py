@@ -65,11 +65,12 @@ def found(commanded):
 def numpy_bounds(omega):
     """The Cramer-Rao bounds of the standard sensors by NumPy, with slopes by central differences."""
     alpha = np.asarray(MODEL.alpha)
-    flown = lambda parameters: euler_trajectory(published_derivative, parameters, omega)  # noqa: E731
-    steps = np.diag(1e-4 * jaxos4.DEFAULT_HALF_WIDTH)
-    slopes = [(flown(alpha + step) - flown(alpha - step)) / (2 * step.sum()) for step in steps]
-    weighted = np.stack(slopes, axis=-1) / np.asarray(jaxos4.SENSOR_SIGMA)[:, None]
-    information = np.einsum("tci,tcj->ij", weighted, weighted)
+    step = 1e-4 * jaxos4.DEFAULT_HALF_WIDTH
+    points = np.concatenate([alpha + np.diag(step), alpha - np.diag(step)])
+    states = euler_trajectory(published_derivative, points, omega, start=np.zeros((16, 12)))
+    up, down = np.split(states / np.asarray(jaxos4.SENSOR_SIGMA), 2, axis=1)
+    weighted = (up - down) / (2 * step[:, None])
+    information = np.einsum("tic,tjc->ij", weighted, weighted)
     scale = np.sqrt(np.diagonal(information))
     return np.sqrt(np.diagonal(np.linalg.inv(information / np.outer(scale, scale)))) / scale
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import standard_flight
+from helpers import curvatures, forcing_of, standard_flight
 
 import jaxos4
 from jaxos4.flight import Inputs
@@ -27,6 +27,11 @@ def whole_of(model, values, rng=None):
     """All parameters of the inner model, the held ones at their values."""
     others = np.asarray(model.alpha) * (1.0 if rng is None else rng.uniform(0.9, 1.1, model.alpha.size))
     return jnp.array([values.get(name, x) for name, x in zip(model.parameter_names, others, strict=True)])
+
+
+@eqx.filter_jit
+def turning(model, rates, forcing, parameters):
+    return model.angular_acceleration(rates, forcing, parameters)
 
 
 def problem_of(model, *, windows=3):
@@ -51,20 +56,15 @@ def test_a_held_model_is_the_inner_one_with_its_values(model, values):
     assert (held.force_axes, held.observes_states) == (model.force_axes, model.observes_states)
     omega = standard_flight().omega[:20]
     inputs, rates = Inputs(omega, jnp.asarray(0.01)), Rates(*jnp.array([0.3, -0.2, 0.1]))
-    forcing = model.forcing(inputs, whole)
+    forcing = forcing_of(model, inputs, whole)
     row = jax.tree.map(lambda leaf: leaf[3], forcing)
     for one, other in (
-        *zip(jax.tree.leaves(held.forcing(inputs, tuple(free))), jax.tree.leaves(forcing), strict=True),
-        (held.angular_acceleration(rates, row, tuple(free)), model.angular_acceleration(rates, row, tuple(whole))),
+        *zip(jax.tree.leaves(forcing_of(held, inputs, tuple(free))), jax.tree.leaves(forcing), strict=True),
+        (turning(held, rates, row, tuple(free)), turning(model, rates, row, tuple(whole))),
     ):
         np.testing.assert_array_equal(one, other)
     flights = [jaxos4.simulate(m, x, omega, dt=0.01, method="rk4").states for m, x in ((held, free), (model, whole))]
     np.testing.assert_allclose(*flights, rtol=1e-12, atol=1e-13)
-
-
-@eqx.filter_jit
-def curvatures(problem, parameters, start):
-    return problem.curvatures(parameters, start)
 
 
 @pytest.mark.parametrize(("model", "values"), [CASES[0], CASES[3]])

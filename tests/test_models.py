@@ -13,6 +13,7 @@ from helpers import (
     REFERENCES,
     corrected_derivative,
     euler_trajectory,
+    forcing_of,
     published_derivative,
     standard_flight,
     standard_problem,
@@ -203,7 +204,7 @@ def test_the_corrected_model_is_a_rigid_body(airframe):
 def test_the_published_model_is_not_a_rigid_body():
     model = jaxos4.PublishedOS4()
     x = jnp.array([0, 0, 0, 0, 0, 0, 0.3, 0.1, 0.2, -0.4, 0.5, 0.6])
-    acceleration = np.asarray(model.derivative(x, jnp.full(4, 230.0), model.alpha))[[1, 3, 5]]
+    acceleration = np.asarray(derivative(model, x, jnp.full(4, 230.0), model.alpha))[[1, 3, 5]]
     thrust = 4 * OS4["b"] * 230.0**2 / OS4["m"]
     physics = rotation(0.3, 0.2, 0.5) @ [0, 0, thrust] - [0, 0, OS4["g"]]
     assert acceleration[2] == pytest.approx(physics[2], rel=1e-12)
@@ -235,10 +236,11 @@ def test_models_are_abstract_or_final():
 def test_the_table_of_parameters_is_complete(model):
     size = len(model.parameters)
     assert len(set(model.parameter_names)) == len(model.parameter_units) == size
-    assert model.alpha.shape == model.half_width.shape == (size,)
-    assert model.alpha.dtype == model.half_width.dtype == jnp.float64
-    assert np.isfinite(model.alpha).all()
-    assert np.all(np.isfinite(model.half_width) & (model.half_width > 0))
+    center, half_width = model.alpha, model.half_width
+    assert center.shape == half_width.shape == (size,)
+    assert center.dtype == half_width.dtype == jnp.float64
+    assert np.isfinite(center).all()
+    assert np.all(np.isfinite(half_width) & (np.asarray(half_width) > 0))
 
 
 @every_model
@@ -247,30 +249,37 @@ def test_the_table_says_what_the_parameters_do(model):
     inputs = Inputs(standard_flight().omega[:20], jnp.asarray(0.01), velocity=jnp.ones((20, 3)))
     at = model.alpha + 0.1 * model.half_width
     slopes = jax.tree.leaves(jax.jit(jax.jacfwd(lambda x: model.forcing(inputs, x)))(at))
-    acting = {i for i in range(at.size) if any((slope[..., i] != 0).any() for slope in slopes)}
+    acting = {i for i in range(at.size) if any((np.asarray(slope)[..., i] != 0).any() for slope in slopes)}
     assert acting == set(model.forcing_parameters)
-    row = jax.tree.map(lambda leaf: leaf[3], model.forcing(inputs, at))
+    row = jax.tree.map(lambda leaf: np.asarray(leaf)[3], forcing_of(model, inputs, at))
     rates = Rates(*jnp.array([0.3, -0.2, 0.1]))
     bend = jax.jit(jax.hessian(lambda x: jnp.stack(model.angular_acceleration(rates, row, x))))(at)
-    bend = np.abs(bend * model.half_width * model.half_width[:, None]).max(axis=0)
+    half_width = np.asarray(model.half_width)
+    bend = np.abs(bend * half_width * half_width[:, None]).max(axis=0)
     curved = {i for i in range(at.size) if bend[i, i] > 1e-12}
     assert curved == {i for i, parameter in enumerate(model.parameters) if not parameter.linear}
     assert model.is_linear == (not acting and not curved)
+
+
+@eqx.filter_jit
+def slopes_and_sensors(model, cascade, forcing, parameters):
+    state = unstack(cascade)
+    sensors = model.observe(state, forcing, parameters)
+    return stack(model.cascade(state, forcing, parameters)), jnp.stack(sensors)
 
 
 @every_model
 def test_a_shallower_state_gives_the_same_derivative(model):
     state = jnp.asarray(random_points(1)[0][0])
     inputs = Inputs(standard_flight().omega[:2], jnp.asarray(0.01), velocity=jnp.ones((2, 3)))
-    row = jax.tree.map(lambda leaf: leaf[0], model.forcing(inputs, model.alpha))
-    full = stack(model.cascade(unstack(state[CASCADE_ORDER]), row, model.alpha))
-    seen = jnp.stack(model.observe(unstack(state[CASCADE_ORDER]), row, model.alpha))
+    row = jax.tree.map(lambda leaf: np.asarray(leaf)[0], forcing_of(model, inputs, model.alpha))
+    full, seen = slopes_and_sensors(model, state[CASCADE_ORDER], row, model.alpha)
     assert seen.shape == (12 + len(model.force_axes),)
     assert model.observes_states == np.array_equal(seen, state[CASCADE_ORDER])
     for size in CHANNELS.values():
-        part = unstack(state[CASCADE_ORDER[:size]])
-        np.testing.assert_array_equal(stack(model.cascade(part, row, model.alpha)), full[:size])
-        np.testing.assert_array_equal(model.observe(part, row, model.alpha)[:size], seen[:size])
+        slopes, sensors = slopes_and_sensors(model, state[CASCADE_ORDER[:size]], row, model.alpha)
+        np.testing.assert_array_equal(slopes, full[:size])
+        np.testing.assert_array_equal(sensors[:size], seen[:size])
 
 
 @every_model

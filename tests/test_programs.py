@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from helpers import noisy_states, standard_flight, standard_problem
+from helpers import curvatures, noisy_states, standard_flight, standard_problem
 
 import jaxos4
 from jaxos4.analysis.evaluation import evaluate
@@ -92,7 +92,7 @@ def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
         problem.model, problem.flight, sigma=problem.sigma, channels="attitude", windows=windows
     )
     found, start = evaluate(problem, problem.model.alpha), problem.first_state()[0]
-    expected = problem.curvatures(problem.model.alpha, start)
+    expected = curvatures(problem, problem.model.alpha, start)
     assert found.sound
     np.testing.assert_allclose(found.cost, expected.shot.cost.sum(), rtol=1e-12)
     scale = np.sqrt(np.abs(np.asarray(expected.information)).max())

@@ -147,8 +147,8 @@ class AbstractOS4(AbstractModel):
     def half_width(self) -> Float[Array, "8"]:
         """`DEFAULT_HALF_WIDTH`, with the widths of alpha3, alpha6 and alpha8 scaled to the airframe's inertia."""
         os4, own = (alpha_from_inertia(airframe.inertia, jnp.zeros(())) for airframe in (OS4, self.airframe))
-        scaled = jnp.zeros(8, dtype=bool).at[jnp.array([2, 5, 7])].set(True)
-        return jnp.asarray(DEFAULT_HALF_WIDTH) * jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0)
+        scaled = np.isin(np.arange(8), (2, 5, 7))
+        return jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0) * DEFAULT_HALF_WIDTH
 
     @property
     def force_axes(self) -> tuple[int, ...]:
