@@ -1,6 +1,10 @@
 """Designed references: what they tell, the limits that they keep, and the command."""
 
+import contextlib
 import dataclasses
+import io
+import shutil
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +13,7 @@ import pytest
 from helpers import CRAZYFLIE, CRAZYFLIE_TOML, refused
 
 import jaxos4
+from jaxos4.cli import main
 from jaxos4.design import Envelope, design_and_compare_references, model_of, read_references, standard_references
 from jaxos4.design.batch import LANES, batch_of, fly_batch
 from jaxos4.design.filtered import Filters, informations
@@ -20,20 +25,40 @@ BRACKET = jaxos4.Bracket.default(model_of(LOOP))
 INERTIA = np.asarray(CRAZYFLIE.inertia)
 
 
+# What `jaxos4 design --closed-loop --duration 10` asks of the library.
+ASKED = {"angle": 0.3, "limits": {}, "duration": SECONDS, "dt": DT, "criterion": "D", "bandwidth": 6.0, "seed": 0}
+OPTIONS = ("--airframe", "mine.toml", "--closed-loop")
+
+
 @pytest.fixture(scope="module")
-def found():
+def commanded(tmp_path_factory):
+    """A run of the command: its folder, what it prints, its vehicle, what it asks of the library, what that finds."""
+    folder, printed, failed, calls = tmp_path_factory.mktemp("design"), io.StringIO(), io.StringIO(), []
+    (folder / "mine.toml").write_text(CRAZYFLIE_TOML)
+
+    def seen(loop, **asked):
+        calls.append((loop, asked, design_and_compare_references(loop, **asked)))
+        return calls[0][-1]
+
+    design = ("--duration", "10", "--out", "references.csv", "--figure", "references.svg")
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(printed),
+        contextlib.redirect_stderr(failed),
+    ):
+        patch.chdir(folder)
+        patch.setattr("jaxos4.design.design_and_compare_references", seen)
+        patch.setattr(sys, "argv", ["jaxos4", "design", *OPTIONS, *design])
+        with pytest.raises(SystemExit) as stop:
+            main()
+    assert (stop.value.code or 0, failed.getvalue()) == (0, "")
+    return folder, printed.getvalue(), *calls[0]
+
+
+@pytest.fixture(scope="module")
+def found(commanded):
     """What the command designs for a flight of 10 s."""
-    return design_and_compare_references(
-        LOOP,
-        angle=0.3,
-        limits={},
-        bracket=BRACKET,
-        duration=SECONDS,
-        dt=DT,
-        criterion="D",
-        bandwidth=6.0,
-        seed=0,
-    )
+    return commanded[-1]
 
 
 def test_designed_references_tell_twice_as_much_as_3211(found):
@@ -89,24 +114,26 @@ def test_repeated_references_add_the_same_information(found):
     np.testing.assert_allclose(seconds, 4 * SECONDS, rtol=1e-9)
 
 
-def test_the_command_writes_references_that_simulate_flies(found, run, tmp_path):
-    (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
-    options = ("--airframe", "mine.toml", "--closed-loop")
-    design = ("--duration", "10", "--out", "references.csv", "--figure", "references.svg")
-    code, out, err = run("design", *options, *design)
-    assert (code, err) == (0, "")
+def test_the_command_writes_references_that_simulate_flies(commanded, run, tmp_path):
+    folder, out, loop, asked, found = commanded
+    assert {name: asked[name] for name in ASKED} == ASKED
+    assert set(asked) == {*ASKED, "bracket", "progress"}
+    assert jax.tree.structure(loop) == jax.tree.structure(LOOP)
+    for one, other in zip(jax.tree.leaves((loop, asked["bracket"])), jax.tree.leaves((LOOP, BRACKET)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     references, dt = read_references(tmp_path / "references.csv")
     assert dt == pytest.approx(DT)
     np.testing.assert_allclose(references, found.designed.references, atol=1e-6)
     assert "x 3211" in out
     assert "known to 5 %: Ix after" in out
     assert (tmp_path / "references.svg").read_text().count("<svg") == 1
-    code, out, err = run("simulate", *options, "--references", "references.csv", "--out", "flight.csv")
+    code, out, err = run("simulate", *OPTIONS, "--references", "references.csv", "--out", "flight.csv")
     assert (code, err) == (0, "")
     assert "2501 samples of 0.004 s" in out
     (tmp_path / "references.csv").write_text("t,roll_reference\n0,0\n1,0\n")
     refused(
-        run("simulate", *options, "--references", "references.csv", "--out", "new.csv"),
+        run("simulate", *OPTIONS, "--references", "references.csv", "--out", "new.csv"),
         *("references.csv", "pitch_reference is missing"),
     )
 

@@ -19,7 +19,7 @@ BACKGROUND = {"light": "rgb(255, 255, 255)", "dark": "rgb(22, 25, 29)"}
 def addresses(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     study = synthetic_study(flights=12, estimators=("ibss", "network", "svsf"), scales=(0.1, 1.0))
-    report = write_report(study.isel(state=[0, 2, 4, 7]), folder)[0]
+    report = write_report(study.isel(state=[0, 2, 4, 7]), folder, with_pdf=False)[0]  # the page has the SVG
     flight, bare = folder / "flight.html", folder / "bare.html"
     write_flight_page(flight, identified_vehicle(), title="A flight")
     write_flight_page(bare, identified_vehicle(predictions=None), title="A flight")

@@ -65,26 +65,42 @@ def loaded(
     return process, set(process.stdout.splitlines()[-1].split()[1:])
 
 
-@pytest.mark.parametrize(
-    ("line", "code", "said"),
-    [
-        ("--help", 0, "identifiability"),
-        ("--version", 0, jaxos4.__version__),
-        ("estimate --help", 0, "--estimator"),
-        ("train --help", 0, "--steps"),
-        ("compare --help", 0, "--quick"),
-        ("none", 2, "none"),
-        ("simulate", 2, "--out"),
-        ("estimate flight.csv --estimator none", 2, "output-error"),
-        ("estimate flight.csv --model none", 2, "corrected"),
-        ("simulate --out flight.csv --excitation none", 2, "multisine"),
-    ],
+LINES = (
+    ("--help", 0, "identifiability"),
+    ("--version", 0, jaxos4.__version__),
+    ("estimate --help", 0, "--estimator"),
+    ("train --help", 0, "--steps"),
+    ("compare --help", 0, "--quick"),
+    ("none", 2, "none"),
+    ("simulate", 2, "--out"),
+    ("estimate flight.csv --estimator none", 2, "output-error"),
+    ("estimate flight.csv --model none", 2, "corrected"),
+    ("simulate --out flight.csv --excitation none", 2, "multisine"),
 )
-def test_help_and_mistakes_import_no_library(line, code, said):
-    process, packages = loaded(*line.split())
-    assert process.returncode == code, process.stderr
-    assert said in process.stdout + process.stderr
-    assert not packages & (HEAVY | {"jax", "equinox", "jaxtyping", "numpy", "msgspec"})
+# Runs each line of its arguments. Prints its code, what it printed, and the packages that are loaded after it.
+EACH = """
+import contextlib, io, json, sys
+from jaxos4.cli import main
+for line in sys.argv[1:]:
+    sys.argv, printed = ["jaxos4", *line.split()], io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+    packages = sorted({name.split(".")[0] for name in sys.modules})
+    sys.__stdout__.write(json.dumps([line, code, printed.getvalue(), packages]) + "\\n")
+"""
+
+
+def test_help_and_mistakes_import_no_library():
+    process = start(*(line for line, *_ in LINES), code=EACH)
+    assert process.returncode == 0, process.stderr
+    answers = [json.loads(answer) for answer in process.stdout.splitlines()]
+    for (line, code, said), (answered, ended, printed, packages) in zip(LINES, answers, strict=True):
+        assert (answered, ended) == (line, code)
+        assert said in printed, line
+        assert not set(packages) & (HEAVY | {"jax", "equinox", "jaxtyping", "numpy", "msgspec"}), line
 
 
 def test_shell_completion_offers_estimators_and_imports_no_library():

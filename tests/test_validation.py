@@ -12,9 +12,14 @@ HORIZONS = (0.1, 0.25, 0.5)
 RATES = (7, 9, 11)
 
 
-def flown(model, *, seconds=6.0, dt=DT, method="rk4"):
-    omega = jaxos4.multisine(model.airframe, duration=seconds, dt=dt)
-    return jaxos4.simulate(model, model.alpha, omega, dt=dt, method=method)
+SAMPLES = 601  # of a simulation; shorter flights are its beginning, so that each model needs one program
+
+
+def flown(model, *, seconds=6.0, dt=DT):
+    omega = np.asarray(jaxos4.multisine(model.airframe, duration=seconds, dt=dt))
+    held = np.concatenate([omega, np.repeat(omega[-1:], SAMPLES - len(omega), axis=0)])
+    flight = jaxos4.simulate(model, model.alpha, jnp.asarray(held), dt=dt, method="rk4")
+    return jaxos4.Flight(*(np.asarray(x)[: len(omega)] for x in (flight.time, flight.omega, flight.states)))
 
 
 def problem_of(model, flight, **arguments):
