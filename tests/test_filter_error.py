@@ -16,13 +16,16 @@ import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.estimators.filter_error import lanes_of, observed_of
 from jaxos4.models.state import CASCADE_ORDER
-from jaxos4.shooting.filtering import Noise, filter_gains, innovate
+from jaxos4.shooting.filtering import Noise, filter_gains as gains_of, innovate
 
 MODEL, TESTS = jaxos4.PublishedOS4(), pathlib.Path(__file__).parent
 RATES = CASCADE_ORDER[:3]
 # Without gyroscopic torques a disturbed rate changes no other channel.
 UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 NOISE = Noise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 1.0], [0.02, 0.01, 0.03])))
+
+
+filter_gains = eqx.filter_jit(gains_of)  # one program
 
 
 def one_lane(samples=501):

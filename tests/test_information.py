@@ -1,13 +1,21 @@
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import REFERENCES, euler_trajectory, noisy_states, standard_problem
 
 import jaxos4
-from jaxos4.linalg import covariance_of_shared, covariances, invert, joint_factor
+from jaxos4 import linalg
 from jaxos4.models.state import CASCADE_ORDER, CHANNELS
 
+# Each as one program.
+invert = jax.jit(linalg.invert)
+joint_factor, covariances, covariance_of_shared = (
+    jax.jit(function, static_argnums=1)
+    for function in (linalg.joint_factor, linalg.covariances, linalg.covariance_of_shared)
+)
+first_state = eqx.filter_jit(lambda problem: problem.first_state()[0])
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
 
 # Standard flight, known initial state: standard deviations in % of alpha (alpha2, 5 and 7: absolute x 100).
@@ -52,7 +60,7 @@ def test_information_is_the_jacobians_square(model_class, channels):
     alpha = model_class().alpha
     for free in (False, True):
         problem = standard_problem(model_class, channels, free=free)
-        slopes = jacobian(problem, alpha, problem.first_state()[0])
+        slopes = jacobian(problem, alpha, first_state(problem))
         joint = slopes.T @ slopes
         information = np.linalg.inv(np.linalg.inv(joint)[:8, :8]) if free else joint[:8, :8]
         scale = np.sqrt(np.diagonal(information))
