@@ -18,11 +18,12 @@ from .._custom_types import Scalar
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_bracket, conclude
 from ..linalg import covariance_of_shared, joint_factor
-from ..shooting import Curvature, ShootingProblem, Shot
+from ..shooting import Curvature, ShootingProblem, Shot, in_blocks
 
 Unknowns = Float[Array, "windows unknowns"]
 
 _FIRST_DAMPING = 1.0  # in units of the bracket: it hardly changes the first step of a flight with information
+_COARSE = 1e-3  # tolerance of the rates, if all channels follow
 _DAMPING_FACTOR = 10.0  # how much more, or less, is damped after a step that failed, or succeeded
 
 
@@ -45,8 +46,8 @@ class OutputError(AbstractEstimator):
 
     **Arguments:**
 
-    - `tolerance`: the search ends once a step changes no unknown by more, in half-widths of the bracket, and the cost
-      by no larger share.
+    - `tolerance`: the search ends with a step that changes no unknown by more, in half-widths of the bracket. Cost and
+      covariance are those before this step.
     - `max_steps`: for each stage.
     """
 
@@ -55,7 +56,7 @@ class OutputError(AbstractEstimator):
     prior: ClassVar[float] = NO_PRIOR
     needs_network: ClassVar[bool] = False
 
-    tolerance: float = eqx.field(static=True, default=1e-8)
+    tolerance: float = eqx.field(static=True, default=1e-5)
     max_steps: int = eqx.field(static=True, default=100)
 
     def __check_init__(self):
@@ -73,6 +74,10 @@ class OutputError(AbstractEstimator):
         **Raises:** `ValueError` for a bracket of another length than the model's parameters.
         """
         check_bracket(problem, bracket)
+        return in_blocks(self._identify, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """One flight, or a block of flights."""
         usable, count = bracket.usable, len(problem.model.parameter_names)
         starts, off = (problem.split(x) for x in problem.first_state())
         parameters = jnp.broadcast_to(usable.center, (problem.windows, count))
@@ -82,7 +87,8 @@ class OutputError(AbstractEstimator):
             free = stage.free_size
             # The damping treats all unknowns alike in these units.
             scale = jnp.concatenate([jnp.broadcast_to(usable.half_width, parameters.shape), off[:, :free]], axis=1)
-            search = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free]], axis=1), scale)
+            tolerance = self.tolerance if channels == problem.channels else max(self.tolerance, _COARSE)
+            search = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free]], axis=1), scale, tolerance)
             starts = starts.at[:, :free].set(search.best[:, count:])
             return search, search.best[:, :count], starts, (search.steps + 1) * (1 + count + problem.windows * free)
 
@@ -103,8 +109,11 @@ class OutputError(AbstractEstimator):
             done=search.done,
         )
 
-    def _minimise(self, problem: ShootingProblem, start: Unknowns, scale: Unknowns) -> _Search:
-        """The minimum of the cost. The first trial is the start itself, so that the curvature is compiled once."""
+    def _minimise(self, problem: ShootingProblem, start: Unknowns, scale: Unknowns, tolerance: float) -> _Search:
+        """The minimum of the cost. The first trial is the start itself, so that the curvature is compiled once.
+
+        `tolerance`: the search ends with a step that changes no unknown by more, in units of `scale`.
+        """
         count, windows = len(problem.model.parameter_names), problem.windows
         known = problem.first_state()[0]
         # The windows share the damping of a parameter, so that it counts once.
@@ -121,11 +130,10 @@ class OutputError(AbstractEstimator):
             factor = jnp.where(first, 1.0, jnp.where(better, 1 / _DAMPING_FACTOR, _DAMPING_FACTOR))
             damping = search.damping * factor
             step = _step(curvature, damping, unit, count)
-            taken = jnp.abs(search.trial - search.best) / scale
-            small = (taken <= self.tolerance * (1 + jnp.abs(search.best / scale))).all()
-            settled = small & ~(jnp.abs(now - before) > self.tolerance * (1 + before))
-            done = (~first & settled) | ~jnp.isfinite(step).all()
-            return _Search(best, curvature, best + step, damping, search.steps + 1, done)
+            small = (jnp.abs(step) <= tolerance * scale).all()
+            done = small | ~jnp.isfinite(step).all()
+            trial = best + step
+            return _Search(jnp.where(small, trial, best), curvature, trial, damping, search.steps + 1, done)
 
         size = start.shape[1]
         zero, square = jnp.zeros(windows, dtype=float), jnp.zeros((windows, size, size), dtype=float)

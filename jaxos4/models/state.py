@@ -85,7 +85,7 @@ CASCADE_ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])
 CHANNELS = {"rates": 3, "attitude": 6, "all": 12}
 
 
-def unstack(values: Float[Array, " states"]) -> State:
+def unstack(values: Float[Array, "states *batch"]) -> State:
     """A `State` from its first 3, 6 or 12 leaves in cascade order."""
     v = tuple(values)
     attitude, translation = Attitude(*v[3:6]) if len(v) > 3 else None, Translation(*v[6:]) if len(v) > 6 else None

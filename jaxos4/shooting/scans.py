@@ -6,8 +6,9 @@ inside a scan are scalars of a lane, because stacking them in every step is slow
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,14 +16,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import InitialState, Parameters, Scalar
 from ..models.state import Forcing, State, unstack
+from .lanes import computed_once, with_batch
 from .rows import Rows
 
 # A body rate [rad/s] that no quadrotor reaches and no gyro measures: a faster trajectory has diverged.
 FASTEST = 1e3
 
+# Rows of the information that are summed together, without the columns right of their square.
+_PANEL = 4
+
 # From a state, the forcing and the parameters: the state one sample later, and the output of noise-free sensors.
 Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
 Carry = TypeVar("Carry")
+# One value, or one for each lane of a batch.
+Lanes = Float[Array, "*#lanes"]
 # The number of rows that count in a padded flight. It is data and not a shape, so that flights of different lengths
 # share one compiled program.
 Length = Int[Array, ""] | None
@@ -110,67 +117,150 @@ def shoot_with_derivatives(
 ) -> Curvature:
     """`shoot` with the gradient and the information in the parameters and, if it is free, the initial state.
 
-    One tangent for each unknown travels with the state.
+    One tangent for each unknown travels with the state. A batch is computed in lanes.
     """
-    count, size = parameters.shape[0], initial_state.shape[0]
+
+    def alone(*data: Any) -> Curvature:
+        return _linearised_shot(*data, forcing_parameters, initial_state_is_free)
+
+    def together(lanes: int, many: Any, shared: Any) -> Curvature:
+        if many[-1] is not None:  # lanes of different lengths
+            return jax.vmap(lambda one: alone(*eqx.combine(one, shared)))(many)
+        last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), many[1:-1])
+        same = jax.tree.map(lambda leaf: leaf[..., None], shared[1:-1])
+        rows, weights, *at = eqx.combine(last, same)
+        at = (jnp.broadcast_to(values, (values.shape[0], lanes)) for values in at)
+
+        def advance(*at: Any) -> tuple[State, tuple[Lanes, ...]]:
+            return jax.vmap(lambda one, *at: eqx.combine(one, shared[0])(*at))(many[0], *at)
+
+        out = alone(advance, rows, weights, *at, shared[-1])
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), out)
+
+    return with_batch(alone, together, advance, rows, weights, parameters, initial_state, length)
+
+
+class _Carried(NamedTuple):
+    """A linearised shot up to some sample.
+
+    `information`: panels of `_PANEL` rows of the information, each without what lies right of its square.
+    """
+
+    state: State
+    tangent: State
+    shot: Shot
+    gradient: Float[Array, "unknowns *lanes"]
+    information: tuple[Array, ...]
+
+
+def _linearised_shot(
+    advance: Advance,
+    rows: Rows,
+    weights: tuple[Lanes, ...],
+    parameters: Float[Array, "parameters *lanes"],
+    initial_state: Float[Array, "size *lanes"],
+    length: Length,
+    forcing_parameters: tuple[int, ...],
+    initial_state_is_free: bool,
+) -> Curvature:
+    """`shoot_with_derivatives` of one flight, or of flights in lanes, which are then the last axis of all arrays.
+
+    Rows and weights that all lanes share have a last axis of 1.
+    """
+    (count, *lanes), size = parameters.shape, initial_state.shape[0]
     free = size if initial_state_is_free else 0
     unknowns = count + free
+    panels = [(top, min(top + _PANEL, unknowns)) for top in range(0, unknowns, _PANEL)]
     # NumPy, so that they are constants of the program.
     identity = np.eye(unknowns, dtype=parameters.dtype)
-    scalars = tuple(parameters)
     parameter_tangents = tuple(identity[:, :count].T)
-    start_tangents = identity[:, count:] if free else np.zeros((unknowns, size), dtype=parameters.dtype)
+    start_tangents = identity[:, count:].T if free else np.zeros((size, unknowns), dtype=parameters.dtype)
+    scalars = tuple(parameters)
 
-    def linearised(state: State, tangent: State, row: Rows):
-        if row.forcing_tangents is None:
-            at, push = jax.linearize(lambda x, a: advance(x, row.forcing, a), state, scalars)
-            return at, jax.vmap(push)(tangent, parameter_tangents)
-        at, push = jax.linearize(advance, state, row.forcing, scalars)
-        positions = np.asarray(forcing_parameters)
-        forcing = jax.tree.map(
-            lambda slope: jnp.zeros(unknowns, dtype=float).at[positions].set(slope), row.forcing_tangents
+    def zeros(*shape: int) -> Array:
+        return jnp.zeros((*shape, *lanes), dtype=parameters.dtype)
+
+    def along_lanes(leaf: Array) -> Array:
+        return jnp.broadcast_to(leaf, tuple(lanes))
+
+    def step(carry: _Carried, row: Rows) -> _Carried:
+        sound = carry.shot.sound & _is_sound(carry.state)
+        # At rest after a failure, so that no derivative overflows.
+        state = jax.tree.map(lambda x: jnp.where(sound, x, 0.0), carry.state)
+        forcing = jax.tree.map(along_lanes, row.forcing)
+
+        def shot():
+            if row.forcing_tangents is None:
+                (following, predicted), push = jax.linearize(
+                    lambda state, scalars: advance(state, forcing, scalars), state, scalars
+                )
+            else:
+                (following, predicted), push = jax.linearize(advance, state, forcing, scalars)
+            errors = _errors(row, predicted, weights, sound)
+            known = [jnp.where(jnp.isnan(y) | ~sound, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
+            pull = [w * e for w, e in zip(known, errors, strict=True)]
+            return following, push, _half_square(errors), pull, [w * w for w in known]
+
+        following, push, cost, pull, squares = computed_once(sound, shot) if lanes else shot()
+        directions = [carry.tangent, parameter_tangents]
+        if row.forcing_tangents is not None:
+            nothing, positions = zeros(unknowns), np.asarray(forcing_parameters)
+            wide = jax.tree.map(lambda slope: nothing.at[positions].set(slope), row.forcing_tangents)
+            directions.insert(1, wide)
+
+        def pushed(*direction: Any) -> tuple[State, tuple[Lanes, ...]]:
+            return push(*jax.tree.map(along_lanes, direction))
+
+        tangent, slopes = jax.vmap(pushed)(*directions)
+        gradient = carry.gradient - sum(p * s for p, s in zip(pull, slopes, strict=True))
+        information = tuple(
+            panel + sum((w * s[top:end])[:, None] * s[:end] for w, s in zip(squares, slopes, strict=True))
+            for panel, (top, end) in zip(carry.information, panels, strict=True)
         )
-        return at, jax.vmap(push)(tangent, forcing, parameter_tangents)
+        return _Carried(following, tangent, Shot(carry.shot.cost + cost, sound), gradient, information)
 
-    def step(carry: tuple[State, State, Curvature], row: Rows):
-        state, tangent, total = carry
-        sound = total.shot.sound & _is_sound(state)
-        (following, predicted), (following_tangent, slope) = linearised(state, tangent, row)
-        errors = _errors(row, predicted, weights, sound)
-        slopes = [
-            jnp.where(jnp.isnan(y) | ~sound, 0.0, -w * dx)
-            for y, w, dx in zip(row.measured, weights, slope, strict=True)
-        ]
-        total = Curvature(
-            Shot(total.shot.cost + _half_square(errors), sound),
-            total.gradient + sum(e * s for e, s in zip(errors, slopes, strict=True)),
-            total.information + sum(s[:, None] * s[None, :] for s in slopes),
-        )
-        return following, following_tangent, total
+    tangents = np.reshape(start_tangents, (*start_tangents.shape, *(1 for _ in lanes)))
+    first = _Carried(
+        state=unstack(initial_state),
+        tangent=unstack(jnp.broadcast_to(tangents, (size, unknowns, *lanes))),
+        shot=Shot(zeros(), jnp.ones(tuple(lanes), dtype=bool)),
+        gradient=zeros(unknowns),
+        information=tuple(zeros(end - top, end) for top, end in panels),
+    )
+    last = _fold(step, first, rows, length)
+    return Curvature(last.shot, last.gradient, _symmetric(last.information))
 
-    zero = Curvature(_no_shot(), jnp.zeros(unknowns, dtype=float), jnp.zeros((unknowns, unknowns), dtype=float))
-    tangents = jax.vmap(unstack)(jnp.asarray(start_tangents))
-    return _fold(step, (unstack(initial_state), tangents, zero), rows, length)[2]
+
+def _symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *lanes"]:
+    """The symmetric matrix of which each panel holds some rows, without what lies right of the panel's square."""
+    size, lanes = panels[-1].shape[1], panels[0].ndim - 2
+    filled = [jnp.pad(panel, ((0, 0), (0, size - panel.shape[1]), *((0, 0),) * lanes)) for panel in panels]
+    lower = jnp.concatenate(filled)
+    below = np.tri(size, dtype=bool).reshape(size, size, *(1,) * lanes)
+    return jnp.where(below, lower, jnp.swapaxes(lower, 0, 1))
 
 
 def _no_shot() -> Shot:
     return Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
 
 
-def _is_sound(state: State) -> Bool[Array, ""]:
+def _is_sound(state: State) -> Bool[Array, " *lanes"]:
     p, q, r = state.rates
     slow = (jnp.abs(p) < FASTEST) & (jnp.abs(q) < FASTEST) & (jnp.abs(r) < FASTEST)
     return slow if state.attitude is None else slow & (jnp.abs(state.attitude.theta) < jnp.pi / 2)
 
 
 def _errors(
-    row: Rows, predicted: tuple[Scalar, ...], weights: tuple[Scalar, ...], sound: Bool[Array, ""]
-) -> list[Scalar]:
+    row: Rows,
+    predicted: tuple[Lanes, ...],
+    weights: tuple[Lanes, ...],
+    sound: Bool[Array, "*#lanes"],
+) -> list[Lanes]:
     return [
         jnp.where(jnp.isnan(y) | ~sound, 0.0, w * (y - x))
         for y, w, x in zip(row.measured, weights, predicted, strict=True)
     ]
 
 
-def _half_square(errors: list[Scalar]) -> Scalar:
+def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
