@@ -155,7 +155,7 @@ def test_a_start_that_is_not_finite_is_reported_and_leaves_the_others_alone():
 def test_too_few_sweeps_are_reported():
     case = "published-rates"
     estimates = identify(
-        jaxos4.IBSS(max_sweeps=1, tolerance=1e-6),
+        jaxos4.IBSS(max_sweeps=1, tolerance=1e-8),
         *lanes(case, noisy_states(LANES), starts=random_starts(PUBLISHED(), LANES)),
     )
     assert set(names(estimates)) == {"max_sweeps"}
@@ -232,7 +232,7 @@ def test_rollouts_are_counted_right():
     flight = standard_flight(duration=0.5)
     states = noisy_states(1, duration=0.5)[0]
     free, slow = None, {"directions": "coordinate", "halvings": 3, "max_sweeps": 5}
-    for start, unknowns, stages, settings in ((flight.states[0], 8, 3, {}), (free, 11, 1, slow)):
+    for start, unknowns, most, settings in ((flight.states[0], 8, 2, {}), (free, 11, 3 * 11, slow)):
         problem = jaxos4.ShootingProblem(
             Counting(),
             eqx.tree_at(lambda f: f.states, flight, states),
@@ -244,14 +244,14 @@ def test_rollouts_are_counted_right():
         bracket = jaxos4.Bracket.around(PUBLISHED().alpha + 0.5 * HALF, HALF)
         estimate = jaxos4.IBSS(**settings)(problem, bracket)
         jax.effects_barrier()
-        sweeps = int(estimate.sweeps)
-        curvatures = sweeps + stages  # each of them carries one tangent for every unknown
         rolls = np.asarray(problem.forcing(problem.model.alpha).roll)
         assert (rolls == rolls[0]).sum() == 1
-        shots = torques.count(float(rolls[0])) - curvatures
+        shots = torques.count(float(rolls[0]))
+        sweeps = int(estimate.sweeps)
+        assert int(estimate.rollouts) == unknowns * shots  # each shot carries one tangent for every unknown
         assert sweeps > 3
-        assert shots == unknowns * settings.get("halvings", 2) * sweeps
-        assert int(estimate.rollouts) == shots + unknowns * curvatures
+        # A sweep looks around and narrows each bracket; it ends early where the minimum is.
+        assert 2 * sweeps <= shots <= 3 + sweeps * (1 + most)
 
 
 def test_starts_of_another_length_are_named():

@@ -12,7 +12,7 @@ from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
 from ..results import RESULTS
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, in_blocks
 from .ibss import IBSS
 
 _LEVEL = 0.999  # the share of flights in which the seed's intervals hold all parameters at once
@@ -54,6 +54,11 @@ class Hybrid(AbstractEstimator):
 @eqx.filter_jit
 def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> Estimate:
     """Searches near the `seed`, another estimator's answer, and in the whole bracket if that answer was wrong."""
+    return in_blocks(_search_from_seed, ibss, problem, bracket, seed)
+
+
+def _search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> Estimate:
+    """The search of one flight, or of a block of flights."""
     answered, usable = jnp.isfinite(seed.covariance).all(), bracket.usable
     half_width = seed.half_width(_LEVEL, simultaneous=True)
     wide_spread = jnp.diag(jnp.square(usable.half_width / 2))  # the half-width is two standard deviations

@@ -15,7 +15,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
 # The most lanes of a block.
-_BLOCK = 128
+_BLOCK = 64
 
 
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:

@@ -1,100 +1,62 @@
-"""Bisect along a direction, and along all directions one after another."""
+"""Narrow the brackets of all directions, by the sign of the cost's slope along each."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from ...shooting import Rows
-from .brackets import Brackets, room
-from .stage import RowsAt, Stage
-from .view import View
+PerDirection = Float[Array, "windows n"]
 
 
-class Moves(NamedTuple):
-    """Where a sweep has come to, and for each direction its step, the prediction's error, and whether to grow.
+class Lines(NamedTuple):
+    """The search along each direction. All positions are steps from where the sweep began.
 
-    `at_end`: the search ended at an end of its bracket that was not a limit of the unknowns.
+    - `lower`, `upper`: the bracket, around the `predicted` step. `low`, `high`: what is left of it.
+    - `trial`: the step of the next shot.
+    - `last`, `value`: the step of the shot before, and the slope there.
+    - `rate`: the slope's rate of change.
     """
 
-    unknowns: Float[Array, "windows unknowns"]
-    steps: Float[Array, "windows unknowns"]
-    errors: Float[Array, "windows unknowns"]
-    at_end: Bool[Array, "windows unknowns"]
+    predicted: PerDirection
+    lower: PerDirection
+    upper: PerDirection
+    low: PerDirection
+    high: PerDirection
+    trial: PerDirection
+    last: PerDirection
+    value: PerDirection
+    rate: PerDirection
+
+    @property
+    def at_end(self) -> Bool[Array, "windows n"]:
+        """Whether the trial is an end of its bracket."""
+        return (self.trial == self.lower) | (self.trial == self.upper)
 
 
-def move_along_all(stage: Stage, view: View, brackets: Brackets, *, halvings: int, stay: Bool[Array, ""]) -> Moves:
-    """Bisects along each direction in turn; along none with `stay`."""
-    nothing = jnp.zeros_like(view.unknowns)
-    moves = Moves(view.unknowns, nothing, nothing, nothing.astype(bool))
-    changes = len(stage.problem.model.forcing_parameters)
-    first_change = view.unknowns.shape[1] - changes
-    fixed = view.rows._replace(forcing_tangents=None)
+def open_lines(predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection) -> Lines:
+    """Brackets of some half-width around the predicted steps, which go at most `below` backwards, `above` forwards.
 
-    def along(i: Int[Array, ""], moves: Moves) -> Moves:
-        number = stage.order[i]
-
-        def rows_at(unknowns: Float[Array, "windows unknowns"]) -> Rows:
-            """The last directions alone change the forcing: it is recomputed only for those."""
-            if not changes:
-                return fixed
-            return jax.lax.cond(number >= first_change, stage.with_forcing, lambda _: fixed, unknowns)
-
-        return _move_along(stage, view, brackets, rows_at, halvings, number, moves)
-
-    return jax.lax.fori_loop(0, jnp.where(stay, 0, stage.size), along, moves)
-
-
-def _move_along(
-    stage: Stage, view: View, brackets: Brackets, rows_at: RowsAt, halvings: int, number: Int[Array, ""], moves: Moves
-) -> Moves:
-    """Bisects along one direction, in a bracket around the step that the quadratic model predicts from here."""
-    unknowns, steps, errors, ended = moves
-    direction, longest = view.basis[:, :, number], brackets.longest[:, number]
-    below, above = (jnp.minimum(most, longest) for most in room(unknowns, direction, stage.limits))
-    gradient = view.curvature.gradient + jnp.einsum("wuv,wv->wu", view.information, unknowns - view.unknowns)
-    predicted = stage.summed(number, -(direction * gradient).sum(axis=-1))
+    The first trial is the middle, and the expected rate of change is that of unit information.
+    """
     predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
-    lower = jnp.maximum(predicted - brackets.half_width[:, number], -below)
-    upper = jnp.minimum(predicted + brackets.half_width[:, number], above)
-    step, at_end = bisect(stage.slope(rows_at, unknowns, direction, number), lower, upper, halvings)
-    return Moves(
-        unknowns + step[:, None] * direction,
-        steps.at[:, number].set(step),
-        errors.at[:, number].set(step - predicted),
-        ended.at[:, number].set(at_end & (step > -below) & (step < above)),
-    )
+    lower = jnp.maximum(predicted - half_width, -below)
+    upper = jnp.minimum(predicted + half_width, above)
+    middle, zero = (lower + upper) / 2, jnp.zeros_like(lower)
+    return Lines(predicted, lower, upper, lower, upper, middle, middle, zero, jnp.ones_like(lower))
 
 
-def bisect(
-    slope: Callable[[Float[Array, " windows"]], Float[Array, " windows"]],
-    lower: Float[Array, " windows"],
-    upper: Float[Array, " windows"],
-    halvings: int,
-) -> tuple[Float[Array, " windows"], Bool[Array, " windows"]]:
-    """Narrows each bracket towards the zero of the slope, in all windows in parallel.
+def narrow(lines: Lines, slope: PerDirection) -> Lines:
+    """The lines after a shot at their trials.
 
-    The sign of the slope says which side of the trial holds the zero. The first trial is the middle. The next is where
-    a line meets zero: through the last two trials, at first with the slope's rate of change of a direction of unit
-    information. It is the middle again if the line leads out of what is left of the bracket.
-
-    Returns the best guess of the zero, and whether it is an end of the bracket.
+    The sign of the slope says which side of the trial holds the zero. The next trial is where a line meets zero:
+    through the last two trials, at first with the expected rate of change. It is the middle if the line leads out of
+    what is left of the bracket.
     """
-
-    def halve(carry, _):
-        low, high, trial, rate, last = carry
-        value = slope(trial)
-        low, high = jnp.where(value <= 0, trial, low), jnp.where(value >= 0, trial, high)
-        secant = (value - last[1]) / (trial - last[0])
-        rate = jnp.where(secant > 0, secant, rate)
-        zero = trial - value / rate
-        narrowed_there = ((zero <= low) & (low > lower)) | ((zero >= high) & (high < upper))
-        following = jnp.where(narrowed_there, (low + high) / 2, jnp.clip(zero, low, high))
-        return (low, high, following, rate, (trial, value)), None
-
-    middle = (lower + upper) / 2
-    first = lower, upper, middle, jnp.ones_like(middle), (middle, jnp.zeros_like(middle))
-    (_, _, found, _, _), _ = jax.lax.scan(halve, first, length=halvings)
-    return found, (found == lower) | (found == upper)
+    low = jnp.where(slope <= 0, lines.trial, lines.low)
+    high = jnp.where(slope >= 0, lines.trial, lines.high)
+    secant = (slope - lines.value) / (lines.trial - lines.last)
+    rate = jnp.where((secant > 0) & jnp.isfinite(secant), secant, lines.rate)
+    zero = lines.trial - slope / rate
+    narrowed_there = ((zero <= low) & (low > lines.lower)) | ((zero >= high) & (high < lines.upper))
+    following = jnp.where(narrowed_there, (low + high) / 2, jnp.clip(zero, low, high))
+    return lines._replace(low=low, high=high, trial=following, last=lines.trial, value=slope, rate=rate)

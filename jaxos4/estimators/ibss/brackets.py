@@ -18,8 +18,8 @@ GROWTH = 4.0  # of a bracket whose search ended at one of its ends
 class Brackets(NamedTuple):
     """Along each direction: the half-width of the bracket around the predicted step, and the longest step allowed."""
 
-    half_width: Float[Array, "windows unknowns"]
-    longest: Float[Array, "windows unknowns"]
+    half_width: Float[Array, "windows n"]
+    longest: Float[Array, "windows n"]
 
 
 def open_brackets(
@@ -42,13 +42,12 @@ def relative_error(
     return jnp.clip(share, _LEAST, 1.0)
 
 
-def room(
-    unknowns: Float[Array, "windows n"], direction: Float[Array, "windows n"], limits: Limits
-) -> tuple[Float[Array, " windows"], Float[Array, " windows"]]:
-    """How far each window can go against and along `direction` until an unknown reaches its limit."""
-    to_lower, to_upper = ((limit - unknowns) / jnp.where(direction == 0, 1.0, direction) for limit in limits)
-    ahead = jnp.where(direction > 0, to_upper, to_lower)
-    behind = jnp.where(direction > 0, to_lower, to_upper)
-    above = jnp.where(direction == 0, jnp.inf, ahead).min(axis=-1)
-    below = jnp.where(direction == 0, jnp.inf, -behind).min(axis=-1)
+def rooms(
+    unknowns: Float[Array, "windows n"], basis: Float[Array, "windows n n"], limits: Limits
+) -> tuple[Float[Array, "windows n"], Float[Array, "windows n"]]:
+    """How far each window can go against and along each direction until an unknown reaches its limit."""
+    moves = basis != 0
+    to_lower, to_upper = ((limit - unknowns)[:, :, None] / jnp.where(moves, basis, 1.0) for limit in limits)
+    above = jnp.where(moves, jnp.maximum(to_lower, to_upper), jnp.inf).min(axis=1)
+    below = jnp.where(moves, -jnp.minimum(to_lower, to_upper), jnp.inf).min(axis=1)
     return jnp.maximum(below, 0.0), jnp.maximum(above, 0.0)

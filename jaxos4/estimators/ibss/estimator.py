@@ -22,12 +22,13 @@ from ..._custom_types import Parameters, Scalar, as_float
 from ...bracket import NO_PRIOR, Bracket
 from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
 from ...linalg import covariance_of_shared, covariances, gram
-from ...shooting import Curvature, ShootingProblem, Shot
-from .bisection import move_along_all
-from .brackets import GROWTH, open_brackets, relative_error
+from ...shooting import Curvature, ShootingProblem, Shot, in_blocks
+from .bisection import Lines, narrow, open_lines
+from .brackets import GROWTH, Brackets, open_brackets, relative_error, rooms
+from .directions import coordinate_directions, whitened_directions
 from .progress import Progress, Search, record_brackets
 from .stage import Limits, Stage, join, misfit, prior_std, stages
-from .view import look_around
+from .view import View
 
 DIRECTIONS = ("whitened", "coordinate")
 
@@ -105,7 +106,11 @@ class IBSS(AbstractEstimator):
 
         **Raises:** `ValueError` for a bracket or a start of another length than the model's parameters.
         """
-        return self.search(problem, bracket, start=start, spread=spread, free=free)
+
+        def one(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, start, spread, free) -> Estimate:
+            return ibss.search(problem, bracket, start=start, spread=spread, free=free)
+
+        return in_blocks(one, self, problem, bracket, start, spread, free)
 
     def search(
         self,
@@ -183,36 +188,46 @@ class IBSS(AbstractEstimator):
 
     def _fit_stage(self, stage: Stage, progress: Progress, *, last: Bool[Array, ""]) -> tuple[Progress, Curvature]:
         """Sweeps until little is left to go; the last stage down to `tolerance`, the others coarsely."""
+        none, zeros = jnp.zeros((), dtype=int), jnp.zeros_like(progress.unknowns)
         search = Search(
-            unknowns=progress.unknowns,
-            curvature=_no_curvature(progress),
-            basis=jnp.zeros_like(progress.spread),
-            relative_error=jnp.ones((), dtype=float),
-            growth=jnp.ones_like(progress.unknowns),
-            sweeps=jnp.zeros((), dtype=int),
+            view=View(progress.unknowns, _no_curvature(progress), jnp.zeros_like(progress.spread)),
+            brackets=Brackets(zeros, zeros),
+            lines=open_lines(zeros, zeros, zeros, zeros),
+            turn=self._turns(stage),  # a sweep ends here, so that the first shot looks around
+            shots=none,
+            steps=zeros,
+            errors=zeros,
+            at_end=zeros > 0,
+            growth=jnp.ones_like(zeros),
+            sweeps=none,
+            rollouts=none,
             done=progress.done,
             ended=progress.done,
-            brackets=progress.brackets,
+            record=progress.brackets,
         )
-        sweep = functools.partial(self._sweep, stage, spread=progress.spread, before=progress.sweeps, last=last)
-        search = jax.lax.while_loop(lambda search: ~search.ended, sweep, search)
+        shoot = functools.partial(self._shoot, stage, spread=progress.spread, before=progress.sweeps, last=last)
+        search = jax.lax.while_loop(lambda search: ~search.ended, shoot, search)
+        curvature = search.view.curvature
         if self.directions == "coordinate":
-            covariance = covariances(search.curvature.information + stage.prior, stage.parameter_count)
+            covariance = covariances(curvature.information + stage.prior, stage.parameter_count)
         else:
-            covariance = gram(search.basis)
-        noise = jnp.maximum(misfit(search.curvature.shot.cost.sum(), stage.measurements), 1.0)
+            covariance = gram(search.view.basis)
+        noise = jnp.maximum(misfit(curvature.shot.cost.sum(), stage.measurements), 1.0)
         searched = stage.searched
-        rollouts = jnp.where(progress.done, 0, stage.size * (1 + search.sweeps * (self.halvings + 1)))
         return Progress(
-            search.unknowns,
+            search.view.unknowns,
             jnp.where(searched & searched[:, None], jnp.square(noise) * covariance, progress.spread),
             progress.sweeps + search.sweeps,
-            progress.rollouts + rollouts,
+            progress.rollouts + search.rollouts,
             search.done,
-            search.brackets,
-        ), search.curvature
+            search.record,
+        ), curvature
 
-    def _sweep(
+    def _turns(self, stage: Stage) -> Int[Array, ""]:
+        """How many turns a sweep has: one for all whitened directions together, or one for each coordinate."""
+        return jnp.ones((), dtype=int) if self.directions == "whitened" else stage.size
+
+    def _shoot(
         self,
         stage: Stage,
         search: Search,
@@ -221,32 +236,100 @@ class IBSS(AbstractEstimator):
         before: Int[Array, ""],
         last: Bool[Array, ""],
     ) -> Search:
-        """Looks around, and unless the search ends here moves along each direction. `before`: sweeps so far."""
-        whitened, first = self.directions == "whitened", search.sweeps == 0
-        view = look_around(stage, search.unknowns, whitened=whitened)
-        fine = jnp.maximum(self.tolerance * view.misfit, stage.smallest_step)
-        close_enough = jnp.where(last, fine, _COARSE * jnp.maximum(view.misfit, 1.0))
-        done = ~first & (view.longest_step <= close_enough)
-        finite = jnp.isfinite(view.curvature.shot.cost).all()
-        stay = done | ~finite | (search.sweeps >= self.max_sweeps)
-
-        later = jnp.maximum(search.relative_error * view.longest_step, stage.smallest_step) * search.growth
-        brackets = open_brackets(view.factor, spread, later=later, first=first)
-        moves = move_along_all(stage, view, brackets, halvings=self.halvings, stay=stay)
-
-        sound = finite & jnp.isfinite(moves.unknowns).all()
-        cost, trusted = view.curvature.shot
-        return Search(
-            unknowns=jnp.where(sound, moves.unknowns, search.unknowns),
-            curvature=view.curvature._replace(shot=Shot(cost, trusted & sound)),
-            basis=view.basis,
-            relative_error=relative_error(moves.errors, moves.steps, stage.smallest_step),
-            growth=jnp.where(moves.at_end, GROWTH * search.growth, 1.0),
-            sweeps=search.sweeps + jnp.where(stay, 0, 1),
-            done=done | ~sound,
-            ended=stay | ~sound,
-            brackets=record_brackets(search.brackets, before + search.sweeps, view, brackets.half_width, skip=stay),
+        """One shot: it narrows the brackets of this turn, or looks around. `before`: sweeps of earlier stages."""
+        whitened = self.directions == "whitened"
+        bisected = stage.bisected(search.turn, together=whitened)
+        steps = jnp.where(bisected, search.lines.trial, search.steps)
+        unknowns = jnp.clip(search.view.after(steps), *stage.limits)
+        curvature = stage.curvature(unknowns)
+        slope = stage.along(search.view.basis, curvature.gradient)
+        search = search._replace(rollouts=search.rollouts + stage.size)
+        arrived = jnp.abs(slope).max() <= self._close_enough(stage, curvature, last)
+        return jax.lax.cond(
+            arrived | (search.turn == self._turns(stage)),
+            lambda: self._look_around(stage, search, unknowns, curvature, spread, before, last),
+            lambda: self._narrow(stage, search, bisected, slope),
         )
+
+    def _close_enough(self, stage: Stage, curvature: Curvature, last: Bool[Array, ""]) -> Scalar:
+        """The search of a stage ends if the minimum is at most so far away along each direction."""
+        noise = misfit(curvature.shot.cost.sum(), stage.measurements)
+        fine = jnp.maximum(self.tolerance * noise, stage.smallest_step)
+        return jnp.where(last, fine, _COARSE * jnp.maximum(noise, 1.0))
+
+    def _narrow(
+        self, stage: Stage, search: Search, bisected: Bool[Array, " n"], slope: Float[Array, "windows n"]
+    ) -> Search:
+        """Narrows the brackets of this turn; after its last shot moves, and opens the brackets of the next turn."""
+        view, lines = search.view, search.lines
+        # A failed shot points back to the beginning.
+        lines = narrow(lines, jnp.where(jnp.isfinite(slope), slope, lines.trial))
+        over = search.shots + 1 == self.halvings
+        found = over & bisected
+        steps = jnp.where(found, lines.trial, search.steps)
+        following = self._open(stage, view, search.brackets, steps)
+        return search._replace(
+            lines=jax.tree.map(lambda new, old: jnp.where(over, new, old), following, lines),
+            turn=search.turn + over,
+            shots=jnp.where(over, 0, search.shots + 1),
+            steps=steps,
+            errors=jnp.where(found, lines.trial - lines.predicted, search.errors),
+            at_end=jnp.where(found, lines.at_end, search.at_end),
+        )
+
+    def _look_around(
+        self,
+        stage: Stage,
+        search: Search,
+        unknowns: Float[Array, "windows unknowns"],
+        curvature: Curvature,
+        spread: Float[Array, "windows unknowns unknowns"],
+        before: Int[Array, ""],
+        last: Bool[Array, ""],
+    ) -> Search:
+        """Chooses directions and opens brackets, unless the search ends here."""
+        choose = whitened_directions if self.directions == "whitened" else coordinate_directions
+        factor, basis = choose(curvature.information + stage.prior, stage.parameter_count)
+        first, nothing = search.sweeps == 0, jnp.zeros_like(search.steps)
+        below, above = rooms(unknowns, basis, stage.limits)
+        longest_step = jnp.abs(jnp.clip(-stage.along(basis, curvature.gradient), -below, above)).max()
+        done = ~first & (longest_step <= self._close_enough(stage, curvature, last))
+        sound = jnp.isfinite(unknowns).all() & jnp.isfinite(curvature.shot.cost).all()
+        stay = done | ~sound | (search.sweeps >= self.max_sweeps)
+
+        growth = jnp.where(search.at_end, GROWTH * search.growth, 1.0)
+        share = relative_error(search.errors, search.steps, stage.smallest_step)
+        later = jnp.maximum(share * longest_step, stage.smallest_step) * growth
+        brackets = open_brackets(factor, spread, later=later, first=first)
+        cost, trusted = curvature.shot
+        view = View(
+            jnp.where(sound, unknowns, search.view.unknowns),
+            curvature._replace(shot=Shot(cost, trusted & sound)),
+            basis,
+        )
+        return Search(
+            view=view,
+            brackets=brackets,
+            lines=self._open(stage, view, brackets, nothing),
+            turn=jnp.zeros((), dtype=int),
+            shots=jnp.zeros((), dtype=int),
+            steps=nothing,
+            errors=nothing,
+            at_end=nothing > 0,
+            growth=growth,
+            sweeps=search.sweeps + jnp.where(stay, 0, 1),
+            rollouts=search.rollouts,
+            done=done | ~sound,
+            ended=stay,
+            record=record_brackets(search.record, before + search.sweeps, view, brackets.half_width, skip=stay),
+        )
+
+    def _open(self, stage: Stage, view: View, brackets: Brackets, steps: Float[Array, "windows n"]) -> Lines:
+        """The lines along all directions, after these steps."""
+        below, above = (
+            jnp.minimum(room, brackets.longest) for room in rooms(view.after(steps), view.basis, stage.limits)
+        )
+        return open_lines(view.predicted(stage, steps), brackets.half_width, below, above)
 
     def _finish(
         self,

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._custom_types import Scalar
-from ...shooting import Curvature
+from .bisection import Lines, PerDirection
+from .brackets import Brackets
 from .view import View
 
 
@@ -22,22 +22,31 @@ class Progress(NamedTuple):
 
 
 class Search(NamedTuple):
-    """One stage between two sweeps; `curvature` and `basis` are those of the last look around.
+    """One stage between two shots.
 
-    - `relative_error`: of the last sweep's predicted steps, see `brackets.relative_error`.
-    - `growth`: by how much the brackets of each direction are wider than `relative_error` asks for.
+    - `view`: from where this sweep began.
+    - `brackets`, `lines`: of all directions.
+    - `turn`, `shots`: the number of this turn, in which some directions are bisected, and of its shots so far.
+    - `steps`, `errors`, `at_end`: along the directions of earlier turns, the steps that were found, how far off their
+      predictions were, and whether the bracket was too narrow.
+    - `growth`: by how much the brackets of each direction are wider than the last relative error asks for.
     - `done`: the search ended by itself. `ended`: it ended, for whatever reason.
     """
 
-    unknowns: Float[Array, "windows unknowns"]
-    curvature: Curvature
-    basis: Float[Array, "windows unknowns unknowns"]
-    relative_error: Scalar
-    growth: Float[Array, "windows unknowns"]
+    view: View
+    brackets: Brackets
+    lines: Lines
+    turn: Int[Array, ""]
+    shots: Int[Array, ""]
+    steps: PerDirection
+    errors: PerDirection
+    at_end: Bool[Array, "windows n"]
+    growth: PerDirection
     sweeps: Int[Array, ""]
+    rollouts: Int[Array, ""]
     done: Bool[Array, ""]
     ended: Bool[Array, ""]
-    brackets: Float[Array, "record 2 parameters"] | None
+    record: Float[Array, "record 2 parameters"] | None
 
 
 def record_brackets(

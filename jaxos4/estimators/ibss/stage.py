@@ -1,4 +1,4 @@
-"""One stage of the search: a problem on some of its channels, and the slope of its cost along a direction."""
+"""One stage of the search: a problem on some of its channels."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -14,10 +14,9 @@ from ..._custom_types import Parameters, Scalar
 from ...bracket import Bracket
 from ...flight import Inputs
 from ...shooting import ROUNDING, Curvature, Length, Rows, ShootingProblem, each_window
-from .directions import sequence
+from .directions import unknown_of_each
 
 Limits = tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]
-RowsAt = Callable[[Float[Array, "windows unknowns"]], Rows]
 
 
 class Stage(NamedTuple):
@@ -25,7 +24,7 @@ class Stage(NamedTuple):
 
     The *unknowns* have one row for each window: the parameters, the same in all rows, then the window's own initial
     state if it is free. All stages have the same unknowns; a stage on few channels searches the first of the initial
-    state alone. Directions are numbered in the opposite order: those of the initial states come first.
+    state alone.
 
     - `problem`: on all channels. `parts`: the problem on each choice of channels that a stage fits.
     - `part`: the position in `parts` of what this stage fits.
@@ -66,18 +65,13 @@ class Stage(NamedTuple):
         """Number of unknowns of a window that this stage searches."""
         return self.searched.sum()
 
-    def with_forcing(self, unknowns: Float[Array, "windows unknowns"], *, tangents: bool = False) -> Rows:
-        """The rows with the forcing of these parameters, and its derivatives if wanted."""
-        return self.problem.with_forcing(
-            self.rows, unknowns[0, : self.parameter_count], inputs=self.inputs, tangents=tangents
-        )
-
-    def curvature(self, rows: Rows, unknowns: Float[Array, "windows unknowns"]) -> Curvature:
+    def curvature(self, unknowns: Float[Array, "windows unknowns"]) -> Curvature:
         """The curvature of every window in all unknowns; 0 in those that this stage does not search."""
-        size = unknowns.shape[1]
+        parameters, size = unknowns[0, : self.parameter_count], unknowns.shape[1]
+        rows = self.problem.with_forcing(self.rows, parameters, inputs=self.inputs, tangents=True)
 
         def of(part: ShootingProblem) -> Curvature:
-            shot, gradient, information = self._fly("curvature", part, rows, unknowns)
+            shot, gradient, information = self._curvature_on(part, rows, unknowns)
             more = (0, size - gradient.shape[1])
             none = (0, 0)
             return Curvature(shot, jnp.pad(gradient, (none, more)), jnp.pad(information, (none, more, more)))
@@ -86,34 +80,19 @@ class Stage(NamedTuple):
         both = self.searched & self.searched[:, None]
         return Curvature(shot, jnp.where(self.searched, gradient, 0.0), jnp.where(both, information, 0.0))
 
-    def summed(self, number: Int[Array, ""], slopes: Float[Array, " windows"]) -> Float[Array, " windows"]:
-        """Slopes along direction `number`: summed over the windows, if the direction belongs to all of them."""
-        return jnp.where(number >= self.problem.free_size, slopes.sum(), slopes)
+    def bisected(self, turn: Int[Array, ""], *, together: bool) -> Bool[Array, " n"]:
+        """The directions of a turn: all that this stage searches, or one; none after the last turn."""
+        places = unknown_of_each(self.searched.shape[0], self.parameter_count)
+        if together:
+            return self.searched[places] & (turn == 0)
+        return (np.arange(places.size) == self.order[turn]) & (turn < self.size)
 
-    def slope(
-        self,
-        rows_at: RowsAt,
-        unknowns: Float[Array, "windows unknowns"],
-        direction: Float[Array, "windows unknowns"],
-        number: Int[Array, ""],
-    ) -> Callable[[Float[Array, " windows"]], Float[Array, " windows"]]:
-        """The slope of the cost as a function of the step from `unknowns` along direction `number`.
-
-        Each call is one shot. A failed shot returns the step itself as the slope, which points back to the beginning.
-        """
-
-        def at(step: Float[Array, " windows"]) -> Float[Array, " windows"]:
-            def of(part: ShootingProblem) -> Float[Array, " windows"]:
-                def cost(s: Float[Array, " windows"]) -> Float[Array, " windows"]:
-                    moved = unknowns + s[:, None] * direction
-                    return self._fly("shot", part, rows_at(moved), moved).cost
-
-                return jax.jvp(cost, (step,), (jnp.ones_like(step),))[1]
-
-            value = self.summed(number, self._on_part(of))
-            return jnp.where(jnp.isfinite(value), value, step)
-
-        return at
+    def along(
+        self, basis: Float[Array, "windows unknowns n"], gradient: Float[Array, "windows unknowns"]
+    ) -> Float[Array, "windows n"]:
+        """The slope along each direction: summed over the windows, if the direction belongs to all of them."""
+        slopes, own = jnp.einsum("wud,wu->wd", basis, gradient), self.problem.free_size
+        return slopes.at[:, own:].set(slopes[:, own:].sum(axis=0))
 
     def _on_part(self, function: Callable):
         """`function` of the part that this stage fits. The stage is the same in all lanes of a batch."""
@@ -121,13 +100,12 @@ class Stage(NamedTuple):
             return function(self.parts[0])
         return jax.lax.switch(self.part, [functools.partial(function, part) for part in self.parts])
 
-    def _fly(self, name: str, part: ShootingProblem, rows: Rows, unknowns: Float[Array, "windows unknowns"]):
-        """`"shot"` or `"curvature"` of every window."""
-        function = getattr(eqx.tree_at(lambda p: p.length, part, self.length, is_leaf=lambda leaf: leaf is None), name)
+    def _curvature_on(self, part: ShootingProblem, rows: Rows, unknowns: Float[Array, "windows unknowns"]) -> Curvature:
+        part = eqx.tree_at(lambda p: p.length, part, self.length, is_leaf=lambda leaf: leaf is None)
         count, states = self.parameter_count, self.problem.size
         fitted = rows.measured[: part.size] + rows.measured[states:]
         starts = unknowns[:, count : count + part.size] if part.free_size else self.starts[:, : part.size]
-        return each_window(function, rows._replace(measured=fitted), unknowns[:, :count], starts)
+        return each_window(part.curvature, rows._replace(measured=fitted), unknowns[:, :count], starts)
 
 
 def stages(
@@ -162,7 +140,7 @@ def stages(
         parts=parts,
         part=jnp.asarray(place),
         searched=searched,
-        order=jnp.argsort(~searched[:, sequence(prior.shape[1], count, problem.model.forcing_parameters)], axis=1),
+        order=jnp.argsort(~searched[:, unknown_of_each(prior.shape[1], count)], axis=1),
         length=lengths if problem.windows == 1 else None,
         rows=problem.rows(),
         starts=problem.split(problem.first_state()[0]),
