@@ -1,11 +1,15 @@
 """Iterative Bi-Section Shooting: the settings, the stages, and one sweep.
 
-A *shot* simulates the flight at trial unknowns and returns the slope of the cost along one direction. The sign of the
-slope says which half of a bracket holds the minimum. A *sweep* bisects along every direction once, each time around the
-step that the cost's quadratic model predicts. A *stage* repeats sweeps on some channels until the minimum is near.
+A *shot* simulates the flight at trial unknowns, with its derivatives. The sign of the cost's slope along a direction
+says which side of the trial holds the minimum. A *sweep* looks around, opens a bracket along each direction around the
+step that the cost's quadratic model predicts, and narrows the brackets. A *stage* repeats sweeps on some channels until
+the minimum is near.
+
+A sweep has turns: in each turn some directions are bisected together. Whitened directions hardly change each other's
+minimum and take one turn; coordinates take a turn each.
 
 If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
-windows' slopes; initial states are bisected in all windows in parallel.
+windows' slopes, initial states on their own window's.
 """
 
 import functools
@@ -37,6 +41,8 @@ DIRECTIONS = ("whitened", "coordinate")
 _HORIZONS = (0.1, 0.3)
 # A stage that is not the last ends once no direction has more than this many standard deviations to go.
 _COARSE = 0.5
+# After a sweep that raised the cost by more than chance does, the next goes at most this share of the predicted steps.
+_CHANCE, _RETREAT = 1.0, 0.25
 
 
 class IBSS(AbstractEstimator):
@@ -48,7 +54,7 @@ class IBSS(AbstractEstimator):
       cost is nearly separable along them. The rates are fitted first, then all channels.
       `"coordinate"`: the parameters themselves, against all of the problem's channels at once, in the manner of the
       paper; good on the rates, slow on more channels.
-    - `halvings`: the shots along each direction in a sweep, each of which narrows the bracket.
+    - `halvings`: the shots of each turn of a sweep, each of which narrows the brackets.
     - `max_sweeps`: the most sweeps of each stage.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
       direction. The standard deviation follows from the actual residuals, so the fit of noise-free data ends at
@@ -201,6 +207,7 @@ class IBSS(AbstractEstimator):
             growth=jnp.ones_like(zeros),
             sweeps=none,
             rollouts=none,
+            trust=jnp.ones((), dtype=float),
             done=progress.done,
             ended=progress.done,
             record=progress.brackets,
@@ -244,7 +251,7 @@ class IBSS(AbstractEstimator):
         curvature = stage.curvature(unknowns)
         slope = stage.along(search.view.basis, curvature.gradient)
         search = search._replace(rollouts=search.rollouts + stage.size)
-        arrived = jnp.abs(slope).max() <= self._close_enough(stage, curvature, last)
+        arrived = curvature.shot.sound.all() & (jnp.abs(slope).max() <= self._close_enough(stage, curvature, last))
         return jax.lax.cond(
             arrived | (search.turn == self._turns(stage)),
             lambda: self._look_around(stage, search, unknowns, curvature, spread, before, last),
@@ -287,26 +294,31 @@ class IBSS(AbstractEstimator):
         before: Int[Array, ""],
         last: Bool[Array, ""],
     ) -> Search:
-        """Chooses directions and opens brackets, unless the search ends here."""
+        """Chooses directions and opens brackets, unless the search ends here.
+
+        If the sweep made things worse, the search goes back to where it began, and stays closer.
+        """
+        first, nothing, before_it = search.sweeps == 0, jnp.zeros_like(search.steps), search.view
+        finite = jnp.isfinite(unknowns).all() & jnp.isfinite(curvature.shot.cost).all()
+        failed = ~first & ~(finite & _no_worse(curvature.shot, before_it.curvature.shot))
+        unknowns, curvature = jax.tree.map(
+            lambda new, old: jnp.where(failed, old, new), (unknowns, curvature), before_it[:2]
+        )
         choose = whitened_directions if self.directions == "whitened" else coordinate_directions
         factor, basis = choose(curvature.information + stage.prior, stage.parameter_count)
-        first, nothing = search.sweeps == 0, jnp.zeros_like(search.steps)
         below, above = rooms(unknowns, basis, stage.limits)
         longest_step = jnp.abs(jnp.clip(-stage.along(basis, curvature.gradient), -below, above)).max()
         done = ~first & (longest_step <= self._close_enough(stage, curvature, last))
-        sound = jnp.isfinite(unknowns).all() & jnp.isfinite(curvature.shot.cost).all()
-        stay = done | ~sound | (search.sweeps >= self.max_sweeps)
+        hopeless = first & ~finite
+        stay = done | hopeless | (search.sweeps >= self.max_sweeps)
 
+        trust = jnp.where(failed, search.trust * _RETREAT, jnp.minimum(search.trust / _RETREAT, 1.0))
         growth = jnp.where(search.at_end, GROWTH * search.growth, 1.0)
         share = relative_error(search.errors, search.steps, stage.smallest_step)
         later = jnp.maximum(share * longest_step, stage.smallest_step) * growth
         brackets = open_brackets(factor, spread, later=later, first=first)
-        cost, trusted = curvature.shot
-        view = View(
-            jnp.where(sound, unknowns, search.view.unknowns),
-            curvature._replace(shot=Shot(cost, trusted & sound)),
-            basis,
-        )
+        brackets = brackets._replace(longest=jnp.where(trust < 1, trust * longest_step, brackets.longest))
+        view = View(unknowns, curvature, basis)
         return Search(
             view=view,
             brackets=brackets,
@@ -319,7 +331,8 @@ class IBSS(AbstractEstimator):
             growth=growth,
             sweeps=search.sweeps + jnp.where(stay, 0, 1),
             rollouts=search.rollouts,
-            done=done | ~sound,
+            trust=trust,
+            done=done | hopeless,
             ended=stay,
             record=record_brackets(search.record, before + search.sweeps, view, brackets.half_width, skip=stay),
         )
@@ -359,3 +372,9 @@ class IBSS(AbstractEstimator):
 def _no_curvature(progress: Progress) -> Curvature:
     zero = jnp.zeros(progress.unknowns.shape[:1], dtype=float)
     return Curvature(Shot(zero, zero > 0), jnp.zeros_like(progress.unknowns), jnp.zeros_like(progress.spread))
+
+
+def _no_worse(shot: Shot, before: Shot) -> Bool[Array, ""]:
+    """The cost of a flight that fails means nothing."""
+    sound, was_sound = shot.sound.all(), before.sound.all()
+    return ~was_sound | (sound & (shot.cost.sum() <= before.cost.sum() + _CHANCE))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..._custom_types import Scalar
 from .bisection import Lines, PerDirection
 from .brackets import Brackets
 from .view import View
@@ -30,6 +31,7 @@ class Search(NamedTuple):
     - `steps`, `errors`, `at_end`: along the directions of earlier turns, the steps that were found, how far off their
       predictions were, and whether the bracket was too narrow.
     - `growth`: by how much the brackets of each direction are wider than the last relative error asks for.
+    - `trust`: the share of the longest predicted step that a sweep may go.
     - `done`: the search ended by itself. `ended`: it ended, for whatever reason.
     """
 
@@ -44,6 +46,7 @@ class Search(NamedTuple):
     growth: PerDirection
     sweeps: Int[Array, ""]
     rollouts: Int[Array, ""]
+    trust: Scalar
     done: Bool[Array, ""]
     ended: Bool[Array, ""]
     record: Float[Array, "record 2 parameters"] | None
