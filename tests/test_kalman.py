@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, REFERENCES, noisy_states, random_starts, standard_problem
+from helpers import DT, REFERENCES, noisy_states, random_starts, single_precision, standard_problem
 from lanes import HALF, assert_chi_square, assert_covered, bound, errors, identify, information, lanes, names
 
 import jaxos4
@@ -217,24 +217,33 @@ def test_what_was_not_measured_stays_as_uncertain_as_the_bracket_with_a_free_sta
     np.testing.assert_allclose(estimate.std, HALF)
 
 
-def test_single_precision_is_enough():
+SINGLE = """
+import jax, json, sys
+import jaxos4
+import numpy as np
+from jaxos4.estimators import JointEKF
+
+data = {name: np.asarray(value, np.float32) for name, value in np.load(FILE).items()}
+flight = jaxos4.Flight(data["time"], data["omega"], data["states"])
+problem = jaxos4.ShootingProblem(
+    jaxos4.PublishedOS4(jaxos4.OS4), flight, channels="rates", sigma=jaxos4.SENSOR_SIGMA, initial_state=data["start"]
+)
+estimate = JointEKF()(problem, jaxos4.Bracket(data["lower"], data["upper"]))
+assert estimate.parameters.dtype == "float32"
+result = str(jaxos4.result_names(estimate.result))
+json.dump([result, estimate.parameters.tolist(), estimate.std.tolist()], sys.stdout)
+"""
+
+
+def test_single_precision_is_enough(tmp_path):
     """Everything in float32 from the data on; the bracket's errors are a thousand times the rounding's."""
-    case = "published-rates"
-    problem, states, _, lower, upper = data(case, noisy_states(1))
-    double = JointEKF()(eqx.tree_at(lambda p: p.flight.states, problem, states[0]), jaxos4.Bracket(lower[0], upper[0]))
-    with jax.enable_x64(False):
-        model = PUBLISHED(jaxos4.OS4)
-        time, omega, measured = (
-            np.asarray(x, np.float32) for x in (problem.flight.time, problem.flight.omega, states[0])
-        )
-        flight = jaxos4.Flight(time, omega, measured)
-        single = JointEKF()(
-            jaxos4.ShootingProblem(
-                model, flight, channels="rates", sigma=jaxos4.SENSOR_SIGMA, initial_state=np.zeros(12, np.float32)
-            ),
-            jaxos4.Bracket(np.asarray(lower[0], np.float32), np.asarray(upper[0], np.float32)),
-        )
-    assert single.parameters.dtype == np.float32
-    assert str(names(single)) == "successful"
-    assert np.abs((np.asarray(single.parameters) - double.parameters) / double.std).max() < 0.05
-    np.testing.assert_allclose(single.std, double.std, rtol=0.02)
+    problem, states, _, lower, upper = data("published-rates", noisy_states(1))
+    problem = eqx.tree_at(lambda p: p.flight.states, problem, states[0])
+    double = JointEKF()(problem, jaxos4.Bracket(lower[0], upper[0]))
+    flight = problem.flight
+    measured = {"time": flight.time, "omega": flight.omega, "states": flight.states, "start": problem.initial_state}
+    np.savez(tmp_path / "flight.npz", lower=lower[0], upper=upper[0], **measured)
+    result, parameters, std = single_precision(SINGLE.replace("FILE", repr(str(tmp_path / "flight.npz"))))
+    assert result == "successful"
+    assert np.abs((np.asarray(parameters) - double.parameters) / double.std).max() < 0.05
+    np.testing.assert_allclose(std, double.std, rtol=0.02)
