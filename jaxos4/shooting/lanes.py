@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
-# The most lanes of a block.
+# The most lanes of a block. The tangents of 20 unknowns in 64 lanes fit the cache; in 128 a flight takes twice as long.
 _BLOCK = 64
 
 

@@ -121,7 +121,9 @@ def shoot_with_derivatives(
     """
 
     def alone(*data: Any) -> Curvature:
-        return _linearised_shot(*data, forcing_parameters, initial_state_is_free)
+        return _linearised_shot(
+            *data, forcing_parameters=forcing_parameters, initial_state_is_free=initial_state_is_free
+        )
 
     def together(lanes: int, many: Any, shared: Any) -> Curvature:
         if many[-1] is not None:  # lanes of different lengths
@@ -160,6 +162,7 @@ def _linearised_shot(
     parameters: Float[Array, "parameters *lanes"],
     initial_state: Float[Array, "size *lanes"],
     length: Length,
+    *,
     forcing_parameters: tuple[int, ...],
     initial_state_is_free: bool,
 ) -> Curvature:
