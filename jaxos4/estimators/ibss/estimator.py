@@ -73,7 +73,7 @@ class IBSS(AbstractEstimator):
     directions: str = eqx.field(static=True, default="whitened")
     halvings: int = eqx.field(static=True, default=2)
     max_sweeps: int = eqx.field(static=True, default=60)
-    tolerance: Scalar = eqx.field(converter=as_float, default=0.02)
+    tolerance: Scalar = eqx.field(converter=as_float, default=0.005)
     reach: Scalar = eqx.field(converter=as_float, default=REACH)
     record: int = eqx.field(static=True, default=0)
 
