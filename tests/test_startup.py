@@ -269,6 +269,13 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
     assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52
 
 
+def test_all_commands_but_study_compile_quickly(run, save, monkeypatch):
+    asked, empty = [], str(save("", "empty.toml"))
+    monkeypatch.setattr("jaxos4.cli._app.prepare", lambda *, quick_to_compile: asked.append(quick_to_compile))
+    assert run("study", empty, "--out", "out")[0] == run("estimate", empty)[0] == 2
+    assert asked == [False, True]
+
+
 @pytest.mark.parametrize(
     ("version", "own", "flags"),
     [("0.10.2", None, _jax.QUICK_TO_COMPILE), ("0.10.2", "--own=1", "--own=1"), ("1.0.0", None, None)],

@@ -26,11 +26,14 @@ _EPILOG = f"Compiled programs are kept in your cache folder, at most 1 GB. {NO_C
 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, with JAX prepared first. Its arguments are parsed before that: help and mistakes need no JAX."""
+    """The command, with JAX prepared first. Its arguments are parsed before that: help and mistakes need no JAX.
+
+    A study computes for longer than it compiles.
+    """
 
     @functools.wraps(command)
     def run(*args, **kwargs) -> None:
-        prepare()
+        prepare(quick_to_compile=command is not study)
         command(*args, **kwargs)
 
     return run

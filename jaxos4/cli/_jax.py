@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 
 QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
-"""XLA's older way to write loops, and fewer optimisations: compile in half of the time, the programs are as fast."""
+"""XLA's older way to write loops, and fewer optimisations: half of the compile time, and twice the time for a batch."""
 
 _KNOWS_IT = ("0.10.",)  # versions of jaxlib: a flag that XLA does not know would end the process
 
@@ -20,9 +20,11 @@ _LEAST_FREE_BYTES = 200 << 20  # with less space on the disk, programs might be 
 _JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in less than this [s]
 
 
-def prepare() -> None:
+def prepare(*, quick_to_compile: bool) -> None:
     """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off."""
-    compile_quickly()
+    rarely_collect_garbage()
+    if quick_to_compile:
+        compile_quickly()
 
     import jax
 
@@ -41,14 +43,15 @@ def prepare() -> None:
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
 
 
-def compile_quickly() -> None:
-    """Sets XLA's flags, which JAX reads when it starts to compute, unless the user has set some. Tracing is faster too.
+def rarely_collect_garbage() -> None:
+    """Tracing makes millions of small objects that stay."""
+    gc.set_threshold(100_000, 20, 100)
 
-    JAX makes millions of small objects that stay: searches for garbage become rarer.
-    """
+
+def compile_quickly() -> None:
+    """Sets XLA's flags, which JAX reads when it starts to compute, unless the user has set some."""
     import jaxlib.version
 
-    gc.set_threshold(100_000, 20, 100)
     if "XLA_FLAGS" not in os.environ and jaxlib.version.__version__.startswith(_KNOWS_IT):
         os.environ["XLA_FLAGS"] = QUICK_TO_COMPILE
 
