@@ -270,9 +270,9 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
 
 
 def test_all_commands_but_study_compile_quickly(run, save, monkeypatch):
-    asked, empty = [], str(save("", "empty.toml"))
+    asked, wrong = [], str(save("wrong = 1", "wrong.toml"))
     monkeypatch.setattr("jaxos4.cli._app.prepare", lambda *, quick_to_compile: asked.append(quick_to_compile))
-    assert run("study", empty, "--out", "out")[0] == run("estimate", empty)[0] == 2
+    assert run("study", wrong, "--out", "out")[0] == run("estimate", wrong)[0] == 2
     assert asked == [False, True]
 
 
