@@ -18,7 +18,7 @@ from jaxos4.estimators.hybrid import search_from_seed
 from jaxos4.networks.architecture import Regressor
 from jaxos4.networks.features import FEATURES, Coordinates
 from jaxos4.networks.first_weights import first_regressor
-from jaxos4.networks.training import draw_many
+from jaxos4.networks.training import Purpose, simulate
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 DURATION = 3.0
@@ -95,7 +95,7 @@ def test_simulated_features_are_those_of_the_simulated_flight(kind, free):
     initial_state = jnp.zeros(12).at[jnp.array([7, 9, 11])].set(start)
     flight = jaxos4.simulate(PUBLISHED(), parameters, OMEGA, dt=DT, initial_state=initial_state)
     measured = features(problem_of(flight.states, free=free))
-    simulated = features.simulated(u, jnp.zeros(features.size))
+    simulated = features.simulated(u)
     np.testing.assert_allclose(simulated, measured.values, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(measured.inflation, 1.0, rtol=1e-12)
 
@@ -108,7 +108,9 @@ def test_simulated_noise_is_that_of_noisy_flights(kind):
     keys = jax.random.split(jax.random.key(3), count)
     exact = standard_flight(duration=DURATION)
     measure = eqx.filter_jit(lambda features, k: features(problem_of(noise(exact, key=k).states)).values)
-    draw = eqx.filter_jit(lambda features, k: features.simulated(u, scale * jax.random.normal(k, (features.size,))))
+    draw = eqx.filter_jit(
+        lambda features, k: features.simulated(u) + features.noise(scale * jax.random.normal(k, (features.size,)))
+    )
     u = jnp.zeros(features.coordinates.center.shape)
     measured, drawn = (jax.lax.map(lambda k, one=one: one(features, k), keys) for one in (measure, draw))
     picked = slice(None) if kind == "score" else slice(300, 308)
@@ -130,7 +132,8 @@ def test_features_of_flights_that_diverge_are_not_a_number():
     problem = problem_of(model=CORRECTED())
     wild = jaxos4.Bracket.around(CORRECTED().alpha, 100 * CORRECTED().half_width)
     features = FEATURES["score"].of(problem, Coordinates.of(problem, wild, jnp.asarray(1.0)))
-    flown = jnp.isfinite(draw_many(features, jnp.ones(2), 200, key=jax.random.key(0)).features).all(axis=1)
+    (chunk,) = simulate(features, 200, key=jax.random.key(0), purpose=Purpose.VALIDATION)
+    flown = jnp.isfinite(chunk.features).all(axis=1)
     assert 0 <= flown.mean() < 1
 
 
@@ -147,16 +150,20 @@ def test_first_weights_are_uniform_as_those_of_equinox():
     assert shapes[0] == shapes[1]
     np.testing.assert_array_equal(first.skip, linear_map)
     used = set()
-    for perceptron, other in ((first.approximator, second.approximator), (first.spread, second.spread)):
-        for layer, elsewhere in zip(perceptron.layers, other.layers, strict=True):
-            for x, y in ((layer.weight, elsewhere.weight), (layer.bias, elsewhere.bias)):
-                u = np.asarray(x).ravel() * np.sqrt(layer.in_features)
-                assert np.abs(u).max() <= 1
-                assert abs(u.mean()) < 4.5 * np.sqrt(1 / 3 / u.size)
-                assert abs(np.mean(u**2) - 1 / 3) < 4.5 * np.sqrt(4 / 45 / u.size)
-                assert not np.isclose(x, y).any()
-                assert used.isdisjoint(u.tolist())  # no number is used twice
-                used.update(u.tolist())
+
+    def layers(regressor):
+        approximator = regressor.approximator
+        return *approximator.hidden.layers, approximator.gate, approximator.last, *regressor.spread.layers
+
+    for layer, elsewhere in zip(layers(first), layers(second), strict=True):
+        for x, y in ((layer.weight, elsewhere.weight), (layer.bias, elsewhere.bias)):
+            u = np.asarray(x).ravel() * np.sqrt(layer.in_features)
+            assert np.abs(u).max() <= 1
+            assert abs(u.mean()) < 4.5 * np.sqrt(1 / 3 / u.size)
+            assert abs(np.mean(u**2) - 1 / 3) < 4.5 * np.sqrt(4 / 45 / u.size)
+            assert not np.isclose(x, y).any()
+            assert used.isdisjoint(u.tolist())  # no number is used twice
+            used.update(u.tolist())
 
 
 def test_training_learns_and_comes_near_the_bound():
@@ -214,6 +221,26 @@ def test_the_same_key_gives_the_same_network_and_another_another():
     assert eqx.tree_equal(a, b)
     assert not eqx.tree_equal(a.regressor, c.regressor)
     assert reports == [(5, 5, float(network.history[0, 1])) for network in (a, b, c)]
+
+
+def test_a_second_training_of_the_same_shapes_compiles_nothing():
+    """Other numbers are no reason to compile: bracket, noise, rate, number of steps, key."""
+    compiled = []
+
+    def count(event: str, _: float, **__) -> None:
+        compiled.append(event == "/jax/core/compile/backend_compile_duration")
+
+    def fit(changes, bracket, key):
+        jaxos4.NetworkEstimator(**(SHORT | changes)).fit(problem_of(), bracket, key=jax.random.key(key))
+
+    other = jaxos4.Bracket.around(BRACKET.center + 0.1 * BRACKET.half_width, 0.5 * BRACKET.half_width)
+    fit({}, BRACKET, 0)
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        fit({"noise": (0.5, 2.0), "steps": 300, "learning_rate": 0.01}, other, 1)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    assert not any(compiled)
 
 
 def test_training_stops_early_without_progress():

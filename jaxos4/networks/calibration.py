@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Scalar, as_float
 from ..errors import TrainingError
 from .architecture import Regressor, Scaling
 from .features import AbstractFeatures
-from .training import CHUNK, Pair, Purpose, draw_chunks
+from .training import Flights, Purpose, noisy, simulate
 
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
@@ -49,11 +49,16 @@ class ErrorTable(NamedTuple):
         return rms, correlation, factors, simultaneous
 
 
-def uncalibrated(noise: tuple[float, float], parameters: int) -> ErrorTable:
-    """The table of a network before training: noise scales from the lowest to the highest, and ones for the errors."""
-    scales, levels = as_float(np.asarray(noise)), 1 if noise[0] == noise[1] else _SCALES
+def calibrated_scales(noise: tuple[float, float]) -> Float[Array, " scales"]:
+    """The noise scales at which a network is calibrated, from the lowest to the highest of its training."""
+    return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else _SCALES))
+
+
+def uncalibrated(scales: Float[Array, " scales"], parameters: int) -> ErrorTable:
+    """The table of a network before training: ones for the errors."""
+    levels = scales.shape[0]
     return ErrorTable(
-        jnp.geomspace(scales[0], scales[1], levels),
+        scales,
         jnp.ones((levels, parameters)),
         jnp.tile(jnp.eye(parameters), (levels, 1, 1)),
         jnp.ones((levels, len(LEVELS), parameters)),
@@ -69,30 +74,39 @@ def calibrate(
     count: int,
     key: Key,
 ) -> ErrorTable:
-    """Measures a network's errors on `count` new simulated flights at each noise scale.
+    """Measures a network's errors on `count` new simulated flights, with new noise at each noise scale.
 
     Each quantile is the smallest that holds its level for one more flight. Flights that diverge do not count.
 
     **Raises:** `TrainingError` if too few flights can be flown.
     """
-    parameters, chunks = len(features.problem.model.parameter_names), -(-count // CHUNK)
-    tables = []
+    parameters, tables = len(features.problem.model.parameter_names), []
+    flights = simulate(features, count, key=key, purpose=Purpose.CALIBRATION, uniform=True)
     for number, scale in enumerate(np.asarray(scales)):
-        both, first = np.full(2, scale), number * chunks
-        pairs = draw_chunks(features, both, count, key=key, purpose=Purpose.CALIBRATION, first=first)
-        tables.append(_table(np.asarray(_standardised(regressor, scaling, pairs))[:, :parameters]))
+        first = (1 + number) * len(flights)  # behind the places of the flights
+        errors = [
+            _standardised(regressor, scaling, features, chunk, scale, key, Purpose.CALIBRATION.place(first + i))
+            for i, chunk in enumerate(flights)
+        ]
+        tables.append(_table(np.concatenate(errors)[:, :parameters]))
     return ErrorTable(scales, *(as_float(np.stack(column)) for column in zip(*tables, strict=True)))
 
 
 @eqx.filter_jit
-def _standardised(regressor: Regressor, scaling: Scaling, pairs: Pair) -> Float[Array, "flights unknowns"]:
+def _standardised(
+    regressor: Regressor,
+    scaling: Scaling,
+    features: AbstractFeatures,
+    chunk: Flights,
+    scale: Scalar,
+    key: Key,
+    place: Int[Array, ""],
+) -> Float[Array, "flights unknowns"]:
     """Errors in units of the standard deviation that the network gives."""
-
-    def one(pair: Pair) -> Float[Array, " unknowns"]:
-        output = regressor(pair.features, pair.scale, scaling)
-        return (output.u - pair.u) / (scaling.bound(pair.scale) * jnp.exp(output.log_spread))
-
-    return jax.vmap(one)(pairs)
+    output = jax.vmap(regressor, in_axes=(0, None, None))(
+        noisy(features, chunk, jnp.stack([scale, scale]), key, place).features, scale, scaling
+    )
+    return (output.u - chunk.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
 
 
 def _table(error: Float[np.ndarray, "flights parameters"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -13,27 +13,25 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
-from .._custom_types import Key, Scalar, as_float
+from .._custom_types import Key, Numeric, Scalar, as_float
 from ..bracket import UNIFORM_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Calibration, Estimate, check_bracket
 from ..flight import STATE_NAMES
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem
-from .architecture import Regressor, Scaling, squared_error
-from .calibration import LEVELS, ErrorTable, calibrate, uncalibrated
+from .architecture import Regressor, Scaling
+from .calibration import LEVELS, ErrorTable, calibrate, calibrated_scales, uncalibrated
 from .features import FEATURES, AbstractFeatures, Coordinates
 from .first_weights import first_regressor, linear_samples, scaling_and_linear_map
 from .progress_bar import training_bar
-from .training import CHUNK, Pair, Progress, Purpose, train
+from .training import Pair, Progress, Purpose, train
 
 APPROXIMATORS = ("mlp", "cmac")
 
 # The first linear map is a matrix of features times features: more features than this do not fit in memory.
 _MOST_FEATURES = 6000
 _MOST_STEPS = 1_000_000
-_WARM_UP_STEPS = 200
-_LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
 _LARGEST_INFLATION = 2.0  # if missing samples enlarge a standard deviation by more, the problem is another one
 _SAME = 1e-6  # relative tolerance of equal numbers: files round them
 
@@ -51,10 +49,9 @@ class NetworkEstimator(eqx.Module):
     - `noise`: the lowest and highest noise scale of training, in multiples of the problem's sigma. Scales are drawn
       log-uniformly, and the scale is an input of the network.
     - `width`, `depth`: of the perceptron.
-    - `steps`, `batch`, `learning_rate`: of the training, by Muon with a cosine schedule; a step simulates `batch`
-      flights.
+    - `steps`, `batch`, `learning_rate`: of the training, by Muon with a cosine schedule; a step uses `batch` flights.
     - `patience`: training stops early after this many checks, of 250 steps each, without a better validation loss.
-    - `held_out`: simulated flights for the calibration of the intervals, at each of nine noise scales.
+    - `held_out`: simulated flights for the calibration of the intervals, each with new noise at nine noise scales.
 
     **Raises:** `ValueError` for a setting out of range.
     """
@@ -67,7 +64,7 @@ class NetworkEstimator(eqx.Module):
     depth: int = eqx.field(static=True, default=3)
     steps: int = eqx.field(static=True, default=10_000)
     batch: int = eqx.field(static=True, default=256)
-    learning_rate: float = eqx.field(static=True, default=0.02)
+    learning_rate: float = eqx.field(static=True, default=0.01)
     patience: int = eqx.field(static=True, default=10)
     held_out: int = eqx.field(static=True, default=20_000)
 
@@ -77,7 +74,7 @@ class NetworkEstimator(eqx.Module):
                 raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
         if self.features == "raw" and self.approximator == "cmac":
             raise ValueError('`approximator` "cmac" tiles every pair of features: it needs `features` "score".')
-        smallest = {"width": 1, "depth": 0, "steps": 1, "batch": 1, "patience": 1, "held_out": 1000}
+        smallest = {"width": 1, "depth": 1, "steps": 1, "batch": 1, "patience": 1, "held_out": 1000}
         for name, least in smallest.items():
             value = getattr(self, name)
             if not isinstance(value, int) or value < least:
@@ -105,71 +102,40 @@ class NetworkEstimator(eqx.Module):
         **Raises:** `ValueError` for a bracket without width or channels that the problem lacks; `TrainingError` if
         training diverges, or if the flights of the bracket diverge.
         """
-        import optax  # here, because it is slow to import
-
         self._check(problem, bracket)
-        blank = self._untrained(problem.restrict(self.channels), bracket, key)
-        schedule = optax.warmup_cosine_decay_schedule(
-            0.0, self.learning_rate, min(_WARM_UP_STEPS, self.steps // 2), self.steps, _LAST_RATE * self.learning_rate
+        scales = np.asarray(self.noise, float)
+        features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
+        scaling, regressor = _first(
+            features, linear_samples(features, scales, key), scales, key, self.approximator, self.width, self.depth
         )
-        scaling = blank.scaling
-        single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), scaling)
         bar = training_bar(self.steps) if progress is True else contextlib.nullcontext(progress or None)
         with bar as report:
             regressor, history = train(
-                blank.regressor,
-                lambda regressor, pair: squared_error(regressor, single, *pair),
-                blank.features,
-                as_float(np.asarray(self.noise)),
-                optax.contrib.muon(schedule),
+                regressor,
+                scaling,
+                features,
+                scales,
                 batch=self.batch,
                 steps=self.steps,
-                validation=2 * CHUNK,
+                learning_rate=self.learning_rate,
                 patience=self.patience,
                 key=key,
                 progress=report,
             )
-        errors = calibrate(regressor, scaling, blank.features, blank.errors.scales, self.held_out, key)
-        return TrainedNetwork(
-            self, blank.features, scaling, regressor, errors, as_float(history), jax.random.key_data(key)
-        )
+        errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
+        return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
     def blank(self, problem: ShootingProblem, bracket: Bracket) -> "TrainedNetwork":
         """A network with the shapes of a trained one and no values, for a problem with its channels."""
-        features = FEATURES[self.features].blank(problem, self._coordinates(problem, bracket))
+        features = FEATURES[self.features].blank(problem, Coordinates.of(problem, bracket, as_float(self.noise[1])))
         unknowns, size = features.coordinates.center.shape[0], features.size
         scaling = Scaling(jnp.zeros(size), jnp.zeros(unknowns), jnp.zeros(unknowns), jnp.zeros(()))
         regressor = Regressor(
             jnp.zeros((unknowns, size)), self.approximator, width=self.width, depth=self.depth, key=jax.random.key(0)
         )
-        return self._network(features, scaling, regressor, jax.random.key(0))
-
-    def _untrained(self, problem: ShootingProblem, bracket: Bracket, key: Key) -> "TrainedNetwork":
-        """The network before training: scaled, with its linear map fitted."""
-        features = self._prepared(problem, bracket)
-        return self._first(features, linear_samples(features, np.asarray(self.noise, float), key), key)
-
-    @eqx.filter_jit
-    def _prepared(self, problem: ShootingProblem, bracket: Bracket) -> AbstractFeatures:
-        return FEATURES[self.features].of(problem, self._coordinates(problem, bracket))
-
-    @eqx.filter_jit
-    def _first(self, features: AbstractFeatures, samples: Pair, key: Key) -> "TrainedNetwork":
-        scaling, linear_map = scaling_and_linear_map(features, np.asarray(self.noise, float), samples)
-        size = {"width": self.width, "depth": self.depth}
-        regressor = first_regressor(
-            linear_map, self.approximator, **size, key=jax.random.fold_in(key, Purpose.WEIGHTS.place(0))
-        )
-        return self._network(features, scaling, regressor, key)
-
-    def _coordinates(self, problem: ShootingProblem, bracket: Bracket) -> Coordinates:
-        return Coordinates.of(problem, bracket, as_float(self.noise[1]))
-
-    def _network(
-        self, features: AbstractFeatures, scaling: Scaling, regressor: Regressor, key: Key
-    ) -> "TrainedNetwork":
-        errors = uncalibrated(self.noise, len(features.problem.model.parameter_names))
-        return TrainedNetwork(self, features, scaling, regressor, errors, jnp.zeros((0, 2)), jax.random.key_data(key))
+        errors = uncalibrated(calibrated_scales(self.noise), len(features.problem.model.parameter_names))
+        key = jax.random.key_data(jax.random.key(0))
+        return TrainedNetwork(self, features, scaling, regressor, errors, jnp.zeros((0, 2)), key)
 
     def _check(self, problem: ShootingProblem, bracket: Bracket) -> None:
         if CHANNELS[self.channels] > problem.size:
@@ -183,6 +149,29 @@ class NetworkEstimator(eqx.Module):
         if self.features == "raw" and numbers > _MOST_FEATURES:
             what = f"of this flight are {numbers} numbers, more than {_MOST_FEATURES}"
             raise ValueError(f'`features` "raw" {what}: use "score".')
+
+
+@eqx.filter_jit
+def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> AbstractFeatures:
+    return FEATURES[features].of(problem, Coordinates.of(problem, bracket, as_float(noise)))
+
+
+@eqx.filter_jit
+def _first(
+    features: AbstractFeatures,
+    samples: list[Pair],
+    scales: Float[Numeric, "2"],
+    key: Key,
+    approximator: str,
+    width: int,
+    depth: int,
+) -> tuple[Scaling, Regressor]:
+    """Scaling and regressor before training, with the linear map fitted to `samples`."""
+    scaling, linear_map = scaling_and_linear_map(features, scales, samples)
+    place = Purpose.WEIGHTS.place(0)
+    return scaling, first_regressor(
+        linear_map, approximator, width=width, depth=depth, key=jax.random.fold_in(key, place)
+    )
 
 
 class TrainedNetwork(AbstractEstimator):

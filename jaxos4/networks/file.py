@@ -22,7 +22,7 @@ from ..models import MODELS
 from ..shooting import ShootingProblem
 from .estimator import NetworkEstimator, TrainedNetwork
 
-_FORMAT = 2
+_FORMAT = 3
 _LARGEST = 2**30
 
 

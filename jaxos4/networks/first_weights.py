@@ -12,22 +12,25 @@ from jaxtyping import Array, Float
 from .._custom_types import Key, Numeric
 from .architecture import Regressor, Scaling, compress
 from .features import AbstractFeatures, Score
-from .training import CHUNK, Pair, Purpose, draw_chunks
+from .training import CHUNK, Pair, Purpose, noisy, simulate
 
 # Flights for each feature, and the ridge, of the fit of the linear map.
 _PER_FEATURE, _RIDGE = 4, 1e-6
 _DRAWN = 1024  # random numbers at once
 
 
-def linear_samples(features: AbstractFeatures, scales: Float[np.ndarray, "2"], key: Key) -> Pair:
-    """The simulated flights of `scaling_and_linear_map`."""
-    return draw_chunks(features, scales, max(CHUNK, _PER_FEATURE * features.size), key=key, purpose=Purpose.LINEAR_MAP)
+def linear_samples(features: AbstractFeatures, scales: Float[np.ndarray, "2"], key: Key) -> list[Pair]:
+    """The simulated flights of `scaling_and_linear_map`, in chunks."""
+    count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
+    chunks = simulate(features, count, key=key, purpose=purpose)
+    return [noisy(features, chunk, scales, key, purpose.place(len(chunks) + i)) for i, chunk in enumerate(chunks)]
 
 
 def scaling_and_linear_map(
-    features: AbstractFeatures, scales: Float[Numeric, "2"], samples: Pair
+    features: AbstractFeatures, scales: Float[Numeric, "2"], chunks: list[Pair]
 ) -> tuple[Scaling, Float[Array, "unknowns features"]]:
     """Measures the features' sizes on simulated flights, and fits the best linear map from features to unknowns."""
+    samples = jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
     # The score's own derivatives give the bound.
     score = features if isinstance(features, Score) else Score.of(features.problem, features.coordinates)
     unit = jnp.linalg.norm(score.noise_factor, axis=1)

@@ -1,27 +1,29 @@
 """Simulated flights for training, and the loop that trains a network on them.
 
-No flight is stored. Each step simulates its own batch: parameters, initial state, noise scale and noise are new draws.
+Between two checks, training simulates new flights. Each step takes some of them, with new noise.
 """
 
 import enum
+import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._custom_types import Key, Numeric, Scalar
 from ..errors import TrainingError
+from .architecture import Regressor, Scaling, loss
 from .features import AbstractFeatures
 
 if TYPE_CHECKING:
-    import optax  # `train` imports it, because it is slow to import
+    import optax  # `_optimiser` imports it, because it is slow to import
 
 CHUNK = 1000
-"""Flights that are simulated at once, apart from the steps of training."""
+"""Flights that are simulated at once. All chunks share one compiled program."""
 
 
 class Purpose(enum.IntEnum):
@@ -32,6 +34,7 @@ class Purpose(enum.IntEnum):
     VALIDATION = 2
     STEPS = 3
     CALIBRATION = 4
+    FLIGHTS = 5
 
     def place(self, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
         """The place of a number, or of each number."""
@@ -44,11 +47,22 @@ CHECK = 250
 Progress = Callable[[int, int, float], None]
 """Called at every check with the steps done, the number of steps, and the validation loss."""
 
+_VALIDATION = 2  # chunks of the validation
+_USES = 4  # how often training uses a simulated flight, each time with new noise
 _IMPROVEMENT = 1e-4  # a loss is an improvement if it is lower by this share
 _DIVERGED = 1e15  # in units of the noise; the worst answer inside a bracket has a far lower loss
 _FLYABLE = 0.01  # the smallest share of simulated flights that must not diverge
 
-Network = TypeVar("Network", bound=eqx.Module)
+_WARM_UP = 200  # steps
+_LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
+_NEWTON_SCHULZ = ((3.4445, -4.7750, 2.0315),) * 5  # Optax's coefficients; as rows they compile to a loop
+
+
+class Flights(NamedTuple):
+    """Simulated flights without noise: features, and the true unknowns in bracket coordinates."""
+
+    features: Float[Array, "*batch features"]
+    u: Float[Array, "*batch unknowns"]
 
 
 class Pair(NamedTuple):
@@ -59,112 +73,182 @@ class Pair(NamedTuple):
     u: Float[Array, "*batch unknowns"]
 
 
-def draw_many(features: AbstractFeatures, scales: Float[Array, "2"], count: int, *, key: Key) -> Pair:
-    """Simulates `count` flights: unknowns uniform in the bracket, noise scale log-uniform between `scales`."""
-    unknowns, (low, high) = features.coordinates.center.shape[0], jnp.log(scales)
-    # All random numbers in one draw, which compiles faster than one for each flight and quantity.
-    drawn = jax.random.uniform(key, (count, unknowns + 1 + features.size), minval=-1, maxval=1, dtype=float)
-    u, scale = drawn[:, :unknowns], jnp.exp((low + high + (high - low) * drawn[:, unknowns]) / 2)
-    most = 1 - jnp.finfo(drawn.dtype).eps  # a finite number of standard deviations
-    normal = jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(drawn[:, unknowns + 1 :], -most, most))
-    noise = scale[:, None] * normal
-    return Pair(jax.vmap(features.simulated)(u, noise), scale, u)
+def simulate(
+    features: AbstractFeatures, count: int, *, key: Key, purpose: Purpose, first: int = 0, uniform: bool = False
+) -> list[Flights]:
+    """Simulates at least `count` flights in chunks of `CHUNK`. Parameters are uniform in the bracket.
 
-
-def draw_chunks(
-    features: AbstractFeatures, scales: Float[Numeric, "2"], count: int, *, key: Key, purpose: Purpose, first: int = 0
-) -> Pair:
-    """Simulates at least `count` flights in chunks of `CHUNK`, all by one compiled program.
-
+    Initial states are denser near the bracket's center, where most flights begin, unless they are to be `uniform` too.
     Chunk i is drawn from `key` at the place `first` + i of the `purpose`.
     """
-    numbers = range(first, first - (-count // CHUNK))
-    drawn = [_chunk(features, scales, key, purpose.place(number)) for number in numbers]
-    # By NumPy: JAX would compile a program.
-    return Pair(*(jax.device_put(np.concatenate(parts)) for parts in zip(*drawn, strict=True)))
+    numbers = range(first, first + math.ceil(count / CHUNK))
+    return [_chunk(features, key, purpose.place(number), np.asarray(uniform)) for number in numbers]
 
 
 @eqx.filter_jit
-def _chunk(features: AbstractFeatures, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]) -> Pair:
-    return draw_many(features, jnp.asarray(scales), CHUNK, key=jax.random.fold_in(key, place))
+def _chunk(features: AbstractFeatures, key: Key, place: Int[Numeric, ""], uniform: Bool[Numeric, ""]) -> Flights:
+    unknowns, parameters = features.coordinates.center.shape[0], len(features.problem.model.parameter_names)
+    drawn = jax.random.uniform(jax.random.fold_in(key, place), (CHUNK, unknowns + 1), minval=-1, maxval=1, dtype=float)
+    shrunk = jnp.where(uniform, 1.0, jnp.abs(drawn[:, -1:]))
+    u = drawn[:, :-1] * jnp.where(np.arange(unknowns) < parameters, 1.0, shrunk)
+    return Flights(jax.vmap(features.simulated)(u), u)
+
+
+def with_noise(
+    features: AbstractFeatures, flights: Flights, scales: Float[Numeric, "2"], uniform: Float[Array, "flights random"]
+) -> Pair:
+    """Adds noise to flights, with scales that are log-uniform between `scales`.
+
+    `uniform`: random numbers between -1 and 1, one for the scale and one for each feature.
+    """
+    low, high = jnp.log(jnp.asarray(scales, uniform.dtype))
+    scale = jnp.exp((low + high + (high - low) * uniform[:, 0]) / 2)
+    most = 1 - jnp.finfo(uniform.dtype).eps  # a finite number of standard deviations
+    normal = jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(uniform[:, 1:], -most, most))
+    return Pair(flights.features + jax.vmap(features.noise)(scale[:, None] * normal), scale, flights.u)
+
+
+@eqx.filter_jit
+def noisy(
+    features: AbstractFeatures, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
+) -> Pair:
+    """Adds noise to a chunk of flights, drawn from `key` at a place, by one compiled program for all chunks."""
+    shape = CHUNK, 1 + features.size
+    drawn = jax.random.uniform(jax.random.fold_in(key, place), shape, minval=-1, maxval=1, dtype=float)
+    return with_noise(features, chunk, scales, drawn)
 
 
 def train(
-    network: Network,
-    loss: Callable[[Network, Pair], Scalar],
+    regressor: Regressor,
+    scaling: Scaling,
     features: AbstractFeatures,
-    scales: Float[Array, "2"],
-    optimiser: "optax.GradientTransformation",
+    scales: Float[np.ndarray, "2"],
     *,
     batch: int,
     steps: int,
-    validation: int,
+    learning_rate: float,
     patience: int,
     key: Key,
     progress: Progress | None = None,
-) -> tuple[Network, Float[np.ndarray, "checks 2"]]:
-    """Trains a network on the `loss` of one flight; flights that diverge do not count.
+) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
+    """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
 
-    **Returns:** the network as it was at the check with the best validation loss, and the losses of training and
+    **Returns:** the regressor as it was at the check with the best validation loss, and the losses of training and
     validation at every check.
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
-    import optax
-
-    held_out = draw_chunks(features, scales, validation, key=key, purpose=Purpose.VALIDATION)
-    given, structure = eqx.partition(network, eqx.is_inexact_array)
-    _check_trainable(held_out, given)
+    held_out = [
+        noisy(features, chunk, scales, key, Purpose.VALIDATION.place(_VALIDATION + number))
+        for number, chunk in enumerate(simulate(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION))
+    ]
+    _check_trainable(held_out, regressor)
     # Single precision: rounding is far below the noise of a step's flights.
-    weights, held_out = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), (given, held_out))
-
-    def mean_loss(weights: PyTree, pairs: Pair) -> Scalar:
-        flown = jnp.isfinite(pairs.features).all(axis=1)
-        # NaN would make the gradient NaN even at a weight of 0.
-        finite = jnp.where(flown[:, None], pairs.features, 0.0)
-        losses = jax.vmap(lambda pair: loss(eqx.combine(weights, structure), pair))(pairs._replace(features=finite))
-        return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
-
-    @eqx.filter_jit
-    def advance(features, held_out, weights, state, key, places):
-        def step(carry, place):
-            weights, state = carry
-            drawn = draw_many(features, scales, batch, key=jax.random.fold_in(key, place))
-            pairs = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), drawn)
-            value, gradient = jax.value_and_grad(mean_loss)(weights, pairs)
-            updates, state = optimiser.update(gradient, state, weights)
-            return (optax.apply_updates(weights, updates), state), value
-
-        (weights, state), values = jax.lax.scan(step, (weights, state), places)
-        return weights, state, values.mean(), mean_loss(weights, held_out)
-
-    state = jax.jit(optimiser.init)(weights)
-    best, lowest, without_improvement, history = weights, np.inf, 0, []
-    for first in range(0, steps, CHECK):
-        indices = np.arange(first, min(first + CHECK, steps))
-        places = Purpose.STEPS.place(indices)
-        weights, state, *losses = advance(features, held_out, weights, state, key, places)
+    given, held_out, data = regressor, _single(held_out), _single((scaling, features, scales))
+    regressor = _single(regressor)
+    state, rates = _first_state(regressor), _learning_rates(learning_rate, steps)
+    flown = batch * CHECK // _USES
+    best, lowest, without_improvement, history = regressor, np.inf, 0, []
+    for number, first in enumerate(range(0, steps, CHECK)):
+        flights = simulate(features, flown, key=key, purpose=Purpose.FLIGHTS, first=number * math.ceil(flown / CHUNK))
+        count = min(CHECK, steps - first)
+        places = Purpose.STEPS.place(first + np.arange(CHECK))
+        rate = np.resize(rates[first : first + count], CHECK)
+        regressor, state, *losses = _advance(
+            regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
+        )
         history.append([float(value) for value in losses])
         value, current = history[-1]
         if not np.less(history[-1], _DIVERGED).all():
             raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
         if progress is not None:
-            progress(int(indices[-1]) + 1, steps, current)
+            progress(first + count, steps, current)
         without_improvement += 1
         if current < lowest - _IMPROVEMENT * abs(current):
-            best, lowest, without_improvement = weights, current, 0
+            best, lowest, without_improvement = regressor, current, 0
         if without_improvement >= patience:
             break
-    best = jax.tree.map(lambda leaf, like: jnp.asarray(np.asarray(leaf), like.dtype), best, given)
-    return eqx.combine(best, structure), np.asarray(history)
+    best = jax.tree.map(
+        lambda leaf, like: jnp.asarray(np.asarray(leaf), like.dtype) if eqx.is_inexact_array(like) else like,
+        best,
+        given,
+    )
+    return best, np.asarray(history)
 
 
-def _check_trainable(held_out: Pair, weights: PyTree) -> None:
-    flyable = np.isfinite(np.asarray(held_out.features)).all(axis=1).mean()
+@eqx.filter_jit
+def _advance(
+    regressor: Regressor,
+    state: PyTree,
+    data: tuple[Scaling, AbstractFeatures, Float[Array, "2"]],
+    flights: list[Flights],
+    held_out: list[Pair],
+    key: Key,
+    places: Int[Array, " steps"],
+    rates: Float[Array, " steps"],
+    count: Int[Array, ""],
+    batch: int,
+) -> tuple[Regressor, PyTree, Scalar, Scalar]:
+    """The first `count` steps of training, their mean loss, and the loss on `held_out` flights."""
+    scaling, features, scales = data
+    flights, held_out = (jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks) for chunks in (flights, held_out))
+    flights = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), flights)
+
+    def mean_loss(regressor: Regressor, pairs: Pair) -> Scalar:
+        flown = jnp.isfinite(pairs.features).all(axis=1)
+        # NaN would make the gradient NaN even at a weight of 0.
+        finite = pairs._replace(features=jnp.where(flown[:, None], pairs.features, 0.0))
+        losses = jax.vmap(lambda pair: loss(regressor, scaling, *pair))(finite)
+        return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
+
+    def step(i: Int[Array, ""], carry: tuple[PyTree, PyTree, Scalar]) -> tuple[PyTree, PyTree, Scalar]:
+        weights, state, total = carry
+        # All random numbers in one draw, which compiles faster than one for each quantity.
+        drawn = jax.random.uniform(
+            jax.random.fold_in(key, places[i]), (batch, 2 + features.size), jnp.float32, minval=-1, maxval=1
+        )
+        picked = ((drawn[:, 0] + 1) / 2 * flights.u.shape[0]).astype(int)
+        pairs = with_noise(features, jax.tree.map(lambda leaf: leaf[picked], flights), scales, drawn[:, 1:])
+        value, gradient = jax.value_and_grad(lambda weights: mean_loss(eqx.combine(weights, rest), pairs))(weights)
+        updates, state = _optimiser(rates[i]).update(gradient, state, weights)
+        return eqx.apply_updates(weights, updates), state, total + value
+
+    weights, rest = eqx.partition(regressor, eqx.is_inexact_array)
+    weights, state, total = jax.lax.fori_loop(0, count, step, (weights, state, jnp.zeros((), jnp.float32)))
+    regressor = eqx.combine(weights, rest)
+    return regressor, state, total / count, mean_loss(regressor, held_out)
+
+
+@eqx.filter_jit
+def _first_state(regressor: Regressor) -> PyTree:
+    return _optimiser(0.0).init(eqx.filter(regressor, eqx.is_inexact_array))
+
+
+def _optimiser(rate: Scalar | float) -> "optax.GradientTransformation":
+    import optax
+
+    return optax.contrib.muon(rate, ns_coeffs=_NEWTON_SCHULZ)
+
+
+def _learning_rates(largest: float, steps: int) -> Float[np.ndarray, " steps"]:
+    """The learning rate of each step: a linear rise, then half a cosine."""
+    step, warm_up = np.arange(steps), min(_WARM_UP, steps // 2)
+    wave = (1 + np.cos(np.pi * (step - warm_up) / (steps - warm_up))) / 2
+    return np.float32(largest * np.where(step < warm_up, step / max(warm_up, 1), _LAST_RATE + (1 - _LAST_RATE) * wave))
+
+
+def _single(tree: Any) -> Any:
+    """All floating-point numbers in single precision, by NumPy: JAX would compile programs."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32) if eqx.is_inexact_array_like(leaf) else leaf, tree)
+
+
+def _check_trainable(held_out: list[Pair], regressor: Regressor) -> None:
+    flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
     if not flyable > _FLYABLE:
         what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
-    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(weights)):
+    weights = jax.tree.leaves(eqx.filter(regressor, eqx.is_inexact_array))
+    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in weights):
         raise TrainingError(
             "the network's first weights are not finite, because the flight at the bracket's center diverges or too "
             "few samples were measured: move the bracket, or use a longer flight."
