@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._custom_types import Key, Scalar, as_float
+from .._custom_types import Key, Numeric, Scalar, as_float
 from ..errors import TrainingError
 from .architecture import Regressor, Scaling
 from .features import AbstractFeatures
@@ -100,7 +100,7 @@ def _standardised(
     chunk: Flights,
     scale: Scalar,
     key: Key,
-    place: Int[Array, ""],
+    place: Int[Numeric, ""],
 ) -> Float[Array, "flights unknowns"]:
     """Errors in units of the standard deviation that the network gives."""
     output = jax.vmap(regressor, in_axes=(0, None, None))(

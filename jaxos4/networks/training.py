@@ -181,18 +181,18 @@ def _advance(
     regressor: Regressor,
     state: PyTree,
     data: tuple[Scaling, AbstractFeatures, Float[Array, "2"]],
-    flights: list[Flights],
+    chunks: list[Flights],
     held_out: list[Pair],
     key: Key,
-    places: Int[Array, " steps"],
-    rates: Float[Array, " steps"],
-    count: Int[Array, ""],
+    places: Int[Numeric, " steps"],
+    rates: Float[Numeric, " steps"],
+    count: Int[Numeric, ""],
     batch: int,
 ) -> tuple[Regressor, PyTree, Scalar, Scalar]:
     """The first `count` steps of training, their mean loss, and the loss on `held_out` flights."""
     scaling, features, scales = data
-    flights, held_out = (jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks) for chunks in (flights, held_out))
-    flights = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), flights)
+    flights = Flights(*(jnp.concatenate(parts).astype(jnp.float32) for parts in zip(*chunks, strict=True)))
+    validation = Pair(*map(jnp.concatenate, zip(*held_out, strict=True)))
 
     def mean_loss(regressor: Regressor, pairs: Pair) -> Scalar:
         flown = jnp.isfinite(pairs.features).all(axis=1)
@@ -216,7 +216,7 @@ def _advance(
     weights, rest = eqx.partition(regressor, eqx.is_inexact_array)
     weights, state, total = jax.lax.fori_loop(0, count, step, (weights, state, jnp.zeros((), jnp.float32)))
     regressor = eqx.combine(weights, rest)
-    return regressor, state, total / count, mean_loss(regressor, held_out)
+    return regressor, state, total / count, mean_loss(regressor, validation)
 
 
 @eqx.filter_jit
@@ -234,7 +234,8 @@ def _learning_rates(largest: float, steps: int) -> Float[np.ndarray, " steps"]:
     """The learning rate of each step: a linear rise, then half a cosine."""
     step, warm_up = np.arange(steps), min(_WARM_UP, steps // 2)
     wave = (1 + np.cos(np.pi * (step - warm_up) / (steps - warm_up))) / 2
-    return np.float32(largest * np.where(step < warm_up, step / max(warm_up, 1), _LAST_RATE + (1 - _LAST_RATE) * wave))
+    share = np.where(step < warm_up, step / max(warm_up, 1), _LAST_RATE + (1 - _LAST_RATE) * wave)
+    return (largest * share).astype(np.float32)
 
 
 def _single(tree: Any) -> Any:
