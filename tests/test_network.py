@@ -18,7 +18,7 @@ from jaxos4.estimators.hybrid import search_from_seed
 from jaxos4.networks.architecture import Regressor
 from jaxos4.networks.features import FEATURES, Coordinates
 from jaxos4.networks.first_weights import first_regressor
-from jaxos4.networks.training import Purpose, simulate
+from jaxos4.networks.training import Purpose, draw_chunks
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 DURATION = 3.0
@@ -132,7 +132,7 @@ def test_features_of_flights_that_diverge_are_not_a_number():
     problem = problem_of(model=CORRECTED())
     wild = jaxos4.Bracket.around(CORRECTED().alpha, 100 * CORRECTED().half_width)
     features = FEATURES["score"].of(problem, Coordinates.of(problem, wild, jnp.asarray(1.0)))
-    (chunk,) = simulate(features, 200, key=jax.random.key(0), purpose=Purpose.VALIDATION)
+    (chunk,) = draw_chunks(features, 200, key=jax.random.key(0), purpose=Purpose.VALIDATION)
     flown = jnp.isfinite(chunk.features).all(axis=1)
     assert 0 <= flown.mean() < 1
 
@@ -440,6 +440,17 @@ def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(tmp_path_factory,
     except jaxos4.InputError as error:
         message = str(error)
     assert "\n" not in message
+
+
+def test_a_file_of_another_version_says_what_to_do(tmp_path, network_file):
+    path = tmp_path / "old.net"
+    path.write_bytes(network_file)
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays["header"]))
+    np.savez(path.with_suffix(".npz"), **arrays | {"header": np.asarray(json.dumps(header | {"format": 2}))})
+    with pytest.raises(jaxos4.InputError, match="trained by another version of jaxos4; train it again"):
+        jaxos4.load_network(path.with_suffix(".npz"))
 
 
 def test_objects_in_a_file_are_not_run(tmp_path):

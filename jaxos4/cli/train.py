@@ -25,7 +25,7 @@ from ._output import check_output
 from ._progress import stages
 
 # Of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
-NOISE, STEPS = (0.1, 10.0), 10_000
+NOISE, STEPS = (0.1, 10.0), 4000
 
 
 def train(

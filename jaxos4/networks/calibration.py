@@ -13,7 +13,7 @@ from .._custom_types import Key, Numeric, Scalar, as_float
 from ..errors import TrainingError
 from .architecture import Regressor, Scaling
 from .features import AbstractFeatures
-from .training import Flights, Purpose, noisy, simulate
+from .training import Flights, Purpose, draw_chunks, noisy_chunk
 
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
@@ -81,7 +81,7 @@ def calibrate(
     **Raises:** `TrainingError` if too few flights can be flown.
     """
     parameters, tables = len(features.problem.model.parameter_names), []
-    flights = simulate(features, count, key=key, purpose=Purpose.CALIBRATION, uniform=True)
+    flights = draw_chunks(features, count, key=key, purpose=Purpose.CALIBRATION, uniform=True)
     for number, scale in enumerate(np.asarray(scales)):
         first = (1 + number) * len(flights)  # behind the places of the flights
         errors = [
@@ -104,7 +104,7 @@ def _standardised(
 ) -> Float[Array, "flights unknowns"]:
     """Errors in units of the standard deviation that the network gives."""
     output = jax.vmap(regressor, in_axes=(0, None, None))(
-        noisy(features, chunk, jnp.stack([scale, scale]), key, place).features, scale, scaling
+        noisy_chunk(features, chunk, jnp.stack([scale, scale]), key, place).features, scale, scaling
     )
     return (output.u - chunk.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
 

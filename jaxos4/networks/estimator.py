@@ -49,7 +49,8 @@ class NetworkEstimator(eqx.Module):
     - `noise`: the lowest and highest noise scale of training, in multiples of the problem's sigma. Scales are drawn
       log-uniformly, and the scale is an input of the network.
     - `width`, `depth`: of the perceptron.
-    - `steps`, `batch`, `learning_rate`: of the training, by Muon with a cosine schedule; a step uses `batch` flights.
+    - `steps`, `batch`, `learning_rate`: of the training, by Muon with a cosine schedule; a step uses `batch` flights,
+      and each flight is used four times with new noise.
     - `patience`: training stops early after this many checks, of 250 steps each, without a better validation loss.
     - `held_out`: simulated flights for the calibration of the intervals, each with new noise at nine noise scales.
 
@@ -62,7 +63,7 @@ class NetworkEstimator(eqx.Module):
     noise: tuple[float, float] = eqx.field(static=True, default=(0.1, 10.0))
     width: int = eqx.field(static=True, default=128)
     depth: int = eqx.field(static=True, default=3)
-    steps: int = eqx.field(static=True, default=10_000)
+    steps: int = eqx.field(static=True, default=4000)
     batch: int = eqx.field(static=True, default=256)
     learning_rate: float = eqx.field(static=True, default=0.01)
     patience: int = eqx.field(static=True, default=10)

@@ -61,14 +61,14 @@ def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
 def load_network(path: str | os.PathLike[str]) -> TrainedNetwork:
     """Reads a network that `save_network` wrote, in the current precision.
 
-    **Raises:** `InputError` if it is no complete network file of this format; `OSError` if it cannot be read.
+    **Raises:** `InputError` if it is no complete network file of this version; `OSError` if it cannot be read.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
                 raise InputError(f"{path}: larger than any network; give a file that `jaxos4 train` wrote.")
         with np.load(path, allow_pickle=False) as file:
-            return _restore({name: file[name] for name in file.files})
+            return _restore(path, {name: file[name] for name in file.files})
     except InputError:
         raise
     except (*BROKEN, OSError) as error:
@@ -78,10 +78,10 @@ def load_network(path: str | os.PathLike[str]) -> TrainedNetwork:
         raise InputError(f"{path}: not a whole network file ({what}); train it again with `jaxos4 train`.") from None
 
 
-def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
+def _restore(path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     header = json.loads(str(arrays["header"]))
     if header["format"] != _FORMAT:
-        raise ValueError(f"format {header['format']}, expected {_FORMAT}")
+        raise InputError(f"{path}: trained by another version of jaxos4; train it again with `jaxos4 train`.")
     for name, value in arrays.items():
         valid = value.dtype.kind in "fui" and (name == "states" or not np.isnan(value).any())
         if name != "header" and not valid:
@@ -101,10 +101,10 @@ def _restore(arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     history = jax.ShapeDtypeStruct((header["checks"], 2), float)
     blank = eqx.tree_at(lambda n: (n.features.problem, n.history), blank, (problem, history))
 
-    def fill(path: tuple, leaf: Any) -> Any:
+    def fill(place: tuple, leaf: Any) -> Any:
         if not isinstance(leaf, jax.ShapeDtypeStruct):
             return leaf
-        name = _name(path)
+        name = _name(place)
         value = arrays[name]
         if value.shape != leaf.shape:
             raise ValueError(f"{name} has shape {value.shape}, expected {leaf.shape}")

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._custom_types import Key, Numeric
 from .architecture import Regressor, Scaling, compress
 from .features import AbstractFeatures, Score
-from .training import CHUNK, Pair, Purpose, noisy, simulate
+from .training import CHUNK, Pair, Purpose, draw_chunks, noisy_chunk
 
 # Flights for each feature, and the ridge, of the fit of the linear map.
 _PER_FEATURE, _RIDGE = 4, 1e-6
@@ -22,8 +22,8 @@ _DRAWN = 1024  # random numbers at once
 def linear_samples(features: AbstractFeatures, scales: Float[np.ndarray, "2"], key: Key) -> list[Pair]:
     """The simulated flights of `scaling_and_linear_map`, in chunks."""
     count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
-    chunks = simulate(features, count, key=key, purpose=purpose)
-    return [noisy(features, chunk, scales, key, purpose.place(len(chunks) + i)) for i, chunk in enumerate(chunks)]
+    chunks = draw_chunks(features, count, key=key, purpose=purpose)
+    return [noisy_chunk(features, chunk, scales, key, purpose.place(len(chunks) + i)) for i, chunk in enumerate(chunks)]
 
 
 def scaling_and_linear_map(

@@ -6,7 +6,7 @@ Between two checks, training simulates new flights. Each step takes some of them
 import enum
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -66,19 +66,19 @@ class Flights(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A simulated flight: features, noise scale (multiples of sigma), and the true unknowns in bracket coordinates."""
+    """A simulated flight with noise: features, noise scale (multiples of sigma), and the true unknowns."""
 
     features: Float[Array, "*batch features"]
     scale: Float[Array, "*batch"]
     u: Float[Array, "*batch unknowns"]
 
 
-def simulate(
+def draw_chunks(
     features: AbstractFeatures, count: int, *, key: Key, purpose: Purpose, first: int = 0, uniform: bool = False
 ) -> list[Flights]:
     """Simulates at least `count` flights in chunks of `CHUNK`. Parameters are uniform in the bracket.
 
-    Initial states are denser near the bracket's center, where most flights begin, unless they are to be `uniform` too.
+    `uniform`: whether free initial states are uniform in the bracket too. Otherwise they are denser near its center.
     Chunk i is drawn from `key` at the place `first` + i of the `purpose`.
     """
     numbers = range(first, first + math.ceil(count / CHUNK))
@@ -109,7 +109,7 @@ def with_noise(
 
 
 @eqx.filter_jit
-def noisy(
+def noisy_chunk(
     features: AbstractFeatures, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
 ) -> Pair:
     """Adds noise to a chunk of flights, drawn from `key` at a place, by one compiled program for all chunks."""
@@ -139,8 +139,8 @@ def train(
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
     held_out = [
-        noisy(features, chunk, scales, key, Purpose.VALIDATION.place(_VALIDATION + number))
-        for number, chunk in enumerate(simulate(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION))
+        noisy_chunk(features, chunk, scales, key, Purpose.VALIDATION.place(_VALIDATION + number))
+        for number, chunk in enumerate(draw_chunks(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION))
     ]
     _check_trainable(held_out, regressor)
     # Single precision: rounding is far below the noise of a step's flights.
@@ -150,10 +150,12 @@ def train(
     flown = batch * CHECK // _USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
     for number, first in enumerate(range(0, steps, CHECK)):
-        flights = simulate(features, flown, key=key, purpose=Purpose.FLIGHTS, first=number * math.ceil(flown / CHUNK))
+        flights = draw_chunks(
+            features, flown, key=key, purpose=Purpose.FLIGHTS, first=number * math.ceil(flown / CHUNK)
+        )
         count = min(CHECK, steps - first)
         places = Purpose.STEPS.place(first + np.arange(CHECK))
-        rate = np.resize(rates[first : first + count], CHECK)
+        rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
         regressor, state, *losses = _advance(
             regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
         )
@@ -238,7 +240,7 @@ def _learning_rates(largest: float, steps: int) -> Float[np.ndarray, " steps"]:
     return (largest * share).astype(np.float32)
 
 
-def _single(tree: Any) -> Any:
+def _single(tree: PyTree) -> PyTree:
     """All floating-point numbers in single precision, by NumPy: JAX would compile programs."""
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32) if eqx.is_inexact_array_like(leaf) else leaf, tree)
 
