@@ -21,8 +21,7 @@ from .._custom_types import Key, Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
 from ..linalg import covariance_of_shared
-from ..shooting import ShootingProblem
-from ..shooting.problem import ROUNDING
+from ..shooting import ROUNDING, ShootingProblem
 
 Points = Float[Array, "archive unknowns"]
 Costs = Float[Array, " archive"]

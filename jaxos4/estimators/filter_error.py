@@ -323,7 +323,7 @@ def innovations_of(
     rows = Rows(windowed(problem.forcing(model.alpha), samples), ())
 
     def evaluate(parameters: Parameters, noise: Noise) -> Innovations:
-        forced = problem.with_forcing(rows, parameters, inputs=inputs, index=samples, tangents=True)
+        forced = problem.with_forcing(rows, parameters, inputs=inputs, index=samples)
         tangents = forced.forcing_tangents
         return innovate(
             problem.step,

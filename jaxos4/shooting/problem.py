@@ -150,9 +150,8 @@ class ShootingProblem(eqx.Module):
         *,
         inputs: Inputs | None = None,
         index: Int[np.ndarray, "windows length"] | None = None,
-        tangents: bool = False,
     ) -> Rows:
-        """Recompute the forcing for these parameters, optionally with its derivatives.
+        """Recompute the forcing for these parameters, with its derivatives.
 
         Does nothing if the forcing depends on no parameter. `inputs`: `flight.inputs`, prepared outside of a loop.
         `index`: the samples of each window, by default those of `cut`.
@@ -171,10 +170,7 @@ class ShootingProblem(eqx.Module):
             # No parameter changes these fields: they are copied instead of computed again.
             return forcing._replace(recording=source.recording, velocity=source.velocity, lateral=source.lateral)
 
-        values = parameters[positions]
-        if not tangents:
-            return rows._replace(forcing=completed(forcing(values), rows.forcing))
-        slopes, new = jax.jacfwd(lambda x: (forcing(x),) * 2, has_aux=True)(values)
+        slopes, new = jax.jacfwd(lambda x: (forcing(x),) * 2, has_aux=True)(parameters[positions])
         zeros = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), rows.forcing)
         return rows._replace(forcing=completed(new, rows.forcing), forcing_tangents=completed(slopes, zeros))
 
@@ -235,7 +231,7 @@ class ShootingProblem(eqx.Module):
 
     def curvatures(self, parameters: Parameters, initial_state: InitialStates) -> Curvature:
         """The curvature of each window, in the parameters and the window's own initial state."""
-        rows = self.with_forcing(self.rows(), parameters, tangents=True)
+        rows = self.with_forcing(self.rows(), parameters)
         starts = self.split(initial_state)
         return each_window(lambda rows, start: self.curvature(rows, parameters, start), rows, starts)
 

@@ -1,5 +1,7 @@
 """The directions along which a sweep bisects: the columns of a `basis`.
 
+The whitened directions are those of `linalg.joint_factor`: the cost is nearly separable along them.
+
 The unknowns of a window are the parameters, which all windows share, then its own initial state. Directions are in the
 opposite order: those of the initial state come first, so that a step along a parameter carries the initial states to
 where they fit best.
@@ -9,17 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ...linalg import JointFactor, joint_factor
+from ...linalg import JointFactor
 
 
 def unknown_of_each(size: int, count: int) -> Int[np.ndarray, " size"]:
     """The unknown to which each direction belongs. The first `count` unknowns are the parameters."""
     return np.roll(np.arange(size), -count)
-
-
-def whitened_directions(information: Float[Array, "windows n n"], count: int) -> JointFactor:
-    """A factor A of the information A A^T, and the directions: A^-T's columns, along which the cost is separable."""
-    return joint_factor(information, count)
 
 
 def coordinate_directions(information: Float[Array, "windows n n"], count: int) -> JointFactor:

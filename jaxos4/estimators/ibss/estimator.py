@@ -25,11 +25,11 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._custom_types import Parameters, Scalar, as_float
 from ...bracket import NO_PRIOR, Bracket
 from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
-from ...linalg import covariance_of_shared, covariances, gram
+from ...linalg import covariance_of_shared, covariances, gram, joint_factor
 from ...shooting import Curvature, ShootingProblem, Shot, in_blocks
 from .bisection import Lines, narrow, open_lines
 from .brackets import GROWTH, Brackets, open_brackets, relative_error, rooms
-from .directions import coordinate_directions, whitened_directions
+from .directions import coordinate_directions
 from .progress import Progress, Search, record_brackets
 from .stage import Limits, Stage, join, misfit, prior_std, stages
 from .view import View
@@ -304,7 +304,7 @@ class IBSS(AbstractEstimator):
         unknowns, curvature = jax.tree.map(
             lambda new, old: jnp.where(failed, old, new), (unknowns, curvature), before_it[:2]
         )
-        choose = whitened_directions if self.directions == "whitened" else coordinate_directions
+        choose = joint_factor if self.directions == "whitened" else coordinate_directions
         factor, basis = choose(curvature.information + stage.prior, stage.parameter_count)
         below, above = rooms(unknowns, basis, stage.limits)
         longest_step = jnp.abs(jnp.clip(-stage.along(basis, curvature.gradient), -below, above)).max()

@@ -68,7 +68,7 @@ class Stage(NamedTuple):
     def curvature(self, unknowns: Float[Array, "windows unknowns"]) -> Curvature:
         """The curvature of every window in all unknowns; 0 in those that this stage does not search."""
         parameters, size = unknowns[0, : self.parameter_count], unknowns.shape[1]
-        rows = self.problem.with_forcing(self.rows, parameters, inputs=self.inputs, tangents=True)
+        rows = self.problem.with_forcing(self.rows, parameters, inputs=self.inputs)
 
         def of(part: ShootingProblem) -> Curvature:
             shot, gradient, information = self._curvature_on(part, rows, unknowns)
