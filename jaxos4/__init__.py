@@ -3,8 +3,12 @@
 Precision is the caller's choice: `jax.config.update("jax_enable_x64", True)` before anything else, for double.
 
 The public names are in `__init__.pyi`. Each is imported when it is first used, because JAX takes a second to import.
+Import this package before JAX computes: it sets how loops are compiled (`jaxos4._xla`).
 """
 
 import lazy_loader
 
+from ._xla import compile_loops_whole
+
+compile_loops_whole()
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -13,6 +13,7 @@ import jax
 import pytest
 
 import jaxos4
+from jaxos4._xla import WHOLE_LOOPS, compile_loops_whole
 from jaxos4.cli import _choices, _jax, train
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
@@ -278,12 +279,18 @@ def test_all_commands_but_study_compile_quickly(run, save, monkeypatch):
 
 @pytest.mark.parametrize(
     ("version", "own", "flags"),
-    [("0.10.2", None, _jax.QUICK_TO_COMPILE), ("0.10.2", "--own=1", "--own=1"), ("1.0.0", None, None)],
+    [
+        ("0.10.2", None, _jax.QUICK_TO_COMPILE),
+        ("1.0.0", None, WHOLE_LOOPS),
+        ("0.10.2", "--own=1", f"--own=1 {WHOLE_LOOPS}"),
+        ("0.10.2", "--xla_backend_extra_options=own=1", "--xla_backend_extra_options=own=1"),
+    ],
 )
 def test_flags_of_xla_are_set_for_versions_that_know_them_and_never_replaced(version, own, flags, monkeypatch):
     monkeypatch.setattr("jaxlib.version.__version__", version)
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     if own is not None:
         monkeypatch.setenv("XLA_FLAGS", own)
+    compile_loops_whole()
     _jax.compile_quickly()
     assert os.environ.get("XLA_FLAGS") == flags

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
-# The most lanes of a block. The tangents of 20 unknowns in 64 lanes fit the cache; in 128 a flight takes twice as long.
-_BLOCK = 64
+# The most lanes of a block: a few of the processor's vectors. In 64 lanes a flight with 20 unknowns takes twice as long.
+_BLOCK = 16
 
 
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
