@@ -1,6 +1,7 @@
 """How many programs an identification compiles, and that the next flight compiles none."""
 
 import contextlib
+import os
 
 import equinox as eqx
 import jax
@@ -9,6 +10,7 @@ import pytest
 from helpers import curvatures, noisy_states, standard_flight, standard_problem
 
 import jaxos4
+from jaxos4._xla import WHOLE_LOOPS
 from jaxos4.analysis.evaluation import evaluate
 from jaxos4.shooting import padded
 
@@ -103,3 +105,14 @@ def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
     diverged = evaluate(problem, problem.model.alpha.at[2].set(1e9))
     assert not diverged.sound
     assert diverged.cost == float("inf")
+
+
+@pytest.mark.skipif(WHOLE_LOOPS not in os.environ.get("XLA_FLAGS", ""), reason="XLA_FLAGS are the user's own")
+def test_a_search_is_one_native_loop():
+    """If XLA called a function for each few operations of a step instead, a flight would take ten times as long."""
+    search = eqx.filter_jit(lambda problem, bracket: jaxos4.OutputError()(problem, bracket))
+    problem = standard_problem(channels="rates")
+    program = search.lower(problem, jaxos4.Bracket.default(problem.model)).compile().compiled.as_text()
+    assert "xla_cpu_small_call" in program
+    entry = program[program.index("\nENTRY") :]
+    assert " while(" not in entry

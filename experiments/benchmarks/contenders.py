@@ -33,8 +33,9 @@ class Contender(NamedTuple):
         return f"{self.needs} is not installed: pip install {self.needs}"
 
 
-def _ours(estimator: str, lanes: int = 1000) -> Contender:
-    return Contender("jaxos4_fit:fit", alone=lanes == 1, options={"estimator": estimator, "lanes": lanes})
+def _ours(estimator: str, **options: Any) -> Contender:
+    alone = options.get("lanes") == 1
+    return Contender("jaxos4_fit:fit", alone=alone, options={"estimator": estimator, **options})
 
 
 OURS = ("kalman", "output-error", "ibss", "hybrid")
@@ -44,6 +45,7 @@ FITS = {
     "SciPy least_squares": Contender("scipy_fit:levenberg_marquardt", "scipy", alone=True),
     "pyPESTO, 4 starts": Contender("pypesto_fit:multi_start", "pypesto", alone=True),
     "JAX and optimistix": Contender("optimistix_fit:levenberg_marquardt", "optimistix"),
+    **{f"jaxos4 {name}, all cores": _ours(name, all_cores=True) for name in OURS},
     **{f"jaxos4 {name}": _ours(name) for name in OURS},
     **{f"jaxos4 {name}, one flight": _ours(name, lanes=1) for name in OURS},
 }
@@ -54,6 +56,8 @@ SHOTS = {
     "jaxos4, slope": Contender("jaxos4_shots:shots", options={"slope": True}),
     "jaxos4, rates": Contender("jaxos4_shots:shots", options={"channels": "rates"}),
     "jaxos4, rates, slope": Contender("jaxos4_shots:shots", options={"channels": "rates", "slope": True}),
+    "jaxos4, all cores": Contender("jaxos4_shots:shots", options={"all_cores": True}),
+    "jaxos4, rates, all cores": Contender("jaxos4_shots:shots", options={"channels": "rates", "all_cores": True}),
     "crazyflow (richer model)": Contender("crazyflow_steps:steps", "crazyflow"),
 }
 NETWORKS = {

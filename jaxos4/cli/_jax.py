@@ -54,7 +54,7 @@ def compile_quickly() -> None:
     """Sets XLA's flags, unless the user has set some."""
     import jaxlib.version
 
-    if os.environ["XLA_FLAGS"] == WHOLE_LOOPS and jaxlib.version.__version__.startswith(_KNOWS_IT):
+    if os.environ.get("XLA_FLAGS") == WHOLE_LOOPS and jaxlib.version.__version__.startswith(_KNOWS_IT):
         os.environ["XLA_FLAGS"] = QUICK_TO_COMPILE
 
 

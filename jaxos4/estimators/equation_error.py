@@ -7,7 +7,7 @@ import equinox as eqx
 from .._custom_types import Parameters, Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_bracket
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, in_blocks
 from ._regression import answer, check_settings, normal_equations, propagated_covariance, regression, solve
 
 
@@ -56,6 +56,10 @@ class EquationError(AbstractEstimator):
         linear in them.
         """
         check_bracket(problem, bracket)
+        return in_blocks(EquationError._identify, self, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """One flight, or a block of flights."""
         data = regression(problem, bracket.usable, memory=self.memory, bridge=self.bridge)
         rows, back = data.rows()
         steps, inverse = solve(*normal_equations(rows))

@@ -17,7 +17,7 @@ from ..bracket import GAUSSIAN_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_recursive, conclude
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
-from ..shooting import Rows, ShootingProblem
+from ..shooting import Rows, ShootingProblem, in_blocks
 
 _SETTLED = 0.1  # standard deviations: the passes end once one of them moves no parameter by more
 
@@ -84,6 +84,10 @@ class JointEKF(AbstractEstimator):
         windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
         check_recursive(problem, bracket)
+        return in_blocks(JointEKF._identify, self, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """One flight, or a block of flights."""
         rows, prior = jax.tree.map(lambda leaf: leaf[0], problem.rows()), bracket.usable
         count, size = prior.center.shape[0], problem.size
         start = problem.first_state()[0]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from .._custom_types import Scalar, as_float
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_recursive
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, in_blocks
 from ._regression import answer, check_settings, normal_equations, propagated_covariance, regression, solve
 
 
@@ -55,6 +55,10 @@ class RecursiveLeastSquares(AbstractEstimator):
         in them, or a flight that is cut into windows.
         """
         check_recursive(problem, bracket)
+        return in_blocks(RecursiveLeastSquares._identify, self, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """One flight, or a block of flights."""
         usable, count = bracket.usable, bracket.lower.shape[0]
         data = regression(problem, usable, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
         rows, back = data.rows()

@@ -24,7 +24,7 @@ from ..bracket import GAUSSIAN_PRIOR, Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, check_recursive, conclude, fit_start
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, stack, unstack
-from ..shooting import Rows, ShootingProblem
+from ..shooting import Rows, ShootingProblem, in_blocks
 
 _AVERAGED = 0.5  # the share of the last pass over which the parameters are averaged
 
@@ -112,6 +112,10 @@ class SVSF(AbstractEstimator):
         windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
         check_recursive(problem, bracket)
+        return in_blocks(SVSF._identify, self, problem, bracket)
+
+    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """One flight, or a block of flights."""
         box, rates = bracket.usable, problem.restrict("rates")
         rows, start = jax.tree.map(lambda leaf: leaf[0], rates.rows()), rates.first_state()
         count, samples = box.center.shape[0], rows.measured[0].shape[0]

@@ -19,7 +19,7 @@ from ..estimate import AbstractEstimator, Calibration, Estimate, check_bracket
 from ..flight import STATE_NAMES
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, in_blocks
 from .architecture import Regressor, Scaling
 from .calibration import LEVELS, ErrorTable, calibrate, calibrated_scales, uncalibrated
 from .features import FEATURES, AbstractFeatures, Coordinates
@@ -282,6 +282,10 @@ class TrainedNetwork(AbstractEstimator):
 
     @eqx.filter_jit
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        return in_blocks(TrainedNetwork._answer, self, problem, bracket)
+
+    def _answer(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+        """The estimate of one flight, or of a block of flights."""
         count, coordinates = len(problem.model.parameter_names), self.features.coordinates
         scale = self._scale(problem)
         within = jnp.clip(scale, *self.settings.noise)

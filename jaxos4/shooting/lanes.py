@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
-# The most lanes of a block: a few of the processor's vectors. In 64 lanes a flight with 20 unknowns takes twice as long.
+# The most lanes of a block: two to four of the processor's vectors. In 64 lanes a flight takes up to twice as long.
 _BLOCK = 16
 
 

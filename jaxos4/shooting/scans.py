@@ -204,7 +204,9 @@ def _linearised_shot(
             pull = [w * e for w, e in zip(known, errors, strict=True)]
             return following, push, _half_square(errors), pull, [w * w for w in known]
 
-        following, push, cost, pull, squares = computed_once(sound, shot) if lanes and carry.state.attitude is not None else shot()
+        # The rates alone are cheaper to repeat.
+        repeated = not lanes or state.attitude is None
+        following, push, cost, pull, squares = shot() if repeated else computed_once(sound, shot)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
             nothing, positions = zeros(unknowns), np.asarray(forcing_parameters)

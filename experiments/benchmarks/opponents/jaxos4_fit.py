@@ -10,6 +10,7 @@ from benchmarks.case import Case
 
 import jaxos4
 from jaxos4.estimators import make_estimator
+from jaxos4.study.devices import use_all_cores
 
 jax.config.update("jax_enable_x64", True)
 
@@ -25,9 +26,20 @@ def problem_of(case: Case, channels: str = "all") -> jaxos4.ShootingProblem:
 
 
 def fit(
-    case: Case, *, estimator: str, lanes: int = 1000, channels: str = "all", parameters: int = 8
+    case: Case,
+    *,
+    estimator: str,
+    lanes: int = 1000,
+    channels: str = "all",
+    parameters: int = 8,
+    all_cores: bool = False,
 ) -> Callable[[], dict]:
-    """Calls of at most `lanes` flights. The first `parameters` are estimated, and the others are known."""
+    """Calls of at most `lanes` flights. The first `parameters` are estimated, and the others are known.
+
+    `all_cores`: each core takes its part of a call. The cores must divide the flights.
+    """
+    if all_cores:
+        use_all_cores()
     problem, lanes = problem_of(case, channels), min(lanes, case.flights)
     places, names = np.arange(parameters), problem.model.parameter_names
     held = {name: case.truth[place] for place, name in enumerate(names) if place >= parameters}
@@ -35,19 +47,17 @@ def fit(
         problem = eqx.tree_at(lambda p: p.model, problem, jaxos4.hold(problem.model, held))
     searching = _estimator(estimator, problem, case)
 
-    @eqx.filter_jit
-    @eqx.filter_vmap(in_axes=(None, None, 0, 0))
-    def identify(estimator, problem, measured, center):
+    def identify(measured, center):
         data = eqx.tree_at(lambda p: p.flight.states, problem, measured)
-        found = estimator(data, jaxos4.Bracket.around(center, case.half_width[places]))
+        found = searching(data, jaxos4.Bracket.around(center, case.half_width[places]))
         return found.parameters, found.initial_state
 
     measured, starts = jnp.asarray(case.measured), jnp.asarray(case.starts[:, places])
     groups = [slice(first, first + lanes) for first in range(0, case.flights, lanes)]
-    compiled = identify.lower(searching, problem, measured[:lanes], starts[:lanes]).compile()
+    compiled = jax.jit(for_all_flights(identify, all_cores)).lower(measured[:lanes], starts[:lanes]).compile()
 
     def run() -> dict:
-        found = [jax.block_until_ready(compiled(searching, problem, measured[g], starts[g])) for g in groups]
+        found = [jax.block_until_ready(compiled(measured[g], starts[g])) for g in groups]
         answer = np.broadcast_to(case.truth, case.starts.shape).copy()
         answer[:, places] = np.concatenate([p for p, _ in found])
         first = np.zeros((case.flights, 12))
@@ -55,6 +65,15 @@ def fit(
         return {"parameters": answer, "first": first}
 
     return run
+
+
+def for_all_flights(function: Callable, all_cores: bool, batch: Callable = jax.vmap) -> Callable:
+    """`batch(function)`; with `all_cores`, each core computes the batch of its own flights."""
+    if not all_cores:
+        return batch(function)
+    flights = jax.sharding.PartitionSpec("flights")
+    mesh = jax.make_mesh((jax.device_count(),), ("flights",), axis_types=(jax.sharding.AxisType.Auto,))
+    return jax.shard_map(batch(function), mesh=mesh, in_specs=flights, out_specs=flights, check_vma=False)
 
 
 def _estimator(name: str, problem: jaxos4.ShootingProblem, case: Case) -> jaxos4.AbstractEstimator:

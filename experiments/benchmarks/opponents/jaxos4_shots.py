@@ -6,21 +6,28 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from benchmarks.case import Case
-from benchmarks.opponents.jaxos4_fit import problem_of
+from benchmarks.opponents.jaxos4_fit import for_all_flights, problem_of
+
+from jaxos4.study.devices import use_all_cores
+
+BLOCK = 32  # so many shots at a time fit the processor's first cache
 
 
-def shots(case: Case, *, channels: str = "all", slope: bool = False) -> Callable[[], dict]:
+def shots(case: Case, *, channels: str = "all", slope: bool = False, all_cores: bool = False) -> Callable[[], dict]:
     """The cost of each flight at its start, and with `slope` also the derivative along one direction."""
+    if all_cores:
+        use_all_cores()
     problem = problem_of(case, channels)
 
-    @eqx.filter_jit
-    @eqx.filter_vmap(in_axes=(None, 0, 0))
-    def shoot(problem, measured, alpha):
+    def shoot(measured, alpha):
         cost = eqx.tree_at(lambda p: p.flight.states, problem, measured).cost
         return jax.jvp(cost, (alpha,), (jnp.asarray(case.half_width),)) if slope else (cost(alpha),)
 
-    arguments = problem, jnp.asarray(case.measured), jnp.asarray(case.starts)
-    compiled = shoot.lower(*arguments).compile()
+    def in_blocks(function: Callable) -> Callable:
+        return lambda *data: jax.lax.map(lambda one: function(*one), data, batch_size=BLOCK)
+
+    arguments = jnp.asarray(case.measured), jnp.asarray(case.starts)
+    compiled = jax.jit(for_all_flights(shoot, all_cores, in_blocks)).lower(*arguments).compile()
 
     def run() -> dict:
         found = jax.block_until_ready(compiled(*arguments))
