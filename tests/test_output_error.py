@@ -83,12 +83,13 @@ def test_a_free_initial_state_gives_the_answer_of_ibss():
 def test_many_lanes_at_once_come_back():
     flights = 512
     states, starts = noisy_states(flights, duration=0.5), random_starts(jaxos4.PublishedOS4(), flights)
+    problem = standard_problem(channels="rates", duration=0.5)
 
     @eqx.filter_jit
     @eqx.filter_vmap
     def short(states, center):
-        problem = standard_problem(channels="rates", states=states, duration=0.5)
-        return OutputError()(problem, around(jaxos4.PublishedOS4, center))
+        flight = eqx.tree_at(lambda p: p.flight.states, problem, states)
+        return OutputError()(flight, around(jaxos4.PublishedOS4, center))
 
     assert np.isfinite(short(states, starts).parameters).all()
 
