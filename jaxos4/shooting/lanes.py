@@ -14,8 +14,10 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
-# The most lanes of a block: two to four of the processor's vectors. In 64 lanes a flight takes up to twice as long.
-_BLOCK = 16
+# The most lanes of a block. On a CPU they are two to four vectors; in 64 lanes a flight takes up to twice as long.
+_CPU_BLOCK = 16
+# An accelerator computes all lanes of a block at once.
+_ACCELERATOR_BLOCK = 1 << 16
 
 
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
@@ -47,7 +49,8 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
     """
 
     def of_batch(lanes: int, many: Any, shared: Any) -> Any:
-        blocks = -(-lanes // _BLOCK)
+        most = _CPU_BLOCK if jax.default_backend() == "cpu" else _ACCELERATOR_BLOCK
+        blocks = -(-lanes // most)
         size = -(-lanes // blocks)
 
         def block(many: Any) -> Any:
