@@ -348,3 +348,14 @@ def test_single_precision_is_enough():
         assert result == "successful"
         assert np.abs((np.array(parameters) - PUBLISHED().alpha) / sigma).max() < 0.01
         assert (np.array(std) > 0.99 * sigma).all()
+
+
+def test_a_batch_without_flights_gives_no_estimates():
+    problem = standard_problem(channels="rates")
+    states = jnp.zeros((0, *problem.flight.states.shape))
+
+    def identify(states):
+        flight = eqx.tree_at(lambda p: p.flight.states, problem, states)
+        return jaxos4.EquationError()(flight, jaxos4.Bracket.default(problem.model)).parameters
+
+    assert eqx.filter_vmap(identify)(states).shape == (0, 8)

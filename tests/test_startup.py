@@ -283,7 +283,9 @@ def test_all_commands_but_study_compile_quickly(run, save, monkeypatch):
         ("0.10.2", None, _jax.QUICK_TO_COMPILE),
         ("1.0.0", None, WHOLE_LOOPS),
         ("0.10.2", "--own=1", f"--own=1 {WHOLE_LOOPS}"),
-        ("0.10.2", "--xla_backend_extra_options=own=1", "--xla_backend_extra_options=own=1"),
+        ("0.10.2", "--xla_backend_extra_options=own=1", f"--xla_backend_extra_options=own=1 {WHOLE_LOOPS}"),
+        ("0.10.2", WHOLE_LOOPS.replace("1000000000", "1000"), WHOLE_LOOPS.replace("1000000000", "1000")),
+        ("0.10.2", "flags.txt", "flags.txt"),
     ],
 )
 def test_flags_of_xla_are_set_for_versions_that_know_them_and_never_replaced(version, own, flags, monkeypatch):
@@ -294,3 +296,11 @@ def test_flags_of_xla_are_set_for_versions_that_know_them_and_never_replaced(ver
     compile_loops_whole()
     _jax.compile_quickly()
     assert os.environ.get("XLA_FLAGS") == flags
+
+
+def test_the_import_makes_loops_native():
+    """In a process of its own: the flags of this one are set for tests."""
+    code = "import os, jaxos4; print(os.environ['XLA_FLAGS'])"
+    unset = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=unset, check=True)
+    assert done.stdout.strip() == WHOLE_LOOPS

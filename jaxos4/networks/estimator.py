@@ -282,7 +282,7 @@ class TrainedNetwork(AbstractEstimator):
 
     @eqx.filter_jit
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        return in_blocks(TrainedNetwork._answer, self, problem, bracket)
+        return in_blocks(type(self)._answer, self, problem, bracket)
 
     def _answer(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """The estimate of one flight, or of a block of flights."""

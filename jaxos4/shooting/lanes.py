@@ -14,10 +14,8 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
 
-# The most lanes of a block. On a CPU they are two to four vectors; in 64 lanes a flight takes up to twice as long.
-_CPU_BLOCK = 16
-# An accelerator computes all lanes of a block at once.
-_ACCELERATOR_BLOCK = 1 << 16
+# The most lanes of a block: two to four of the processor's vectors. In 64 lanes a flight takes up to twice as long.
+_BLOCK = 16
 
 
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
@@ -45,12 +43,12 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *ar
 def in_blocks(function: Callable, *arguments: Any) -> Any:
     """`function(*arguments)`, of which `jax.vmap` computes a batch in blocks, one after the other.
 
-    A slow flight then holds up its block only. The last lane is repeated until all blocks are full.
+    A slow flight then holds up its block only. The last lane is repeated until all blocks are full. An accelerator
+    computes the whole batch at once.
     """
 
     def of_batch(lanes: int, many: Any, shared: Any) -> Any:
-        most = _CPU_BLOCK if jax.default_backend() == "cpu" else _ACCELERATOR_BLOCK
-        blocks = -(-lanes // most)
+        blocks = max(-(-lanes // _BLOCK), 1) if jax.default_backend() == "cpu" else 1
         size = -(-lanes // blocks)
 
         def block(many: Any) -> Any:

@@ -36,7 +36,7 @@ def fit(
 ) -> Callable[[], dict]:
     """Calls of at most `lanes` flights. The first `parameters` are estimated, and the others are known.
 
-    `all_cores`: each core takes its part of a call. The cores must divide the flights.
+    `all_cores`: each core takes its part of a call.
     """
     if all_cores:
         use_all_cores()
@@ -71,9 +71,17 @@ def for_all_flights(function: Callable, all_cores: bool, batch: Callable = jax.v
     """`batch(function)`; with `all_cores`, each core computes the batch of its own flights."""
     if not all_cores:
         return batch(function)
-    flights = jax.sharding.PartitionSpec("flights")
-    mesh = jax.make_mesh((jax.device_count(),), ("flights",), axis_types=(jax.sharding.AxisType.Auto,))
-    return jax.shard_map(batch(function), mesh=mesh, in_specs=flights, out_specs=flights, check_vma=False)
+    cores, share = jax.device_count(), jax.sharding.PartitionSpec("flights")
+    mesh = jax.make_mesh((cores,), ("flights",), axis_types=(jax.sharding.AxisType.Auto,))
+    divided = jax.shard_map(batch(function), mesh=mesh, in_specs=share, out_specs=share, check_vma=False)
+
+    def whole(*data):
+        count = data[0].shape[0]
+        # The last flight is repeated, so that all cores have the same number.
+        even = [jnp.concatenate([x, jnp.repeat(x[-1:], -count % cores, axis=0)]) for x in data]
+        return jax.tree.map(lambda x: x[:count], divided(*even))
+
+    return whole
 
 
 def _estimator(name: str, problem: jaxos4.ShootingProblem, case: Case) -> jaxos4.AbstractEstimator:

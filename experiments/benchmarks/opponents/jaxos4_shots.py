@@ -23,11 +23,11 @@ def shots(case: Case, *, channels: str = "all", slope: bool = False, all_cores: 
         cost = eqx.tree_at(lambda p: p.flight.states, problem, measured).cost
         return jax.jvp(cost, (alpha,), (jnp.asarray(case.half_width),)) if slope else (cost(alpha),)
 
-    def in_blocks(function: Callable) -> Callable:
+    def blockwise(function: Callable) -> Callable:
         return lambda *data: jax.lax.map(lambda one: function(*one), data, batch_size=BLOCK)
 
     arguments = jnp.asarray(case.measured), jnp.asarray(case.starts)
-    compiled = jax.jit(for_all_flights(shoot, all_cores, in_blocks)).lower(*arguments).compile()
+    compiled = jax.jit(for_all_flights(shoot, all_cores, blockwise)).lower(*arguments).compile()
 
     def run() -> dict:
         found = jax.block_until_ready(compiled(*arguments))
