@@ -173,7 +173,7 @@ def design_references(
     - `duration`, `dt`: length and sample time [s].
     - `criterion`: as of `design_input`, for the logarithms of Ix, Iy and Iz.
     - `bandwidth`: the highest frequency [Hz].
-    - `key`: of the draws, the gusts and the starts. `progress`: is told each stage.
+    - `key`: of the draws, the gusts and the starts. `progress`: called with the name of each stage.
 
     **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
     """
