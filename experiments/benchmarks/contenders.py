@@ -38,6 +38,10 @@ def _ours(estimator: str, **options: Any) -> Contender:
     return Contender("jaxos4_fit:fit", alone=alone, options={"estimator": estimator, **options})
 
 
+def _shots(**options: Any) -> Contender:
+    return Contender("jaxos4_shots:shots", options=options)
+
+
 OURS = ("kalman", "output-error", "ibss", "hybrid")
 FITS = {
     REFERENCE_FIT: Contender("casadi_fit:single", "casadi", alone=True),
@@ -49,15 +53,19 @@ FITS = {
     **{f"jaxos4 {name}": _ours(name) for name in OURS},
     **{f"jaxos4 {name}, one flight": _ours(name, lanes=1) for name in OURS},
 }
+KINDS: dict[str, dict[str, Any]] = {
+    "": {},
+    ", slope": {"slope": True},
+    ", rates": {"channels": "rates"},
+    ", rates, slope": {"channels": "rates", "slope": True},
+}
 SHOTS = {
     REFERENCE_SHOT: Contender("c_shots:shots", "cc"),
     "JAX, plain": Contender("optimistix_fit:shots", "optimistix"),
-    "jaxos4": Contender("jaxos4_shots:shots"),
-    "jaxos4, slope": Contender("jaxos4_shots:shots", options={"slope": True}),
-    "jaxos4, rates": Contender("jaxos4_shots:shots", options={"channels": "rates"}),
-    "jaxos4, rates, slope": Contender("jaxos4_shots:shots", options={"channels": "rates", "slope": True}),
-    "jaxos4, all cores": Contender("jaxos4_shots:shots", options={"all_cores": True}),
-    "jaxos4, rates, all cores": Contender("jaxos4_shots:shots", options={"channels": "rates", "all_cores": True}),
+    **{f"jaxos4{kind}": _shots(**options) for kind, options in KINDS.items()},
+    **{f"jaxos4, same flight{kind}": _shots(same_flight=True, **options) for kind, options in KINDS.items()},
+    "jaxos4, all cores": _shots(all_cores=True),
+    "jaxos4, rates, all cores": _shots(all_cores=True, channels="rates"),
     "crazyflow (richer model)": Contender("crazyflow_steps:steps", "crazyflow"),
 }
 NETWORKS = {

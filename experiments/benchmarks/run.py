@@ -95,7 +95,9 @@ def shots(contenders: dict[str, Contender], case: Case, repeats: int, skipped: l
     for name, racer in list(racers.items()):
         if "costs" not in racer.answer:
             continue
-        expected = costs(case, case.starts, first, RATES if "rates" in name else ALL)
+        options = contenders[name].options
+        compared = case.first(1) if options.get("same_flight") else case
+        expected = costs(compared, case.starts, first, RATES if options.get("channels") == "rates" else ALL)
         if not np.allclose(racer.answer["costs"], expected, rtol=SHOT_TOLERANCE):
             skipped.append(f"{name}: its costs are not those of NumPy")
             racers.pop(name).stop()

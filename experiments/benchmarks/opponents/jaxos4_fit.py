@@ -76,9 +76,9 @@ def for_all_flights(function: Callable, all_cores: bool, batch: Callable = jax.v
     divided = jax.shard_map(batch(function), mesh=mesh, in_specs=share, out_specs=share, check_vma=False)
 
     def whole(*data):
-        count = data[0].shape[0]
+        count = jax.tree.leaves(data)[0].shape[0]
         # The last flight is repeated, so that all cores have the same number.
-        even = [jnp.concatenate([x, jnp.repeat(x[-1:], -count % cores, axis=0)]) for x in data]
+        even = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], -count % cores, axis=0)]), data)
         return jax.tree.map(lambda x: x[:count], divided(*even))
 
     return whole

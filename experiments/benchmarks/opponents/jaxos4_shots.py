@@ -2,35 +2,52 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from benchmarks.case import Case
 from benchmarks.opponents.jaxos4_fit import for_all_flights, problem_of
 
 from jaxos4.study.devices import use_all_cores
 
-BLOCK = 32  # shots at a time: 16 to 64 take about the same, 4 and 8 longer
+BLOCK = 32  # shots at a time
 
 
-def shots(case: Case, *, channels: str = "all", slope: bool = False, all_cores: bool = False) -> Callable[[], dict]:
-    """The cost of each flight at its start, and with `slope` also the derivative along one direction."""
+def shots(
+    case: Case, *, channels: str = "all", slope: bool = False, same_flight: bool = False, all_cores: bool = False
+) -> Callable[[], dict]:
+    """The cost of each flight at its start, and with `slope` also the derivative along one direction.
+
+    The measurements are put in the order in which they are read before the time counts. `same_flight`: all shots are
+    compared with the first flight, as those of a search are.
+    """
     if all_cores:
         use_all_cores()
     problem = problem_of(case, channels)
+    rows = jax.tree.map(lambda leaf: leaf[0], problem.rows())  # of its only window
+    first = problem.first_state()[0]
+    # The last flight is repeated, so that all blocks have the same number.
+    places = np.minimum(np.arange(-case.flights % BLOCK + case.flights), case.flights - 1).reshape(-1, BLOCK)
+    blocks = np.moveaxis(case.measured[places][..., problem.columns], 1, -1)  # blocks, samples, columns, lanes
+    blocks[:, : case.begin] = np.nan
+    measured = None if same_flight else tuple(jnp.asarray(blocks[:, :, i]) for i in range(len(problem.columns)))
 
     def shoot(measured, alpha):
-        cost = eqx.tree_at(lambda p: p.flight.states, problem, measured).cost
+        def cost(alpha):
+            data = rows if measured is None else rows._replace(measured=measured)
+            return problem.shot(data, alpha, first).cost
+
         return jax.jvp(cost, (alpha,), (jnp.asarray(case.half_width),)) if slope else (cost(alpha),)
 
-    def blockwise(function: Callable) -> Callable:
-        return lambda *data: jax.lax.map(lambda one: function(*one), data, batch_size=BLOCK)
+    def each_block(function: Callable) -> Callable:
+        return lambda *data: jax.lax.map(lambda block: function(*block), data)
 
-    arguments = jnp.asarray(case.measured), jnp.asarray(case.starts)
-    compiled = jax.jit(for_all_flights(shoot, all_cores, blockwise)).lower(*arguments).compile()
+    arguments = measured, jnp.asarray(case.starts[places])
+    together = jax.vmap(shoot, in_axes=(-1, 0))
+    compiled = jax.jit(for_all_flights(together, all_cores, each_block)).lower(*arguments).compile()
 
     def run() -> dict:
         found = jax.block_until_ready(compiled(*arguments))
-        return {"costs": found[0]}
+        return {"costs": found[0].ravel()[: case.flights]}
 
     return run
