@@ -472,12 +472,15 @@ def test_objects_in_a_file_are_not_run(tmp_path):
 # The hybrid.
 
 
-def test_the_hybrid_finds_what_ibss_finds_in_fewer_rollouts():
+@pytest.mark.parametrize(("channels", "free", "share"), [("all", False, 0.5), ("rates", True, 0.3)])
+def test_the_hybrid_finds_what_ibss_finds_in_fewer_rollouts(channels, free, share):
+    """A free initial state is searched from where the network saw it."""
     alpha, states = flights(LANES, seed=18)
-    hybrid, alone = (identify(e, states, channels="all") for e in (jaxos4.Hybrid(trained()), jaxos4.IBSS()))
+    estimators = jaxos4.Hybrid(trained(free=free)), jaxos4.IBSS()
+    hybrid, alone = (identify(e, states, channels=channels, free=free) for e in estimators)
     assert names(hybrid) == names(alone) == ["successful"] * LANES
     assert np.abs((hybrid.parameters - alone.parameters) / alone.std).max() < 0.1
-    assert hybrid.rollouts.mean() < 0.5 * alone.rollouts.mean()
+    assert hybrid.rollouts.mean() < share * alone.rollouts.mean()
     hit = (alpha >= hybrid.seed.lower) & (alpha <= hybrid.seed.upper)
     assert hit.all(axis=1).mean() > 0.95
 

@@ -22,7 +22,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._custom_types import Parameters, Scalar, as_float
+from ..._custom_types import InitialStates, Parameters, Scalar, as_float
 from ...bracket import NO_PRIOR, Bracket
 from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
 from ...linalg import covariance_of_shared, covariances, gram, joint_factor
@@ -126,6 +126,7 @@ class IBSS(AbstractEstimator):
         start: Parameters | None = None,
         spread: Float[Array, "parameters parameters"] | None = None,
         free: Bool[Array, " parameters"] | None = None,
+        initial_state: InitialStates | None = None,
         cascade: Bool[Array, ""] | bool = True,
         skip: Bool[Array, ""] | None = None,
     ) -> Estimate:
@@ -133,6 +134,7 @@ class IBSS(AbstractEstimator):
 
         **Arguments:** as of a call, and
 
+        - `initial_state`: where the search for a free initial state begins; by default the first measurements.
         - `cascade`: whether to fit the rates before the other channels. A `start` that is close needs no cascade.
         - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
         """
@@ -152,7 +154,8 @@ class IBSS(AbstractEstimator):
             stage, last = stage_of(number), number == len(plan) - 1
             return self._fit_stage(stage, progress._replace(done=skip), last=last)
 
-        progress = self._begin(problem, usable, limits, start, spread, skip=skip)
+        initial_state = problem.first_state()[0] if initial_state is None else initial_state
+        progress = self._begin(problem, usable, limits, join(problem, start, initial_state), spread, skip=skip)
         # One loop, so that the search is compiled once for all stages.
         first = jnp.where(cascade, 0, len(plan) - 1)
         progress, curvature = jax.lax.fori_loop(first, len(plan), fit, (progress, _no_curvature(progress)))
@@ -173,12 +176,12 @@ class IBSS(AbstractEstimator):
         problem: ShootingProblem,
         bracket: Bracket,
         limits: Limits,
-        start: Parameters,
+        unknowns: Float[Array, "windows unknowns"],
         spread: Float[Array, "parameters parameters"] | None,
         *,
         skip: Bool[Array, ""],
     ) -> Progress:
-        unknowns, count = join(problem, start, problem.first_state()[0]), start.shape[0]
+        count = bracket.lower.shape[0]
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem, bracket)))
         if spread is not None:
             known = jnp.where(skip, covariance[:, :count, :count], spread)
