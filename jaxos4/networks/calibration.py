@@ -38,14 +38,12 @@ class ErrorTable(NamedTuple):
 
     def at(self, scale: Scalar) -> tuple[Array, Array, Array, Array]:
         """`rms`, `correlation`, `factors` and `simultaneous`, interpolated in the logarithm of the noise scale."""
-        knots = jnp.log(self.scales)
-
-        def interpolate(table):
-            flat = table.reshape(table.shape[0], -1)
-            values = jax.vmap(lambda column: jnp.interp(jnp.log(scale), knots, column), in_axes=1)(flat)
-            return values.reshape(table.shape[1:])
-
-        rms, correlation, factors, simultaneous = map(interpolate, self[1:])
+        rows = np.arange(self.scales.shape[0])
+        place = jnp.interp(jnp.log(scale), jnp.log(self.scales), as_float(rows))
+        weights = jnp.maximum(1 - jnp.abs(place - rows), 0.0)
+        rms, correlation, factors, simultaneous = (
+            (weights.reshape(-1, *(1 for _ in table.shape[1:])) * table).sum(axis=0) for table in self[1:]
+        )
         return rms, correlation, factors, simultaneous
 
 

@@ -226,7 +226,7 @@ class TrainedNetwork(AbstractEstimator):
         difference = self.mismatch(problem)
         if difference is not None:
             raise ValueError(f"The network cannot be used on this problem: {difference}; train a network for it.")
-        return self._identify(problem.restrict(self.channels), bracket)
+        return self._identify(problem.restrict(self.channels), bracket)[0]
 
     def mismatch(self, problem: ShootingProblem) -> str | None:
         """How a problem differs from the problem of training, in words; `None` if it does not.
@@ -252,12 +252,11 @@ class TrainedNetwork(AbstractEstimator):
             missing = [STATE_NAMES[i] for i in looked_at if absent[:, i].all()]
             if missing:
                 return f"it looks at {', '.join(missing)}, which this flight did not measure"
-        for what, differs in self._differences(problem).items():
-            if not isinstance(differs, Tracer) and bool(differs):
-                return f"it was trained for another {what}"
-        return None
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((problem, self))):
+            return None
+        _, differences = self._identify(problem.restrict(self.channels), self.bracket)  # the program of `__call__`
+        return next((f"it was trained for another {what}" for what, differs in differences.items() if differs), None)
 
-    @eqx.filter_jit
     def _differences(self, problem: ShootingProblem) -> dict[str, Bool[Array, ""]]:
         """For each quantity, whether its numbers differ from those of training."""
         own, size = self.problem, CHANNELS[self.channels]
@@ -281,11 +280,11 @@ class TrainedNetwork(AbstractEstimator):
         }
 
     @eqx.filter_jit
-    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
         return in_blocks(type(self)._answer, self, problem, bracket)
 
-    def _answer(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        """The estimate of one flight, or of a block of flights."""
+    def _answer(self, problem: ShootingProblem, bracket: Bracket) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
+        """The estimate of one flight, or of a block of flights, and `_differences`."""
         count, coordinates = len(problem.model.parameter_names), self.features.coordinates
         scale = self._scale(problem)
         within = jnp.clip(scale, *self.settings.noise)
@@ -301,7 +300,8 @@ class TrainedNetwork(AbstractEstimator):
         outside = jnp.abs(output.u[:count]) > 1 + factors[-1] * std
         unidentifiable = std > self.prior
 
-        other = jnp.stack(list(self._differences(problem).values())).any()
+        differences = self._differences(problem)
+        other = jnp.stack(list(differences.values())).any()
         other |= (features.inflation > _LARGEST_INFLATION).any() | (scale > self.settings.noise[1] * (1 + _SAME))
         result = RESULTS.where(outside.any(), RESULTS.at_bound, RESULTS.successful)
         result = RESULTS.where(unidentifiable.any(), RESULTS.unidentifiable, result)
@@ -310,7 +310,7 @@ class TrainedNetwork(AbstractEstimator):
         result = RESULTS.where(other, RESULTS.network_mismatch, result)
         result = RESULTS.where(bracket.valid, result, RESULTS.bracket_invalid)
         usable = sound & ~other & bracket.valid
-        return Estimate(
+        estimate = Estimate(
             parameters=jnp.where(usable, parameters, self.bracket.center),
             covariance=jnp.where(usable, correlation * deviations[:, None] * deviations[None, :], jnp.inf),
             initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
@@ -320,6 +320,7 @@ class TrainedNetwork(AbstractEstimator):
             result=result,
             calibration=Calibration(as_float(LEVELS), factors, simultaneous),
         )
+        return estimate, differences
 
     def _scale(self, problem: ShootingProblem) -> Scalar:
         """The problem's noise in multiples of that of training; the largest over the channels."""
