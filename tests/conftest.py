@@ -22,10 +22,10 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # Before the first import of jaxos4: all its annotated functions and modules are checked.
 jaxtyping.install_import_hook("jaxos4", "typechecker.check")
 
-from jaxos4.cli._jax import QUICK_TO_COMPILE, compile_quickly, rarely_collect_garbage  # noqa: E402
+from jaxos4.cli._jax import QUICK_TO_COMPILE, rarely_collect_garbage, set_flags  # noqa: E402
 
 rarely_collect_garbage()
-compile_quickly()  # before JAX starts to compute: the programs of the command line
+set_flags(QUICK_TO_COMPILE)  # before JAX starts to compute: the programs of the command line
 if os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE:
     # The other cores have workers: a program compiled in parts takes a tenth more time of all cores together.
     os.environ["XLA_FLAGS"] += " --xla_cpu_parallel_codegen_split_count=1"

@@ -270,11 +270,12 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
     assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52
 
 
-def test_all_commands_but_study_compile_quickly(run, save, monkeypatch):
+def test_commands_that_compute_little_compile_quickly(run, save, monkeypatch):
     asked, wrong = [], str(save("wrong = 1", "wrong.toml"))
-    monkeypatch.setattr("jaxos4.cli._app.prepare", lambda *, quick_to_compile: asked.append(quick_to_compile))
-    assert run("study", wrong, "--out", "out")[0] == run("estimate", wrong)[0] == 2
-    assert asked == [False, True]
+    monkeypatch.setattr("jaxos4.cli._app.prepare", asked.append)
+    commands = ("study", wrong, "--out", "out"), ("estimate", wrong), ("compare", "--quick", "--out", wrong)
+    assert [run(*command)[0] for command in commands] == [2, 2, 2]
+    assert asked == [WHOLE_LOOPS, _jax.QUICK_TO_COMPILE, _jax.QUICKEST_TO_COMPILE]
 
 
 @pytest.mark.parametrize(
@@ -294,7 +295,7 @@ def test_flags_of_xla_are_set_for_versions_that_know_them_and_never_replaced(ver
     if own is not None:
         monkeypatch.setenv("XLA_FLAGS", own)
     compile_loops_whole()
-    _jax.compile_quickly()
+    _jax.set_flags(_jax.QUICK_TO_COMPILE)
     assert os.environ.get("XLA_FLAGS") == flags
 
 

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from .._xla import WHOLE_LOOPS
 from ..errors import InputError, TrainingError
-from ._jax import NO_CACHE, prepare
+from ._jax import NO_CACHE, QUICK_TO_COMPILE, QUICKEST_TO_COMPILE, prepare
 from .compare import compare
 from .design import design
 from .estimate import estimate
@@ -26,14 +27,14 @@ _EPILOG = f"Compiled programs are kept in your cache folder, at most 1 GB. {NO_C
 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, with JAX prepared first. Its arguments are parsed before that: help and mistakes need no JAX.
-
-    A study computes for longer than it compiles.
-    """
+    """The command, with JAX prepared first. Its arguments are parsed before that: help and mistakes need no JAX."""
 
     @functools.wraps(command)
     def run(*args, **kwargs) -> None:
-        prepare(quick_to_compile=command is not study)
+        if command is study:  # it computes for longer than it compiles
+            prepare(WHOLE_LOOPS)
+        else:
+            prepare(QUICKEST_TO_COMPILE if kwargs.get("quick") else QUICK_TO_COMPILE)
         command(*args, **kwargs)
 
     return run

@@ -9,8 +9,12 @@ from pathlib import Path
 
 from .._xla import WHOLE_LOOPS
 
-QUICK_TO_COMPILE = f"{WHOLE_LOOPS} --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+_OLDER_LOOPS = f"{WHOLE_LOOPS} --xla_cpu_use_fusion_emitters=false"
+QUICK_TO_COMPILE = f"{_OLDER_LOOPS} --xla_backend_optimization_level=1"
 """XLA's older way to write loops, and fewer optimisations: half of the compile time; a batch takes a quarter longer."""
+
+QUICKEST_TO_COMPILE = f"{_OLDER_LOOPS} --xla_backend_optimization_level=0"
+"""No optimisations: a third of the compile time; all programs take four times as long."""
 
 _KNOWS_IT = ("0.10.",)  # versions of jaxlib: a flag that XLA does not know would end the process
 
@@ -22,11 +26,13 @@ _LEAST_FREE_BYTES = 200 << 20  # with less space on the disk, programs might be 
 _JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in less than this [s]
 
 
-def prepare(*, quick_to_compile: bool) -> None:
-    """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off."""
+def prepare(flags: str) -> None:
+    """Prepares this process for JAX, with `flags` for XLA.
+
+    A cache folder that was chosen before is kept, unless the cache is off.
+    """
     rarely_collect_garbage()
-    if quick_to_compile:
-        compile_quickly()
+    set_flags(flags)
 
     import jax
 
@@ -50,12 +56,12 @@ def rarely_collect_garbage() -> None:
     gc.set_threshold(100_000, 20, 100)
 
 
-def compile_quickly() -> None:
-    """Adds XLA's flags, unless the user has set some; an empty `XLA_FLAGS` counts as unset."""
+def set_flags(flags: str) -> None:
+    """Sets XLA's flags, unless the user has set some; an empty `XLA_FLAGS` counts as unset."""
     import jaxlib.version
 
     if os.environ.get("XLA_FLAGS") == WHOLE_LOOPS and jaxlib.version.__version__.startswith(_KNOWS_IT):
-        os.environ["XLA_FLAGS"] = QUICK_TO_COMPILE
+        os.environ["XLA_FLAGS"] = flags
 
 
 def _usable_folder() -> Path | None:
