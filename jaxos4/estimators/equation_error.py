@@ -56,7 +56,7 @@ class EquationError(AbstractEstimator):
         linear in them.
         """
         check_bracket(problem, bracket)
-        return in_blocks(type(self)._identify, self, problem, bracket)
+        return in_blocks(self._identify, problem, bracket)
 
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """One flight, or a block of flights."""

@@ -84,7 +84,7 @@ class JointEKF(AbstractEstimator):
         windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
         check_recursive(problem, bracket)
-        return in_blocks(type(self)._identify, self, problem, bracket)
+        return in_blocks(self._identify, problem, bracket)
 
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """One flight, or a block of flights."""

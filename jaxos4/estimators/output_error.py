@@ -74,7 +74,7 @@ class OutputError(AbstractEstimator):
         **Raises:** `ValueError` for a bracket of another length than the model's parameters.
         """
         check_bracket(problem, bracket)
-        return in_blocks(type(self)._identify, self, problem, bracket)
+        return in_blocks(self._identify, problem, bracket)
 
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """One flight, or a block of flights."""

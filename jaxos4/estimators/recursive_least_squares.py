@@ -55,7 +55,7 @@ class RecursiveLeastSquares(AbstractEstimator):
         in them, or a flight that is cut into windows.
         """
         check_recursive(problem, bracket)
-        return in_blocks(type(self)._identify, self, problem, bracket)
+        return in_blocks(self._identify, problem, bracket)
 
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """One flight, or a block of flights."""

@@ -281,7 +281,7 @@ class TrainedNetwork(AbstractEstimator):
 
     @eqx.filter_jit
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
-        return in_blocks(type(self)._answer, self, problem, bracket)
+        return in_blocks(self._answer, problem, bracket)
 
     def _answer(self, problem: ShootingProblem, bracket: Bracket) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
         """The estimate of one flight, or of a block of flights, and `_differences`."""

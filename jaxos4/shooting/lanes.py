@@ -44,15 +44,18 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
     """`function(*arguments)`, of which `jax.vmap` computes a batch in blocks, one after the other.
 
     A slow flight then holds up its block only. The last lane is repeated until all blocks are full. An accelerator
-    computes the whole batch at once.
+    computes the whole batch at once. `function` may be a method: its module is data, as the arguments are.
     """
+
+    def call(function: Callable, *arguments: Any) -> Any:
+        return function(*arguments)
 
     def of_batch(lanes: int, many: Any, shared: Any) -> Any:
         blocks = max(-(-lanes // _BLOCK), 1) if jax.default_backend() == "cpu" else 1
         size = -(-lanes // blocks)
 
         def block(many: Any) -> Any:
-            return jax.vmap(lambda one: function(*eqx.combine(one, shared)))(many)
+            return jax.vmap(lambda one: call(*eqx.combine(one, shared)))(many)
 
         def cut(leaf: Array) -> Array:
             more = jnp.repeat(leaf[-1:], blocks * size - lanes, axis=0)
@@ -63,7 +66,7 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
         out = jax.lax.map(block, jax.tree.map(cut, many))
         return jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
 
-    return with_batch(function, of_batch, *arguments)
+    return with_batch(call, of_batch, function, *arguments)
 
 
 def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) -> Any:
