@@ -166,7 +166,7 @@ def main(
     starts: Annotated[list[str], typer.Option(help="Initial states: known, free.")] = ("known", "free"),
     contenders: Annotated[list[str], typer.Option(help="Names of the fits; by default all.")] = tuple(FITS),
     shooters: Annotated[list[str], typer.Option(help="Names of the shots; by default all.")] = tuple(SHOTS),
-    growing: Annotated[str, typer.Option(help="The estimator whose growth is measured; empty: none.")] = "kalman",
+    growing: Annotated[str, typer.Option(help="The estimator whose growth is measured; empty: none.")] = "output-error",
     grow_flights: Annotated[list[int], typer.Option(help="Numbers of flights.")] = (1, 10, 100, 1000, 10_000),
     grow_steps: Annotated[list[int], typer.Option(help="Numbers of steps.")] = (100, 1000, 10_000, 100_000),
     grow_parameters: Annotated[list[int], typer.Option(help="Numbers of parameters.")] = (1, 2, 4, 8),
