@@ -1,13 +1,14 @@
-"""Shapes that public signatures share, and the two converters of fields."""
+"""Shapes that public signatures share, and the converters of fields."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 Scalar = Float[Array, ""]
+Count = Int[Array, ""]
 Parameters = Float[Array, " parameters"]
 Covariance = Float[Array, "parameters parameters"]
 InitialStates = Float[Array, " starts"]
@@ -24,6 +25,13 @@ def as_float(x: ArrayLike) -> Array:
     if isinstance(x, np.ndarray | np.generic | float | int):  # without the program that `jnp.asarray` compiles
         return jax.device_put(np.asarray(x, dtype=jax.dtypes.canonicalize_dtype(float)))
     return jnp.asarray(x, dtype=float)
+
+
+def as_int(x: Any) -> Any:
+    """Convert an integer to an array, so that other values share the compiled program; anything else stays."""
+    if not isinstance(x, int | np.integer):
+        return x
+    return jax.device_put(np.asarray(x, dtype=jax.dtypes.canonicalize_dtype(int)))
 
 
 def as_constant(x: Any) -> Array | np.ndarray:

@@ -2,11 +2,13 @@
 
 import abc
 import functools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar
@@ -203,6 +205,15 @@ def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
     names = problem.model.parameter_names
     if bracket.lower.shape != (len(names),):
         raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
+
+
+def check_setting(name: str, value: Any, least: int) -> None:
+    """Raises `ValueError` for a setting that is not an integer of at least `least`."""
+    if isinstance(value, Tracer):
+        return
+    number = np.asarray(value)
+    if number.dtype.kind not in "iu" or number.shape != () or number < least:
+        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value}.")
 
 
 class AbstractEstimator(eqx.Module):

@@ -32,9 +32,10 @@ def test_each_simulated_point_is_counted(monkeypatch):
 
     monkeypatch.setattr(jaxos4.ShootingProblem, "shots", counted)
     problem = standard_problem(channels="rates")
-    estimate = jaxos4.AntColony(max_sweeps=3)(problem, jaxos4.Bracket.default(problem.model))
+    # No other test has so many ants, and so the program that counts.
+    estimate = jaxos4.AntColony(ants=9, max_sweeps=3)(problem, jaxos4.Bracket.default(problem.model))
     jax.effects_barrier()
-    assert len(calls) == 50 + 3 * 10
+    assert len(calls) == 50 + 3 * 9
     assert int(estimate.rollouts) == len(calls) + 1 + 8  # and the information: a shot with eight tangents
     assert (int(estimate.sweeps), str(names(estimate))) == (3, "max_sweeps")
 

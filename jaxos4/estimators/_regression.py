@@ -16,9 +16,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Scalar
+from .._custom_types import Count, Scalar
 from ..bracket import Bracket
-from ..estimate import Estimate, best_start, conclude
+from ..estimate import Estimate, best_start, check_setting, conclude
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
@@ -45,7 +45,7 @@ class Regression(NamedTuple):
     anchored: bool
     memory: Scalar
     forgetting: Scalar
-    bridge: int
+    bridge: Count
 
     def rows(self) -> tuple[Rows, Callable[[Rows], Float[Array, "samples 3"]]]:
         """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
@@ -124,7 +124,7 @@ class Regression(NamedTuple):
 
 
 def regression(
-    problem: ShootingProblem, bracket: Bracket, *, memory: Scalar, bridge: int, forgetting: Scalar | float = 1.0
+    problem: ShootingProblem, bracket: Bracket, *, memory: Scalar, bridge: Count, forgetting: Scalar | float = 1.0
 ) -> Regression:
     """The regression of a flight's body rates."""
     if not problem.model.is_linear:
@@ -196,15 +196,14 @@ def propagated_covariance(
     return (covariance + covariance.T) / 2
 
 
-def check_settings(memory: Scalar, bridge: int, forgetting: Scalar | None = None) -> None:
+def check_settings(memory: Scalar, bridge: Count, forgetting: Scalar | None = None) -> None:
     """Raises `ValueError` for a setting of a regression that is out of range."""
     for name, value, positive in (("forgetting", forgetting, True), ("memory", memory, False)):
         if value is not None and not isinstance(value, Tracer):
             number = np.asarray(value)
             if number.shape != () or not ((number > 0 if positive else number >= 0) and number <= 1):
                 raise ValueError(f"`{name}` must lie in {'(' if positive else '['}0, 1], got {number}.")
-    if not isinstance(bridge, int) or bridge < 0:
-        raise ValueError(f"`bridge` must be an integer of at least 0, got {bridge!r}.")
+    check_setting("bridge", bridge, 0)
 
 
 def answer(

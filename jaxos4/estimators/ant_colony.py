@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Key, Scalar, as_float
+from .._custom_types import Count, Key, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
+from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_setting, conclude
 from ..linalg import covariance_of_shared
 from ..shooting import ROUNDING, ShootingProblem
 
@@ -68,14 +68,12 @@ class AntColony(AbstractEstimator):
     q: Scalar = eqx.field(converter=as_float, default=0.05)
     xi: Scalar = eqx.field(converter=as_float, default=0.85)
     tolerance: Scalar = eqx.field(converter=as_float, default=1e-3)
-    max_sweeps: int = eqx.field(static=True, default=5000)
-    seed: int = eqx.field(static=True, default=0)
+    max_sweeps: Count = eqx.field(converter=as_int, default=5000)
+    seed: Count = eqx.field(converter=as_int, default=0)
 
     def __check_init__(self):
         for name, least in {"archive": 2, "ants": 1, "max_sweeps": 1, "seed": 0}.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
+            check_setting(name, getattr(self, name), least)
         for name in ("q", "xi", "tolerance"):
             value = getattr(self, name)
             if not 0 < value < float("inf"):

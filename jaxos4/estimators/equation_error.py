@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from .._custom_types import Parameters, Scalar, as_float
+from .._custom_types import Count, Parameters, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_bracket
 from ..shooting import ShootingProblem, in_blocks
@@ -43,7 +43,7 @@ class EquationError(AbstractEstimator):
     needs_network: ClassVar[bool] = False
 
     memory: Scalar = eqx.field(converter=as_float, default=1.0)
-    bridge: int = eqx.field(static=True, default=4)
+    bridge: Count = eqx.field(converter=as_int, default=4)
 
     def __check_init__(self):
         check_settings(self.memory, self.bridge)

@@ -15,11 +15,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import Count, Parameters, Scalar, as_float, as_int
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude, fit_start
+from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_setting, conclude, fit_start
 from ..linalg import invert
 from ..models.state import CASCADE_ORDER, Forcing
 from ..shooting import Rows, ShootingProblem
@@ -116,17 +117,16 @@ class FilterError(AbstractEstimator):
     prior: ClassVar[float] = GAUSSIAN_PRIOR
     needs_network: ClassVar[bool] = False
 
-    tolerance: float = eqx.field(static=True, default=0.1)
-    max_steps: int = eqx.field(static=True, default=100)
+    tolerance: Scalar = eqx.field(converter=as_float, default=0.1)
+    max_steps: Count = eqx.field(converter=as_int, default=100)
     lane: int = eqx.field(static=True, default=_LANE)
     settling: int = eqx.field(static=True, default=_SETTLING)
 
     def __check_init__(self):
-        if not self.tolerance > 0:
+        if not isinstance(self.tolerance, Tracer) and not np.asarray(self.tolerance) > 0:
             raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
-        for name, value in (("max_steps", self.max_steps), ("lane", self.lane), ("settling", self.settling)):
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"`{name}` must be an integer of at least 1, got {value!r}.")
+        for name in ("max_steps", "lane", "settling"):
+            check_setting(name, getattr(self, name), 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import Count, Parameters, Scalar, as_int
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_recursive, conclude
+from ..estimate import AbstractEstimator, Estimate, check_recursive, check_setting, conclude
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, in_blocks
@@ -70,11 +70,10 @@ class JointEKF(AbstractEstimator):
     prior: ClassVar[float] = GAUSSIAN_PRIOR
     needs_network: ClassVar[bool] = False
 
-    passes: int = eqx.field(static=True, default=10)
+    passes: Count = eqx.field(converter=as_int, default=10)
 
     def __check_init__(self):
-        if not isinstance(self.passes, int) or self.passes < 1:
-            raise ValueError(f"`passes` must be an integer of at least 1, got {self.passes!r}.")
+        check_setting("passes", self.passes, 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

@@ -12,11 +12,13 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Scalar
+from .._custom_types import Count, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_bracket, conclude
+from ..estimate import AbstractEstimator, Estimate, check_bracket, check_setting, conclude
 from ..linalg import covariance_of_shared, joint_factor
 from ..shooting import Curvature, ShootingProblem, Shot, in_blocks
 
@@ -56,14 +58,13 @@ class OutputError(AbstractEstimator):
     prior: ClassVar[float] = NO_PRIOR
     needs_network: ClassVar[bool] = False
 
-    tolerance: float = eqx.field(static=True, default=1e-5)
-    max_steps: int = eqx.field(static=True, default=100)
+    tolerance: Scalar = eqx.field(converter=as_float, default=1e-5)
+    max_steps: Count = eqx.field(converter=as_int, default=100)
 
     def __check_init__(self):
-        if not self.tolerance > 0:
+        if not isinstance(self.tolerance, Tracer) and not np.asarray(self.tolerance) > 0:
             raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
-        if not isinstance(self.max_steps, int) or self.max_steps < 1:
-            raise ValueError(f"`max_steps` must be an integer of at least 1, got {self.max_steps!r}.")
+        check_setting("max_steps", self.max_steps, 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
@@ -87,7 +88,7 @@ class OutputError(AbstractEstimator):
             free = stage.free_size
             # The damping treats all unknowns alike in these units.
             scale = jnp.concatenate([jnp.broadcast_to(usable.half_width, parameters.shape), off[:, :free]], axis=1)
-            tolerance = self.tolerance if channels == problem.channels else max(self.tolerance, _COARSE)
+            tolerance = self.tolerance if channels == problem.channels else jnp.maximum(self.tolerance, _COARSE)
             search = self._minimise(stage, jnp.concatenate([parameters, starts[:, :free]], axis=1), scale, tolerance)
             starts = starts.at[:, :free].set(search.best[:, count:])
             return search, search.best[:, :count], starts, (search.steps + 1) * (1 + count + problem.windows * free)
@@ -109,7 +110,7 @@ class OutputError(AbstractEstimator):
             done=search.done,
         )
 
-    def _minimise(self, problem: ShootingProblem, start: Unknowns, scale: Unknowns, tolerance: float) -> _Search:
+    def _minimise(self, problem: ShootingProblem, start: Unknowns, scale: Unknowns, tolerance: Scalar) -> _Search:
         """The minimum of the cost. The first trial is the start itself, so that the curvature is compiled once.
 
         `tolerance`: the search ends with a step that changes no unknown by more, in units of `scale`.

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._custom_types import Scalar, as_float
+from .._custom_types import Count, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_recursive
 from ..shooting import ShootingProblem, in_blocks
@@ -42,7 +42,7 @@ class RecursiveLeastSquares(AbstractEstimator):
 
     forgetting: Scalar = eqx.field(converter=as_float, default=1.0)
     memory: Scalar = eqx.field(converter=as_float, default=1.0)
-    bridge: int = eqx.field(static=True, default=4)
+    bridge: Count = eqx.field(converter=as_int, default=4)
 
     def __check_init__(self):
         check_settings(self.memory, self.bridge, self.forgetting)

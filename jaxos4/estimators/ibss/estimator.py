@@ -22,9 +22,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ..._custom_types import InitialStates, Parameters, Scalar, as_float
+from ..._custom_types import Count, InitialStates, Parameters, Scalar, as_float, as_int
 from ...bracket import NO_PRIOR, Bracket
-from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, conclude
+from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_setting, conclude
 from ...linalg import covariance_of_shared, covariances, gram, joint_factor
 from ...shooting import Curvature, ShootingProblem, Shot, in_blocks
 from .bisection import Lines, narrow, open_lines
@@ -72,7 +72,7 @@ class IBSS(AbstractEstimator):
 
     directions: str = eqx.field(static=True, default="whitened")
     halvings: int = eqx.field(static=True, default=2)
-    max_sweeps: int = eqx.field(static=True, default=60)
+    max_sweeps: Count = eqx.field(converter=as_int, default=60)
     tolerance: Scalar = eqx.field(converter=as_float, default=0.005)
     reach: Scalar = eqx.field(converter=as_float, default=REACH)
     record: int = eqx.field(static=True, default=0)
@@ -81,9 +81,7 @@ class IBSS(AbstractEstimator):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
         for name, least in (("halvings", 2), ("max_sweeps", 1), ("record", 0)):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
+            check_setting(name, getattr(self, name), least)
         for name in ("tolerance", "reach"):
             value = getattr(self, name)
             if not isinstance(value, Tracer) and not np.asarray(value) > 0:
