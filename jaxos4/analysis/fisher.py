@@ -1,6 +1,9 @@
 """Fisher information of a flight in the parameters, and the Cramer-Rao bound."""
 
+import functools
+
 import equinox as eqx
+import jax
 from jaxtyping import Array, Float
 
 from .._custom_types import Covariance, InitialStates, Parameters, as_float
@@ -8,7 +11,6 @@ from ..linalg import covariance_of_shared, gram, joint_factor
 from ..shooting import ShootingProblem
 
 
-@eqx.filter_jit
 def fisher_information(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Covariance:
@@ -17,12 +19,9 @@ def fisher_information(
     A free initial state is unknown too and is eliminated (Schur complement). `initial_state` is where J is computed, by
     default the measured one.
     """
-    count = parameters.shape[0]
-    factor = joint_factor(_information(problem, parameters, initial_state), count).factor[0, :count, -count:]
-    return gram(factor)
+    return _information_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
 
 
-@eqx.filter_jit
 def cramer_rao_bound(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Covariance:
@@ -30,9 +29,21 @@ def cramer_rao_bound(
 
     A parameter that is not excited has a huge variance, but not an infinite one.
     """
-    return covariance_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
+    return _covariance_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
 
 
-def _information(problem, parameters, initial_state) -> Float[Array, "windows unknowns unknowns"]:
+# A program of its own: information and bound share it, and the simulation is what takes long to compile.
+@eqx.filter_jit
+def _information(
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
+) -> Float[Array, "windows unknowns unknowns"]:
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     return problem.curvatures(as_float(parameters), start).information
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _information_of_shared(information: Float[Array, "windows unknowns unknowns"], count: int) -> Covariance:
+    return gram(joint_factor(information, count).factor[0, :count, -count:])
+
+
+_covariance_of_shared = jax.jit(covariance_of_shared, static_argnums=1)
