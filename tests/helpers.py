@@ -1,6 +1,7 @@
 """The standard flight, and an independent copy of the equations of motion in NumPy, from the printed equations."""
 
 import functools
+import itertools
 import json
 import os
 import subprocess
@@ -60,6 +61,17 @@ def standard_problem(
         flight = eqx.tree_at(lambda f: f.states, flight, states)
     arguments = {"channels": channels, "sigma": jaxos4.SENSOR_SIGMA, "initial_state": start, "method": method}
     return jaxos4.ShootingProblem(model_class(jaxos4.OS4), flight, **arguments)
+
+
+def doublet_problem(axes, *, free=False):
+    """The rates of a noisy flight of doublets, and a bracket whose center is off."""
+    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    omega = jaxos4.doublet(model.airframe, duration=5.0, dt=DT, axes=axes)
+    flight = jaxos4.simulate(model, model.alpha, omega, dt=DT)
+    noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
+    start = None if free else flight.states[0]
+    problem = jaxos4.ShootingProblem(model, noisy, sigma=jaxos4.SENSOR_SIGMA, initial_state=start, channels="rates")
+    return problem, jaxos4.Bracket.around(model.alpha + 0.4 * model.half_width, model.half_width)
 
 
 # As one program, where each operation would be one.
@@ -174,29 +186,39 @@ def first_samples(problem):
     return [k * len(problem.flight.time) // problem.windows for k in range(problem.windows + 1)]
 
 
-def numpy_costs(problem, parameters, starts):
-    """The cost by the NumPy equations at each row of parameters and initial states, from the first sample on."""
-    order, flight = CASCADE_ORDER[: problem.size], problem.flight
-    whole = np.zeros((len(starts), 12))
-    whole[:, order] = starts
-    states = euler_trajectory(REFERENCES[type(problem.model)], parameters, flight.omega, start=whole, dt=flight.dt)
-    residuals = ((np.asarray(flight.states)[:, None] - states) / np.asarray(problem.sigma))[..., order]
-    first = 0 if problem.initial_state is None else 1  # a known first sample is no data
-    return 0.5 * np.square(residuals[first:]).sum(axis=(0, 2))
-
-
 def numpy_residuals(problem, parameters, starts):
-    """W (y - x) by the NumPy equations, each window from its own start; NaN where nothing was measured."""
+    """W (y - x) by the NumPy equations, each window from its own start; NaN where nothing was measured.
+
+    Leading axes of parameters and starts are a batch.
+    """
     flight, derivative = problem.flight, REFERENCES[type(problem.model)]
     order, ends = CASCADE_ORDER[: problem.size], first_samples(problem)
-    states = []
-    for start, first, end in zip(np.reshape(starts, (problem.windows, -1)), ends[:-1], ends[1:], strict=True):
-        whole = np.zeros(12)
-        whole[order] = start
-        states.append(
-            euler_trajectory(derivative, np.asarray(parameters), flight.omega[first:end], start=whole, dt=flight.dt)
-        )
-    return ((np.asarray(flight.states) - np.concatenate(states)) / np.asarray(problem.sigma))[:, order]
+    first = np.zeros((*np.shape(starts)[:-1], problem.windows, 12))
+    first[..., order] = np.reshape(starts, (*np.shape(starts)[:-1], problem.windows, -1))
+    states = np.concatenate(
+        [
+            euler_trajectory(derivative, parameters, flight.omega[begin:end], start=first[..., w, :], dt=flight.dt)
+            for w, (begin, end) in enumerate(itertools.pairwise(ends))
+        ]
+    )
+    return ((np.asarray(flight.states) - np.moveaxis(states, 0, -2)) / np.asarray(problem.sigma))[..., order]
+
+
+def numpy_jacobian(problem, parameters, starts):
+    """Derivatives of `numpy_residuals` in the parameters and the starts, by central differences."""
+    step = np.concatenate([1e-4 * jaxos4.DEFAULT_HALF_WIDTH, np.full(len(starts), 1e-4)])
+    point, moves = np.concatenate([parameters, starts]), np.diag(step)
+    up, down = (numpy_residuals(problem, *np.split(x, [8], axis=1)) for x in (point + moves, point - moves))
+    slopes = (up - down) / (2 * step[:, None, None])
+    if problem.initial_state is not None:
+        slopes[:, 0] = 0  # a known first sample is no data
+    return slopes.reshape(step.size, -1).T
+
+
+def inverse_square(slopes):
+    """(J^T J)^-1, whatever the units of the columns."""
+    scale = np.linalg.norm(slopes, axis=0)
+    return np.linalg.inv((slopes / scale).T @ (slopes / scale)) / np.outer(scale, scale)
 
 
 def same(one, other):
@@ -222,6 +244,7 @@ def single_precision(script):
     cache = str(jax.config.values["jax_compilation_cache_dir"])
     environment = {**os.environ, "JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
     environment |= {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
+    environment["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # it compiles for longer than it computes
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -5,7 +5,7 @@ import functools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from helpers import random_starts, standard_flight, standard_problem
+from helpers import inverse_square, numpy_jacobian, random_starts, standard_flight, standard_problem
 
 import jaxos4
 
@@ -43,15 +43,15 @@ def bound(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
 @functools.cache
 def information(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
     """The information about the parameters at the truth."""
-    covariance = _covariance(model_class, channels, free)
-    scale = np.outer(*2 * (np.sqrt(np.diagonal(covariance)),))
-    return np.linalg.inv(covariance / scale) / scale
+    return inverse_square(np.linalg.cholesky(_covariance(model_class, channels, free)).T)
 
 
 @functools.cache
 def _covariance(model_class, channels, free):
+    """Of the NumPy equations. That of the library: `test_information.py`."""
     problem = standard_problem(model_class, channels, free=free)
-    return np.asarray(jaxos4.cramer_rao_bound(problem, model_class().alpha))
+    slopes = numpy_jacobian(problem, model_class().alpha, np.zeros(problem.size))
+    return inverse_square(slopes if free else slopes[:, :8])[:8, :8]
 
 
 def errors(estimates, model_class=jaxos4.PublishedOS4):
@@ -69,6 +69,14 @@ def assert_covered(error, std):
     """95 % intervals hold the truth as often as they say. The errors of a flight are correlated: flights count."""
     inside = np.mean(np.abs(error) < 1.96 * np.asarray(std))
     assert abs(inside - 0.95) < 4 * np.sqrt(0.95 * 0.05 / len(error)), inside
+
+
+def assert_nothing_invented(estimator, problem, bracket):
+    """A flight that does not identify all parameters is named so. The cost is that of the estimate."""
+    found = estimator(problem, bracket)
+    assert names(found) == "unidentifiable"
+    assert np.isfinite(found.parameters).all()
+    np.testing.assert_allclose(found.cost, problem.cost(found.parameters, found.initial_state), rtol=1e-9)
 
 
 def lost(states, share=0.3, seed=8):

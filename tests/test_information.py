@@ -3,11 +3,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import REFERENCES, euler_trajectory, noisy_states, standard_problem
+from helpers import noisy_states, numpy_jacobian, standard_problem
 
 import jaxos4
 from jaxos4 import linalg
-from jaxos4.models.state import CASCADE_ORDER, CHANNELS
+from jaxos4.models.state import CHANNELS
 
 # Each as one program.
 invert = jax.jit(linalg.invert)
@@ -15,7 +15,6 @@ joint_factor, covariances, covariance_of_shared = (
     jax.jit(function, static_argnums=1)
     for function in (linalg.joint_factor, linalg.covariances, linalg.covariance_of_shared)
 )
-first_state = eqx.filter_jit(lambda problem: problem.first_state()[0])
 every_channels = pytest.mark.parametrize("channels", CHANNELS)
 
 # Standard flight, known initial state: standard deviations in % of alpha (alpha2, 5 and 7: absolute x 100).
@@ -39,20 +38,6 @@ def test_the_standard_flights_bounds_are_the_known_figures(channels):
     assert rounded == list(PRINTED[channels])
 
 
-def jacobian(problem, parameters, start):
-    """Derivatives of the weighted residuals of the NumPy equations, by central differences."""
-    point, order = np.concatenate([parameters, start]), CASCADE_ORDER[: problem.size]
-    step = np.concatenate([1e-4 * jaxos4.DEFAULT_HALF_WIDTH, np.full(problem.size, 1e-4)])
-    points, starts = np.concatenate([point + np.diag(step), point - np.diag(step)]), np.zeros((2 * step.size, 12))
-    starts[:, order] = points[:, 8:]
-    derivative = REFERENCES[type(problem.model)]
-    states = euler_trajectory(derivative, points[:, :8], problem.flight.omega, start=starts)[..., order]
-    if problem.initial_state is not None:
-        states[0] = 0  # a known first sample is no data
-    up, down = np.split(-np.moveaxis(states, 1, 0) / np.asarray(problem.sigma)[order], 2)
-    return ((up - down) / (2 * step[:, None, None])).reshape(step.size, -1).T
-
-
 @pytest.mark.parametrize("model_class", [jaxos4.PublishedOS4, jaxos4.CorrectedOS4])
 @every_channels
 def test_information_is_the_jacobians_square(model_class, channels):
@@ -60,7 +45,7 @@ def test_information_is_the_jacobians_square(model_class, channels):
     alpha = model_class().alpha
     for free in (False, True):
         problem = standard_problem(model_class, channels, free=free)
-        slopes = jacobian(problem, alpha, first_state(problem))
+        slopes = numpy_jacobian(problem, alpha, np.zeros(problem.size))  # from rest
         joint = slopes.T @ slopes
         information = np.linalg.inv(np.linalg.inv(joint)[:8, :8]) if free else joint[:8, :8]
         scale = np.sqrt(np.diagonal(information))

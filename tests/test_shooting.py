@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import REFERENCES, noisy_states, numpy_costs, numpy_residuals, standard_flight, standard_problem
+from helpers import REFERENCES, noisy_states, numpy_residuals, standard_flight, standard_problem
 
 import jaxos4
 from jaxos4.models.state import CASCADE_ORDER, CHANNELS
@@ -18,6 +18,7 @@ THETA = jaxos4.STATE_NAMES.index("theta")
 
 
 # Each compiles once for each kind of problem, like `cost` and `residuals`.
+outputs_of = eqx.filter_jit(lambda problem, parameters: (problem.cost(parameters), problem.residuals(parameters)))
 slope_of = eqx.filter_jit(lambda problem, *args: jax.jacfwd(problem.cost)(*args))
 curvature_of = eqx.filter_jit(lambda problem, *args: jax.tree.map(lambda x: x[0], problem.curvatures(*args)))
 
@@ -31,11 +32,15 @@ def problem_of(channels="all", *, free=False, states=None, model_class=jaxos4.Pu
     return standard_problem(model_class, channels, free=free, states=states, duration=DURATION, method=method)
 
 
+def first_of(problem):
+    """Where a search starts if everything was measured."""
+    states = problem.flight.states[0] if problem.initial_state is None else problem.initial_state
+    return np.asarray(states)[CASCADE_ORDER[: problem.size]]
+
+
 def off(model_class=jaxos4.PublishedOS4):
     """Parameters where the cost is neither zero nor stationary."""
-    return model_class().alpha + 0.1 * jnp.asarray(jaxos4.DEFAULT_HALF_WIDTH) * jnp.array(
-        [1, -1, 1, -1, 1, -1, 1, -1.0]
-    )
+    return jnp.asarray(model_class().alpha + 0.1 * jaxos4.DEFAULT_HALF_WIDTH * np.tile([1, -1], 4))
 
 
 # The cost.
@@ -46,13 +51,12 @@ def off(model_class=jaxos4.PublishedOS4):
 @known_or_free
 def test_cost_and_residuals_are_the_weighted_mismatch(model_class, channels, free):
     problem = problem_of(channels, free=free, model_class=model_class)
-    expected = numpy_residuals(problem, off(model_class), problem.first_state()[0])
+    expected = numpy_residuals(problem, off(model_class), first_of(problem))
     if not free:
         expected[0] = 0  # a known first sample is no data
-    residuals = problem.residuals(off(model_class))
+    cost, residuals = outputs_of(problem, off(model_class))
     assert residuals.shape == (101 * CHANNELS[channels],)
     np.testing.assert_allclose(residuals, expected.ravel(), atol=1e-9)
-    cost = float(problem.cost(off(model_class)))
     assert cost == pytest.approx(0.5 * float(residuals @ residuals), rel=1e-13)
     assert cost == pytest.approx(0.5 * np.sum(expected**2), rel=1e-11)
     assert cost > 1
@@ -69,7 +73,7 @@ def test_the_first_sample_counts_only_if_the_initial_state_is_free():
     for free in (False, True):
         states = measured()
         problem, moved = (problem_of("rates", free=free, states=s) for s in (states, states.at[0].add(0.01)))
-        start = problem.first_state()[0]
+        start = jnp.asarray(first_of(problem))
         same = float(moved.cost(off(), start)) == float(problem.cost(off(), start))
         assert same is not free
 
@@ -169,8 +173,12 @@ def central_differences(problem, parameters, start, step):
     """Derivatives by Richardson's extrapolation of central differences over `step` and half of it."""
     point, moves = np.concatenate([parameters, start]), np.diag(step)
     points = np.concatenate([point + share * moves for share in (1, -1, 0.5, -0.5)])
-    costs = numpy_costs if problem.method == "euler" else costs_of
-    up, down, half_up, half_down = np.split(np.asarray(costs(problem, points[:, :8], points[:, 8:])), 4)
+    if problem.method == "euler":
+        first = 0 if problem.initial_state is None else 1  # a known first sample is no data
+        costs = np.square(numpy_residuals(problem, points[:, :8], points[:, 8:])[:, first:]).sum(axis=(1, 2)) / 2
+    else:
+        costs = costs_of(problem, points[:, :8], points[:, 8:])
+    up, down, half_up, half_down = np.split(np.asarray(costs), 4)
     return (4 * (half_up - half_down) / step - (up - down) / (2 * step)) / 3
 
 
@@ -184,7 +192,7 @@ CASES = [(jaxos4.PublishedOS4, c, f, "euler") for c in CHANNELS for f in (False,
 def test_forward_and_reverse_mode_equal_finite_differences(model_class, channels, free, method):
     problem = problem_of(channels, free=free, model_class=model_class, method=method)
     # Even if the initial state is known, the cost depends on the one that is given.
-    start = problem.first_state()[0] + 0.01
+    start = jnp.asarray(first_of(problem) + 0.01)
     (cost, reverse), forward, curvature = all_derivatives(problem, off(model_class), start)
     order = CASCADE_ORDER[: problem.size]
     step = np.concatenate([1e-3 * jaxos4.DEFAULT_HALF_WIDTH, 0.1 * SIGMA[order]])
@@ -203,7 +211,7 @@ def test_forward_and_reverse_mode_equal_finite_differences(model_class, channels
 
 def test_a_wrong_derivative_would_fail():
     problem = problem_of("rates")
-    start = problem.first_state()[0]
+    start = jnp.asarray(first_of(problem))
     (_, reverse), _, _ = all_derivatives(problem, off(), start)
     step = np.concatenate([1e-3 * jaxos4.DEFAULT_HALF_WIDTH, np.full(3, 1e-3)])
     expected = central_differences(problem, off() * (1 + 1e-5), start, step)
@@ -222,9 +230,10 @@ def test_loop_and_vmap_agree(channels):
         data = eqx.tree_at(lambda f: f.states, flight, states)
         return jaxos4.ShootingProblem(jaxos4.PublishedOS4(), data, sigma=sigma, channels=channels).cost(alpha)
 
-    alphas, sigmas = off() * jnp.linspace(0.9, 1.1, 3)[:, None], SIGMA * jnp.array([[1.0], [2.0], [0.5]])
-    batch = alphas, noisy_states(3, duration=DURATION), sigmas
-    np.testing.assert_allclose(jax.vmap(cost)(*batch), [cost(*lane) for lane in zip(*batch, strict=True)], rtol=1e-12)
+    alphas, sigmas = np.asarray(off()) * np.array([[0.9], [1.0], [1.1]]), SIGMA * np.array([[1.0], [2.0], [0.5]])
+    batch = [jnp.asarray(x) for x in (alphas, noisy_states(3, duration=DURATION), sigmas)]
+    together, alone = jax.jit(jax.vmap(cost))(*batch), [cost(*lane) for lane in zip(*batch, strict=True)]
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
 
 
 def test_jitted_and_not_agree():
@@ -237,10 +246,10 @@ def test_jitted_and_not_agree():
 @every_channels
 def test_a_failed_trajectory_costs_infinity_and_changes_no_other_lane(channels):
     problem = problem_of(channels)
-    divergent = problem.model.alpha.at[2].set(1e7)
-    alphas = jnp.stack([problem.model.alpha, divergent, off(), jnp.full(8, jnp.nan)])
-    start = jnp.zeros((4, problem.size))
-    costs, expected = (np.asarray(costs_of(problem, a, start)) for a in (alphas, alphas[jnp.array([0, 0, 2, 2])]))
+    alphas, start = np.stack([problem.model.alpha, problem.model.alpha, off(), off()]), np.zeros((4, problem.size))
+    expected = np.asarray(costs_of(problem, alphas, start))
+    alphas[1, 2], alphas[3] = 1e7, np.nan  # the first diverges
+    costs = np.asarray(costs_of(problem, alphas, start))
     assert costs[[1, 3]].tolist() == [np.inf, np.inf]
     np.testing.assert_array_equal(costs[[0, 2]], expected[[0, 2]])
     assert np.isfinite(costs[[0, 2]]).all()
@@ -248,18 +257,18 @@ def test_a_failed_trajectory_costs_infinity_and_changes_no_other_lane(channels):
 
 def test_a_failed_shot_is_compared_up_to_the_failure():
     """Its cost means nothing, but its derivative is finite."""
-    problem = problem_of("attitude")
-    start = jnp.zeros(6).at[4].set(1.4)
+    problem, start, steep = problem_of("attitude"), 1.4 * np.eye(6)[4], np.array(off())
+    steep[5] = 1000.0
 
-    def shot(parameters):
-        return problem.shots(parameters, start)
+    @eqx.filter_jit
+    def shot(problem, parameters, along):
+        return jax.jvp(lambda x: problem.shots(x, jnp.asarray(start)), (parameters,), (along,))
 
-    steep = off().at[5].set(1000.0)
-    (cost, sound), (slope, _) = jax.jvp(lambda a: shot(a), (steep,), (jnp.zeros(8).at[5].set(1.0),))
+    (cost, sound), (slope, _) = shot(problem, steep, np.eye(8)[5])
     assert not bool(sound)
     assert np.isfinite(cost)
     assert np.isfinite(slope)
-    assert float(problem.cost(steep, start)) == np.inf
+    assert float(problem.cost(jnp.asarray(steep), jnp.asarray(start))) == np.inf
 
 
 # Noise levels, and misuse.
