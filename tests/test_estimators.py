@@ -1,14 +1,26 @@
 """Laws that hold for every estimator of the registry that needs no network: one batch of noisy flights, one program."""
 
 import functools
+import pathlib
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import noisy_states, standard_flight, standard_problem
-from lanes import HALF, LANES, assert_chi_square, bound, errors, identify, lanes, lost, names
+from helpers import doublet_problem, noisy_states, single_precision, standard_flight, standard_problem
+from lanes import (
+    HALF,
+    LANES,
+    assert_chi_square,
+    assert_nothing_invented,
+    bound,
+    errors,
+    identify,
+    lanes,
+    lost,
+    names,
+)
 
 import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
@@ -92,6 +104,61 @@ def test_missing_samples_only_cost_precision(name):
     assert set(names(estimates)) == {"successful"}
     assert (np.median(estimates.std, axis=0) > 1.05 * bound()).all()
     assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))
+
+
+@pytest.mark.parametrize(("name", "free"), [*((name, False) for name in NAMES), ("svsf", True)])
+def test_no_estimator_invents_numbers_for_doublets(name, free):
+    """Doublets do not identify all parameters. For a hover: above. For regressions with a free start: their tests."""
+    for axes in (["roll"], ["roll", "pitch", "yaw"]):
+        assert_nothing_invented(make_estimator(name), *doublet_problem(axes, free=free))
+
+
+SINGLE = """
+import json, sys
+sys.path.insert(0, TESTS)
+import numpy as np
+import jaxos4
+from helpers import noisy_states, standard_problem
+from jaxos4.estimators import make_estimator
+from lanes import HALF, identify, lanes, names
+
+def found(estimates):
+    assert estimates.parameters.dtype == estimates.std.dtype == "float32"
+    return np.atleast_1d(names(estimates)).tolist(), estimates.parameters.tolist(), estimates.std.tolist()
+
+states, lower, upper = (x.astype("float32") for x in np.load(FILE).values())
+noisy, exact = standard_problem(channels="rates", states=states), standard_problem()
+bracket = jaxos4.Bracket.around(exact.model.alpha + 0.5 * HALF, HALF)
+regressions = {name: make_estimator(name) for name in ("equation-error", "rls")}
+regressions["rls that forgets"] = jaxos4.RecursiveLeastSquares(forgetting=0.99)
+answers = {name: found(estimator(exact, bracket)) for name, estimator in regressions.items()}
+for name in ("filter-error", "kalman"):
+    answers[name] = found(make_estimator(name)(noisy, jaxos4.Bracket(lower, upper)))
+answers["ibss"] = found(identify(jaxos4.IBSS(), *lanes(noisy_states(8), channels="all")))
+json.dump(answers, sys.stdout)
+"""
+
+
+def test_single_precision_is_enough(tmp_path):
+    _, states, _, lower, upper = lanes(noisy_states(LANES, seed=50))
+    np.savez(tmp_path / "flight.npz", states=states[0], lower=lower[0], upper=upper[0])
+    tests = str(pathlib.Path(__file__).parent)
+    script = SINGLE.replace("TESTS", repr(tests)).replace("FILE", repr(str(tmp_path / "flight.npz")))
+    answers = {name: tuple(map(np.array, answer)) for name, answer in single_precision(script).items()}
+    assert all((result == "successful").all() for result, _, _ in answers.values())
+    # The answer of double precision.
+    for name, most, off in (("filter-error", 0.1, 0.05), ("kalman", 0.05, 0.02)):
+        (_, parameters, std), double = answers.pop(name), noisy(name)
+        assert (np.abs(parameters - double.parameters[0]) < most * double.std[0]).all(), name
+        np.testing.assert_allclose(std, double.std[0], rtol=off)
+    # Noisy flights, all channels: errors are those of the noise.
+    sigma, (_, parameters, std) = bound(channels="all"), answers.pop("ibss")
+    assert (np.abs(parameters - MODEL.alpha) < 4 * sigma).all()
+    np.testing.assert_allclose(std / sigma, np.ones((8, 8)), atol=0.1)
+    # An exact flight, to a hundredth of what noise would do.
+    for _, parameters, std in answers.values():
+        assert (np.abs(parameters - MODEL.alpha) < 0.01 * bound()).all()
+        assert (std > 0.99 * bound()).all()
 
 
 @every_estimator
