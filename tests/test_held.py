@@ -38,9 +38,7 @@ def problem_of(model, *, windows=3):
     flight = standard_flight(jaxos4.CorrectedOS4, 1.0)
     force = np.random.default_rng(0).normal(size=(101, 3))
     flight = eqx.tree_at(lambda f: f.specific_force, flight, jnp.asarray(force), is_leaf=lambda leaf: leaf is None)
-    return jaxos4.ShootingProblem(
-        model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="attitude", windows=windows, method="rk4"
-    )
+    return jaxos4.ShootingProblem(model, flight, sigma=jaxos4.SENSOR_SIGMA, channels="attitude", windows=windows)
 
 
 @pytest.mark.parametrize(("model", "values"), CASES)
@@ -63,7 +61,7 @@ def test_a_held_model_is_the_inner_one_with_its_values(model, values):
         (turning(held, rates, row, tuple(free)), turning(model, rates, row, tuple(whole))),
     ):
         np.testing.assert_array_equal(one, other)
-    flights = [jaxos4.simulate(m, x, omega, dt=0.01, method="rk4").states for m, x in ((held, free), (model, whole))]
+    flights = [jaxos4.simulate(m, x, omega, dt=0.01).states for m, x in ((held, free), (model, whole))]
     np.testing.assert_allclose(*flights, rtol=1e-12, atol=1e-13)
 
 

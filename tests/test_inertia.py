@@ -1,6 +1,7 @@
 """The constants of a rigid body: fitted to alphas, and estimated instead of them."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -93,30 +94,25 @@ def test_a_model_in_constants_flies_as_the_one_in_alphas(model_class):
     assert np.abs(other.states - flight.states).max() > 1e-3
 
 
+@eqx.filter_jit
+def identify(estimator, problem, states):
+    bracket = jaxos4.Bracket.around(1.1 * problem.model.alpha, problem.model.half_width)
+    return jax.vmap(lambda s: estimator(eqx.tree_at(lambda p: p.flight.states, problem, s), bracket))(states)
+
+
 @pytest.mark.parametrize("estimator", [jaxos4.IBSS(), OutputError()])
 def test_constants_are_estimated_directly_and_know_more_than_alphas(estimator):
-    flights, inertial = 64, jaxos4.InertialOS4(jaxos4.CorrectedOS4())
-    states = noisy_states(flights, jaxos4.CorrectedOS4)
-
-    @eqx.filter_jit
-    @eqx.filter_vmap
-    def identify(states):
-        problem = standard_problem(jaxos4.CorrectedOS4, "attitude", states=states)
-        problem = eqx.tree_at(lambda p: p.model, problem, inertial)
-        bracket = jaxos4.Bracket.around(1.1 * inertial.alpha, inertial.half_width)
-        return estimator(problem, bracket)
-
-    found = identify(states)
+    flights, problem = 64, standard_problem(jaxos4.CorrectedOS4, "rates")
+    inertial = eqx.tree_at(lambda p: p.model, problem, jaxos4.InertialOS4(problem.model))
+    found = identify(estimator, inertial, noisy_states(flights, jaxos4.CorrectedOS4))
     assert set(jaxos4.result_names(found.result)) == {"successful"}
     errors = (found.parameters - constants()) / found.std
     assert np.all(np.abs(np.sqrt((errors**2).mean(axis=0)) - 1) < 4 / np.sqrt(2 * flights))
-    problem = standard_problem(jaxos4.CorrectedOS4, "attitude")
-    from_alphas = jaxos4.fit_inertia(
-        problem.model, problem.model.alpha, jaxos4.cramer_rao_bound(problem, problem.model.alpha)
-    )
+    covariance = bound_of(jaxos4.CorrectedOS4, "rates")
+    from_alphas = jaxos4.fit_inertia(problem.model, problem.model.alpha, covariance)
     # Both ways use the same information, to first order.
     np.testing.assert_allclose(np.median(found.std, axis=0), from_alphas.std, rtol=0.02)
-    alone = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(problem, problem.model.alpha)))[[2, 5, 7]]
+    alone = np.sqrt(np.diagonal(covariance))[[2, 5, 7]]
     assert np.all(np.median(found.std, axis=0)[:3] < alone * constants()[:3] ** 2)
 
 

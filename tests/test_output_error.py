@@ -5,37 +5,22 @@ import numpy as np
 import optimistix
 import pytest
 from helpers import noisy_states, random_starts, standard_problem
+from lanes import LANES, bound, identify, lanes
 
 import jaxos4
 from jaxos4.estimators.output_error import OutputError
 
-MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
+every_case = pytest.mark.parametrize(
+    ("model_class", "channels"), [(jaxos4.PublishedOS4, "all"), (jaxos4.CorrectedOS4, "rates")]
+)
 
 
-def around(model_class, center):
-    """A bracket of the default width about any center: where the search starts."""
-    return jaxos4.Bracket.around(center, model_class(jaxos4.OS4).half_width)
-
-
-@eqx.filter_jit
-def identify(states, centers, model_class, channels, free=False, estimator=None):
-    """Many flights, each from its own start."""
-
-    def one(states, center):
-        problem = standard_problem(model_class, channels, states=states, free=free)
-        return (estimator or OutputError())(problem, around(model_class, center))
-
-    return eqx.filter_vmap(one)(states, centers)
-
-
-@pytest.mark.parametrize(("model_class", "channels"), [(MODELS[0], "attitude"), (MODELS[1], "rates")])
+@every_case
 def test_without_noise_the_truth_is_found(model_class, channels):
-    model = model_class(jaxos4.OS4)
-    flights = 16
-    starts = random_starts(model, flights, seed=1)
-    found = identify(noisy_states(flights, model_class, scale=0.0), starts, model_class, channels)
+    states = noisy_states(LANES, model_class, scale=0.0)
+    found = identify(OutputError(), *lanes(states, model_class, channels, seed=1))
     assert set(jaxos4.result_names(found.result)) == {"successful"}
-    np.testing.assert_allclose(found.parameters, np.tile(model.alpha, (flights, 1)), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(found.parameters, np.tile(model_class().alpha, (LANES, 1)), rtol=1e-7, atol=1e-9)
 
 
 def test_it_is_the_minimum_that_another_minimiser_finds():
@@ -56,25 +41,21 @@ def test_it_is_the_minimum_that_another_minimiser_finds():
     assert off(early.parameters) > 0.1
 
 
-@pytest.mark.parametrize(("model_class", "channels"), [(MODELS[0], "all"), (MODELS[1], "rates")])
+@every_case
 def test_errors_are_those_of_the_bound(model_class, channels):
-    flights, alpha = 64, model_class(jaxos4.OS4).alpha
-    starts = random_starts(model_class(jaxos4.OS4), flights)
-    found = identify(noisy_states(flights, model_class), starts, model_class, channels)
+    found = identify(OutputError(), *lanes(noisy_states(LANES, model_class), model_class, channels, seed=0))
     assert set(jaxos4.result_names(found.result)) == {"successful"}
-    bound = np.sqrt(np.diagonal(jaxos4.cramer_rao_bound(standard_problem(model_class, channels), alpha)))
-    efficiency = np.sqrt(np.mean(((found.parameters - alpha) / bound) ** 2, axis=0))
-    assert np.all(np.abs(efficiency - 1) < 4 / np.sqrt(2 * flights))
-    held = (np.abs(found.parameters - alpha) < found.half_width(0.95)).mean()
+    error = np.asarray(found.parameters - model_class().alpha)
+    efficiency = np.sqrt(np.mean((error / bound(model_class, channels)) ** 2, axis=0))
+    assert np.all(np.abs(efficiency - 1) < 4 / np.sqrt(2 * LANES))
+    held = (np.abs(error) < found.half_width(0.95)).mean()
     # Parameters are correlated: as if there were one of them.
-    assert abs(held - 0.95) < 4 * np.sqrt(0.95 * 0.05 / flights)
+    assert abs(held - 0.95) < 4 * np.sqrt(0.95 * 0.05 / LANES)
 
 
 def test_a_free_initial_state_gives_the_answer_of_ibss():
-    states, starts = noisy_states(4, seed=2), random_starts(jaxos4.PublishedOS4(), 4, seed=2)
-    ours, other = (
-        identify(states, starts, jaxos4.PublishedOS4, "rates", True, e) for e in (OutputError(), jaxos4.IBSS())
-    )
+    arguments = lanes(noisy_states(4, seed=2), free=True, seed=2)
+    ours, other = (identify(estimator, *arguments) for estimator in (OutputError(), jaxos4.IBSS()))
     assert np.abs((ours.parameters - other.parameters) / other.std).max() < 0.1
     np.testing.assert_allclose(ours.std, other.std, rtol=1e-2)
     assert np.abs(ours.initial_state - other.initial_state).max() < 0.01
@@ -89,7 +70,7 @@ def test_many_lanes_at_once_come_back():
     @eqx.filter_vmap
     def short(states, center):
         flight = eqx.tree_at(lambda p: p.flight.states, problem, states)
-        return OutputError()(flight, around(jaxos4.PublishedOS4, center))
+        return OutputError()(flight, jaxos4.Bracket.around(center, problem.model.half_width))
 
     assert np.isfinite(short(states, starts).parameters).all()
 
