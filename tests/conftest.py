@@ -98,6 +98,29 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
     return LoadFileScheduling(config, log)
 
 
+# Modules that compile for longer than they compute: XLA hardly optimises their programs, which then compile in a third
+# of the time, and compute three to five times as long.
+COMPILING = {
+    *("equation_error", "held", "ibss", "identifiability", "inertia", "information", "kalman", "models"),
+    *("multiple_shooting", "output_error", "robust", "shooting"),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_are_optimised_if_it_pays(request: pytest.FixtureRequest) -> None:
+    """A module that compiles for long wants no optimisations."""
+    name = request.path.stem.removeprefix("test_")
+    jax.config.update("jax_disable_most_optimizations", name in COMPILING)
+
+
+@pytest.fixture
+def optimised() -> Iterator[None]:
+    """For a test that computes for long, in a module of `COMPILING`."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
 MOST_MAPS = 30_000
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import noisy_states, random_starts, single_precision, standard_flight, standard_problem
+from helpers import noisy_states, random_starts, standard_flight, standard_problem
 from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors, identify, information, lost, names
 
 import jaxos4
@@ -163,23 +163,28 @@ def test_too_few_sweeps_are_reported():
     assert (np.asarray(estimates.sweeps) == 3).all()  # one for each share of the flight
 
 
+@eqx.filter_jit
+def table_of(estimator, problem, states, *ends):
+    """An estimate for each flight and each bracket."""
+
+    def one(states, *ends):
+        return estimator(eqx.tree_at(lambda p: p.flight.states, problem, states), jaxos4.Bracket(*ends))
+
+    return jax.vmap(jax.vmap(one, in_axes=(None, 0, 0)), in_axes=(0, None, None))(states, *ends)
+
+
 def test_vmaps_over_brackets_flights_and_both():
-    """A table of flights by brackets, in one call, is one estimate after the other."""
-    model = PUBLISHED()
-    problem, states = standard_problem(channels="rates"), noisy_states(2)
-    shifts = np.array([[0.0], [0.4], [-0.4]]) * HALF
-    brackets = eqx.filter_vmap(lambda shift: jaxos4.Bracket.around(model.alpha + shift, HALF))(jnp.asarray(shifts))
-    problems = eqx.filter_vmap(lambda s: eqx.tree_at(lambda p: p.flight.states, problem, s))(states)
-    estimator = jaxos4.IBSS(tolerance=1e-4)
-    over_brackets = eqx.filter_vmap(estimator, in_axes=(None, 0))
-    table = eqx.filter_vmap(over_brackets, in_axes=(0, None))(problems, brackets)
+    """A table of flights by brackets, in one call, is a row of lanes. That a lane is an estimate: `test_estimators`."""
+    case, states, estimator = "published-rates", noisy_states(2), jaxos4.IBSS(tolerance=1e-4)
+    shifts = np.array([[0.0], [0.4], [-0.4]]) * np.ones(8)
+    centers = np.asarray(PUBLISHED().alpha) + shifts * HALF
+    table = table_of(estimator, standard_problem(channels="rates"), states, centers - HALF, centers + HALF)
     assert table.parameters.shape == (2, 3, 8)
     assert table.std.shape == (2, 3, 8)
     sigma = np.asarray(table.std[0, 0])
-    for place in ((0, 0), (0, 2), (1, 1)):
-        one = eqx.tree_at(lambda p: p.flight.states, problem, states[place[0]])
-        alone = estimator(one, jaxos4.Bracket(brackets.lower[place[1]], brackets.upper[place[1]]))
-        np.testing.assert_allclose(table.parameters[place] / sigma, alone.parameters / sigma, atol=1e-6)
+    flights, offset = (np.resize(x, (LANES, *np.shape(x)[1:])) for x in (np.repeat(states, 3, axis=0), shifts))
+    row = identify(estimator, *lanes(case, jnp.asarray(flights), offset=offset))
+    np.testing.assert_allclose(table.parameters.reshape(6, 8) / sigma, row.parameters[:6] / sigma, atol=1e-6)
     # Where it began does not matter, and two flights are two estimates.
     assert np.abs((table.parameters - table.parameters[:, :1]) / sigma).max() < 1e-2
     assert np.abs((table.parameters[0] - table.parameters[1]) / sigma).max() > 0.1
@@ -205,6 +210,7 @@ def jacobian(problem, parameters):
     return jax.jacfwd(lambda x: (problem.residuals(x),) * 2, has_aux=True)(parameters)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_both_kinds_of_directions_reach_the_maximum_of_the_likelihood():
     case, count = "published-rates", 4
     states = noisy_states(LANES, seed=5)
@@ -270,35 +276,3 @@ def test_dropouts_and_channels_that_were_never_measured_only_cost_precision():
     assert names(estimates).tolist() == ["successful"] * LANES
     assert (np.asarray(estimates.std) > bound(*CASES[case])).all()
     assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))
-
-
-SINGLE = """
-import equinox as eqx, jax, json, sys
-import jaxos4
-
-model = jaxos4.PublishedOS4(jaxos4.OS4)
-flight = jaxos4.simulate(model, model.alpha, jaxos4.multisine(model.airframe), dt=0.01)
-noise, bracket = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), jaxos4.Bracket.default(model)
-
-def lane(key):
-    noise_key, start_key = jax.random.split(key)
-    problem = jaxos4.ShootingProblem(
-        model, noise(flight, key=noise_key), sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0]
-    )
-    away = jax.random.uniform(start_key, (8,), minval=-0.8, maxval=0.8)
-    return jaxos4.IBSS()(problem, bracket, start=bracket.center + away * bracket.half_width)
-
-estimates = eqx.filter_vmap(lane)(jax.random.split(jax.random.key(0), 8))
-assert estimates.parameters.dtype == flight.states.dtype == "float32"
-result = jaxos4.result_names(estimates.result).tolist()
-json.dump({"result": result, "parameters": estimates.parameters.tolist(), "std": estimates.std.tolist()}, sys.stdout)
-"""
-
-
-def test_single_precision_is_enough_for_noisy_flights():
-    estimates = single_precision(SINGLE)
-    assert estimates["result"] == ["successful"] * 8
-    sigma = bound(*CASES["published-all"])
-    error = (np.array(estimates["parameters"]) - PUBLISHED().alpha) / sigma
-    assert np.abs(error).max() < 4
-    np.testing.assert_allclose(estimates["std"] / sigma, np.ones((8, 8)), atol=0.1)
