@@ -83,6 +83,11 @@ def forcing_of(model, inputs, parameters):
 
 
 @eqx.filter_jit
+def first_state(problem):
+    return problem.first_state()[0]
+
+
+@eqx.filter_jit
 def curvatures(problem, parameters, starts):
     return problem.curvatures(parameters, starts)
 

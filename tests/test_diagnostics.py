@@ -1,5 +1,7 @@
 """Diagnostics of residuals accept true models and detect wrong ones."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,9 +25,10 @@ def judged(states):
     for first in range(0, len(states), LANES):
         some = jnp.asarray(np.resize(states[first : first + LANES], (LANES, *states.shape[1:])))
         found = identify(jaxos4.IBSS(), problem, some, *settings)
-        for lane in range(min(LANES, len(states) - first)):
-            flight = eqx.tree_at(lambda p: p.flight.states, problem, some[lane])
-            each.append(jaxos4.residual_diagnostics(flight, found.parameters[lane], found.initial_state[lane]))
+        answers = zip(some, found.parameters, found.initial_state, strict=True)
+        for flown, parameters, start in itertools.islice(answers, len(states) - first):
+            flight = eqx.tree_at(lambda p: p.flight.states, problem, flown)
+            each.append(jaxos4.residual_diagnostics(flight, parameters, start))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import curvatures, forcing_of, standard_flight
+from helpers import curvatures, first_state, forcing_of, standard_flight
 
 import jaxos4
 from jaxos4.flight import Inputs, Stretches
@@ -200,10 +200,11 @@ def test_flapping_is_the_measured_force_as_an_input():
     filled = force.copy()
     filled[10:14, 0], filled[:3, 1] = force[9, 0], force[3, 1]
     plain = jaxos4.CorrectedOS4()
-    rates, forcing = np.zeros((101, 3)), plain.forcing(Inputs(jnp.asarray(omega), jnp.asarray(0.01)), plain.alpha)
+    alpha = np.asarray(plain.alpha)
+    rates, forcing = np.zeros((101, 3)), forcing_of(plain, Inputs(jnp.asarray(omega), jnp.asarray(0.01)), plain.alpha)
     for k in range(100):
-        at = jax.tree.map(lambda leaf, k=k: leaf[k], forcing)
-        slope = np.array(plain.angular_acceleration(Rates(*rates[k]), at, plain.alpha))
+        at = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], forcing)
+        slope = np.array(plain.angular_acceleration(Rates(*rates[k]), at, alpha))
         slope[:2] += VALUES["roll_flapping"] * filled[k, 1], VALUES["pitch_flapping"] * filled[k, 0]
         rates[k + 1] = rates[k] + 0.01 * slope
     np.testing.assert_allclose(found, rates, rtol=1e-10, atol=1e-12)
@@ -409,12 +410,13 @@ def test_gradient_and_information_are_the_residuals_derivatives(recordings):
     problem = two_flights(jaxos4.FlightModel(FULL, terms=terms, recordings=recordings), windows=4, noise=0.01)
     count = len(problem.model.parameter_names)
     parameters = truth(problem.model) * 1.03
-    unknowns = jnp.concatenate([parameters, problem.first_state()[0]])
+    unknowns = jnp.concatenate([parameters, first_state(problem)])
 
     def residuals(u):
-        return problem.residuals(u[:count], u[count:])
+        found = problem.residuals(u[:count], u[count:])
+        return found, found
 
-    jacobian, errors = (np.asarray(jax.jit(f)(unknowns)) for f in (jax.jacfwd(residuals), residuals))
+    jacobian, errors = map(np.asarray, jax.jit(jax.jacfwd(residuals, has_aux=True))(unknowns))
     scale = np.linalg.norm(jacobian, axis=0)
     found = curvatures(problem, parameters, unknowns[count:])
     own = problem.size

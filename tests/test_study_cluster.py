@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 
+import dask
 import pytest
 import xarray as xr
 from distributed import Client, LocalCluster
@@ -28,7 +29,8 @@ def cluster():
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment().items():
             patch.setenv(name, value)
-        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
+        forked = dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})  # with Dask imported
+        with forked, LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
             yield cluster
 
 

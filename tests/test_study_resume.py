@@ -16,17 +16,7 @@ from helpers import refused
 from small_study import SPECIFICATION, cells, finish, results, run_study, specification, start
 
 from jaxos4.study import Store, load_study, open_store, read_store
-
-SHUFFLED = """
-import pathlib, random, sys
-import jax
-jax.config.update("jax_enable_x64", True)
-from jaxos4.study import load_study
 from jaxos4.study.run import compute
-study, out = load_study(pathlib.Path(sys.argv[1])), pathlib.Path(sys.argv[2])
-for index in random.Random(0).sample(range(study.count), study.count):
-    (out / f"{index:08d}.npz").write_bytes(compute(study, study.cell(index), None)[0])
-"""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +37,8 @@ def logged(out: pathlib.Path) -> list[int]:
     return [entry["cell"] for entry in Store(out, study, "", "").read_log() if "cell" in entry]
 
 
-def test_a_study_is_the_same_after_any_number_of_kills(whole, tmp_path):
+def test_a_study_is_the_same_after_any_number_of_kills_and_on_any_number_of_devices(whole, tmp_path):
+    """The processes that are killed have one device; the process that finishes the study has two."""
     out, moments, kills = tmp_path / "out", random.Random(1), 0
     command = ("study", specification(tmp_path), "--out", out)
     count, before = load_study(tmp_path / "spec.toml").count, 0
@@ -65,7 +56,7 @@ def test_a_study_is_the_same_after_any_number_of_kills(whole, tmp_path):
         assert before < count
     assert before > 0
     finished = cells(out)
-    assert "190 estimates" in finish(start(*command))
+    assert "190 estimates" in finish(start(*command, devices=2))
     xr.testing.assert_identical(results(out), results(whole))
     assert cells(out) == cells(whole)
     assert finished.items() <= cells(out).items()
@@ -89,21 +80,14 @@ def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_re
     assert (process.returncode, err) == (130, f"jaxos4: {out}: interrupted; run the same command again to continue.\n")
     finished = cells(out)
     assert finished.items() <= cells(whole).items()
+    assert read_store(out).device.startswith("2 x")
     assert len(read_store(out).missing()) == 96 - len(finished)
 
 
-def test_cells_are_the_same_in_any_order_in_another_process(whole, tmp_path):
-    finish(start(specification(tmp_path), tmp_path, code=SHUFFLED))
-    ours = {path.name: path.read_bytes() for path in tmp_path.glob("*.npz")}
-    assert ours == cells(whole)
-
-
-def test_a_study_is_the_same_on_any_number_of_devices(whole, tmp_path):
-    out = tmp_path / "out"
-    finish(start("study", specification(tmp_path), "--out", out, devices=2))
-    assert read_store(out).device.startswith("2 x")
-    assert cells(out) == cells(whole)
-    xr.testing.assert_identical(results(out), results(whole))
+def test_cells_are_the_same_in_any_order(whole):
+    study = load_study(whole.parent / "spec.toml")
+    order = random.Random(0).sample(range(study.count), study.count)
+    assert {f"{index:08d}.npz": compute(study, study.cell(index), None)[0] for index in order} == cells(whole)
 
 
 @pytest.mark.parametrize(("after", "name"), [(0, "study.json"), (20, "00000019.npz"), (49, "results.nc")])

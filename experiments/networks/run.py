@@ -79,6 +79,20 @@ def many_times(bracket: jaxos4.Bracket, flights: int) -> jaxos4.Bracket:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), bracket)
 
 
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, None, None, None, 0))
+def fly(case: Case, channels: str, bracket: jaxos4.Bracket, omega: jax.Array, noise: jax.Array, key: jax.Array):
+    """A noisy flight with parameters drawn over the bracket: parameters, states, bounds, and whether it succeeded."""
+    alpha_key, noise_key = jax.random.split(key)
+    u = jax.random.uniform(alpha_key, (8,), minval=-1, maxval=1)
+    alpha = bracket.center + u * bracket.half_width
+    truth = jaxos4.simulate(case.model(jaxos4.OS4), alpha, omega, dt=0.01)
+    flight = jaxos4.WhiteNoise(noise * jaxos4.SENSOR_SIGMA)(truth, key=noise_key)
+    bound = jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(case.problem(truth, noise, channels), alpha)))
+    flown = (truth.result == jaxos4.RESULTS.successful) & jnp.isfinite(bound).all()
+    return alpha, flight.states, bound, flown
+
+
 def unseen(
     case: Case,
     estimator: jaxos4.AbstractEstimator,
@@ -90,24 +104,11 @@ def unseen(
 ) -> Iterator[tuple[float, dict]]:
     """For each noise, identifies `flights` flights that do not diverge, with parameters drawn over the bracket."""
     bracket, exact, at_once = case.bracket, case.flight, min(CHUNK, flights)
-
-    @eqx.filter_jit
-    @eqx.filter_vmap(in_axes=(0, None))
-    def fly(key, noise):
-        alpha_key, noise_key = jax.random.split(key)
-        u = jax.random.uniform(alpha_key, (8,), minval=-1, maxval=1)
-        alpha = bracket.center + u * bracket.half_width
-        truth = jaxos4.simulate(case.model(jaxos4.OS4), alpha, exact.omega, dt=0.01)
-        flight = jaxos4.WhiteNoise(noise * jaxos4.SENSOR_SIGMA)(truth, key=noise_key)
-        bound = jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(case.problem(truth, noise, bound_channels), alpha)))
-        flown = (truth.result == jaxos4.RESULTS.successful) & jnp.isfinite(bound).all()
-        return alpha, flight.states, bound, flown
-
     for noise in noises:
         problem, rows, seconds, chunk = case.problem(exact, noise, channels), [], [], 0
         while sum(len(r["alpha"]) for r in rows) < flights and chunk < 20 + 20 * flights / at_once:
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), chunk), at_once)
-            alpha, states, bound, flown = fly(keys, jnp.asarray(noise))
+            alpha, states, bound, flown = fly(case, bound_channels, bracket, exact.omega, jnp.asarray(noise), keys)
             begin, chunk = time.perf_counter(), chunk + 1
             found = jax.block_until_ready(identify(estimator, problem, many_times(bracket, at_once), states))
             seconds.append(time.perf_counter() - begin)

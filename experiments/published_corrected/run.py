@@ -19,7 +19,7 @@ import xarray as xr
 import jaxos4
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
-from jaxos4.report.experiment import save_results
+from jaxos4.report.experiment import measure, save_results
 from jaxos4.study import Study, load_study
 
 jax.config.update("jax_enable_x64", True)
@@ -75,7 +75,7 @@ def fits(study: Study, channels: str, flown: str, fitted: str) -> xr.Dataset:
     flight, noise = jaxos4.simulate(truth, truth.alpha, omega, dt=study.dt), jaxos4.WhiteNoise(sigma)
     keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(study.seed), i))(jnp.arange(study.flights))
     bracket = jaxos4.Bracket.around(model.alpha + 0.3 * model.half_width, model.half_width)
-    states = jax.vmap(lambda key: noise(flight, key=key).states)(keys)
+    states = measure(noise, flight, keys)
     found = judge(exact, identify(exact, bracket, states), states)
     answered = np.isin(found.result, ["successful", "unidentifiable"])
     error = found.estimate - np.asarray(model.alpha)

@@ -162,14 +162,15 @@ def _correlations(
 
     `of_a`, `of_b`: which samples were measured; the others are 0. Columns of `a` and `b` are paired.
     """
-    length = 1 << (a.shape[0] + lags - 1).bit_length()  # no lag wraps around; a power of two has the fastest transform
-
-    def sums(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        spectrum = np.fft.rfft(x, length, axis=0) * np.conj(np.fft.rfft(y, length, axis=0))
-        return np.fft.irfft(spectrum, length, axis=0)[np.arange(-lags, lags + 1)].T
-
-    pairs = np.round(sums(of_a, of_b))
+    pairs = np.round(_lagged_sums(of_a, of_b, lags))
     power = [np.square(x).sum(axis=0) / np.maximum(of_x.sum(axis=0), 1) for x, of_x in ((a, of_a), (b, of_b))]
     variance = (power[0] * power[1])[:, None]
-    mean = sums(a, b) / np.maximum(pairs, 1)
+    mean = _lagged_sums(a, b, lags) / np.maximum(pairs, 1)
     return np.where((variance > 0) & (pairs > 0), mean / np.sqrt(np.where(variance > 0, variance, 1.0)), 0.0), pairs
+
+
+def _lagged_sums(a: np.ndarray, b: np.ndarray, lags: int) -> np.ndarray:
+    """The sum of a(t + lag) b(t) for lags from -`lags` to `lags`, by the Fourier transform; (size, both)."""
+    length = 1 << (a.shape[0] + lags - 1).bit_length()  # no lag wraps around; a power of two has the fastest transform
+    spectrum = np.fft.rfft(a, length, axis=0) * np.conj(np.fft.rfft(b, length, axis=0))
+    return np.fft.irfft(spectrum, length, axis=0)[np.arange(-lags, lags + 1)].T

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
@@ -140,7 +142,7 @@ def scale_axis(axes: Axes, scales: np.ndarray) -> None:
 def svg(figure: Figure) -> bytes:
     """The figure as SVG. The same figure gives the same bytes."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})  # `savefig` would draw twice
     figure.set_layout_engine("none")  # keeps the layout for the next format
     return buffer.getvalue()
 
@@ -148,5 +150,5 @@ def svg(figure: Figure) -> bytes:
 def pdf(figure: Figure) -> bytes:
     """The figure as PDF. The same figure gives the same bytes."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
+    FigureCanvasPdf(figure).print_pdf(buffer, metadata={"CreationDate": None})
     return buffer.getvalue()
