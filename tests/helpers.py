@@ -130,9 +130,9 @@ def uniform(key, count):
 
 def published_derivative(state, omega, alpha, constants=OS4):
     """dX/dt by Eqs. (1)-(13), state in the order of Eq. (14); leading axes are a batch."""
-    _, vx, _, vy, _, vz, phi, p, theta, q, psi, r = np.moveaxis(np.asarray(state, dtype=float), -1, 0)
+    _, vx, _, vy, _, vz, phi, p, theta, q, psi, r = np.moveaxis(np.asarray(state), -1, 0)
     w1, w2, w3, w4 = np.moveaxis(np.asarray(omega, dtype=float), -1, 0)
-    a1, a2, a3, a4, a5, a6, a7, a8 = np.moveaxis(np.asarray(alpha, dtype=float), -1, 0)
+    a1, a2, a3, a4, a5, a6, a7, a8 = np.moveaxis(np.asarray(alpha), -1, 0)
     arm, b, d, m, g = (constants[name] for name in ("L", "b", "d", "m", "g"))
     roll = arm * b * (w4**2 - w2**2)
     pitch = arm * b * (w3**2 - w1**2)
@@ -159,9 +159,9 @@ def published_derivative(state, omega, alpha, constants=OS4):
 
 def corrected_derivative(state, omega, alpha, constants=OS4):
     """dX/dt of the corrected model: starts from the printed equations and replaces those that it corrects."""
-    _, _, _, _, _, _, phi, p, theta, q, psi, r = np.moveaxis(np.asarray(state, dtype=float), -1, 0)
+    _, _, _, _, _, _, phi, p, theta, q, psi, r = np.moveaxis(np.asarray(state), -1, 0)
     w1, w2, w3, w4 = np.moveaxis(np.asarray(omega, dtype=float), -1, 0)
-    a1, a2, a3, a4, a5, a6, a7, a8 = np.moveaxis(np.asarray(alpha, dtype=float), -1, 0)
+    a1, a2, a3, a4, a5, a6, a7, a8 = np.moveaxis(np.asarray(alpha), -1, 0)
     arm, b, d, m, g = (constants[name] for name in ("L", "b", "d", "m", "g"))
     residual_speed = w1 + w3 - w2 - w4
     thrust = b * (w1**2 + w2**2 + w3**2 + w4**2) / m
@@ -180,7 +180,7 @@ REFERENCES = {jaxos4.PublishedOS4: published_derivative, jaxos4.CorrectedOS4: co
 
 def euler_trajectory(derivative, alpha, omega, *, dt=DT, start=None, constants=OS4):
     """x_{k+1} = x_k + T f(x_k, u_k), one row for each sample."""
-    states, dt = [np.zeros(12) if start is None else np.asarray(start, dtype=float)], float(dt)
+    states, dt = [np.zeros(12) if start is None else np.asarray(start)], float(dt)
     for row in np.asarray(omega)[:-1]:
         states.append(states[-1] + dt * derivative(states[-1], row, alpha, constants))
     return np.stack(states)
@@ -198,7 +198,7 @@ def numpy_residuals(problem, parameters, starts):
     """
     flight, derivative = problem.flight, REFERENCES[type(problem.model)]
     order, ends = CASCADE_ORDER[: problem.size], first_samples(problem)
-    first = np.zeros((*np.shape(starts)[:-1], problem.windows, 12))
+    first = np.zeros((*np.shape(starts)[:-1], problem.windows, 12), dtype=np.result_type(starts))
     first[..., order] = np.reshape(starts, (*np.shape(starts)[:-1], problem.windows, -1))
     states = np.concatenate(
         [
@@ -210,14 +210,13 @@ def numpy_residuals(problem, parameters, starts):
 
 
 def numpy_jacobian(problem, parameters, starts):
-    """Derivatives of `numpy_residuals` in the parameters and the starts, by central differences."""
-    step = np.concatenate([1e-4 * jaxos4.DEFAULT_HALF_WIDTH, np.full(len(starts), 1e-4)])
-    point, moves = np.concatenate([parameters, starts]), np.diag(step)
-    up, down = (numpy_residuals(problem, *np.split(x, [8], axis=1)) for x in (point + moves, point - moves))
-    slopes = (up - down) / (2 * step[:, None, None])
+    """Derivatives of `numpy_residuals` in the parameters and the starts, by complex steps: to the last digits."""
+    point, step = np.concatenate([parameters, starts]), 1e-30
+    moved = point + 1j * step * np.eye(point.size)
+    slopes = numpy_residuals(problem, *np.split(moved, [8], axis=1)).imag / step
     if problem.initial_state is not None:
         slopes[:, 0] = 0  # a known first sample is no data
-    return slopes.reshape(step.size, -1).T
+    return slopes.reshape(point.size, -1).T
 
 
 def inverse_square(slopes):

@@ -85,7 +85,7 @@ def test_the_bound_counts_all_initial_states_as_unknowns(model_class, channels):
     inverse = inverse_square(numpy_jacobian(problem, alpha, starts))[:8, :8]
     bound = jaxos4.cramer_rao_bound(problem, problem.model.alpha, jnp.asarray(starts))
     std = np.sqrt(np.diagonal(inverse))
-    np.testing.assert_allclose(bound / np.outer(std, std), inverse / np.outer(std, std), atol=1e-6)
+    np.testing.assert_allclose(bound / np.outer(std, std), inverse / np.outer(std, std), atol=1e-8)
     # Windows are not tied together, which loses information.
     tied = inverse_square(numpy_jacobian(whole, alpha, starts[: problem.size]))[:8, :8]
     assert np.all(np.diagonal(bound) > np.diagonal(tied))

@@ -43,6 +43,9 @@ _HORIZONS = (0.1, 0.3)
 _COARSE = 0.5
 # After a sweep that raised the cost by more than chance does, the next goes at most this share of the predicted steps.
 _CHANCE, _RETREAT = 1.0, 0.25
+# After a sweep that did not, the next may go this many times as far. If the share were back at 1 at once, every second
+# sweep of a strongly nonlinear search would fail.
+_ADVANCE = 1.4
 
 
 class IBSS(AbstractEstimator):
@@ -313,7 +316,7 @@ class IBSS(AbstractEstimator):
         hopeless = first & ~finite
         stay = done | hopeless | (search.sweeps >= self.max_sweeps)
 
-        trust = jnp.where(failed, search.trust * _RETREAT, jnp.minimum(search.trust / _RETREAT, 1.0))
+        trust = jnp.where(failed, search.trust * _RETREAT, jnp.minimum(search.trust * _ADVANCE, 1.0))
         growth = jnp.where(search.at_end, GROWTH * search.growth, 1.0)
         share = relative_error(search.errors, search.steps, stage.smallest_step)
         later = jnp.maximum(share * longest_step, stage.smallest_step) * growth
