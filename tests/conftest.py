@@ -39,12 +39,11 @@ hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("network", "experiment_studies", "experiments", "filter_error", "ibss", "multiple_shooting", "cli"),
-    *("flight_model", "design", "study_resume", "estimators", "equation_error", "study_cluster", "compare"),
-    *("held", "identifiability", "study", "noise", "checks", "kalman", "startup", "report", "diagnostics"),
-    *("programs", "information", "models", "output_error", "closed_loop", "new_estimator", "identify", "svsf"),
-    *("shooting", "vehicle", "join", "logs_betaflight", "logs_blackbox", "inertia", "logs_fuzz"),
-    *("report_browser", "cli_vehicle"),
+    *("network", "experiments", "estimators", "experiment_studies", "filter_error", "study_resume", "ibss", "cli"),
+    *("design_references", "multiple_shooting", "design", "study_cluster", "flight_model", "shooting", "report"),
+    *("startup", "study", "diagnostics", "identifiability", "equation_error", "report_browser", "checks", "compare"),
+    *("held", "models", "svsf", "simulate", "kalman", "programs", "new_estimator", "output_error", "identify"),
+    *("logs_blackbox", "closed_loop", "logs_betaflight", "inertia", "information", "vehicle", "robust", "signs"),
 )
 
 
@@ -102,11 +101,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
     return LoadFileScheduling(config, log)
 
 
-# Modules that compile for longer than they compute: XLA hardly optimises their programs, which then compile in a third
-# of the time, and compute three to five times as long.
-COMPILING = {
-    *("equation_error", "held", "ibss", "identifiability", "inertia", "information", "kalman", "models"),
-    *("multiple_shooting", "output_error", "robust", "shooting"),
+# Modules that compute for longer than they compile. In the others XLA hardly optimises the programs, which then compile
+# in a third of the time, and compute three to five times as long.
+COMPUTING = {
+    *("ant_colony", "design", "design_references", "diagnostics", "estimators", "experiments", "filter_error"),
+    *("programs", "svsf"),
 }
 
 
@@ -114,12 +113,12 @@ COMPILING = {
 def programs_are_optimised_if_it_pays(request: pytest.FixtureRequest) -> None:
     """A module that compiles for long wants no optimisations."""
     name = request.path.stem.removeprefix("test_")
-    jax.config.update("jax_disable_most_optimizations", name in COMPILING)
+    jax.config.update("jax_disable_most_optimizations", name not in COMPUTING)
 
 
 @pytest.fixture
 def optimised() -> Iterator[None]:
-    """For a test that computes for long, in a module of `COMPILING`."""
+    """For a test that computes for long, in a module that does not."""
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", True)
