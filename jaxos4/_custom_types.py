@@ -19,19 +19,29 @@ RotorSpeeds = Float[Array, "samples 4"]
 Key = PRNGKeyArray
 Numeric = Array | np.ndarray
 
+LARGEST = 2**31 - 1  # of the integers in single precision
+
 
 def as_float(x: ArrayLike) -> Array:
     """Convert to a strongly typed array of the default float type, so that equal shapes share one compiled program."""
     if isinstance(x, np.ndarray | np.generic | float | int):  # without the program that `jnp.asarray` compiles
-        return jax.device_put(np.asarray(x, dtype=jax.dtypes.canonicalize_dtype(float)))
+        return _constant(x, float)
     return jnp.asarray(x, dtype=float)
 
 
 def as_int(x: Any) -> Any:
-    """Convert an integer to an array, so that other values share the compiled program; anything else stays."""
-    if not isinstance(x, int | np.integer):
+    """Convert a setting that is an integer to an array, so that other values share the compiled program.
+
+    Anything else stays as it is, also an integer beyond `LARGEST`.
+    """
+    if isinstance(x, bool) or not isinstance(x, int | np.integer) or abs(int(x)) > LARGEST:
         return x
-    return jax.device_put(np.asarray(x, dtype=jax.dtypes.canonicalize_dtype(int)))
+    return _constant(x, int)
+
+
+def _constant(x: ArrayLike, kind: type) -> Array:
+    with jax.ensure_compile_time_eval():  # its value is known, also while a function is traced
+        return jax.device_put(np.asarray(x, dtype=jax.dtypes.canonicalize_dtype(kind)))
 
 
 def as_constant(x: Any) -> Array | np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ._custom_types import Parameters, Scalar
+from ._custom_types import LARGEST, Parameters, Scalar
 from .bracket import NO_PRIOR, Bracket
 from .linalg import invert
 from .results import RESULTS
@@ -207,13 +207,22 @@ def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
         raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
 
 
-def check_setting(name: str, value: Any, least: int) -> None:
-    """Raises `ValueError` for a setting that is not an integer of at least `least`."""
-    if isinstance(value, Tracer):
-        return
-    number = np.asarray(value)
-    if number.dtype.kind not in "iu" or number.shape != () or number < least:
-        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value}.")
+def check_count(name: str, value: Any, least: int) -> None:
+    """Raises `ValueError` for a setting that is not an integer of at least `least`; a traced one is checked by type."""
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
+        if isinstance(value, Tracer):
+            return
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
+    if value > LARGEST:
+        raise ValueError(f"`{name}` must be at most {LARGEST}, got {value}.")
+
+
+def check_positive(name: str, value: Scalar) -> None:
+    """Raises `ValueError` for a setting that is not one positive number; a traced one is not checked."""
+    if not isinstance(value, Tracer) and (np.shape(value) != () or not np.asarray(value) > 0):
+        raise ValueError(f"`{name}` must be positive, got {value}.")
 
 
 class AbstractEstimator(eqx.Module):

@@ -30,7 +30,8 @@ from jaxos4.cli._jax import QUICK_TO_COMPILE, rarely_collect_garbage, set_flags 
 
 rarely_collect_garbage()
 set_flags(QUICK_TO_COMPILE)  # before JAX starts to compute: the programs of the command line
-if os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE:
+OWN_FLAGS = os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE
+if OWN_FLAGS:
     # The other cores have workers: a program compiled in parts takes a tenth more time of all cores together.
     os.environ["XLA_FLAGS"] += " --xla_cpu_parallel_codegen_split_count=1"
 
@@ -106,14 +107,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 COMPUTING = {
     *("ant_colony", "design", "design_references", "diagnostics", "estimators", "experiments", "filter_error"),
     *("programs", "svsf"),
+    *("study_cluster", "study_resume"),  # compared bit for bit with processes that optimise
 }
 
 
 @pytest.fixture(scope="module", autouse=True)
 def programs_are_optimised_if_it_pays(request: pytest.FixtureRequest) -> None:
-    """A module that compiles for long wants no optimisations."""
+    """Only the modules of `COMPUTING` have optimised programs; all have them if `XLA_FLAGS` are the user's own."""
     name = request.path.stem.removeprefix("test_")
-    jax.config.update("jax_disable_most_optimizations", name not in COMPUTING)
+    jax.config.update("jax_disable_most_optimizations", OWN_FLAGS and name not in COMPUTING)
 
 
 @pytest.fixture
@@ -121,7 +123,7 @@ def optimised() -> Iterator[None]:
     """For a test that computes for long, in a module that does not."""
     jax.config.update("jax_disable_most_optimizations", False)
     yield
-    jax.config.update("jax_disable_most_optimizations", True)
+    jax.config.update("jax_disable_most_optimizations", OWN_FLAGS)
 
 
 MOST_MAPS = 30_000

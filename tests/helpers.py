@@ -198,7 +198,7 @@ def numpy_residuals(problem, parameters, starts):
     """
     flight, derivative = problem.flight, REFERENCES[type(problem.model)]
     order, ends = CASCADE_ORDER[: problem.size], first_samples(problem)
-    first = np.zeros((*np.shape(starts)[:-1], problem.windows, 12), dtype=np.result_type(starts))
+    first = np.zeros((*np.shape(starts)[:-1], problem.windows, 12), dtype=np.asarray(starts).dtype)
     first[..., order] = np.reshape(starts, (*np.shape(starts)[:-1], problem.windows, -1))
     states = np.concatenate(
         [

@@ -187,7 +187,10 @@ def test_the_registry_makes_every_estimator_and_names_misuse():
         (jaxos4.IBSS, "tolerance", [0.0, np.nan], "must be positive"),
         (jaxos4.IBSS, "reach", [-1.0], "must be positive"),
         (jaxos4.OutputError, "tolerance", [0.0, -1.0], "must be positive"),
-        (jaxos4.OutputError, "max_steps", [0], "must be an integer of at least 1"),
+        (jaxos4.OutputError, "max_steps", [0, 2.5, "x", True, None], "must be an integer of at least 1"),
+        (jaxos4.IBSS, "max_sweeps", [2**70], "must be at most 2147483647"),
+        (jaxos4.AntColony, "max_sweeps", [0], "must be an integer of at least 1"),
+        (jaxos4.AntColony, "seed", [-1], "must be an integer of at least 0"),
         (jaxos4.FilterError, "tolerance", [0.0, np.nan], "must be positive"),
         (jaxos4.FilterError, "max_steps", [0], "must be an integer of at least 1"),
         (jaxos4.EquationError, "memory", [-0.1, 1.5, np.nan], r"must lie in \[0, 1\]"),
@@ -210,3 +213,15 @@ def test_settings_out_of_range_are_named(make, setting, values, message):
     for value in values:
         with pytest.raises(ValueError, match=f"`{setting}` {message}.*, got '?{value}'?"):
             make(**{setting: value})
+
+
+def test_settings_out_of_range_are_named_while_a_function_is_traced():
+    for make, setting, value in (
+        (jaxos4.IBSS, "max_sweeps", 0),
+        (jaxos4.OutputError, "tolerance", -1.0),
+        (jaxos4.EquationError, "bridge", -1),
+    ):
+        with pytest.raises(ValueError, match=f"`{setting}` must be .*, got {value}"):
+            eqx.filter_eval_shape(make, **{setting: value})
+    with pytest.raises(ValueError, match="`passes` must be an integer of at least 1"):
+        jax.eval_shape(lambda passes: jaxos4.JointEKF(passes=passes).passes, 2.5)

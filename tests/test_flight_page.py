@@ -7,6 +7,7 @@ import re
 import msgspec
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 from synthetic_identification import (
     COLOURED,
@@ -21,7 +22,7 @@ from jaxos4.identification.results import HeldParameter, RigidBody, Validation
 from jaxos4.report import print_identification, write_flight_page
 from jaxos4.report.figures_prediction import predicted_rates
 from jaxos4.report.figures_response import frequency_responses
-from jaxos4.report.style import drawing, styles
+from jaxos4.report.style import drawing, pdf, styles, svg
 
 EVIL = "</script><script>alert(1)</script>"
 
@@ -186,3 +187,10 @@ def test_the_text_of_a_vehicle():
     ):
         assert words in text, words
     assert "Predictions" not in printed(identified_vehicle(skill=None))
+
+
+def test_a_figure_with_an_image_has_the_same_bytes_again():
+    with drawing():
+        figure = Figure()
+        figure.add_subplot().imshow(np.arange(16.0).reshape(4, 4))
+        assert [svg(figure), pdf(figure)] == [svg(figure), pdf(figure)]

@@ -337,6 +337,24 @@ def test_fewer_samples_and_channels_are_errors():
         trained(channels="attitude", steps=1)(problem_of(), BRACKET)
 
 
+def test_a_problem_may_be_a_constant_of_a_traced_function():
+    network, problem = trained(), problem_of()
+    traced = eqx.filter_jit(lambda bracket: (network.mismatch(problem), network(problem, bracket).parameters))
+    assert traced(BRACKET)[0] is None
+    np.testing.assert_allclose(traced(BRACKET)[1], network(problem, BRACKET).parameters, rtol=1e-12)
+
+
+def test_a_network_for_other_held_values_is_refused():
+    def held(value, name="alpha2"):
+        return problem_of(model=jaxos4.hold(PUBLISHED(), {name: value}))
+
+    bracket = jaxos4.Bracket.default(held(0.0).model)
+    network = jaxos4.NetworkEstimator(**SHORT).blank(held(0.0), bracket)
+    assert network.mismatch(held(0.0)) is None
+    assert network.mismatch(held(0.5)) == "it was trained for another model"
+    assert "parameters alpha1, alpha3" in network.mismatch(held(0.0, "alpha5"))
+
+
 def test_in_a_batch_each_lane_has_its_own_result_and_leaves_the_others_alone():
     network, lanes = trained(), 8
     states = flights(LANES, seed=14)[1][:lanes]

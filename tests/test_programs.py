@@ -67,6 +67,20 @@ def cost_and_residuals(problem, *at):
     return problem.cost(*at), problem.residuals(*at).reshape(-1, problem.size)
 
 
+def test_other_limits_and_tolerances_of_a_search_need_no_other_program():
+    problem = standard_problem(states=noisy_states(1)[0], channels="rates", free=True)
+    bracket = jaxos4.Bracket.default(problem.model)
+    for make, settings in (
+        (jaxos4.OutputError, {"max_steps": 7, "tolerance": 1e-3}),
+        (jaxos4.EquationError, {"bridge": 7}),
+    ):
+        make()(problem, bracket)
+        other = make(**settings)
+        with compiled_programs() as programs:
+            other(problem, bracket)
+        assert not programs
+
+
 @pytest.mark.parametrize("channels", ["rates", "all"])
 def test_padding_changes_no_result(channels):
     problem = standard_problem(states=noisy_states(1)[0], channels=channels, free=True)

@@ -46,7 +46,7 @@ def test_a_study_is_the_same_after_any_number_of_kills_and_on_any_number_of_devi
         process = start(*command)
         # The first kill comes during the start, the others after some more cells.
         deadline = time.monotonic() + (moments.uniform(0, 2) if kills == 0 else 120)
-        wanted = before + moments.randint(1, 12)
+        wanted = before + moments.randint(1, 6)
         while process.poll() is None and time.monotonic() < deadline and len(list(out.glob("cells/*.npz"))) < wanted:
             time.sleep(moments.uniform(0, 0.004))
         process.kill()
@@ -54,7 +54,7 @@ def test_a_study_is_the_same_after_any_number_of_kills_and_on_any_number_of_devi
         assert process.returncode == -signal.SIGKILL  # it was at work
         kills, before = kills + 1, len(list(out.glob("cells/*.npz")))
         assert before < count
-    assert before > 0
+    assert 0 < before < count / 2  # most cells are left for two devices
     finished = cells(out)
     assert "190 estimates" in finish(start(*command, devices=2))
     xr.testing.assert_identical(results(out), results(whole))

@@ -34,7 +34,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
         if command is study:  # it computes for longer than it compiles
             prepare(WHOLE_LOOPS)
         else:
-            prepare(QUICKEST_TO_COMPILE if kwargs.get("quick") else QUICK_TO_COMPILE)
+            prepare(QUICKEST_TO_COMPILE if command is compare and kwargs["quick"] else QUICK_TO_COMPILE)
         command(*args, **kwargs)
 
     return run

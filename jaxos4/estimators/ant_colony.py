@@ -15,11 +15,12 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Key, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_setting, conclude
+from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_count, conclude
 from ..linalg import covariance_of_shared
 from ..shooting import ROUNDING, ShootingProblem
 
@@ -73,10 +74,10 @@ class AntColony(AbstractEstimator):
 
     def __check_init__(self):
         for name, least in {"archive": 2, "ants": 1, "max_sweeps": 1, "seed": 0}.items():
-            check_setting(name, getattr(self, name), least)
+            check_count(name, getattr(self, name), least)
         for name in ("q", "xi", "tolerance"):
             value = getattr(self, name)
-            if not 0 < value < float("inf"):
+            if not isinstance(value, Tracer) and not 0 < value < float("inf"):
                 raise ValueError(f"`{name}` must be positive and finite, got {value}.")
 
     @eqx.filter_jit

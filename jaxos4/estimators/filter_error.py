@@ -15,12 +15,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Parameters, Scalar, as_float, as_int
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_setting, conclude, fit_start
+from ..estimate import (
+    REACH,
+    AbstractEstimator,
+    Estimate,
+    check_bracket,
+    check_count,
+    check_positive,
+    conclude,
+    fit_start,
+)
 from ..linalg import invert
 from ..models.state import CASCADE_ORDER, Forcing
 from ..shooting import Rows, ShootingProblem
@@ -123,10 +131,9 @@ class FilterError(AbstractEstimator):
     settling: int = eqx.field(static=True, default=_SETTLING)
 
     def __check_init__(self):
-        if not isinstance(self.tolerance, Tracer) and not np.asarray(self.tolerance) > 0:
-            raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
+        check_positive("tolerance", self.tolerance)
         for name in ("max_steps", "lane", "settling"):
-            check_setting(name, getattr(self, name), 1)
+            check_count(name, getattr(self, name), 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

@@ -26,9 +26,9 @@ class Hybrid(AbstractEstimator):
     """IBSS near the answer of a network.
 
     The network's answer, the *seed*, and its covariance open the first brackets, against all of the problem's channels
-    at once. The search for a free initial state begins where the network saw it. If the search shows that the seed was
-    wrong, or if the network had no answer, IBSS searches the whole bracket, as without a network. The better answer is
-    returned.
+    at once. The search for a free initial state begins at the network's estimate of it; what the network does not
+    look at begins at the first measurements. If the search shows that the seed was wrong, or if the network had no
+    answer, IBSS searches the whole bracket, as without a network. The better answer is returned.
 
     The estimate's `seed` is the bracket of the network's 99.9 % intervals for all parameters at once. `rollouts` are
     those of network and search together.
@@ -64,7 +64,8 @@ def _search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, se
     half_width = seed.half_width(_LEVEL, simultaneous=True)
     wide_spread = jnp.diag(jnp.square(usable.half_width / 2))  # the half-width is two standard deviations
     first = problem.split(problem.first_state()[0])
-    estimated = seed.initial_state.reshape(problem.windows, -1)  # the network's channels come first
+    # The network's channels come first.
+    estimated = seed.initial_state.reshape(problem.windows, -1)[:, : problem.size]
     seeded = first.at[:, : estimated.shape[1]].set(estimated)
 
     def search(hit: Bool[Array, ""], near: Bool[Array, ""]) -> tuple[Bool[Array, ""], Estimate]:

@@ -12,13 +12,11 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_bracket, check_setting, conclude
+from ..estimate import AbstractEstimator, Estimate, check_bracket, check_count, check_positive, conclude
 from ..linalg import covariance_of_shared, joint_factor
 from ..shooting import Curvature, ShootingProblem, Shot, in_blocks
 
@@ -62,9 +60,8 @@ class OutputError(AbstractEstimator):
     max_steps: Count = eqx.field(converter=as_int, default=100)
 
     def __check_init__(self):
-        if not isinstance(self.tolerance, Tracer) and not np.asarray(self.tolerance) > 0:
-            raise ValueError(f"`tolerance` must be positive, got {self.tolerance}.")
-        check_setting("max_steps", self.max_steps, 1)
+        check_positive("tolerance", self.tolerance)
+        check_count("max_steps", self.max_steps, 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, as_float
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_recursive, check_setting, conclude, fit_start
+from ..estimate import REACH, AbstractEstimator, Estimate, check_count, check_recursive, conclude, fit_start
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, in_blocks
@@ -93,7 +93,7 @@ class SVSF(AbstractEstimator):
     memory: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
-        check_setting("passes", self.passes, 1)
+        check_count("passes", self.passes, 1)
         if not isinstance(self.gamma, Tracer) and not 0 <= self.gamma < 1:
             raise ValueError(f"`gamma` must be at least 0 and below 1, got {self.gamma}.")
         for name in ("rates_layer", "parameter_layer", "damping"):

@@ -40,7 +40,7 @@ class ErrorTable(NamedTuple):
         """`rms`, `correlation`, `factors` and `simultaneous`, interpolated in the logarithm of the noise scale."""
         rows = np.arange(self.scales.shape[0])
         place = jnp.interp(jnp.log(scale), jnp.log(self.scales), as_float(rows))
-        weights = jnp.maximum(1 - jnp.abs(place - rows), 0.0)
+        weights = jnp.maximum(1 - jnp.abs(place - rows), 0.0)  # of all rows: linear between the two nearest
         rms, correlation, factors, simultaneous = (
             (weights.reshape(-1, *(1 for _ in table.shape[1:])) * table).sum(axis=0) for table in self[1:]
         )

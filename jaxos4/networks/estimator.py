@@ -238,6 +238,9 @@ class TrainedNetwork(AbstractEstimator):
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"
         if type(problem.model) is not type(own.model):
             return f"it was trained for {type(own.model).__name__}, not {type(problem.model).__name__}"
+        if problem.model.parameter_names != own.model.parameter_names:
+            trained, given = (", ".join(p.model.parameter_names) for p in (own, problem))
+            return f"it was trained for the parameters {trained}, not {given}"
         if problem.method != own.method:
             return f"it was trained with the method {own.method!r}, not {problem.method!r}"
         if problem.flight.omega.shape != own.flight.omega.shape:
@@ -255,7 +258,10 @@ class TrainedNetwork(AbstractEstimator):
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((problem, self))):
             return None
         _, differences = self._identify(problem.restrict(self.channels), self.bracket)  # the program of `__call__`
-        return next((f"it was trained for another {what}" for what, differs in differences.items() if differs), None)
+        for what, differs in differences.items():
+            if not isinstance(differs, Tracer) and differs:
+                return f"it was trained for another {what}"
+        return None
 
     def _differences(self, problem: ShootingProblem) -> dict[str, Bool[Array, ""]]:
         """For each quantity, whether its numbers differ from those of training."""
@@ -266,14 +272,18 @@ class TrainedNetwork(AbstractEstimator):
             return ~((a == b) | (jnp.abs(a - b) <= tolerance)).all()
 
         fastest = jnp.abs(own.flight.omega).max()
-        constants, own_constants = (jax.tree.leaves(p.model.airframe) for p in (problem, own))
-        airframe = [differ(a, b, _SAME * jnp.abs(b).max()) for a, b in zip(constants, own_constants, strict=True)]
+
+        def differ_in(constants, own_constants) -> Bool[Array, ""]:
+            pairs = zip(jax.tree.leaves(constants), jax.tree.leaves(own_constants), strict=True)
+            return jnp.stack([differ(a, b, _SAME * jnp.abs(b).max()) for a, b in pairs]).any()
+
         width = self.features.coordinates.width[len(own.model.parameter_names) :]
         first_state, off = (problem.split(x)[:, :size].ravel() for x in problem.first_state())
         own_start = self.features.coordinates.first_state
         allowed = 1.5 * width + off if width.size else _SAME * (1 + jnp.abs(own_start))
         return {
-            "airframe": jnp.stack(airframe).any(),
+            "airframe": differ_in(problem.model.airframe, own.model.airframe),
+            "model": differ_in(problem.model, own.model),
             "sample time": differ(problem.flight.dt, own.flight.dt, _SAME * own.flight.dt),
             "series of rotor speeds": differ(problem.flight.omega, own.flight.omega, _SAME * fastest),
             "start": ~(jnp.abs(first_state - own_start) <= allowed).all(),

@@ -141,14 +141,16 @@ def scale_axis(axes: Axes, scales: np.ndarray) -> None:
 
 def svg(figure: Figure) -> bytes:
     """The figure as SVG. The same figure gives the same bytes."""
-    buffer = io.BytesIO()
+    buffer, resolution = io.BytesIO(), figure.dpi
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})  # `savefig` would draw twice
+    figure.set_dpi(resolution)
     figure.set_layout_engine("none")  # keeps the layout for the next format
     return buffer.getvalue()
 
 
 def pdf(figure: Figure) -> bytes:
     """The figure as PDF. The same figure gives the same bytes."""
-    buffer = io.BytesIO()
+    buffer, resolution = io.BytesIO(), figure.dpi
     FigureCanvasPdf(figure).print_pdf(buffer, metadata={"CreationDate": None})
+    figure.set_dpi(resolution)
     return buffer.getvalue()

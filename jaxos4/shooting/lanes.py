@@ -44,7 +44,7 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
     """`function(*arguments)`, of which `jax.vmap` computes a batch in blocks, one after the other.
 
     A slow flight then holds up its block only. The last lane is repeated until all blocks are full. An accelerator
-    computes the whole batch at once. `function` may be a method: its module is data, as the arguments are.
+    computes the whole batch at once. `function` may be a method; the arrays of its module are batched as arguments are.
     """
 
     def call(function: Callable, *arguments: Any) -> Any:

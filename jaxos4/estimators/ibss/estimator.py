@@ -18,13 +18,11 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._custom_types import Count, InitialStates, Parameters, Scalar, as_float, as_int
 from ...bracket import NO_PRIOR, Bracket
-from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_setting, conclude
+from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_count, check_positive, conclude
 from ...linalg import covariance_of_shared, covariances, gram, joint_factor
 from ...shooting import Curvature, ShootingProblem, Shot, in_blocks
 from .bisection import Lines, narrow, open_lines
@@ -84,11 +82,9 @@ class IBSS(AbstractEstimator):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
         for name, least in (("halvings", 2), ("max_sweeps", 1), ("record", 0)):
-            check_setting(name, getattr(self, name), least)
-        for name in ("tolerance", "reach"):
-            value = getattr(self, name)
-            if not isinstance(value, Tracer) and not np.asarray(value) > 0:
-                raise ValueError(f"`{name}` must be positive, got {value}.")
+            check_count(name, getattr(self, name), least)
+        check_positive("tolerance", self.tolerance)
+        check_positive("reach", self.reach)
 
     @eqx.filter_jit
     def __call__(
