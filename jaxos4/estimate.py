@@ -207,22 +207,29 @@ def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
         raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
 
 
-def check_count(name: str, value: Any, least: int) -> None:
-    """Raises `ValueError` for a setting that is not an integer of at least `least`; a traced one is checked by type."""
+def check_dynamic_count(name: str, value: Any, least: int) -> None:
+    """`check_count` of a setting that is data, made by `as_int`; a traced one is checked by type."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
         if isinstance(value, Tracer):
             return
         value = int(value)
+    check_count(name, value, least)
+
+
+def check_count(name: str, value: Any, least: int) -> None:
+    """Raises `ValueError` for a setting that is not an integer of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
     if value > LARGEST:
         raise ValueError(f"`{name}` must be at most {LARGEST}, got {value}.")
 
 
-def check_positive(name: str, value: Scalar) -> None:
+def check_positive(name: str, value: Scalar | float, *, finite: bool = False) -> None:
     """Raises `ValueError` for a setting that is not one positive number; a traced one is not checked."""
-    if not isinstance(value, Tracer) and (np.shape(value) != () or not np.asarray(value) > 0):
-        raise ValueError(f"`{name}` must be positive, got {value}.")
+    if isinstance(value, Tracer):
+        return
+    if np.shape(value) != () or not np.asarray(value) > 0 or (finite and not np.isfinite(value)):
+        raise ValueError(f"`{name}` must be positive{' and finite' if finite else ''}, got {value}.")
 
 
 class AbstractEstimator(eqx.Module):

@@ -30,8 +30,8 @@ from jaxos4.cli._jax import QUICK_TO_COMPILE, rarely_collect_garbage, set_flags 
 
 rarely_collect_garbage()
 set_flags(QUICK_TO_COMPILE)  # before JAX starts to compute: the programs of the command line
-OWN_FLAGS = os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE
-if OWN_FLAGS:
+FLAGS_OF_TESTS = os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE
+if FLAGS_OF_TESTS:
     # The other cores have workers: a program compiled in parts takes a tenth more time of all cores together.
     os.environ["XLA_FLAGS"] += " --xla_cpu_parallel_codegen_split_count=1"
 
@@ -115,7 +115,7 @@ COMPUTING = {
 def programs_are_optimised_if_it_pays(request: pytest.FixtureRequest) -> None:
     """Only the modules of `COMPUTING` have optimised programs; all have them if `XLA_FLAGS` are the user's own."""
     name = request.path.stem.removeprefix("test_")
-    jax.config.update("jax_disable_most_optimizations", OWN_FLAGS and name not in COMPUTING)
+    jax.config.update("jax_disable_most_optimizations", FLAGS_OF_TESTS and name not in COMPUTING)
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def optimised() -> Iterator[None]:
     """For a test that computes for long, in a module that does not."""
     jax.config.update("jax_disable_most_optimizations", False)
     yield
-    jax.config.update("jax_disable_most_optimizations", OWN_FLAGS)
+    jax.config.update("jax_disable_most_optimizations", FLAGS_OF_TESTS)
 
 
 MOST_MAPS = 30_000

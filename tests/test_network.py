@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, standard_flight
+from helpers import DT, same, standard_flight
 from hypothesis import given, settings, strategies as st
 from lanes import LANES, lost
 
@@ -80,10 +80,6 @@ def identified(estimator, states, noise, channels, free):
 def half_widths(estimates):
     """For each level, those of each parameter and of all at once."""
     return {x: (estimates.half_width(x), estimates.half_width(x, simultaneous=True)) for x in LEVELS}
-
-
-def same(a, b):
-    return eqx.tree_equal(*(jax.tree.map(lambda x: np.asarray(x) if eqx.is_array(x) else x, tree) for tree in (a, b)))
 
 
 def names(estimates):

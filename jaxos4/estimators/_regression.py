@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Scalar
 from ..bracket import Bracket
-from ..estimate import Estimate, best_start, check_count, conclude
+from ..estimate import Estimate, best_start, check_dynamic_count, conclude
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
@@ -203,7 +203,7 @@ def check_settings(memory: Scalar, bridge: Count, forgetting: Scalar | None = No
             number = np.asarray(value)
             if number.shape != () or not ((number > 0 if positive else number >= 0) and number <= 1):
                 raise ValueError(f"`{name}` must lie in {'(' if positive else '['}0, 1], got {number}.")
-    check_count("bridge", bridge, 0)
+    check_dynamic_count("bridge", bridge, 0)
 
 
 def answer(

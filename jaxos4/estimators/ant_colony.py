@@ -15,12 +15,20 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Key, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_count, conclude
+from ..estimate import (
+    REACH,
+    AbstractEstimator,
+    Estimate,
+    check_bracket,
+    check_count,
+    check_dynamic_count,
+    check_positive,
+    conclude,
+)
 from ..linalg import covariance_of_shared
 from ..shooting import ROUNDING, ShootingProblem
 
@@ -73,12 +81,12 @@ class AntColony(AbstractEstimator):
     seed: Count = eqx.field(converter=as_int, default=0)
 
     def __check_init__(self):
-        for name, least in {"archive": 2, "ants": 1, "max_sweeps": 1, "seed": 0}.items():
-            check_count(name, getattr(self, name), least)
+        check_count("archive", self.archive, 2)
+        check_count("ants", self.ants, 1)
+        check_dynamic_count("max_sweeps", self.max_sweeps, 1)
+        check_dynamic_count("seed", self.seed, 0)
         for name in ("q", "xi", "tolerance"):
-            value = getattr(self, name)
-            if not isinstance(value, Tracer) and not 0 < value < float("inf"):
-                raise ValueError(f"`{name}` must be positive and finite, got {value}.")
+            check_positive(name, getattr(self, name), finite=True)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

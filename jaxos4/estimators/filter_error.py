@@ -25,6 +25,7 @@ from ..estimate import (
     Estimate,
     check_bracket,
     check_count,
+    check_dynamic_count,
     check_positive,
     conclude,
     fit_start,
@@ -132,8 +133,9 @@ class FilterError(AbstractEstimator):
 
     def __check_init__(self):
         check_positive("tolerance", self.tolerance)
-        for name in ("max_steps", "lane", "settling"):
-            check_count(name, getattr(self, name), 1)
+        check_dynamic_count("max_steps", self.max_steps, 1)
+        check_count("lane", self.lane, 1)
+        check_count("settling", self.settling, 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Parameters, Scalar, as_int
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_count, check_recursive, conclude
+from ..estimate import AbstractEstimator, Estimate, check_dynamic_count, check_recursive, conclude
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, in_blocks
@@ -73,7 +73,7 @@ class JointEKF(AbstractEstimator):
     passes: Count = eqx.field(converter=as_int, default=10)
 
     def __check_init__(self):
-        check_count("passes", self.passes, 1)
+        check_dynamic_count("passes", self.passes, 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Scalar, as_float, as_int
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_bracket, check_count, check_positive, conclude
+from ..estimate import AbstractEstimator, Estimate, check_bracket, check_dynamic_count, check_positive, conclude
 from ..linalg import covariance_of_shared, joint_factor
 from ..shooting import Curvature, ShootingProblem, Shot, in_blocks
 
@@ -61,7 +61,7 @@ class OutputError(AbstractEstimator):
 
     def __check_init__(self):
         check_positive("tolerance", self.tolerance)
-        check_count("max_steps", self.max_steps, 1)
+        check_dynamic_count("max_steps", self.max_steps, 1)
 
     @eqx.filter_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:

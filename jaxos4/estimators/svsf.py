@@ -21,7 +21,16 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, as_float
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_count, check_recursive, conclude, fit_start
+from ..estimate import (
+    REACH,
+    AbstractEstimator,
+    Estimate,
+    check_count,
+    check_positive,
+    check_recursive,
+    conclude,
+    fit_start,
+)
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, in_blocks
@@ -97,9 +106,7 @@ class SVSF(AbstractEstimator):
         if not isinstance(self.gamma, Tracer) and not 0 <= self.gamma < 1:
             raise ValueError(f"`gamma` must be at least 0 and below 1, got {self.gamma}.")
         for name in ("rates_layer", "parameter_layer", "damping"):
-            value = getattr(self, name)
-            if not isinstance(value, Tracer) and not 0 < value < float("inf"):
-                raise ValueError(f"`{name}` must be positive and finite, got {value}.")
+            check_positive(name, getattr(self, name), finite=True)
         if not isinstance(self.equilibration, Tracer) and not 1 <= self.equilibration < float("inf"):
             raise ValueError(f"`equilibration` must be finite and at least 1, got {self.equilibration}.")
 

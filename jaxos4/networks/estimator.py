@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from .._custom_types import Key, Numeric, Scalar, as_float
 from ..bracket import UNIFORM_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Calibration, Estimate, check_bracket
+from ..estimate import AbstractEstimator, Calibration, Estimate, check_bracket, check_count, check_positive
 from ..flight import STATE_NAMES
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
@@ -77,13 +77,10 @@ class NetworkEstimator(eqx.Module):
             raise ValueError('`approximator` "cmac" tiles every pair of features: it needs `features` "score".')
         smallest = {"width": 1, "depth": 1, "steps": 1, "batch": 1, "patience": 1, "held_out": 1000}
         for name, least in smallest.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
+            check_count(name, getattr(self, name), least)
         if self.steps > _MOST_STEPS:
             raise ValueError(f"`steps` must be at most {_MOST_STEPS}, got {self.steps}.")
-        if not (self.learning_rate > 0 and np.isfinite(self.learning_rate)):
-            raise ValueError(f"`learning_rate` must be positive and finite, got {self.learning_rate}.")
+        check_positive("learning_rate", self.learning_rate, finite=True)
         if not (len(self.noise) == 2 and 0 < self.noise[0] <= self.noise[1] < np.inf):
             raise ValueError(f"`noise` must be (lowest, highest), positive and finite, got {self.noise}.")
 
@@ -223,16 +220,31 @@ class TrainedNetwork(AbstractEstimator):
         **Raises:** `ValueError` if the network was trained for another problem, with what differs. Inside `jit` or
         `vmap`, numbers that differ give the result `network_mismatch` instead.
         """
-        difference = self.mismatch(problem)
-        if difference is not None:
+        difference, estimate = self._compare(problem, bracket)
+        if estimate is None or difference is not None:
             raise ValueError(f"The network cannot be used on this problem: {difference}; train a network for it.")
-        return self._identify(problem.restrict(self.channels), bracket)[0]
+        return estimate
 
     def mismatch(self, problem: ShootingProblem) -> str | None:
         """How a problem differs from the problem of training, in words; `None` if it does not.
 
         Inside `jit` or `vmap` numbers cannot be compared here; `__call__` compares them there.
         """
+        return self._compare(problem, self.bracket)[0]
+
+    def _compare(self, problem: ShootingProblem, bracket: Bracket) -> tuple[str | None, Estimate | None]:
+        """`mismatch`, and the estimate; one program computes both. No estimate for a problem of another kind."""
+        kind = self._other_kind(problem)
+        if kind is not None:
+            return kind, None
+        estimate, differences = self._identify(problem.restrict(self.channels), bracket)
+        for what, differs in differences.items():
+            if not isinstance(differs, Tracer) and differs:
+                return f"it was trained for another {what}", estimate
+        return None, estimate
+
+    def _other_kind(self, problem: ShootingProblem) -> str | None:
+        """How a problem differs in anything but its numbers, in words; `None` if it does not."""
         own = self.problem
         if CHANNELS[self.channels] > problem.size:
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"
@@ -255,12 +267,6 @@ class TrainedNetwork(AbstractEstimator):
             missing = [STATE_NAMES[i] for i in looked_at if absent[:, i].all()]
             if missing:
                 return f"it looks at {', '.join(missing)}, which this flight did not measure"
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((problem, self))):
-            return None
-        _, differences = self._identify(problem.restrict(self.channels), self.bracket)  # the program of `__call__`
-        for what, differs in differences.items():
-            if not isinstance(differs, Tracer) and differs:
-                return f"it was trained for another {what}"
         return None
 
     def _differences(self, problem: ShootingProblem) -> dict[str, Bool[Array, ""]]:

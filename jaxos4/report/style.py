@@ -3,7 +3,7 @@
 import contextlib
 import io
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -141,16 +141,19 @@ def scale_axis(axes: Axes, scales: np.ndarray) -> None:
 
 def svg(figure: Figure) -> bytes:
     """The figure as SVG. The same figure gives the same bytes."""
-    buffer, resolution = io.BytesIO(), figure.dpi
-    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})  # `savefig` would draw twice
-    figure.set_dpi(resolution)
+    drawn = _printed(figure, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None})
     figure.set_layout_engine("none")  # keeps the layout for the next format
-    return buffer.getvalue()
+    return drawn
 
 
 def pdf(figure: Figure) -> bytes:
     """The figure as PDF. The same figure gives the same bytes."""
+    return _printed(figure, FigureCanvasPdf(figure).print_pdf, {"CreationDate": None})
+
+
+def _printed(figure: Figure, write: Callable[..., None], metadata: dict[str, None]) -> bytes:
+    """What `write` of a canvas draws. `savefig` would draw twice; without it the resolution must be put back."""
     buffer, resolution = io.BytesIO(), figure.dpi
-    FigureCanvasPdf(figure).print_pdf(buffer, metadata={"CreationDate": None})
+    write(buffer, metadata=metadata)
     figure.set_dpi(resolution)
     return buffer.getvalue()

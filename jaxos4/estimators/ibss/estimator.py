@@ -22,7 +22,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..._custom_types import Count, InitialStates, Parameters, Scalar, as_float, as_int
 from ...bracket import NO_PRIOR, Bracket
-from ...estimate import REACH, AbstractEstimator, Estimate, check_bracket, check_count, check_positive, conclude
+from ...estimate import (
+    REACH,
+    AbstractEstimator,
+    Estimate,
+    check_bracket,
+    check_count,
+    check_dynamic_count,
+    check_positive,
+    conclude,
+)
 from ...linalg import covariance_of_shared, covariances, gram, joint_factor
 from ...shooting import Curvature, ShootingProblem, Shot, in_blocks
 from .bisection import Lines, narrow, open_lines
@@ -81,8 +90,9 @@ class IBSS(AbstractEstimator):
     def __check_init__(self):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
-        for name, least in (("halvings", 2), ("max_sweeps", 1), ("record", 0)):
-            check_count(name, getattr(self, name), least)
+        check_count("halvings", self.halvings, 2)
+        check_count("record", self.record, 0)
+        check_dynamic_count("max_sweeps", self.max_sweeps, 1)
         check_positive("tolerance", self.tolerance)
         check_positive("reach", self.reach)
 
