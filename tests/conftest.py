@@ -30,10 +30,11 @@ from jaxos4.cli._jax import QUICK_TO_COMPILE, rarely_collect_garbage, set_flags 
 
 rarely_collect_garbage()
 set_flags(QUICK_TO_COMPILE)  # before JAX starts to compute: the programs of the command line
-FLAGS_OF_TESTS = os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE
-if FLAGS_OF_TESTS:
-    # The other cores have workers: a program compiled in parts takes a tenth more time of all cores together.
-    os.environ["XLA_FLAGS"] += " --xla_cpu_parallel_codegen_split_count=1"
+# The other cores have workers: a program compiled in parts takes a tenth more time of all cores together.
+IN_ONE_PART = f"{QUICK_TO_COMPILE} --xla_cpu_parallel_codegen_split_count=1"
+if os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE:
+    os.environ["XLA_FLAGS"] = IN_ONE_PART
+FLAGS_OF_TESTS = os.environ.get("XLA_FLAGS") == IN_ONE_PART  # a worker has the flags of the controller
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
@@ -60,7 +61,8 @@ PROGRAMS: collections.Counter[str] = collections.Counter()  # of this process; o
 def count_program(event: str, seconds: float, **_) -> None:
     """Counts one program that XLA compiled or that the cache had, and the seconds that this took."""
     if event == "/jax/core/compile/backend_compile_duration":
-        PROGRAMS.update(programs=1, milliseconds=round(1000 * seconds))
+        quickly = bool(jax.config.read("jax_disable_most_optimizations"))
+        PROGRAMS.update(programs=1, quickly=quickly, milliseconds=round(1000 * seconds))
 
 
 def count_cached(event: str, **_) -> None:
@@ -88,7 +90,8 @@ def pytest_terminal_summary(terminalreporter) -> None:
     """Says how many programs the tests needed. Those of processes that the tests start are not known here."""
     cached = PROGRAMS["cached"]
     compiled, seconds = PROGRAMS["programs"] - cached, PROGRAMS["milliseconds"] / 1000
-    terminalreporter.write_line(f"{compiled} programs compiled, {cached} from the cache, in {seconds:.0f} s")
+    what = f"{compiled} programs compiled, {cached} from the cache, in {seconds:.0f} s"
+    terminalreporter.write_line(f"{what}; {PROGRAMS['quickly']} of them almost without optimisations")
 
 
 @pytest.hookimpl(optionalhook=True)
