@@ -273,9 +273,9 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
 def test_commands_that_compute_little_compile_quickly(run, save, monkeypatch):
     asked, wrong = [], str(save("wrong = 1", "wrong.toml"))
     monkeypatch.setattr("jaxos4.cli._app.prepare", asked.append)
-    commands = ("study", wrong, "--out", "out"), ("estimate", wrong), ("compare", "--quick", "--out", wrong)
-    assert [run(*command)[0] for command in commands] == [2, 2, 2]
-    assert asked == [WHOLE_LOOPS, _jax.QUICK_TO_COMPILE, _jax.QUICKEST_TO_COMPILE]
+    for command in ("study", wrong, "--out", "out"), ("estimate", wrong), ("compare", "--quick", "--out", wrong):
+        assert run(*command)[0] == 2
+    assert asked == [WHOLE_LOOPS, _jax.QUICK_TO_COMPILE, _jax.QUICK_TO_COMPILE]
 
 
 @pytest.mark.parametrize(

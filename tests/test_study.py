@@ -30,6 +30,7 @@ from jaxos4.study import (
     run as run_module,
 )
 from jaxos4.study.cell import run_cell
+from jaxos4.study.run import _Work as Work
 from jaxos4.study.specification import AXES
 
 SPECIFICATION = """
@@ -209,6 +210,15 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
     assert hybrid == ("hybrid", 18, 1500, 2, 1, None)  # a network for the attitude, and the network's for the rates
     assert ibss[:5] == ("ibss", 12, 900, 2, 0)
     assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / len(jax.local_devices()))
+
+
+def test_programs_that_wait_for_a_network_are_compiled_while_it_is_trained(tmp_path):
+    study = Study(channels=("rates",), estimators=("ibss", "network", "hybrid"), flights=20)
+    with open_store(tmp_path, study, "these tests") as store:
+        work = Work(store)
+        labels = [work.task(device).label for device in ("one", "another", "another", "another", "another")]
+    assert labels[:3] == ["training for rates", "compiling hybrid", "compiling network"]
+    assert labels[3:] == ["ibss 0.1", "ibss 1"]
 
 
 # The grid.

@@ -10,7 +10,7 @@ import typer
 
 from .._xla import WHOLE_LOOPS
 from ..errors import InputError, TrainingError
-from ._jax import NO_CACHE, QUICK_TO_COMPILE, QUICKEST_TO_COMPILE, prepare
+from ._jax import NO_CACHE, QUICK_TO_COMPILE, prepare
 from .compare import compare
 from .design import design
 from .estimate import estimate
@@ -31,10 +31,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*args, **kwargs) -> None:
-        if command is study:  # it computes for longer than it compiles
-            prepare(WHOLE_LOOPS)
-        else:
-            prepare(QUICKEST_TO_COMPILE if command is compare and kwargs["quick"] else QUICK_TO_COMPILE)
+        prepare(WHOLE_LOOPS if command is study else QUICK_TO_COMPILE)  # a study computes for longer than it compiles
         command(*args, **kwargs)
 
     return run

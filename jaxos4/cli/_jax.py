@@ -9,12 +9,8 @@ from pathlib import Path
 
 from .._xla import WHOLE_LOOPS
 
-_OLDER_LOOPS = f"{WHOLE_LOOPS} --xla_cpu_use_fusion_emitters=false"
-QUICK_TO_COMPILE = f"{_OLDER_LOOPS} --xla_backend_optimization_level=1"
+QUICK_TO_COMPILE = f"{WHOLE_LOOPS} --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
 """XLA's older way to write loops, and fewer optimisations: half of the compile time; a batch takes a quarter longer."""
-
-QUICKEST_TO_COMPILE = f"{_OLDER_LOOPS} --xla_backend_optimization_level=0"
-"""No optimisations: a third of the compile time; all programs take four times as long."""
 
 _KNOWS_IT = ("0.10.",)  # versions of jaxlib: a flag that XLA does not know would end the process
 

@@ -66,29 +66,35 @@ class _Work:
         """The next task for a free device, or `None` if all remaining work waits for other tasks."""
         if self.untrained:
             return self._training(self.untrained.popleft())
-        if (program := self._ready(device)) is not None:
-            program.devices.add(device)
-            return self._cell(program.waiting.popleft(), program)
         if (program := self._untried()) is not None:
             program.devices.add(device)
             cell = program.waiting[0]
             label = f"compiling {cell.scenario.estimator}"
             return _Task(label, lambda device: _compile(self.study, cell, device), lambda _: None)
+        if (program := self._ready(device)) is not None:
+            program.devices.add(device)
+            return self._cell(program.waiting.popleft(), program)
         return None
 
     def _ready(self, device: Any) -> _Program | None:
         """The program that the device runs already, else one that no device runs, else the one with most cells."""
-        ready = [p for p in self.programs if p.waiting and (p.network is None or p.network in self.networks)]
+        ready = [p for p in self.programs if p.waiting and self._has_network(p)]
         own = [p for p in ready if device in p.devices]
         new = [p for p in ready if not p.devices]
         long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
         return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
 
     def _untried(self) -> _Program | None:
-        """A program to compile while it waits for its network; estimators that shoot first, which take longest."""
-        untried = [p for p in self.programs if p.waiting and not p.devices]
+        """A program to compile while its network is trained; estimators that shoot first, which take longest.
+
+        These come before all cells: the cells that need the network are the last ones, and must not wait for more.
+        """
+        untried = [p for p in self.programs if p.waiting and not p.devices and not self._has_network(p)]
         shoots = {name: kind.shoots for name, kind in ESTIMATORS.items()}
         return min(untried, key=lambda p: (p.network, not shoots[p.waiting[0].scenario.estimator]), default=None)
+
+    def _has_network(self, program: _Program) -> bool:
+        return program.network is None or program.network in self.networks
 
     def _training(self, number: int) -> _Task:
         job = self.needed[number]
