@@ -108,8 +108,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 # Modules that compute for longer than they compile. In the others XLA hardly optimises the programs, which then compile
 # in a third of the time, and compute three to five times as long.
 COMPUTING = {
-    *("ant_colony", "design", "design_references", "diagnostics", "estimators", "experiments", "filter_error"),
-    *("programs", "svsf"),
+    *("ant_colony", "design", "design_references", "estimators", "experiments", "filter_error"),
     *("study_cluster", "study_resume"),  # compared bit for bit with processes that optimise
 }
 

@@ -152,6 +152,7 @@ def residual_noise(flights, correlation_time):
     return np.array(naive), np.array(robust)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_not():
     flights = 256
     naive, robust = residual_noise(flights, 0.05)

@@ -203,6 +203,7 @@ def test_training_learns_and_comes_near_the_bound():
     ],
     ids=str,
 )
+@pytest.mark.usefixtures("optimised")
 def test_intervals_hold_whatever_the_networks_quality(changes):
     network = trained(**changes)
     for noise in (1.0,) if "noise" in changes else (0.1, 1.0, 7.0):
