@@ -281,15 +281,17 @@ class TrainedNetwork(AbstractEstimator):
 
         def differ_in(constants, own_constants) -> Bool[Array, ""]:
             pairs = zip(jax.tree.leaves(constants), jax.tree.leaves(own_constants), strict=True)
-            return jnp.stack([differ(a, b, _SAME * jnp.abs(b).max()) for a, b in pairs]).any()
+            each = [differ(a, b, _SAME * jnp.abs(b).max()) for a, b in pairs]
+            return jnp.asarray(each, bool).any()
 
+        rest, own_rest = (eqx.tree_at(lambda m: m.airframe, model, None) for model in (problem.model, own.model))
         width = self.features.coordinates.width[len(own.model.parameter_names) :]
         first_state, off = (problem.split(x)[:, :size].ravel() for x in problem.first_state())
         own_start = self.features.coordinates.first_state
         allowed = 1.5 * width + off if width.size else _SAME * (1 + jnp.abs(own_start))
         return {
             "airframe": differ_in(problem.model.airframe, own.model.airframe),
-            "model": differ_in(problem.model, own.model),
+            "model": differ_in(rest, own_rest),
             "sample time": differ(problem.flight.dt, own.flight.dt, _SAME * own.flight.dt),
             "series of rotor speeds": differ(problem.flight.omega, own.flight.omega, _SAME * fastest),
             "start": ~(jnp.abs(first_state - own_start) <= allowed).all(),
