@@ -1,6 +1,7 @@
 """The command line: output, files and exit codes, for good and for bad input."""
 
 import csv
+import functools
 import json
 import math
 import sys
@@ -12,6 +13,7 @@ from helpers import refused
 
 from jaxos4.cli import _app, main
 from jaxos4.estimators import ESTIMATORS
+from jaxos4.networks import NetworkEstimator
 
 TRUTH = {"alpha1": -0.73333333, "alpha3": 133.33333, "alpha4": 0.73333333, "alpha6": 133.33333, "alpha8": 76.923077}
 
@@ -313,12 +315,14 @@ def test_a_real_flight_is_read_and_fitted(run, tmp_path, shared_flights):
 def network_file(tmp_path_factory):
     """A small network for the standard flight, and that flight."""
     folder = tmp_path_factory.mktemp("network")
+    small = functools.partial(NetworkEstimator, width=32, depth=2, batch=64, held_out=4000)
     flight, network = folder / "flight.csv", folder / "flight.net"
     for arguments in (
         ["simulate", "--noise", "1", "--out", str(flight)],
         ["train", str(flight), "--steps", "1000", "--out", str(network)],
     ):
         with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("jaxos4.networks.NetworkEstimator", small)
             patch.setattr(sys, "argv", ["jaxos4", *arguments])
             with pytest.raises(SystemExit) as stop:
                 main()
