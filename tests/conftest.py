@@ -109,7 +109,6 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 # in a third of the time, and compute three to five times as long.
 COMPUTING = {
     *("ant_colony", "design", "design_references", "estimators", "experiments", "filter_error"),
-    *("study_cluster", "study_resume"),  # compared bit for bit with processes that optimise
 }
 
 

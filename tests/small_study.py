@@ -53,11 +53,12 @@ def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
 
 
 def environment(devices: int = 1) -> dict[str, str]:
-    """The environment of another process: its number of devices, and this process's cache of compiled programs."""
+    """The environment of another process: its number of devices, and the compiled programs of this process."""
     return os.environ | {
         "JAX_NUM_CPU_DEVICES": str(devices),
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(jax.config.values["jax_compilation_cache_dir"]),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": str(jax.config.values["jax_disable_most_optimizations"]),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
         "PYTHONPATH": os.pathsep.join([str(pathlib.Path(__file__).resolve().parents[1]), *sys.path[1:]]),
     }
