@@ -12,6 +12,8 @@ from jaxos4.report import write_flight_page, write_report
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
+# The width and an attribute of each element, in one question to the browser.
+WIDTHS = "(all, name) => all.map(element => [element.getBoundingClientRect().width, element.getAttribute(name)])"
 BACKGROUND = {"light": "rgb(255, 255, 255)", "dark": "rgb(22, 25, 29)"}
 
 
@@ -64,15 +66,13 @@ def test_it_fits_the_screen_and_follows_the_theme(opened, name, width, scheme):
     page = opened(name, width, scheme)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     # What is wider scrolls inside its own box, and can be reached by the keyboard.
-    wide = page.locator(".scroll:visible, .drawing:visible")
-    assert wide.count() >= 2
-    for box in wide.all():
-        assert box.bounding_box()["width"] <= width
-        assert box.get_attribute("tabindex") == "0"
-    for drawing in page.locator(".drawing:visible svg").all():
-        # Letters of 8 points keep at least 8 pixels.
-        points = float(drawing.get_attribute("viewBox").split()[2])
-        assert drawing.bounding_box()["width"] >= points
+    wide = page.locator(".scroll:visible, .drawing:visible").evaluate_all(WIDTHS, "tabindex")
+    assert len(wide) >= 2
+    for pixels, place in wide:
+        assert pixels <= width
+        assert place == "0"
+    for pixels, box in page.locator(".drawing:visible svg").evaluate_all(WIDTHS, "viewBox"):
+        assert pixels >= float(box.split()[2])  # letters of 8 points keep at least 8 pixels
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == BACKGROUND[scheme]
     page.get_by_role("button").filter(has_text="Dark" if scheme == "light" else "Light").click()
     other = {"light": "dark", "dark": "light"}[scheme]
