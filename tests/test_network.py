@@ -192,6 +192,7 @@ def test_first_weights_are_uniform_as_those_of_equinox():
             used.update(u.tolist())
 
 
+@pytest.mark.usefixtures("optimised")
 def test_training_learns_and_comes_near_the_bound(many, answered):
     assert trained().history.shape == (4, 2)
     (alpha, _), estimates = many[1.0], answered
