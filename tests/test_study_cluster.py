@@ -8,6 +8,7 @@ import dask
 import pytest
 import xarray as xr
 from distributed import Client, LocalCluster
+from distributed.utils import get_mp_context
 from helpers import refused
 from small_study import NETWORKED, cells, environment, results, run_study, specification
 
@@ -30,8 +31,11 @@ def cluster():
         for name, value in environment().items():
             patch.setenv(name, value)
         forked = dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})  # with Dask imported
-        with forked, LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
-            yield cluster
+        with forked:
+            # Workers are forked with the library, instead of importing it each.
+            get_mp_context().set_forkserver_preload(["distributed", "jaxos4.study.cluster"])
+            with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
+                yield cluster
 
 
 @pytest.fixture
