@@ -107,9 +107,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 
 # Modules that compute for longer than they compile. In the others XLA hardly optimises the programs, which then compile
 # in a third of the time, and compute three to five times as long.
-COMPUTING = {
-    *("ant_colony", "design", "design_references", "estimators", "experiments", "filter_error"),
-}
+COMPUTING = {"ant_colony", "design", "design_references", "estimators", "experiments"}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -119,12 +117,24 @@ def programs_are_optimised_if_it_pays(request: pytest.FixtureRequest) -> None:
     jax.config.update("jax_disable_most_optimizations", FLAGS_OF_TESTS and name not in COMPUTING)
 
 
+def with_few_optimisations(few: bool) -> Iterator[None]:
+    """A fixture: XLA hardly optimises, or it does, until the test ends."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", few)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture
 def optimised() -> Iterator[None]:
     """For a test that computes for long, in a module that does not."""
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", FLAGS_OF_TESTS)
+    yield from with_few_optimisations(False)
+
+
+@pytest.fixture
+def quickly_compiled() -> Iterator[None]:
+    """For a test that compiles for longer than it computes, in a module of `COMPUTING`."""
+    yield from with_few_optimisations(FLAGS_OF_TESTS)
 
 
 MOST_MAPS = 30_000

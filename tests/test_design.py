@@ -111,6 +111,7 @@ def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(found
     assert 0.9 < max(found.designed.uses.values()) <= 1
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_many_flights_reach_the_bounds(found):
     """RMSE / bound of each parameter by IBSS, within four standard errors of 1."""
     omega = jnp.asarray(found.designed.omega)

@@ -82,6 +82,7 @@ def test_other_vehicles_in_other_gusts_keep_the_limits(found):
     assert max(uses[name] for name in ("angle", "rate")) < 1.15
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_the_bounds_are_those_of_filter_error(found):
     """The bounds of an identified flight, whose filters know neither the noise nor the parameters."""
     key = jax.random.key(5)

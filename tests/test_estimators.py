@@ -46,6 +46,7 @@ def test_tiny_noise_gives_the_truth(name):
 
 
 @every_estimator
+@pytest.mark.usefixtures("quickly_compiled")
 def test_loop_jit_and_vmap_agree(name):
     batched, (problem, states, _, lower, upper) = noisy(name), lanes(noisy_states(LANES, seed=50))
     assert set(names(batched)) == {"successful"}
@@ -107,6 +108,7 @@ def test_missing_samples_only_cost_precision(name):
 
 
 @pytest.mark.parametrize(("name", "free"), [*((name, False) for name in NAMES), ("svsf", True)])
+@pytest.mark.usefixtures("quickly_compiled")
 def test_no_estimator_invents_numbers_for_doublets(name, free):
     """Doublets do not identify all parameters. For a hover: above. For regressions with a free start: their tests."""
     for axes in (["roll"], ["roll", "pitch", "yaw"]):

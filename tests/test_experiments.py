@@ -8,6 +8,7 @@ import pytest
 from small_experiments import load, plot, report_of
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_efficiency(tmp_path):
     case = "published, rates"
     row = report_of("efficiency", tmp_path, flights=48, seed=0, scale=1.0, cases=[case])["cases"][case]
@@ -18,6 +19,7 @@ def test_efficiency(tmp_path):
     assert abs(row["covered"] - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 48)
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_speed(tmp_path):
     sizes = {"batch": 64, "steps": 40, "flights": [2], "repeats": 2}
     report = report_of("speed", tmp_path, **sizes, channels=["rates"], methods=["euler", "rk4"])
@@ -74,6 +76,7 @@ def test_dirty_flights(tmp_path):
     assert abs(found["summary"]["rotor_delay"]["mean_error"]) < 2e-3
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_long_flight(tmp_path):
     """Windows follow a drift that one shot cannot."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
@@ -85,6 +88,7 @@ def test_long_flight(tmp_path):
     assert one["results"] == {"at_bound": 2}
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_real_flight(shared_flights, tmp_path):
     out = tmp_path / "out.json"
     cases = {"names": ["rollpitch"], "estimators": ["filter-error"], "end": 12.0}
@@ -111,6 +115,7 @@ def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_closed_loop(tmp_path):
     cases = {"flights": 4, "gusts": [10.0], "duration": 6.0, "seed": 16, "estimators": ["equation-error"]}
     report = report_of("closed_loop", tmp_path, **cases)
@@ -129,6 +134,7 @@ def test_closed_loop(tmp_path):
 
 def test_benchmarks(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.values["jax_compilation_cache_dir"]))
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
     sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
     growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}

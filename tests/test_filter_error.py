@@ -221,6 +221,7 @@ def test_the_likelihood_does_not_depend_on_the_lanes():
 # Simulated flights without a disturbance.
 
 
+@pytest.mark.usefixtures("optimised")
 def test_it_finds_the_truth_at_nearly_the_bound():
     """White noise and nothing else. The noise is estimated too, and a weak disturbance can never be ruled out.
 
@@ -307,6 +308,7 @@ def test_no_trajectory_runs_away_in_a_long_gap():
     assert all(np.isfinite(leaf).all() for leaf in found)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_a_lane_that_fails_changes_no_other():
     problem, *arrays = lanes(noisy_states(LANES, seed=50))
     whole = identify(FilterError(), problem, *arrays)
@@ -398,6 +400,7 @@ def of_inertias(parameters):
     return np.asarray(parameters)[:, [2, 5]] * np.asarray(CRAZYFLIE.inertia)[:2]
 
 
+@pytest.mark.usefixtures("optimised")
 def test_inertias_of_flights_in_closed_loop_lie_in_their_intervals():
     """The squared errors are chi-square with 16 degrees of freedom: between its 0.05 % and 99.95 % points."""
     found = fits(*flown())
