@@ -29,7 +29,7 @@ def test_speed(tmp_path):
 
 def test_networks(tmp_path):
     cases = {"cases": ["standard"], "networks": ["score, mlp"], "noises": [1.0], "channels": "rates", "separate": False}
-    report = report_of("networks", tmp_path, flights=100, seed=7, steps=250, many=100, **cases)
+    report = report_of("networks", tmp_path, flights=100, seed=7, steps=100, many=100, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
     assert report["one_call"]["flights"] == 100
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
@@ -53,7 +53,7 @@ def test_baselines(tmp_path):
 
 def test_coverage(tmp_path):
     cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
-    rows = report_of("coverage", tmp_path, flights=100, seed=11, scales=[1.0], steps=250, **cases)["rows"]
+    rows = report_of("coverage", tmp_path, flights=100, seed=11, scales=[1.0], steps=100, **cases)["rows"]
     assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
         assert row["results"] == {"successful": 100}
@@ -80,7 +80,7 @@ def test_dirty_flights(tmp_path):
 def test_long_flight(tmp_path):
     """Windows follow a drift that one shot cannot."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
-    one, many = report_of("long_flight", tmp_path, flights=2, seed=3, steps=200, **cases)["rows"]
+    one, many = report_of("long_flight", tmp_path, flights=2, seed=3, steps=100, **cases)["rows"]
     assert many["results"] == {"successful": 2}
     assert max(many["percent"]) < 5
     assert max(many["percent"][place] for place in (1, 3, 4)) < 2  # the gains of the torques
