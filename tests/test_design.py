@@ -32,8 +32,8 @@ MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
 
 
-SECONDS = 3.0
-# What `jaxos4 design --initial-state known --duration 3` asks of the library.
+SECONDS = 2.0
+# What `jaxos4 design --initial-state known --duration 2` asks of the library.
 ASKED = {
     "limits": {},
     "duration": SECONDS,
@@ -55,7 +55,7 @@ def commanded(tmp_path_factory):
         calls.append((asked, design_and_compare(model, **asked)))
         return calls[0][1]
 
-    options = ["--initial-state", "known", "--duration", "3", "--out", "input.csv", "--figure", "input.svg"]
+    options = ["--initial-state", "known", "--duration", "2", "--out", "input.csv", "--figure", "input.svg"]
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.chdir(folder)
         patch.setattr("jaxos4.design.design_and_compare", seen)
@@ -141,11 +141,11 @@ def test_the_command_writes_an_input_that_simulate_and_a_study_fly(commanded, ru
     from jaxos4.study import load_study
     from jaxos4.study.flights import fleet_of
 
-    (folder / "study.toml").write_text('excitations = ["best"]\ndurations = [3]\n[input]\nbest = "input.csv"\n')
+    (folder / "study.toml").write_text('excitations = ["best"]\ndurations = [2]\n[input]\nbest = "input.csv"\n')
     study = load_study(folder / "study.toml")
     np.testing.assert_allclose(fleet_of(study, study.cell(0).scenario).omega, found.designed.omega, rtol=1e-9)
-    (folder / "study.toml").write_text('excitations = ["best"]\ndurations = [4]\n[input]\nbest = "input.csv"\n')
-    with pytest.raises(jaxos4.InputError, match="its file lasts 3 s; correct `durations`"):
+    (folder / "study.toml").write_text('excitations = ["best"]\ndurations = [3]\n[input]\nbest = "input.csv"\n')
+    with pytest.raises(jaxos4.InputError, match="its file lasts 2 s; correct `durations`"):
         load_study(folder / "study.toml")
 
 
@@ -154,9 +154,9 @@ def test_the_command_writes_an_input_that_simulate_and_a_study_fly(commanded, ru
     [
         ("--duration 0", ("--duration", "must be positive")),
         ("--duration 1000", ("--duration", "50 to 2500 samples")),
-        ("--duration 3 --fastest 150", ("cannot hover", "225.7")),
-        ("--duration 3 --slowest 230", ("cannot hover",)),
-        ("--duration 3 --rate -1", ("--rate must be positive",)),
+        ("--duration 2 --fastest 150", ("cannot hover", "225.7")),
+        ("--duration 2 --slowest 230", ("cannot hover",)),
+        ("--duration 2 --rate -1", ("--rate must be positive",)),
         ("--accuracy 0", ("--accuracy",)),
         ("--bandwidth 100", ("--bandwidth", "0.2 to 25 Hz")),  # by default 5 s, sampled every 0.01 s
         ("--airframe none", ("none",)),
