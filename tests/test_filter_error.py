@@ -221,6 +221,11 @@ def test_the_likelihood_does_not_depend_on_the_lanes():
 # Simulated flights without a disturbance.
 
 
+@functools.cache
+def noisy():
+    return identify(FilterError(), *lanes(noisy_states(LANES, seed=50)))
+
+
 @pytest.mark.usefixtures("optimised")
 def test_it_finds_the_truth_at_nearly_the_bound():
     """White noise and nothing else. The noise is estimated too, and a weak disturbance can never be ruled out.
@@ -228,7 +233,7 @@ def test_it_finds_the_truth_at_nearly_the_bound():
     So the standard deviations lie above the bound, which knows that there is none: by little for torques, and by up to
     40 % for parameters that act slowly.
     """
-    found = identify(FilterError(), *lanes(noisy_states(LANES, seed=50)))
+    found = noisy()
     assert set(names(found)) == {"successful"}
     ratio = np.median(found.std, axis=0) / bound()
     assert (ratio > 0.95).all(), ratio
@@ -311,13 +316,12 @@ def test_no_trajectory_runs_away_in_a_long_gap():
 @pytest.mark.usefixtures("optimised")
 def test_a_lane_that_fails_changes_no_other():
     problem, *arrays = lanes(noisy_states(LANES, seed=50))
-    whole = identify(FilterError(), problem, *arrays)
     states, omega, *ends = (np.array(x) for x in arrays)
     omega[1, 100, 0], states[2, 50], omega[3, 500] = np.nan, np.inf, np.nan
     broken = identify(FilterError(), problem, jnp.asarray(states), jnp.asarray(omega), *arrays[2:])
     assert names(broken)[:4].tolist() == ["successful", *["nonfinite_trajectory"] * 2, "successful"]
     others = np.delete(np.arange(LANES), [1, 2])  # lane 3 is one: the last row of rotor speeds drives nothing
-    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(whole), strict=True):
+    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(noisy()), strict=True):
         np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
     # A fit alone says so too.
     for lane in (1, 2):
