@@ -41,11 +41,11 @@ hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("network", "experiments", "estimators", "experiment_studies", "filter_error", "study_resume", "ibss", "cli"),
-    *("design_references", "multiple_shooting", "design", "study_cluster", "flight_model", "shooting", "report"),
-    *("startup", "study", "diagnostics", "identifiability", "equation_error", "report_browser", "checks", "compare"),
-    *("held", "models", "svsf", "simulate", "kalman", "programs", "new_estimator", "output_error", "identify"),
-    *("logs_blackbox", "closed_loop", "logs_betaflight", "inertia", "information", "vehicle", "robust", "signs"),
+    *("experiments", "network", "estimators", "experiment_studies", "study_resume", "filter_error", "ibss", "cli"),
+    *("study_cluster", "design_references", "multiple_shooting", "flight_model", "shooting", "design", "study"),
+    *("report_browser", "checks", "equation_error", "startup", "report", "held", "programs", "compare", "simulate"),
+    *("new_estimator", "diagnostics", "identifiability", "models", "kalman", "output_error", "identify", "svsf"),
+    *("closed_loop", "logs_fuzz", "cli_vehicle", "ant_colony", "vehicle", "noise", "stretches", "inertia", "robust"),
 )
 
 
