@@ -208,7 +208,7 @@ def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
 
 
 def check_dynamic_count(name: str, value: Any, least: int) -> None:
-    """`check_count` of a setting that is data, made by `as_int`; a traced one is checked by type."""
+    """`check_count` for a setting that is data, which may be an integer array; the value of a traced one is unknown."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
         if isinstance(value, Tracer):
             return

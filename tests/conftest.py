@@ -34,7 +34,8 @@ set_flags(QUICK_TO_COMPILE)  # before JAX starts to compute: the programs of the
 IN_ONE_PART = f"{QUICK_TO_COMPILE} --xla_cpu_parallel_codegen_split_count=1"
 if os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE:
     os.environ["XLA_FLAGS"] = IN_ONE_PART
-FLAGS_OF_TESTS = os.environ.get("XLA_FLAGS") == IN_ONE_PART  # a worker has the flags of the controller
+# In a worker, the controller has set them.
+FLAGS_ARE_OURS = os.environ.get("XLA_FLAGS") == IN_ONE_PART
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
@@ -91,7 +92,7 @@ def pytest_terminal_summary(terminalreporter) -> None:
     cached = PROGRAMS["cached"]
     compiled, seconds = PROGRAMS["programs"] - cached, PROGRAMS["milliseconds"] / 1000
     what = f"{compiled} programs compiled, {cached} from the cache, in {seconds:.0f} s"
-    terminalreporter.write_line(f"{what}; {PROGRAMS['quickly']} of them almost without optimisations")
+    terminalreporter.write_line(f"{what}; of all these, {PROGRAMS['quickly']} hardly optimised")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -105,22 +106,23 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
     return LoadFileScheduling(config, log)
 
 
-# Modules that compute for longer than they compile. In the others XLA hardly optimises the programs, which then compile
-# in a third of the time, and compute three to five times as long.
+# Modules that compute for longer than they compile. XLA hardly optimises the programs of the others, which then compile
+# in a third of the time, and compute three to five times as long. A program keeps the level of its first use: the
+# fixtures below act on what a test is the first to compile, and not on fixtures of the module.
 COMPUTING = {"ant_colony", "design", "design_references", "estimators", "experiments"}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def programs_are_optimised_if_it_pays(request: pytest.FixtureRequest) -> None:
-    """Only the modules of `COMPUTING` have optimised programs; all have them if `XLA_FLAGS` are the user's own."""
-    name = request.path.stem.removeprefix("test_")
-    jax.config.update("jax_disable_most_optimizations", FLAGS_OF_TESTS and name not in COMPUTING)
+    """The default of a module. With the user's own `XLA_FLAGS`, all programs are optimised."""
+    hardly = FLAGS_ARE_OURS and request.path.stem.removeprefix("test_") not in COMPUTING
+    jax.config.update("jax_disable_most_optimizations", hardly)
 
 
-def with_few_optimisations(few: bool) -> Iterator[None]:
-    """A fixture: XLA hardly optimises, or it does, until the test ends."""
+def compiling(*, quickly: bool) -> Iterator[None]:
+    """Sets whether XLA hardly optimises, until the test ends."""
     before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", few)
+    jax.config.update("jax_disable_most_optimizations", quickly)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
 
@@ -128,13 +130,13 @@ def with_few_optimisations(few: bool) -> Iterator[None]:
 @pytest.fixture
 def optimised() -> Iterator[None]:
     """For a test that computes for long, in a module that does not."""
-    yield from with_few_optimisations(False)
+    yield from compiling(quickly=False)
 
 
 @pytest.fixture
 def quickly_compiled() -> Iterator[None]:
     """For a test that compiles for longer than it computes, in a module of `COMPUTING`."""
-    yield from with_few_optimisations(FLAGS_OF_TESTS)
+    yield from compiling(quickly=FLAGS_ARE_OURS)
 
 
 MOST_MAPS = 30_000

@@ -53,7 +53,7 @@ def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
 
 
 def environment(devices: int = 1) -> dict[str, str]:
-    """The environment of another process: its number of devices, and the compiled programs of this process."""
+    """The environment of another process: its number of devices, and this process's cache and level of optimisation."""
     return os.environ | {
         "JAX_NUM_CPU_DEVICES": str(devices),
         "JAX_PLATFORMS": "cpu",

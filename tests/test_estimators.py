@@ -209,6 +209,7 @@ def test_the_registry_makes_every_estimator_and_names_misuse():
         (jaxos4.AntColony, "archive", [1], "must be an integer of at least 2"),
         (jaxos4.AntColony, "ants", [0], "must be an integer of at least 1"),
         (jaxos4.AntColony, "q", [0.0, np.nan], "must be positive and finite"),
+        (jaxos4.NetworkEstimator, "learning_rate", [0.0, np.inf], "must be positive and finite"),
     ],
 )
 def test_settings_out_of_range_are_named(make, setting, values, message):

@@ -116,7 +116,13 @@ def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_closed_loop(tmp_path):
+def test_closed_loop(tmp_path, monkeypatch):
+    def load_with_small_chunks(name, script="run"):
+        module = load(name, script)
+        module.CHUNK = 3  # two calls of the regression, the second of them padded
+        return module
+
+    monkeypatch.setattr("small_experiments.load", load_with_small_chunks)
     cases = {"flights": 4, "gusts": [10.0], "duration": 6.0, "seed": 16, "estimators": ["equation-error"]}
     report = report_of("closed_loop", tmp_path, **cases)
     plot("closed_loop", tmp_path / "out.json", tmp_path / "figures")
@@ -132,9 +138,10 @@ def test_closed_loop(tmp_path):
         report_of("closed_loop", tmp_path, **{**cases, "seed": 17})
 
 
+@pytest.mark.usefixtures("quickly_compiled")
 def test_benchmarks(tmp_path, monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(jax.config.values["jax_compilation_cache_dir"]))
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    for setting in ("jax_compilation_cache_dir", "jax_disable_most_optimizations"):
+        monkeypatch.setenv(setting.upper(), str(jax.config.values[setting]))
     fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
     sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
     growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}

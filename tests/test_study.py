@@ -212,13 +212,25 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
     assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / len(jax.local_devices()))
 
 
-def test_programs_that_wait_for_a_network_are_compiled_while_it_is_trained(tmp_path):
+def test_one_program_of_a_network_is_compiled_while_it_is_trained_before_any_cell(tmp_path):
     study = Study(channels=("rates",), estimators=("ibss", "network", "hybrid"), flights=20)
+
+    def labels(work, count):
+        """Of the first device's task, and of those that the second one asks for."""
+        first, *others = [work.task(device) for device in ("one", *["another"] * count)]
+        return first.label, [task.label for task in others]
+
     with open_store(tmp_path, study, "these tests") as store:
+        expected = ["compiling hybrid", "ibss 0.1", "ibss 1", "ibss 10", "compiling network"]
+        assert labels(Work(store), 5) == ("training for rates", expected)
+        # The network of a finished training is only read.
+        store.network_file(0).touch()
+        assert labels(Work(store), 3) == ("training for rates", ["ibss 0.1", "ibss 1", "ibss 10"])
+        # After it, the first device takes what no other device runs.
         work = Work(store)
-        labels = [work.task(device).label for device in ("one", "another", "another", "another", "another")]
-    assert labels[:3] == ["training for rates", "compiling hybrid", "compiling network"]
-    assert labels[3:] == ["ibss 0.1", "ibss 1"]
+        assert [work.task(device).label for device in ("one", "another")] == ["training for rates", "ibss 0.1"]
+        work.networks[0] = "training diverged"
+        assert [work.task("one").label for _ in range(4)] == ["network 0.1", "network 1", "network 10", "hybrid 0.1"]
 
 
 # The grid.

@@ -5,6 +5,7 @@ import shutil
 import signal
 
 import dask
+import jax
 import pytest
 import xarray as xr
 from distributed import Client, LocalCluster
@@ -21,6 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pyte
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The study, run in this process."""
+    jax.clear_caches()  # programs of other modules may have another level of optimisation: other last digits
     return run_study(tmp_path_factory.mktemp("study"), NETWORKED)
 
 
@@ -32,7 +34,7 @@ def cluster():
             patch.setenv(name, value)
         forked = dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})  # with Dask imported
         with forked:
-            # Workers are forked with the library, instead of importing it each.
+            # Workers are forked with the library, instead of importing it each. The first call sets Dask's own list.
             get_mp_context().set_forkserver_preload(["distributed", "jaxos4.study.cluster"])
             with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
                 yield cluster

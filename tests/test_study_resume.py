@@ -10,6 +10,7 @@ import shutil
 import signal
 import time
 
+import jax
 import pytest
 import xarray as xr
 from helpers import refused
@@ -22,6 +23,7 @@ from jaxos4.study.run import compute
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The study in one run, without interruption."""
+    jax.clear_caches()  # programs of other modules may have another level of optimisation: other last digits
     return run_study(tmp_path_factory.mktemp("study"))
 
 

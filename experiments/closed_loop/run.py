@@ -46,7 +46,7 @@ VEHICLE = jaxos4.Airframe(
 LAG, DELAY = 0.05, 0.01
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 DT, WINDOW = 0.004, 62
-# The most flights of one call of the regression, and its memory: the best on real flights.
+# Flights of one call of the regression, and its memory: the best on real flights.
 CHUNK, MEMORY = 25, 0.9
 # The largest references of all flights: angles [rad] and vertical acceleration [m/s^2].
 LARGEST = np.array([0.3, 0.3, 0.3, 1.5])
@@ -109,10 +109,10 @@ def stacked(modules: list) -> object:
 
 def regress(flights: list[tuple[int, jaxos4.Flight]], wrong: float) -> list[dict]:
     """The rows of many flights by equation error. Their standard deviations are those of white gyro noise alone."""
-    rows, chunk = [], max(min(CHUNK, len(flights)), 1)
-    for first in range(0, len(flights), chunk):
-        some = flights[first : first + chunk]
-        padded = some + some[-1:] * (chunk - len(some))  # one program
+    rows = []
+    for first in range(0, len(flights), CHUNK):
+        some = flights[first : first + CHUNK]
+        padded = some + some[-1:] * (CHUNK - len(some))  # one program
         begin = time.perf_counter()
         found = _regressions(stacked([f for _, f in padded]), stacked([known_airframe(i, wrong) for i, _ in padded]))
         results, seconds = jaxos4.result_names(jax.block_until_ready(found).result), time.perf_counter() - begin

@@ -220,28 +220,29 @@ class TrainedNetwork(AbstractEstimator):
         **Raises:** `ValueError` if the network was trained for another problem, with what differs. Inside `jit` or
         `vmap`, numbers that differ give the result `network_mismatch` instead.
         """
-        difference, estimate = self._compare(problem, bracket)
-        if estimate is None or difference is not None:
-            raise ValueError(f"The network cannot be used on this problem: {difference}; train a network for it.")
-        return estimate
+        answer = self._compare(problem, bracket)
+        if isinstance(answer, str):
+            raise ValueError(f"The network cannot be used on this problem: {answer}; train a network for it.")
+        return answer
 
     def mismatch(self, problem: ShootingProblem) -> str | None:
         """How a problem differs from the problem of training, in words; `None` if it does not.
 
         Inside `jit` or `vmap` numbers cannot be compared here; `__call__` compares them there.
         """
-        return self._compare(problem, self.bracket)[0]
+        answer = self._compare(problem, self.bracket)
+        return answer if isinstance(answer, str) else None
 
-    def _compare(self, problem: ShootingProblem, bracket: Bracket) -> tuple[str | None, Estimate | None]:
-        """`mismatch`, and the estimate; one program computes both. No estimate for a problem of another kind."""
+    def _compare(self, problem: ShootingProblem, bracket: Bracket) -> Estimate | str:
+        """The estimate, or how the problem differs from that of training. One program computes both."""
         kind = self._other_kind(problem)
         if kind is not None:
-            return kind, None
+            return kind
         estimate, differences = self._identify(problem.restrict(self.channels), bracket)
         for what, differs in differences.items():
             if not isinstance(differs, Tracer) and differs:
-                return f"it was trained for another {what}", estimate
-        return None, estimate
+                return f"it was trained for another {what}"
+        return estimate
 
     def _other_kind(self, problem: ShootingProblem) -> str | None:
         """How a problem differs in anything but its numbers, in words; `None` if it does not."""

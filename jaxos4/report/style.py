@@ -152,7 +152,7 @@ def pdf(figure: Figure) -> bytes:
 
 
 def _printed(figure: Figure, write: Callable[..., None], metadata: dict[str, None]) -> bytes:
-    """What `write` of a canvas draws. `savefig` would draw twice; without it the resolution must be put back."""
+    """The bytes that `write`, a method of a canvas, prints. `savefig` would draw twice, but restores the resolution."""
     buffer, resolution = io.BytesIO(), figure.dpi
     write(buffer, metadata=metadata)
     figure.set_dpi(resolution)

@@ -22,7 +22,7 @@ from ..results import result_names
 from ..shooting import ShootingProblem
 from .cell_file import LEVELS, OUTCOMES
 from .devices import one_core
-from .flights import Flights, blank_problem, cramer_rao_std, fleet_of, fly
+from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly
 from .network_jobs import job_of
 from .specification import Cell, Study
 
@@ -38,15 +38,34 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
     Raises as the estimator does.
     """
     with jax.enable_x64(study.double):
-        scenario = cell.scenario
+        scenario, (fleet, flights, blank) = cell.scenario, _flown(study, cell)
         with one_core():
-            fleet = fleet_of(study, scenario)
-            flights = fly(study, fleet, cell)
             standard = blank_problem(study, fleet, 1.0, scenario.seen)
             bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
-            blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
         found = _identify(_estimator(scenario.estimator, network), blank, fleet.bracket, flights.measured)
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
+
+
+def compile_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> None:
+    """Compiles the program of `run_cell`, on flights without measurements: each search ends after its first look.
+
+    The values of the network do not matter. Raises as the estimator does.
+    """
+    with jax.enable_x64(study.double):
+        fleet, flights, blank = _flown(study, cell)
+        with one_core():
+            nothing = jax.device_put(np.full_like(flights.measured, np.nan))
+        found = _identify(_estimator(cell.scenario.estimator, network), blank, fleet.bracket, nothing)
+        jax.block_until_ready(found)
+
+
+def _flown(study: Study, cell: Cell) -> tuple[Fleet, Flights, ShootingProblem]:
+    """The flights of a cell, and the problem that an estimator solves for each."""
+    scenario = cell.scenario
+    with one_core():
+        fleet = fleet_of(study, scenario)
+        blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
+        return fleet, fly(study, fleet, cell), blank
 
 
 def program_of(study: Study, cell: Cell) -> tuple:

@@ -13,7 +13,7 @@ import jax
 from ..errors import InputError, TrainingError
 from ..estimators import ESTIMATORS
 from ..networks import TrainedNetwork, save_network
-from .cell import program_of, run_cell
+from .cell import compile_cell, program_of, run_cell
 from .cell_file import encode, failed
 from .devices import give_memory_back
 from .network_jobs import blank_network, job_number, job_of, jobs, train_network
@@ -61,20 +61,21 @@ class _Work:
         self.programs = [_Program(cells, self.study, self.needed) for cells in grouped.values()]
         self.networks: dict[int, TrainedNetwork | str | None] = {}
         self.untrained = deque(dict.fromkeys(p.network for p in self.programs if p.network is not None))
+        self.kept = {number for number in self.untrained if store.network_file(number).exists()}
 
     def task(self, device: Any) -> _Task | None:
         """The next task for a free device, or `None` if all remaining work waits for other tasks."""
         if self.untrained:
             return self._training(self.untrained.popleft())
-        if (program := self._untried()) is not None:
-            program.devices.add(device)
-            cell = program.waiting[0]
-            label = f"compiling {cell.scenario.estimator}"
-            return _Task(label, lambda device: _compile(self.study, cell, device), lambda _: None)
-        if (program := self._ready(device)) is not None:
-            program.devices.add(device)
-            return self._cell(program.waiting.popleft(), program)
-        return None
+        waiting = self._waiting()
+        # One program of each network before any cell. Compiled after the training, it would hold up the end.
+        begun = {p.network for p in self.programs if p.devices}
+        first = next((p for p in waiting if p.network not in begun), None)
+        program = first or self._ready(device) or next(iter(waiting), None)
+        if program is None:
+            return None
+        program.devices.add(device)
+        return self._compilation(program) if program in waiting else self._cell(program.waiting.popleft(), program)
 
     def _ready(self, device: Any) -> _Program | None:
         """The program that the device runs already, else one that no device runs, else the one with most cells."""
@@ -84,14 +85,12 @@ class _Work:
         long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
         return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
 
-    def _untried(self) -> _Program | None:
-        """A program to compile while its network is trained; estimators that shoot first, which take longest.
-
-        These come before all cells: the cells that need the network are the last ones, and must not wait for more.
-        """
-        untried = [p for p in self.programs if p.waiting and not p.devices and not self._has_network(p)]
+    def _waiting(self) -> list[_Program]:
+        """The programs to compile while their network is trained. First those that shoot: they compile for longest."""
+        waiting = [p for p in self.programs if p.waiting and not p.devices and not self._has_network(p)]
+        waiting = [p for p in waiting if p.network not in self.kept]  # which is soon read
         shoots = {name: kind.shoots for name, kind in ESTIMATORS.items()}
-        return min(untried, key=lambda p: (p.network, not shoots[p.waiting[0].scenario.estimator]), default=None)
+        return sorted(waiting, key=lambda p: (p.network, not shoots[p.waiting[0].scenario.estimator]))
 
     def _has_network(self, program: _Program) -> bool:
         return program.network is None or program.network in self.networks
@@ -103,6 +102,11 @@ class _Work:
             lambda device: _train(self.store, number, job, device),
             lambda network: self.networks.update({number: network}),
         )
+
+    def _compilation(self, program: _Program) -> _Task:
+        cell = program.waiting[0]
+        label = f"compiling {cell.scenario.estimator}"
+        return _Task(label, lambda device: _compile(self.study, cell, device), lambda _: None)
 
     def _cell(self, cell: Cell, program: _Program) -> _Task:
         network = None if program.network is None else self.networks[program.network]
@@ -150,7 +154,7 @@ def run_here(store: Store) -> Iterator[Step]:
 
 def _compile(study: Study, cell: Cell, device: Any) -> None:
     with jax.default_device(device), contextlib.suppress(*FAILURES):  # the cell itself will report the failure
-        run_cell(study, cell, blank_network(study, job_of(study, cell.scenario)))
+        compile_cell(study, cell, blank_network(study, job_of(study, cell.scenario)))
 
 
 def _train(store: Store, number: int, job: Job, device: Any) -> TrainedNetwork | str | None:
