@@ -243,12 +243,16 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
         assert fragment in err
 
 
+def how_we_compile():
+    """For the environment of another process: this process's cache and level of optimisation."""
+    settings = ("jax_compilation_cache_dir", "jax_disable_most_optimizations")
+    ours = {name.upper(): str(jax.config.values[name]) for name in settings}
+    return ours | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
+
+
 def single_precision(script):
     """What a script writes as JSON in a process of its own, with JAX as it comes."""
-    cache = str(jax.config.values["jax_compilation_cache_dir"])
-    environment = {**os.environ, "JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
-    environment |= {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
-    environment["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(jax.config.values["jax_disable_most_optimizations"])
+    environment = os.environ | how_we_compile() | {"JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

@@ -5,8 +5,8 @@ import pathlib
 import subprocess
 import sys
 
-import jax
 import xarray as xr
+from helpers import how_we_compile
 
 from jaxos4.study import carry_out, load_study
 
@@ -53,15 +53,10 @@ def run_study(folder: pathlib.Path, text: str = SPECIFICATION) -> pathlib.Path:
 
 
 def environment(devices: int = 1) -> dict[str, str]:
-    """The environment of another process: its number of devices, and this process's cache and level of optimisation."""
-    return os.environ | {
-        "JAX_NUM_CPU_DEVICES": str(devices),
-        "JAX_PLATFORMS": "cpu",
-        "JAX_COMPILATION_CACHE_DIR": str(jax.config.values["jax_compilation_cache_dir"]),
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": str(jax.config.values["jax_disable_most_optimizations"]),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05",
-        "PYTHONPATH": os.pathsep.join([str(pathlib.Path(__file__).resolve().parents[1]), *sys.path[1:]]),
-    }
+    """The environment of another process: its number of devices, and how it compiles."""
+    path = os.pathsep.join([str(pathlib.Path(__file__).resolve().parents[1]), *sys.path[1:]])
+    ours = {"JAX_NUM_CPU_DEVICES": str(devices), "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
+    return os.environ | how_we_compile() | ours
 
 
 def start(*arguments: str | pathlib.Path, code: str = COMMAND, devices: int = 1) -> subprocess.Popen[str]:

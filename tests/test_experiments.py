@@ -2,9 +2,9 @@
 
 import json
 
-import jax
 import numpy as np
 import pytest
+from helpers import how_we_compile
 from small_experiments import load, plot, report_of
 
 
@@ -140,8 +140,8 @@ def test_closed_loop(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("quickly_compiled")
 def test_benchmarks(tmp_path, monkeypatch):
-    for setting in ("jax_compilation_cache_dir", "jax_disable_most_optimizations"):
-        monkeypatch.setenv(setting.upper(), str(jax.config.values[setting]))
+    for name, value in how_we_compile().items():
+        monkeypatch.setenv(name, value)
     fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
     sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
     growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}

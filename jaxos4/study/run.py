@@ -67,15 +67,15 @@ class _Work:
         """The next task for a free device, or `None` if all remaining work waits for other tasks."""
         if self.untrained:
             return self._training(self.untrained.popleft())
-        waiting = self._waiting()
+        ahead = self._ahead()
         # One program of each network before any cell. Compiled after the training, it would hold up the end.
         begun = {p.network for p in self.programs if p.devices}
-        first = next((p for p in waiting if p.network not in begun), None)
-        program = first or self._ready(device) or next(iter(waiting), None)
+        first = next((p for p in ahead if p.network not in begun), None)
+        program = first or self._ready(device) or next(iter(ahead), None)
         if program is None:
             return None
         program.devices.add(device)
-        return self._compilation(program) if program in waiting else self._cell(program.waiting.popleft(), program)
+        return self._compilation(program) if program in ahead else self._cell(program.waiting.popleft(), program)
 
     def _ready(self, device: Any) -> _Program | None:
         """The program that the device runs already, else one that no device runs, else the one with most cells."""
@@ -85,12 +85,16 @@ class _Work:
         long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
         return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
 
-    def _waiting(self) -> list[_Program]:
-        """The programs to compile while their network is trained. First those that shoot: they compile for longest."""
-        waiting = [p for p in self.programs if p.waiting and not p.devices and not self._has_network(p)]
-        waiting = [p for p in waiting if p.network not in self.kept]  # which is soon read
+    def _ahead(self) -> list[_Program]:
+        """The programs to compile while their network is trained. First those that shoot: they compile for longest.
+
+        A network that a file holds is soon read.
+        """
+        unbegun = [
+            p for p in self.programs if not p.devices and not self._has_network(p) and p.network not in self.kept
+        ]
         shoots = {name: kind.shoots for name, kind in ESTIMATORS.items()}
-        return sorted(waiting, key=lambda p: (p.network, not shoots[p.waiting[0].scenario.estimator]))
+        return sorted(unbegun, key=lambda p: (p.network, not shoots[p.waiting[0].scenario.estimator]))
 
     def _has_network(self, program: _Program) -> bool:
         return program.network is None or program.network in self.networks
