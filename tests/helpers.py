@@ -1,5 +1,6 @@
 """The standard flight, and an independent copy of the equations of motion in NumPy, from the printed equations."""
 
+import contextlib
 import functools
 import itertools
 import json
@@ -38,6 +39,22 @@ drag_coefficient = 1.2e-10
 rotor_inertia = 2e-8
 max_rotor_speed = 2500.0
 """
+
+
+@contextlib.contextmanager
+def compiled_programs():
+    """The names of the programs that are compiled, or read from the persistent cache, inside the block."""
+    names, inside = [], True
+
+    def record(event, seconds, **details):
+        if inside and event == "/jax/core/compile/backend_compile_duration":
+            names.append(details.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(record)
+    try:
+        yield names
+    finally:
+        inside = False
 
 
 @functools.cache

@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 import xarray as xr
-from helpers import refused
+from helpers import compiled_programs, refused
 
 from jaxos4.report import write_report
 from jaxos4.study import OUTCOMES, comparison as command
@@ -31,8 +31,11 @@ def cut(monkeypatch):
 
 
 def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monkeypatch):
-    code, out, err = run("compare", "--quick", "--out", "here")
+    with compiled_programs() as programs:
+        code, out, err = run("compare", "--quick", "--out", "here")
     assert (code, err) == (0, "")
+    # The network's, and one search: the hybrid and IBSS share it.
+    assert programs.count("jit(_identify)") == 2
     for words in (
         "noise x 0.1",
         "noise x 10",

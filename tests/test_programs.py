@@ -1,6 +1,5 @@
 """How many programs an identification compiles, and that the next flight compiles none."""
 
-import contextlib
 import os
 
 import equinox as eqx
@@ -8,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import curvatures, first_state, noisy_states, standard_flight, standard_problem
+from helpers import compiled_programs, curvatures, first_state, noisy_states, standard_flight, standard_problem
 
 import jaxos4
 from jaxos4.analysis.evaluation import evaluate
@@ -16,22 +15,6 @@ from jaxos4.shooting import padded
 
 # The search, the simulation with all derivatives, the default bracket, the intervals, a comparison of result codes.
 BUDGET = 6
-
-
-@contextlib.contextmanager
-def compiled_programs():
-    """The names of the programs that are compiled, or read from the persistent cache, inside the block."""
-    names, inside = [], True
-
-    def record(event, seconds, **details):
-        if inside and event == "/jax/core/compile/backend_compile_duration":
-            names.append(details.get("fun_name"))
-
-    jax.monitoring.register_event_duration_secs_listener(record)
-    try:
-        yield names
-    finally:
-        inside = False
 
 
 def recorded(samples, model, seed=0):

@@ -206,31 +206,42 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
         for cell in (cell for cell in study.cells() if cell.scenario.estimator == "ibss" and cell.first == 0):
             store.write(store.cell_file(cell.number), b"", cell=cell.number, seconds=2.0 + cell.scenario.scale)
     network, hybrid, ibss = plan(study, tmp_path)
-    assert network == ("network", 18, 1500, 2, 1, None)
-    assert hybrid == ("hybrid", 18, 1500, 2, 1, None)  # a network for the attitude, and the network's for the rates
-    assert ibss[:5] == ("ibss", 12, 900, 2, 0)
+    assert network == ("network", 18, 1500, 1, 1, None)
+    # A network for the attitude, beside that for the rates; its answers, and two searches.
+    assert hybrid == ("hybrid", 18, 1500, 3, 1, None)
+    assert ibss[:5] == ("ibss", 12, 900, 0, 0)  # the same searches
     assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / len(jax.local_devices()))
+
+
+def labels(work, device, count):
+    """Of the next tasks for a device; `None` if it must wait."""
+    return [task and task.label for task in (work.task(device) for _ in range(count))]
 
 
 def test_one_program_of_a_network_is_compiled_while_it_is_trained_before_any_cell(tmp_path):
     study = Study(channels=("rates",), estimators=("ibss", "network", "hybrid"), flights=20)
-
-    def labels(work, count):
-        """Of the first device's task, and of those that the second one asks for."""
-        first, *others = [work.task(device) for device in ("one", *["another"] * count)]
-        return first.label, [task.label for task in others]
-
     with open_store(tmp_path, study, "these tests") as store:
-        expected = ["compiling hybrid", "ibss 0.1", "ibss 1", "ibss 10", "compiling network"]
-        assert labels(Work(store), 5) == ("training for rates", expected)
-        # The network of a finished training is only read.
-        store.network_file(0).touch()
-        assert labels(Work(store), 3) == ("training for rates", ["ibss 0.1", "ibss 1", "ibss 10"])
-        # After it, the first device takes what no other device runs.
         work = Work(store)
-        assert [work.task(device).label for device in ("one", "another")] == ["training for rates", "ibss 0.1"]
+        assert labels(work, "one", 1) == ["training for rates"]
+        assert labels(work, "another", 5) == ["compiling network", "ibss 0.1", "ibss 1", "ibss 10", None]
+        # The search of the hybrid is that of IBSS.
         work.networks[0] = "training diverged"
-        assert [work.task("one").label for _ in range(4)] == ["network 0.1", "network 1", "network 10", "hybrid 0.1"]
+        assert labels(work, "another", 4) == ["hybrid 0.1", "hybrid 1", "hybrid 10", "network 0.1"]
+        # The network of a finished training is only read. After that, the first device takes what no other one runs.
+        store.network_file(0).touch()
+        work = Work(store)
+        assert labels(work, "one", 1) == ["training for rates"]
+        assert labels(work, "another", 4) == ["ibss 0.1", "ibss 1", "ibss 10", None]
+        work.networks[0] = "training diverged"
+        assert labels(work, "one", 4) == ["network 0.1", "network 1", "network 10", None]
+
+
+def test_what_compiles_longest_is_compiled_first_while_a_network_is_trained(tmp_path):
+    study = Study(channels=("rates",), estimators=("network", "hybrid"), flights=20)
+    with open_store(tmp_path, study, "these tests") as store:
+        work = Work(store)
+        assert labels(work, "one", 1) == ["training for rates"]
+        assert labels(work, "another", 3) == ["compiling hybrid", "compiling network", None]
 
 
 # The grid.

@@ -14,7 +14,7 @@ import jax
 import pytest
 import xarray as xr
 from helpers import refused
-from small_study import SPECIFICATION, cells, finish, results, run_study, specification, start
+from small_study import COMMAND, SPECIFICATION, cells, finish, results, run_study, specification, start
 
 from jaxos4.study import Store, load_study, open_store, read_store
 from jaxos4.study.run import compute
@@ -74,7 +74,9 @@ def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_re
         SPECIFICATION.replace('["equation-error"]', '["equation-error", "network"]') + "[network]\nsteps = 1_000_000\n"
     )
     out, command = tmp_path / "out", ("study", specification(tmp_path, text), "--out", tmp_path / "out")
-    process, deadline = start(*command, devices=2), time.monotonic() + 120
+    # A shell starts its background jobs without Ctrl-C, and their children inherit this.
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {COMMAND}"
+    process, deadline = start(*command, code=code, devices=2), time.monotonic() + 120
     while not list(out.glob("cells/*.npz")) and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)

@@ -1,13 +1,14 @@
 """The hybrid: a network says where to look, and IBSS finds the answer there."""
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from .._custom_types import Numeric
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
@@ -49,19 +50,45 @@ class Hybrid(AbstractEstimator):
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight. Raises as the network does."""
-        return search_from_seed(self.ibss, problem, bracket, self.network(problem, bracket))
+        return search_from_answer(self.ibss, problem, bracket, self.network(problem, bracket))
+
+
+class Seed(NamedTuple):
+    """What a search needs of another estimator's answer.
+
+    - `parameters`, `covariance`: the answer; without one, the covariance is infinite.
+    - `half_width`: of the intervals that hold all parameters at once.
+    - `initial_state`: the state at the first sample of each window, of the channels that the other estimator looks at.
+    - `rollouts`: of the other estimator.
+    """
+
+    parameters: Float[Numeric, " parameters"]
+    covariance: Float[Numeric, "parameters parameters"]
+    half_width: Float[Numeric, " parameters"]
+    initial_state: Float[Numeric, " starts"]
+    rollouts: Int[Numeric, ""]
+
+    @classmethod
+    def of(cls, answer: Estimate) -> "Seed":
+        """The seed of an answer."""
+        half_width = answer.half_width(_LEVEL, simultaneous=True)
+        return cls(answer.parameters, answer.covariance, half_width, answer.initial_state, answer.rollouts)
 
 
 @eqx.filter_jit
-def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> Estimate:
-    """Searches near the `seed`, another estimator's answer, and in the whole bracket if that answer was wrong."""
+def search_from_answer(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, answer: Estimate) -> Estimate:
+    """`search_from_seed` with another estimator's answer, as one program."""
+    return search_from_seed(ibss, problem, bracket, Seed.of(answer))
+
+
+def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
+    """Searches near the `seed`, and in the whole bracket if the seed was wrong or is no answer."""
     return in_blocks(_search_from_seed, ibss, problem, bracket, seed)
 
 
-def _search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Estimate) -> Estimate:
+def _search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
     """The search of one flight, or of a block of flights."""
     answered, usable = jnp.isfinite(seed.covariance).all(), bracket.usable
-    half_width = seed.half_width(_LEVEL, simultaneous=True)
     wide_spread = jnp.diag(jnp.square(usable.half_width / 2))  # the half-width is two standard deviations
     first = problem.split(problem.first_state()[0])
     # The network's channels come first.
@@ -78,7 +105,7 @@ def _search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, se
             cascade=~near,
             skip=jnp.where(near, ~answered, hit),
         )
-        return hit | (near & answered & _confirms(found, seed, half_width, problem)), found
+        return hit | (near & answered & _confirms(found, seed, problem)), found
 
     # A loop over the two searches, so that the search is compiled once. A batch of hits skips the second.
     hit, both = jax.lax.scan(search, jnp.zeros((), dtype=bool), jnp.asarray([True, False]))
@@ -90,15 +117,13 @@ def _search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, se
         best,
         rollouts=seed.rollouts + near.rollouts + wide.rollouts,
         sweeps=near.sweeps + wide.sweeps,
-        seed=Bracket.around(seed.parameters, half_width),
+        seed=Bracket.around(seed.parameters, seed.half_width),
     )
 
 
-def _confirms(
-    near: Estimate, seed: Estimate, half_width: Float[Array, " parameters"], problem: ShootingProblem
-) -> Bool[Array, ""]:
+def _confirms(near: Estimate, seed: Seed, problem: ShootingProblem) -> Bool[Array, ""]:
     """Whether the search near a seed ended well, close to the seed, and with residuals no larger than noise."""
-    far = jnp.abs(near.parameters - seed.parameters) > _MISSED * half_width
+    far = jnp.abs(near.parameters - seed.parameters) > _MISSED * seed.half_width
     measurements = jnp.sum(~jnp.isnan(problem.measured()))
     explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
     # A parameter that is not identifiable near the seed is not identifiable elsewhere either.

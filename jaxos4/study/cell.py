@@ -15,8 +15,10 @@ from jaxtyping import Array, Float
 
 from .._custom_types import States
 from ..bracket import Bracket
-from ..estimate import AbstractEstimator, Estimate
-from ..estimators import make_estimator
+from ..estimate import AbstractEstimator
+from ..estimators import ESTIMATORS, IBSS, Hybrid, make_estimator
+from ..estimators.hybrid import Seed, search_from_seed
+from ..models.state import CHANNELS
 from ..networks import TrainedNetwork
 from ..results import result_names
 from ..shooting import ShootingProblem
@@ -42,12 +44,12 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
         with one_core():
             standard = blank_problem(study, fleet, 1.0, scenario.seen)
             bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
-        found = _identify(_estimator(scenario.estimator, network), blank, fleet.bracket, flights.measured)
+        found = _answers(study, cell, fleet, blank, flights.measured, network)
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
 
 
 def compile_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> None:
-    """Compiles the program of `run_cell`, on flights without measurements: each search ends after its first look.
+    """Compiles the programs of `run_cell`, on flights without measurements: each search ends after its first look.
 
     The values of the network do not matter. Raises as the estimator does.
     """
@@ -55,8 +57,7 @@ def compile_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> No
         fleet, flights, blank = _flown(study, cell)
         with one_core():
             nothing = jax.device_put(np.full_like(flights.measured, np.nan))
-        found = _identify(_estimator(cell.scenario.estimator, network), blank, fleet.bracket, nothing)
-        jax.block_until_ready(found)
+        jax.block_until_ready(_answers(study, cell, fleet, blank, nothing, network))
 
 
 def _flown(study: Study, cell: Cell) -> tuple[Fleet, Flights, ShootingProblem]:
@@ -68,32 +69,81 @@ def _flown(study: Study, cell: Cell) -> tuple[Fleet, Flights, ShootingProblem]:
         return fleet, fly(study, fleet, cell), blank
 
 
-def program_of(study: Study, cell: Cell) -> tuple:
-    """Two cells are run by the same compiled program if this is equal for both."""
-    scenario = cell.scenario._replace(noise="", scale=0.0, method="")
-    return scenario, job_of(study, scenario) if scenario.needs_network else None
+def programs_of(study: Study, cell: Cell) -> list[tuple]:
+    """What tells the compiled programs of a cell from those of other cells, in the order of their use.
+
+    IBSS and the hybrid share their search, and the hybrid asks its network by the network's own program.
+    """
+    scenario = cell.scenario._replace(noise="", scale=0.0, method="", channels=cell.scenario.seen)
+    networks = [tuple(job_of(study, scenario))] if scenario.needs_network else []
+    kind = ESTIMATORS[scenario.estimator]
+    if issubclass(kind, TrainedNetwork):
+        return networks
+    return [*networks, scenario._replace(estimator="ibss") if issubclass(kind, Hybrid) else scenario]
+
+
+def _answers(
+    study: Study,
+    cell: Cell,
+    fleet: Fleet,
+    blank: ShootingProblem,
+    states: Float[Array, "lanes samples 12"],
+    network: TrainedNetwork | None,
+) -> dict[str, Any]:
+    """What `_identify` finds in the measurements of a cell's flights."""
+    estimator = _estimator(cell.scenario.estimator, network)
+    if not isinstance(estimator, Hybrid | IBSS):
+        return _identify(estimator, blank, fleet.bracket, states)
+    # The hybrid is the search of IBSS from a network's seeds. IBSS alone has seeds that are no answers.
+    channels = job_of(study, cell.scenario).channels
+    if isinstance(estimator, Hybrid):
+        looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
+        seeds = _identify(estimator.network, looked_at, fleet.bracket, states)["seeds"]
+        ibss, not_kept = estimator.ibss, "brackets"
+    else:
+        seeds = _no_seeds(study.batch, len(fleet.model.parameter_names), CHANNELS[channels])
+        ibss, not_kept = estimator, "seed"
+    ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
+    return _identify(ibss, blank, fleet.bracket, states, seeds) | {not_kept: None}
+
+
+def _no_seeds(lanes: int, parameters: int, starts: int) -> Seed:
+    """A seed for each lane that is no answer."""
+    kind = jnp.result_type(float)
+    nowhere, unknown = np.zeros((lanes, parameters), kind), np.full((lanes, parameters, parameters), np.inf, kind)
+    return Seed(nowhere, unknown, nowhere, np.zeros((lanes, starts), kind), np.zeros(lanes, jnp.result_type(int)))
 
 
 @eqx.filter_jit
 def _identify(
-    estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"]
+    estimator: AbstractEstimator,
+    blank: ShootingProblem,
+    bracket: Bracket,
+    states: Float[Array, "lanes samples 12"],
+    seeds: Seed | None = None,
 ) -> dict[str, Any]:
-    """The attributes of each flight's `Estimate` that are kept, by name."""
+    """The attributes of each flight's `Estimate` that are kept, by name; of a network's answers, also the seeds.
 
-    def one(states: States) -> dict[str, Any]:
-        found: Estimate = estimator(eqx.tree_at(lambda p: p.flight.states, blank, states), bracket)
+    `seeds`: where IBSS looks first.
+    """
+
+    def one(states: States, seed: Seed | None) -> dict[str, Any]:
+        problem = eqx.tree_at(lambda p: p.flight.states, blank, states)
+        if isinstance(estimator, IBSS) and seed is not None:
+            found = search_from_seed(estimator, problem, bracket, seed)
+        else:
+            found = estimator(problem, bracket)
         half_width = jnp.stack([found.half_width(level) for level in LEVELS], axis=-1)
-        return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width}
+        seeds = Seed.of(found) if isinstance(estimator, TrainedNetwork) else None
+        return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width, "seeds": seeds}
 
-    return jax.vmap(one)(states)
+    return jax.vmap(one)(states, seeds)
 
 
 def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:
     # A history of another length would be another program.
     without_history = None if network is None else eqx.tree_at(lambda n: n.history, network, jnp.zeros((0, 2)))
-    estimator = make_estimator(name, without_history)
-    records = any(field.name == "record" for field in dataclasses.fields(estimator))
-    return dataclasses.replace(estimator, record=_RECORDED_SWEEPS) if records else estimator
+    return make_estimator(name, without_history)
 
 
 def _results(

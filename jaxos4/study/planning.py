@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 
-from .cell import program_of
+from .cell import programs_of
 from .network_jobs import job_of, jobs
 from .specification import Study
 from .store import Store, check_store
@@ -28,11 +28,15 @@ class Plan(NamedTuple):
 
 
 def plan(study: Study, directory: Path) -> list[Plan]:
-    """A row for each estimator; a network counts for the first that needs it. Raises `InputError` as `open_store`."""
+    """A row for each estimator. Programs and networks count for the first estimator that needs them.
+
+    Raises `InputError` as `open_store`.
+    """
     store = check_store(directory, study)
     remaining = [study.cell(index) for index in store.missing()]
     means, rows = _mean_seconds(store), []
     trained = {job for number, job in enumerate(jobs(study)) if store.network_file(number).exists()}
+    compiled: set[tuple] = set()
     devices = len(jax.local_devices())
     for estimator in study.estimators:
         cells = [cell for cell in remaining if cell.scenario.estimator == estimator]
@@ -40,8 +44,9 @@ def plan(study: Study, directory: Path) -> list[Plan]:
         networks = {job_of(study, cell.scenario) for cell in cells if cell.scenario.needs_network} - trained
         trained |= networks
         seconds = means[estimator] * len(cells) / devices if estimator in means else None
-        programs = len({program_of(study, cell) for cell in cells})
-        rows.append(Plan(estimator, len(cells), flights, programs, len(networks), seconds))
+        programs = {program for cell in cells for program in programs_of(study, cell)} - compiled
+        compiled |= programs
+        rows.append(Plan(estimator, len(cells), flights, len(programs), len(networks), seconds))
     return rows
 
 

@@ -13,7 +13,7 @@ import jax
 from ..errors import InputError, TrainingError
 from ..estimators import ESTIMATORS
 from ..networks import TrainedNetwork, save_network
-from .cell import compile_cell, program_of, run_cell
+from .cell import compile_cell, programs_of, run_cell
 from .cell_file import encode, failed
 from .devices import give_memory_back
 from .network_jobs import blank_network, job_number, job_of, jobs, train_network
@@ -42,11 +42,16 @@ class _Task(NamedTuple):
 
 
 class _Program:
-    """The waiting cells of one compiled program, the network that they need, and the devices that run it."""
+    """The waiting cells of one compiled program, with the networks that they need, and the devices that run it."""
 
-    def __init__(self, cells: list[Cell], study: Study, needed: list[Job]):
-        self.waiting, self.network = deque(cells), job_number(study, cells[0], needed)
+    def __init__(self) -> None:
+        self.waiting: deque[tuple[Cell, int | None]] = deque()
         self.devices: set[Any] = set()
+
+    @property
+    def network(self) -> int | None:
+        """The network that the next cell needs."""
+        return self.waiting[0][1] if self.waiting else None
 
 
 class _Work:
@@ -55,12 +60,15 @@ class _Work:
     def __init__(self, store: Store):
         self.store, self.study, missing = store, store.study, store.missing()
         self.needed, self.done = jobs(self.study), self.study.count - len(missing)
-        grouped: dict[tuple, list[Cell]] = {}
-        for cell in map(self.study.cell, missing):
-            grouped.setdefault(program_of(self.study, cell), []).append(cell)
-        self.programs = [_Program(cells, self.study, self.needed) for cells in grouped.values()]
+        grouped: dict[tuple, _Program] = {}
+        # Cells without a network first: others of their program, the hybrid's beside those of IBSS, must wait for it.
+        for cell in sorted(map(self.study.cell, missing), key=lambda cell: cell.scenario.needs_network):
+            program = grouped.setdefault(programs_of(self.study, cell)[-1], _Program())
+            program.waiting.append((cell, job_number(self.study, cell, self.needed)))
+        self.programs = list(grouped.values())
         self.networks: dict[int, TrainedNetwork | str | None] = {}
-        self.untrained = deque(dict.fromkeys(p.network for p in self.programs if p.network is not None))
+        needed = (network for program in self.programs for _, network in program.waiting if network is not None)
+        self.untrained = deque(dict.fromkeys(needed))
         self.kept = {number for number in self.untrained if store.network_file(number).exists()}
 
     def task(self, device: Any) -> _Task | None:
@@ -75,7 +83,7 @@ class _Work:
         if program is None:
             return None
         program.devices.add(device)
-        return self._compilation(program) if program in ahead else self._cell(program.waiting.popleft(), program)
+        return self._compilation(program) if program in ahead else self._cell(*program.waiting.popleft())
 
     def _ready(self, device: Any) -> _Program | None:
         """The program that the device runs already, else one that no device runs, else the one with most cells."""
@@ -94,7 +102,7 @@ class _Work:
             p for p in self.programs if not p.devices and not self._has_network(p) and p.network not in self.kept
         ]
         shoots = {name: kind.shoots for name, kind in ESTIMATORS.items()}
-        return sorted(unbegun, key=lambda p: (p.network, not shoots[p.waiting[0].scenario.estimator]))
+        return sorted(unbegun, key=lambda p: (p.network, not shoots[p.waiting[0][0].scenario.estimator]))
 
     def _has_network(self, program: _Program) -> bool:
         return program.network is None or program.network in self.networks
@@ -108,12 +116,12 @@ class _Work:
         )
 
     def _compilation(self, program: _Program) -> _Task:
-        cell = program.waiting[0]
+        cell, _ = program.waiting[0]
         label = f"compiling {cell.scenario.estimator}"
         return _Task(label, lambda device: _compile(self.study, cell, device), lambda _: None)
 
-    def _cell(self, cell: Cell, program: _Program) -> _Task:
-        network = None if program.network is None else self.networks[program.network]
+    def _cell(self, cell: Cell, number: int | None) -> _Task:
+        network = None if number is None else self.networks[number]
 
         def call(device: Any) -> tuple[bytes, float]:
             with jax.default_device(device):
