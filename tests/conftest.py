@@ -77,9 +77,10 @@ jax.monitoring.register_event_listener(count_cached)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """A worker sends its counts to the controller, and then ends at once: it would free its programs for ten seconds."""
+    """A worker sends its counts to the controller."""
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["programs"] = dict(PROGRAMS)
+        # It has sent its results. Freeing its programs takes ten seconds, after which the controller would kill it.
         atexit.register(os._exit, 0)
 
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 from lanes import LANES, lost
 
 import jaxos4
-from jaxos4.estimators.hybrid import search_from_answer
+from jaxos4.estimators.hybrid import search_from_seed
 from jaxos4.networks.architecture import Regressor
 from jaxos4.networks.features import FEATURES, Coordinates
 from jaxos4.networks.first_weights import first_regressor
@@ -568,7 +568,7 @@ def seed_of(result, parameters=BRACKET.center, std=np.inf):
 def seeded(states, seeds):
     @jax.vmap
     def searched(states, seed):
-        return search_from_answer(jaxos4.IBSS(), problem_of(states, channels="all"), BRACKET, seed)
+        return search_from_seed(jaxos4.IBSS(), problem_of(states, channels="all"), BRACKET, seed)
 
     return searched(states, seeds)
 

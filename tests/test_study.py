@@ -27,6 +27,7 @@ from jaxos4.study import (
     load_study,
     open_store,
     plan,
+    read_store,
     run as run_module,
 )
 from jaxos4.study.cell import run_cell
@@ -207,41 +208,49 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
             store.write(store.cell_file(cell.number), b"", cell=cell.number, seconds=2.0 + cell.scenario.scale)
     network, hybrid, ibss = plan(study, tmp_path)
     assert network == ("network", 18, 1500, 1, 1, None)
-    # A network for the attitude, beside that for the rates; its answers, and two searches.
+    # One more network, for the attitude. Three programs: that network and two searches.
     assert hybrid == ("hybrid", 18, 1500, 3, 1, None)
     assert ibss[:5] == ("ibss", 12, 900, 0, 0)  # the same searches
     assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / len(jax.local_devices()))
 
 
 def labels(work, device, count):
-    """Of the next tasks for a device; `None` if it must wait."""
+    """The labels of the next tasks for a device; `None` if it must wait."""
     return [task and task.label for task in (work.task(device) for _ in range(count))]
 
 
-def test_one_program_of_a_network_is_compiled_while_it_is_trained_before_any_cell(tmp_path):
-    study = Study(channels=("rates",), estimators=("ibss", "network", "hybrid"), flights=20)
+@pytest.mark.parametrize(
+    ("estimators", "channels", "compiled"),
+    [
+        (("ibss", "network", "hybrid"), "rates", {"hybrid": "rates"}),
+        (("network", "ibss"), "rates", {"network": "rates"}),
+        (("ibss", "hybrid"), "all", {"hybrid": "all"}),
+        (("ibss", "network", "hybrid"), "all", {"network": "rates", "hybrid": "all"}),
+    ],
+)
+def test_programs_of_each_network_are_compiled_while_it_is_trained_before_any_cell(
+    tmp_path, estimators, channels, compiled
+):
+    """`compiled`: the estimators whose programs are compiled, and the channels of their networks."""
+    study = Study(channels=(channels,), estimators=estimators, flights=20)
     with open_store(tmp_path, study, "these tests") as store:
         work = Work(store)
-        assert labels(work, "one", 1) == ["training for rates"]
-        assert labels(work, "another", 5) == ["compiling network", "ibss 0.1", "ibss 1", "ibss 10", None]
-        # The search of the hybrid is that of IBSS.
-        work.networks[0] = "training diverged"
-        assert labels(work, "another", 4) == ["hybrid 0.1", "hybrid 1", "hybrid 10", "network 0.1"]
-        # The network of a finished training is only read. After that, the first device takes what no other one runs.
-        store.network_file(0).touch()
+        assert labels(work, "one", len(compiled)) == [f"training for {seen}" for seen in compiled.values()]
+        expected = [*(f"compiling {name}" for name in compiled), "ibss 0.1", "ibss 1", "ibss 10", None]
+        assert labels(work, "another", len(expected)) == expected
+
+
+def test_after_its_training_a_device_takes_what_no_other_one_runs(tmp_path):
+    study = Study(channels=("rates",), estimators=("ibss", "network", "hybrid"), flights=20)
+    with open_store(tmp_path, study, "these tests") as store:
+        store.network_file(0).touch()  # of a finished training: it is only read
         work = Work(store)
         assert labels(work, "one", 1) == ["training for rates"]
         assert labels(work, "another", 4) == ["ibss 0.1", "ibss 1", "ibss 10", None]
         work.networks[0] = "training diverged"
         assert labels(work, "one", 4) == ["network 0.1", "network 1", "network 10", None]
-
-
-def test_what_compiles_longest_is_compiled_first_while_a_network_is_trained(tmp_path):
-    study = Study(channels=("rates",), estimators=("network", "hybrid"), flights=20)
-    with open_store(tmp_path, study, "these tests") as store:
-        work = Work(store)
-        assert labels(work, "one", 1) == ["training for rates"]
-        assert labels(work, "another", 3) == ["compiling hybrid", "compiling network", None]
+        # The search of the hybrid is that of IBSS.
+        assert labels(work, "another", 4) == ["hybrid 0.1", "hybrid 1", "hybrid 10", None]
 
 
 # The grid.
@@ -309,24 +318,25 @@ def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
 # The Dataset.
 
 
-@pytest.mark.parametrize("number", [0, 3, 9])
-@pytest.mark.parametrize("scale", [1.0, 0.1])
-def test_the_dataset_is_what_the_library_computes(dataset, number, scale):
+def flown(number, scale, *, channels="rates", initial_state=None):
+    """Flight `number` of a study with truths that are drawn: its truth, exact states, and problem, by the library."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     omega = jaxos4.multisine(jaxos4.OS4, duration=1.0, dt=0.01)
     bracket = jaxos4.Bracket.default(model)
     truth_key, noise_key = jax.random.split(jax.random.fold_in(jax.random.fold_in(jax.random.key(5), 1), number))
     u = jax.random.uniform(truth_key, (8,), minval=-1, maxval=1)
     truth = bracket.center + u * bracket.half_width
-    flight = jaxos4.simulate(model, truth, omega, dt=0.01)
-    noise = jaxos4.WhiteNoise(scale * jaxos4.SENSOR_SIGMA)
-    problem = jaxos4.ShootingProblem(
-        model,
-        noise(flight, key=noise_key),
-        sigma=scale * jaxos4.SENSOR_SIGMA,
-        initial_state=jnp.zeros(12),
-        channels="rates",
-    )
+    flight, sigma = jaxos4.simulate(model, truth, omega, dt=0.01), scale * jaxos4.SENSOR_SIGMA
+    noisy = jaxos4.WhiteNoise(sigma)(flight, key=noise_key)
+    problem = jaxos4.ShootingProblem(model, noisy, sigma=sigma, initial_state=initial_state, channels=channels)
+    return truth, flight.states, problem
+
+
+@pytest.mark.parametrize("number", [0, 3, 9])
+@pytest.mark.parametrize("scale", [1.0, 0.1])
+def test_the_dataset_is_what_the_library_computes(dataset, number, scale):
+    truth, states, problem = flown(number, scale, initial_state=jnp.zeros(12))
+    model, bracket = problem.model, jaxos4.Bracket.default(problem.model)
     bound = jnp.sqrt(jnp.diagonal(jaxos4.cramer_rao_bound(problem, truth)))
     where = {"flight": number, "scale": scale}
     for estimator in (jaxos4.IBSS(), jaxos4.EquationError()):
@@ -345,14 +355,51 @@ def test_the_dataset_is_what_the_library_computes(dataset, number, scale):
     same(dataset["center"].squeeze(), bracket.center, bracket.half_width)
     same(dataset["bracket_half_width"].squeeze(), bracket.half_width)
     if number == 0 and scale == 1.0:
-        same(dataset["example_true"], flight.states, jaxos4.SENSOR_SIGMA)
+        same(dataset["example_true"], states, jaxos4.SENSOR_SIGMA)
         same(dataset["example_measured"], problem.flight.states, jaxos4.SENSOR_SIGMA)
         found = jaxos4.IBSS()(problem, bracket)
-        flown = jaxos4.simulate(model, found.parameters, omega, dt=0.01).states
-        same(dataset["example_simulated"].sel(estimator="ibss"), flown, jaxos4.SENSOR_SIGMA)
+        again = jaxos4.simulate(model, found.parameters, problem.flight.omega, dt=0.01).states
+        same(dataset["example_simulated"].sel(estimator="ibss"), again, jaxos4.SENSOR_SIGMA)
         assert dataset["state"].to_numpy().tolist() == list(STATE_NAMES)
         middle = dataset["search_estimate"].isel(sweep=0)
         assert np.all(np.abs(middle - truth) <= dataset["search_half_width"].isel(sweep=0) + 2 * bracket.half_width)
+
+
+HYBRID = """
+durations = [1.0]
+scales = [0.1, 1.0]
+channels = ["attitude"]
+estimators = ["ibss", "hybrid"]
+truth = "drawn"
+initial_state = "free"
+flights = 6
+batch = 4
+seed = 5
+[network]
+steps = 2
+held_out = 1000
+hybrid_channels = "rates"
+"""
+
+
+def test_the_hybrid_of_a_study_is_that_of_the_library(tmp_path):
+    """The library searches from the network in one program for each flight, the study in batches with that of IBSS."""
+    out = run_study(tmp_path, HYBRID)
+    with xr.open_dataset(out / "results.nc") as dataset:
+        dataset = dataset.load().squeeze()
+    network = read_store(out).read_network(0)
+    assert network.channels == "rates"
+    for number, scale in ((0, 0.1), (5, 1.0)):
+        truth, _, problem = flown(number, scale, channels="attitude")
+        of = dataset.sel(flight=number, scale=scale, estimator="hybrid")
+        found = jaxos4.Hybrid(network)(problem, jaxos4.Bracket.default(problem.model))
+        assert OUTCOMES[int(of["result"])] == jaxos4.result_names(found.result)
+        assert (np.abs(of["estimate"] - found.parameters) < 1e-6 * found.std).all()
+        np.testing.assert_allclose(of["half_width"].sel(level=0.95), found.half_width(0.95), rtol=1e-6)
+        assert int(of["rollouts"]) == int(found.rollouts)
+        hit = (truth >= found.seed.lower) & (truth <= found.seed.upper)
+        assert int(of["hit"]) == int(hit.all())
+    assert (dataset["hit"].sel(estimator="ibss") == -1).all()
 
 
 def same(ours, theirs, scale=0.0) -> None:

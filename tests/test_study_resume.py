@@ -74,7 +74,7 @@ def test_an_interrupt_ends_a_study_at_once_with_one_line_and_the_same_command_re
         SPECIFICATION.replace('["equation-error"]', '["equation-error", "network"]') + "[network]\nsteps = 1_000_000\n"
     )
     out, command = tmp_path / "out", ("study", specification(tmp_path, text), "--out", tmp_path / "out")
-    # A shell starts its background jobs without Ctrl-C, and their children inherit this.
+    # A shell's background jobs ignore Ctrl-C, and so do their children.
     code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {COMMAND}"
     process, deadline = start(*command, code=code, devices=2), time.monotonic() + 120
     while not list(out.glob("cells/*.npz")) and time.monotonic() < deadline:

@@ -6,6 +6,7 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric
@@ -50,15 +51,15 @@ class Hybrid(AbstractEstimator):
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
         """Identifies one flight. Raises as the network does."""
-        return search_from_answer(self.ibss, problem, bracket, self.network(problem, bracket))
+        return search_from_seed(self.ibss, problem, bracket, self.network(problem, bracket))
 
 
 class Seed(NamedTuple):
-    """What a search needs of another estimator's answer.
+    """Where a search begins: the answer of another estimator.
 
-    - `parameters`, `covariance`: the answer; without one, the covariance is infinite.
-    - `half_width`: of the intervals that hold all parameters at once.
-    - `initial_state`: the state at the first sample of each window, of the channels that the other estimator looks at.
+    - `parameters`, `covariance`: the covariance is infinite if there is no answer.
+    - `half_width`: of the 99.9 % intervals for all parameters at once.
+    - `initial_state`: at the first sample of each window, of the channels that the other estimator looks at.
     - `rollouts`: of the other estimator.
     """
 
@@ -74,19 +75,26 @@ class Seed(NamedTuple):
         half_width = answer.half_width(_LEVEL, simultaneous=True)
         return cls(answer.parameters, answer.covariance, half_width, answer.initial_state, answer.rollouts)
 
+    @classmethod
+    def none(cls, parameters: int, starts: int) -> "Seed":
+        """A seed without an answer. `parameters`, `starts`: the lengths of `parameters` and `initial_state`."""
+        kind = jnp.result_type(float)
+        nowhere, unknown = np.zeros(parameters, kind), np.full((parameters, parameters), np.inf, kind)
+        return cls(nowhere, unknown, nowhere, np.zeros(starts, kind), np.zeros((), jnp.result_type(int)))
+
 
 @eqx.filter_jit
-def search_from_answer(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, answer: Estimate) -> Estimate:
-    """`search_from_seed` with another estimator's answer, as one program."""
-    return search_from_seed(ibss, problem, bracket, Seed.of(answer))
+def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, answer: Estimate) -> Estimate:
+    """`search_near` the seed of an `answer`, as one program."""
+    return search_near(ibss, problem, bracket, Seed.of(answer))
 
 
-def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
-    """Searches near the `seed`, and in the whole bracket if the seed was wrong or is no answer."""
-    return in_blocks(_search_from_seed, ibss, problem, bracket, seed)
+def search_near(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
+    """Searches near the `seed`, and in the whole bracket if the seed was wrong or has no answer."""
+    return in_blocks(_search_near, ibss, problem, bracket, seed)
 
 
-def _search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
+def _search_near(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
     """The search of one flight, or of a block of flights."""
     answered, usable = jnp.isfinite(seed.covariance).all(), bracket.usable
     wide_spread = jnp.diag(jnp.square(usable.half_width / 2))  # the half-width is two standard deviations

@@ -1,7 +1,7 @@
 """The results of a cell: a pure function of the specification, the cell's index, and its network.
 
-A cell is one call of one program on one device. Last digits depend on the length of a batch and on the number of
-devices that share a program; with whole cells they are the same in any order and in any process.
+A cell is one call of each of its programs, on one device. Last digits depend on the length of a batch and on the number
+of devices that share a program; with whole cells they are the same in any order and in any process.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from .._custom_types import States
 from ..bracket import Bracket
-from ..estimate import AbstractEstimator
+from ..estimate import AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, Hybrid, make_estimator
-from ..estimators.hybrid import Seed, search_from_seed
+from ..estimators.hybrid import Seed, search_near
 from ..models.state import CHANNELS
 from ..networks import TrainedNetwork
 from ..results import result_names
@@ -25,7 +25,7 @@ from ..shooting import ShootingProblem
 from .cell_file import LEVELS, OUTCOMES
 from .devices import one_core
 from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly
-from .network_jobs import job_of
+from .network_jobs import hybrid_channels, job_of
 from .specification import Cell, Study
 
 # Sweeps of a search that are kept, for a scenario's first flight.
@@ -70,16 +70,15 @@ def _flown(study: Study, cell: Cell) -> tuple[Fleet, Flights, ShootingProblem]:
 
 
 def programs_of(study: Study, cell: Cell) -> list[tuple]:
-    """What tells the compiled programs of a cell from those of other cells, in the order of their use.
+    """The keys of the programs that a cell runs, in the order of use. Cells with an equal key share the program.
 
-    IBSS and the hybrid share their search, and the hybrid asks its network by the network's own program.
+    IBSS and the hybrid share their search. The hybrid also runs its network's program.
     """
-    scenario = cell.scenario._replace(noise="", scale=0.0, method="", channels=cell.scenario.seen)
-    networks = [tuple(job_of(study, scenario))] if scenario.needs_network else []
-    kind = ESTIMATORS[scenario.estimator]
-    if issubclass(kind, TrainedNetwork):
-        return networks
-    return [*networks, scenario._replace(estimator="ibss") if issubclass(kind, Hybrid) else scenario]
+    scenario = cell.scenario
+    kind, shapes = ESTIMATORS[scenario.estimator], (scenario.model, scenario.duration)
+    if issubclass(kind, Hybrid):
+        return [(TrainedNetwork, *shapes, job_of(study, scenario).channels), (IBSS, *shapes, scenario.seen)]
+    return [(kind, *shapes, scenario.seen)]
 
 
 def _answers(
@@ -90,54 +89,51 @@ def _answers(
     states: Float[Array, "lanes samples 12"],
     network: TrainedNetwork | None,
 ) -> dict[str, Any]:
-    """What `_identify` finds in the measurements of a cell's flights."""
-    estimator = _estimator(cell.scenario.estimator, network)
+    """The attributes in `_KEPT` of each flight's estimate, and its `half_width` at `LEVELS`, by name."""
+    estimator, bracket = _estimator(cell.scenario.estimator, network), fleet.bracket
     if not isinstance(estimator, Hybrid | IBSS):
-        return _identify(estimator, blank, fleet.bracket, states)
-    # The hybrid is the search of IBSS from a network's seeds. IBSS alone has seeds that are no answers.
-    channels = job_of(study, cell.scenario).channels
-    if isinstance(estimator, Hybrid):
+        return _identify(estimator, blank, bracket, states)[0]
+    channels = hybrid_channels(study, cell.scenario)
+    if isinstance(estimator, IBSS):
+        # Without an answer near which to search, it searches the whole bracket.
+        none = Seed.none(len(fleet.model.parameter_names), CHANNELS[channels])
+        seeds = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (study.batch, *leaf.shape)), none)
+        return _search(estimator, blank, bracket, states, seeds) | {"seed": None}
+    with one_core():
         looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
-        seeds = _identify(estimator.network, looked_at, fleet.bracket, states)["seeds"]
-        ibss, not_kept = estimator.ibss, "brackets"
-    else:
-        seeds = _no_seeds(study.batch, len(fleet.model.parameter_names), CHANNELS[channels])
-        ibss, not_kept = estimator, "seed"
-    ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
-    return _identify(ibss, blank, fleet.bracket, states, seeds) | {not_kept: None}
-
-
-def _no_seeds(lanes: int, parameters: int, starts: int) -> Seed:
-    """A seed for each lane that is no answer."""
-    kind = jnp.result_type(float)
-    nowhere, unknown = np.zeros((lanes, parameters), kind), np.full((lanes, parameters, parameters), np.inf, kind)
-    return Seed(nowhere, unknown, nowhere, np.zeros((lanes, starts), kind), np.zeros(lanes, jnp.result_type(int)))
+    _, seeds = _identify(estimator.network, looked_at, bracket, states)
+    return _search(estimator.ibss, blank, bracket, states, seeds) | {"brackets": None}
 
 
 @eqx.filter_jit
 def _identify(
-    estimator: AbstractEstimator,
-    blank: ShootingProblem,
-    bracket: Bracket,
-    states: Float[Array, "lanes samples 12"],
-    seeds: Seed | None = None,
+    estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"]
+) -> tuple[dict[str, Any], Seed]:
+    """What `_answers` returns, and the seed that each answer is for a search."""
+
+    def one(states: States) -> tuple[dict[str, Any], Seed]:
+        found = estimator(eqx.tree_at(lambda p: p.flight.states, blank, states), bracket)
+        return _kept(found), Seed.of(found)
+
+    return jax.vmap(one)(states)
+
+
+@eqx.filter_jit
+def _search(
+    ibss: IBSS, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"], seeds: Seed
 ) -> dict[str, Any]:
-    """The attributes of each flight's `Estimate` that are kept, by name; of a network's answers, also the seeds.
+    """What `_answers` returns, from a search near the seeds. Its sweeps are recorded."""
+    ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
 
-    `seeds`: where IBSS looks first.
-    """
-
-    def one(states: States, seed: Seed | None) -> dict[str, Any]:
-        problem = eqx.tree_at(lambda p: p.flight.states, blank, states)
-        if isinstance(estimator, IBSS) and seed is not None:
-            found = search_from_seed(estimator, problem, bracket, seed)
-        else:
-            found = estimator(problem, bracket)
-        half_width = jnp.stack([found.half_width(level) for level in LEVELS], axis=-1)
-        seeds = Seed.of(found) if isinstance(estimator, TrainedNetwork) else None
-        return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width, "seeds": seeds}
+    def one(states: States, seed: Seed) -> dict[str, Any]:
+        return _kept(search_near(ibss, eqx.tree_at(lambda p: p.flight.states, blank, states), bracket, seed))
 
     return jax.vmap(one)(states, seeds)
+
+
+def _kept(found: Estimate) -> dict[str, Any]:
+    half_width = jnp.stack([found.half_width(level) for level in LEVELS], axis=-1)
+    return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width}
 
 
 def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:

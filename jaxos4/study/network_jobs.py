@@ -21,10 +21,14 @@ def jobs(study: Study) -> list[Job]:
 
 def job_of(study: Study, scenario: Scenario) -> Job:
     """The network that a scenario's estimator needs."""
-    channels = scenario.seen
-    if ESTIMATORS[scenario.estimator].shoots:  # the network only says where to shoot
-        channels = min(channels, study.network.hybrid_channels, key=CHANNELS.__getitem__)
+    # The hybrid's network only says where to shoot.
+    channels = hybrid_channels(study, scenario) if ESTIMATORS[scenario.estimator].shoots else scenario.seen
     return Job(scenario.model, scenario.airframe, scenario.excitation, scenario.duration, scenario.width, channels)
+
+
+def hybrid_channels(study: Study, scenario: Scenario) -> str:
+    """The channels that a hybrid's network looks at."""
+    return min(scenario.seen, study.network.hybrid_channels, key=CHANNELS.__getitem__)
 
 
 def job_number(study: Study, cell: Cell, needed: list[Job]) -> int | None:

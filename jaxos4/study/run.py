@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax
 
 from ..errors import InputError, TrainingError
-from ..estimators import ESTIMATORS
 from ..networks import TrainedNetwork, save_network
 from .cell import compile_cell, programs_of, run_cell
 from .cell_file import encode, failed
@@ -42,16 +41,19 @@ class _Task(NamedTuple):
 
 
 class _Program:
-    """The waiting cells of one compiled program, with the networks that they need, and the devices that run it."""
+    """One compiled program: the devices that run it, and the waiting cells that end with it."""
 
     def __init__(self) -> None:
-        self.waiting: deque[tuple[Cell, int | None]] = deque()
         self.devices: set[Any] = set()
+        self.waiting: deque[_Waiting] = deque()
 
-    @property
-    def network(self) -> int | None:
-        """The network that the next cell needs."""
-        return self.waiting[0][1] if self.waiting else None
+
+class _Waiting(NamedTuple):
+    """A cell that waits, the number of the network that it needs, and the programs that it runs."""
+
+    cell: Cell
+    network: int | None
+    programs: list[_Program]
 
 
 class _Work:
@@ -60,52 +62,64 @@ class _Work:
     def __init__(self, store: Store):
         self.store, self.study, missing = store, store.study, store.missing()
         self.needed, self.done = jobs(self.study), self.study.count - len(missing)
-        grouped: dict[tuple, _Program] = {}
-        # Cells without a network first: others of their program, the hybrid's beside those of IBSS, must wait for it.
-        for cell in sorted(map(self.study.cell, missing), key=lambda cell: cell.scenario.needs_network):
-            program = grouped.setdefault(programs_of(self.study, cell)[-1], _Program())
-            program.waiting.append((cell, job_number(self.study, cell, self.needed)))
-        self.programs = list(grouped.values())
+        programs: dict[tuple, _Program] = {}
+        waiting, untrained = [], {}
+        for cell in map(self.study.cell, missing):
+            keys, network = programs_of(self.study, cell), job_number(self.study, cell, self.needed)
+            one = _Waiting(cell, network, [programs.setdefault(key, _Program()) for key in keys])
+            waiting.append(one)
+            if network is not None:
+                untrained.setdefault((network, *keys), one)
+        # Cells of IBSS first: those of the hybrid, which end with the same program, wait for a network.
+        for one in sorted(waiting, key=lambda one: one.network is not None):
+            one.programs[-1].waiting.append(one)
+        self.programs = list(programs.values())
         self.networks: dict[int, TrainedNetwork | str | None] = {}
-        needed = (network for program in self.programs for _, network in program.waiting if network is not None)
-        self.untrained = deque(dict.fromkeys(needed))
-        self.kept = {number for number in self.untrained if store.network_file(number).exists()}
+        self.untrained = deque(dict.fromkeys(number for number, *_ in untrained))
+        kept = {number for number in self.untrained if store.network_file(number).exists()}  # soon read
+        # For each network and its programs one cell. First the hybrid's: its programs compile for longest.
+        self.blocked = sorted(
+            (one for one in untrained.values() if one.network not in kept),
+            key=lambda one: (one.network, -len(one.programs)),
+        )
+        self.begun: set[int | None] = set()  # networks of which programs were compiled
 
     def task(self, device: Any) -> _Task | None:
         """The next task for a free device, or `None` if all remaining work waits for other tasks."""
         if self.untrained:
             return self._training(self.untrained.popleft())
         ahead = self._ahead()
-        # One program of each network before any cell. Compiled after the training, it would hold up the end.
-        begun = {p.network for p in self.programs if p.devices}
-        first = next((p for p in ahead if p.network not in begun), None)
-        program = first or self._ready(device) or next(iter(ahead), None)
-        if program is None:
+        # Programs of each network before any cell. Compiled after the training, they would hold up the end.
+        first = next((one for one in ahead if one.network not in self.begun), None)
+        ready = None if first else self._ready(device)
+        one = ready.waiting.popleft() if ready else first or next(iter(ahead), None)
+        if one is None:
             return None
-        program.devices.add(device)
-        return self._compilation(program) if program in ahead else self._cell(*program.waiting.popleft())
+        for program in one.programs:
+            program.devices.add(device)
+        if ready:
+            return self._cell(one)
+        self.begun.add(one.network)
+        return self._compilation(one)
+
+    def _ahead(self) -> list[_Waiting]:
+        """Cells whose network is being trained, and whose programs are not all compiled."""
+        return [
+            one
+            for one in self.blocked
+            if one.network not in self.networks and not all(program.devices for program in one.programs)
+        ]
 
     def _ready(self, device: Any) -> _Program | None:
         """The program that the device runs already, else one that no device runs, else the one with most cells."""
-        ready = [p for p in self.programs if p.waiting and self._has_network(p)]
+        ready = [p for p in self.programs if p.waiting and self._has_network(p.waiting[0])]
         own = [p for p in ready if device in p.devices]
         new = [p for p in ready if not p.devices]
         long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
         return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
 
-    def _ahead(self) -> list[_Program]:
-        """The programs to compile while their network is trained. First those that shoot: they compile for longest.
-
-        A network that a file holds is soon read.
-        """
-        unbegun = [
-            p for p in self.programs if not p.devices and not self._has_network(p) and p.network not in self.kept
-        ]
-        shoots = {name: kind.shoots for name, kind in ESTIMATORS.items()}
-        return sorted(unbegun, key=lambda p: (p.network, not shoots[p.waiting[0][0].scenario.estimator]))
-
-    def _has_network(self, program: _Program) -> bool:
-        return program.network is None or program.network in self.networks
+    def _has_network(self, one: _Waiting) -> bool:
+        return one.network is None or one.network in self.networks
 
     def _training(self, number: int) -> _Task:
         job = self.needed[number]
@@ -115,13 +129,12 @@ class _Work:
             lambda network: self.networks.update({number: network}),
         )
 
-    def _compilation(self, program: _Program) -> _Task:
-        cell, _ = program.waiting[0]
-        label = f"compiling {cell.scenario.estimator}"
-        return _Task(label, lambda device: _compile(self.study, cell, device), lambda _: None)
+    def _compilation(self, one: _Waiting) -> _Task:
+        label = f"compiling {one.cell.scenario.estimator}"
+        return _Task(label, lambda device: _compile(self.study, one.cell, device), lambda _: None)
 
-    def _cell(self, cell: Cell, number: int | None) -> _Task:
-        network = None if number is None else self.networks[number]
+    def _cell(self, one: _Waiting) -> _Task:
+        cell, network = one.cell, None if one.network is None else self.networks[one.network]
 
         def call(device: Any) -> tuple[bytes, float]:
             with jax.default_device(device):
