@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from .._custom_types import Key, Numeric, Scalar, as_float
+from .._custom_types import Key, Scalar, as_float
 from ..errors import TrainingError
 from .architecture import Regressor, Scaling
 from .features import AbstractFeatures
-from .training import Flights, Purpose, draw_chunks, noisy_chunk
+from .training import Pair, Purpose, draw_chunks, noisy_chunk
 
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
@@ -83,8 +83,8 @@ def calibrate(
     for number, scale in enumerate(np.asarray(scales)):
         first = (1 + number) * len(flights)  # behind the places of the flights
         errors = [
-            _standardised(regressor, scaling, features, chunk, scale, key, Purpose.CALIBRATION.place(first + i))
-            for i, chunk in enumerate(flights)
+            _standardised(regressor, scaling, noisy_chunk(features, chunk, np.stack([scale, scale]), key, place), scale)
+            for place, chunk in zip(Purpose.CALIBRATION.place(first + np.arange(len(flights))), flights, strict=True)
         ]
         tables.append(_table(np.concatenate(errors)[:, :parameters]))
     return ErrorTable(scales, *(as_float(np.stack(column)) for column in zip(*tables, strict=True)))
@@ -92,19 +92,11 @@ def calibrate(
 
 @eqx.filter_jit
 def _standardised(
-    regressor: Regressor,
-    scaling: Scaling,
-    features: AbstractFeatures,
-    chunk: Flights,
-    scale: Scalar,
-    key: Key,
-    place: Int[Numeric, ""],
+    regressor: Regressor, scaling: Scaling, pairs: Pair, scale: Scalar
 ) -> Float[Array, "flights unknowns"]:
-    """Errors in units of the standard deviation that the network gives."""
-    output = jax.vmap(regressor, in_axes=(0, None, None))(
-        noisy_chunk(features, chunk, jnp.stack([scale, scale]), key, place).features, scale, scaling
-    )
-    return (output.u - chunk.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
+    """Errors in units of the standard deviation that the network gives, at one noise scale."""
+    output = jax.vmap(regressor, in_axes=(0, None, None))(pairs.features, scale, scaling)
+    return (output.u - pairs.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
 
 
 def _table(error: Float[np.ndarray, "flights parameters"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -97,7 +97,7 @@ def _restore(path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> Tra
         method=header["method"],
         windows=header["windows"],
     )
-    blank = eqx.filter_eval_shape(settings.blank, problem, Bracket.default(problem.model))
+    blank = eqx.filter_eval_shape(lambda p: settings.blank(p, Bracket.default(p.model)), problem)
     history = jax.ShapeDtypeStruct((header["checks"], 2), float)
     blank = eqx.tree_at(lambda n: (n.features.problem, n.history), blank, (problem, history))
 

@@ -171,7 +171,7 @@ def train(
         if without_improvement >= patience:
             break
     best = jax.tree.map(
-        lambda leaf, like: jnp.asarray(np.asarray(leaf), like.dtype) if eqx.is_inexact_array(like) else like,
+        lambda leaf, like: jnp.asarray(np.asarray(leaf, like.dtype)) if eqx.is_inexact_array(like) else like,
         best,
         given,
     )

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import States
+from .._custom_types import States, as_float
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, Hybrid, make_estimator
@@ -138,7 +138,7 @@ def _kept(found: Estimate) -> dict[str, Any]:
 
 def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:
     # A history of another length would be another program.
-    without_history = None if network is None else eqx.tree_at(lambda n: n.history, network, jnp.zeros((0, 2)))
+    without_history = None if network is None else eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
     return make_estimator(name, without_history)
 
 
@@ -169,7 +169,7 @@ def _results(
     }
     results = {name: value[:count] for name, value in results.items()}
     if cell.first == 0:  # the example flight of the report
-        results |= {"true": np.asarray(flights.exact[0]), "measured": np.asarray(flights.measured[0])}
+        results |= {"true": np.asarray(flights.exact)[0], "measured": np.asarray(flights.measured)[0]}
         if found["brackets"] is not None:
             results["brackets"] = found["brackets"][0]
     return results
