@@ -15,14 +15,15 @@ class Kind(NamedTuple):
     """A figure that a study can have.
 
     - `draw`: returns nothing if the data are absent.
-    - `of_scale`: it shows one noise scale: the files the one nearest 1, the page the one that the reader chooses.
+    - `of_scale`: it shows one noise scale: the files the one nearest 1, the page the one that the reader chooses. Then
+      `draw` also takes the figure of another scale, and draws into it.
     """
 
     name: str
     title: str
     caption: str
     source: str
-    draw: Callable[[xr.Dataset], Figure | None]
+    draw: Callable[..., Figure | None]
     of_scale: bool = False
 
 
@@ -148,18 +149,18 @@ def _draw(kind: Kind, data: xr.Dataset, stem: str, with_pdf: bool) -> Iterator[D
         figure = kind.draw(data)
         if figure is None:
             return
-        as_svg = svg(figure)
-        choices = _of_each_scale(kind, data, as_svg) if kind.of_scale else {"": as_svg}
-        drawn = Drawn(stem, kind, as_svg, pdf(figure) if with_pdf else None, choices)
-    yield drawn
+        as_svg, as_pdf = svg(figure), pdf(figure) if with_pdf else None
+        choices = _of_each_scale(kind, data, figure, as_svg) if kind.of_scale else {"": as_svg}
+    yield Drawn(stem, kind, as_svg, as_pdf, choices)
 
 
-def _of_each_scale(kind: Kind, data: xr.Dataset, nearest: bytes) -> dict[str, bytes]:
+def _of_each_scale(kind: Kind, data: xr.Dataset, figure: Figure, nearest: bytes) -> dict[str, bytes]:
+    """The figure of each noise scale. `figure`: of the scale nearest 1, and `nearest`, its bytes."""
     choices = {}
     for place, scale in enumerate(data["scale"].values):
         label = f"noise x {scale:g}"
         if place == figures_spread.nearest_scale(data):
             choices[label] = nearest
-        elif (figure := kind.draw(data.isel(scale=[place]))) is not None:
+        elif kind.draw(data.isel(scale=[place]), figure) is not None:
             choices[label] = svg(figure)
     return choices

@@ -28,18 +28,24 @@ def nearest_scale(data: xr.Dataset) -> int:
     return int(np.argmin(np.abs(np.log(positive))))
 
 
-def distribution(data: xr.Dataset) -> Figure | None:
-    """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1."""
+def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None:
+    """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1.
+
+    `drawn`: this figure of another scale, whose boxes are replaced. It keeps its layout, which takes half of the time.
+    """
     every = metrics.normalised_error(data.isel(scale=nearest_scale(data)))
     some = every.notnull().any("flight")
     if not some.any():
         return None
     found = every.where(some, 0.0).quantile(list(_QUANTILES), dim="flight").where(some)
     style = styles(names(data, "estimator"))
-    figure, axes = grid(data.sizes["parameter"], columns=4, height=0.28 * len(style) + 0.75)
+    if drawn is None:
+        drawn, _ = grid(data.sizes["parameter"], columns=4, height=0.28 * len(style) + 0.75)
     # Wide enough for the boxes, but limited in case one estimator is very bad.
     reach = float(np.clip(1.08 * np.nanmax(np.abs(found.values), initial=0.0), 3.0, 12.0))
-    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
+    for place, (panel, name) in enumerate(zip(drawn.axes, names(data, "parameter"), strict=True)):
+        for old in (*panel.lines, *panel.texts):
+            old.remove()
         for x in (-NINETY_FIVE, NINETY_FIVE):
             panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
         panel.axvline(0, color=INK, linewidth=0.8)
@@ -58,8 +64,8 @@ def distribution(data: xr.Dataset) -> Figure | None:
         panel.set_ylim(len(style) - 0.4, -0.6)
         panel.set_yticks(range(len(style)), list(style) if place % 4 == 0 else [])
         panel.grid(axis="y", visible=False)
-    label_edges(axes, 4, x="error / bound")
-    return figure
+    label_edges(drawn.axes, 4, x="error / bound")
+    return drawn
 
 
 def coverage(data: xr.Dataset) -> Figure | None:
