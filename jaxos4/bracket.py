@@ -42,8 +42,9 @@ class Bracket(eqx.Module):
     @classmethod
     def around(cls, center: Float[ArrayLike, " parameters"], half_width: Float[ArrayLike, " parameters"]) -> "Bracket":
         """The bracket from `center - half_width` to `center + half_width`."""
-        center, half_width = as_float(center), as_float(half_width)
-        return cls(center - half_width, center + half_width)
+        middle, reach = _numpy_if_known(as_float(center), as_float(half_width))
+        with np.errstate(all="ignore"):  # infinite ends, as JAX has them
+            return cls(middle - reach, middle + reach)
 
     @classmethod
     def default(cls, model: AbstractModel) -> "Bracket":
@@ -64,10 +65,7 @@ class Bracket(eqx.Module):
 
     @property
     def _ends(self) -> tuple[Numeric, Numeric]:
-        """Both ends; those of a known bracket as NumPy, which needs no compiled program."""
-        if isinstance(self.lower, Tracer) or isinstance(self.upper, Tracer):
-            return self.lower, self.upper
-        return np.asarray(self.lower), np.asarray(self.upper)
+        return _numpy_if_known(self.lower, self.upper)
 
     @property
     def valid(self) -> Bool[Array, ""]:
@@ -83,6 +81,11 @@ class Bracket(eqx.Module):
     def usable(self) -> "Bracket":
         """The bracket itself if it is valid, else 0 +- 1, so that a computation in a batch stays finite."""
         return Bracket.around(jnp.where(self.valid, self.center, 0.0), jnp.where(self.valid, self.half_width, 1.0))
+
+
+def _numpy_if_known(a: Array, b: Array) -> tuple[Numeric, Numeric]:
+    """Both arrays, as NumPy if their values are known: arithmetic then needs no compiled program."""
+    return (a, b) if isinstance(a, Tracer) or isinstance(b, Tracer) else (np.asarray(a), np.asarray(b))
 
 
 @eqx.filter_jit  # one compiled program instead of one for each operation
