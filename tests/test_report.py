@@ -17,7 +17,7 @@ from synthetic_study import ESTIMATORS, LEVELS, RESULTS, SCENARIO, UNITS, synthe
 
 from jaxos4.report import error_table, figures, read_results, write_report, writing
 from jaxos4.report.numbers import MISSING, plain
-from jaxos4.report.style import drawing, log_axis
+from jaxos4.report.style import drawing, grid, log_axis
 
 OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
 OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
@@ -329,6 +329,17 @@ def test_a_logarithmic_axis_has_a_tick_at_1_where_that_is_in_sight(low, high):
     seen = ticks[(ticks >= low) & (ticks <= high)]
     assert np.isclose(seen, 1).any()
     assert 1 < len(seen) < 10
+
+
+def test_a_title_stays_clear_of_the_power_of_ten_of_an_axis():
+    with drawing():
+        figure, (panel,) = grid(1, columns=1)
+        panel.plot([0, 1], [1e-7, 3e-6])
+        title = panel.set_title("p [rad/s]")
+        figure.draw_without_rendering()
+    power = panel.yaxis.get_offset_text()
+    assert power.get_text()
+    assert title.get_window_extent().y0 > power.get_window_extent().y1
 
 
 def test_small_numbers_keep_their_digits():

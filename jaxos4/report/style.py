@@ -61,7 +61,6 @@ _RC: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.titlelocation": "left",
     "axes.titlesize": 9,
-    "axes.titley": 1.0,  # no search for a free place, which is slow
     "figure.facecolor": PAPER,
     "axes.facecolor": "none",
     "font.family": "DejaVu Sans",
