@@ -24,7 +24,7 @@ from ..results import result_names
 from ..shooting import ShootingProblem
 from .cell_file import LEVELS, OUTCOMES
 from .devices import one_core
-from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly
+from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly, problem_of
 from .network_jobs import hybrid_channels, job_of
 from .specification import Cell, Study
 
@@ -112,7 +112,7 @@ def _identify(
     """What `_answers` returns, and the seed that each answer is for a search."""
 
     def one(states: States) -> tuple[dict[str, Any], Seed]:
-        found = estimator(eqx.tree_at(lambda p: p.flight.states, blank, states), bracket)
+        found = estimator(problem_of(blank, states), bracket)
         return _kept(found), Seed.of(found)
 
     return jax.vmap(one)(states)
@@ -126,7 +126,7 @@ def _search(
     ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
 
     def one(states: States, seed: Seed) -> dict[str, Any]:
-        return _kept(search_near(ibss, eqx.tree_at(lambda p: p.flight.states, blank, states), bracket, seed))
+        return _kept(search_near(ibss, problem_of(blank, states), bracket, seed))
 
     return jax.vmap(one)(states, seeds)
 

@@ -94,6 +94,11 @@ def blank_problem(study: Study, fleet: Fleet, scale: float, channels: str) -> Sh
     )
 
 
+def problem_of(blank: ShootingProblem, states: States) -> ShootingProblem:
+    """The problem of a flight with these measurements."""
+    return eqx.tree_at(lambda p: p.flight.states, blank, states)
+
+
 def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
     """Simulates the flights of a cell. Flights of one number have the same random numbers in all scenarios."""
     return _fly(
@@ -159,7 +164,7 @@ def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "la
     """The Cramer-Rao standard deviations of each flight, at the noise of a problem."""
 
     def one(states: States, parameters: Parameters) -> Parameters:
-        problem = eqx.tree_at(lambda p: p.flight.states, blank, states)
+        problem = problem_of(blank, states)
         start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
         return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem, parameters, start)))
 
