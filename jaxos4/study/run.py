@@ -74,7 +74,8 @@ class _Work:
         for one in sorted(waiting, key=lambda one: one.network is not None):
             one.programs[-1].waiting.append(one)
         self.programs = list(programs.values())
-        self.networks: dict[int, TrainedNetwork | str | None] = {}
+        # A cell without a network never waits for one.
+        self.networks: dict[int | None, TrainedNetwork | str | None] = {None: None}
         self.untrained = deque(dict.fromkeys(number for number, *_ in untrained))
         kept = {number for number in self.untrained if store.network_file(number).exists()}  # soon read
         # For each network and its programs one cell. First the hybrid's: its programs compile for longest.
@@ -112,14 +113,11 @@ class _Work:
 
     def _ready(self, device: Any) -> _Program | None:
         """The program that the device runs already, else one that no device runs, else the one with most cells."""
-        ready = [p for p in self.programs if p.waiting and self._has_network(p.waiting[0])]
+        ready = [p for p in self.programs if p.waiting and p.waiting[0].network in self.networks]
         own = [p for p in ready if device in p.devices]
         new = [p for p in ready if not p.devices]
         long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
         return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
-
-    def _has_network(self, one: _Waiting) -> bool:
-        return one.network is None or one.network in self.networks
 
     def _training(self, number: int) -> _Task:
         job = self.needed[number]
@@ -134,7 +132,7 @@ class _Work:
         return _Task(label, lambda device: _compile(self.study, one.cell, device), lambda _: None)
 
     def _cell(self, one: _Waiting) -> _Task:
-        cell, network = one.cell, None if one.network is None else self.networks[one.network]
+        cell, network = one.cell, self.networks[one.network]
 
         def call(device: Any) -> tuple[bytes, float]:
             with jax.default_device(device):
