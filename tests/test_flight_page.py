@@ -7,6 +7,8 @@ import re
 import msgspec
 import numpy as np
 import pytest
+from jaxos4.report.figures_prediction import predicted_rates
+from jaxos4.report.figures_response import frequency_responses
 from matplotlib.figure import Figure
 from rich.console import Console
 from synthetic_identification import (
@@ -20,8 +22,6 @@ from synthetic_identification import (
 
 from jaxos4.identification.results import HeldParameter, RigidBody, Validation
 from jaxos4.report import print_identification, write_flight_page
-from jaxos4.report.figures_prediction import predicted_rates
-from jaxos4.report.figures_response import frequency_responses
 from jaxos4.report.style import drawing, pdf, styles, svg
 
 EVIL = "</script><script>alert(1)</script>"

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import refused
+from jaxos4.report.numbers import MISSING, plain
 from rich.console import Console
 from synthetic_study import ESTIMATORS, LEVELS, RESULTS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.report import error_table, figures, read_results, write_report, writing
-from jaxos4.report.numbers import MISSING, plain
 from jaxos4.report.style import drawing, grid, log_axis
 
 OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}

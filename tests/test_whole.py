@@ -5,7 +5,7 @@ import io
 from hypothesis import given, strategies as st
 from rich.console import Console
 
-from jaxos4.report.whole import Listing
+from jaxos4.report.text import Listing
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: f"{x:.5g}")
 NOTES = st.sampled_from(

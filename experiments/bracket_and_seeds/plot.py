@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxos4.report import read_results
 from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import dodged
+from jaxos4.report.study_figures import dodged
 from jaxos4.report.style import INK, grid, log_axis, styles
 from jaxos4.study import metrics
 

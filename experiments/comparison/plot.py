@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 
 from jaxos4.report import read_results
 from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import error_unit
-from jaxos4.report.numbers import plain
+from jaxos4.report.study_figures import error_unit
 from jaxos4.report.style import INK, PAPER, grid
+from jaxos4.report.text import plain
 from jaxos4.study import metrics
 
 WORST = 30.0

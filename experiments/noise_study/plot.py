@@ -6,7 +6,7 @@ import typer
 
 from jaxos4.report import read_results
 from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import efficiency, errors
+from jaxos4.report.study_figures import efficiency, errors
 from jaxos4.study import metrics
 
 

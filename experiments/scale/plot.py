@@ -6,8 +6,7 @@ import typer
 
 from jaxos4.report import read_results
 from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import efficiency
-from jaxos4.report.figures_spread import coverage
+from jaxos4.report.study_figures import coverage, efficiency
 from jaxos4.study import metrics
 
 

@@ -23,8 +23,8 @@ def compare(
         from rich.console import Console
 
         from ..report import error_table, write_report
-        from ..report.progress import count_outcomes, run_with_bar
-        from ..report.whole import print_whole
+        from ..report.study_terminal import count_outcomes, run_with_bar
+        from ..report.text import print_whole
         from ..study import comparison, use_all_cores
 
     use_all_cores()

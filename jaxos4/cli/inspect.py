@@ -109,7 +109,7 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
 
 
 def _print_parts(console: "Console", found: "Inspection") -> None:
-    from ..report.whole import Listing
+    from ..report.text import Listing
 
     rows = []
     shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:MOST_PARTS]

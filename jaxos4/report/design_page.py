@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..design import InputDesign
-from .numbers import plain
+from .text import plain
 
 _LONGEST_REPEATED = 1e4
 

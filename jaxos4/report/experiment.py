@@ -21,7 +21,7 @@ from ..models.abstract import AbstractModel
 from ..noise import AbstractNoise
 from ..shooting import ShootingProblem
 from ..study import RESULTS_FILE, Study, device_name, provenance, save_dataset, use_all_cores as use_all_cores
-from .progress import run_with_bar
+from .study_terminal import run_with_bar
 from .style import Style, drawing, pdf, svg
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..design import ReferenceDesign
-from .numbers import plain
+from .text import plain
 
 # A bound above this share of the bracket's standard deviation says that the flight adds little.
 _LITTLE = 0.9

@@ -1,11 +1,12 @@
-"""A study run with a progress bar in the terminal."""
+"""A study in a terminal: a progress bar while it runs, and at its end the outcomes and the table of errors."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import rich.box
 import xarray as xr
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -15,8 +16,12 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
+from rich.text import Text
 
 from ..study import OUTCOMES, Step, Store, Study, carry_out, device_name, run_here
+from . import study_tables
+from .study_data import scenarios
 
 
 def run_with_bar(
@@ -45,3 +50,31 @@ def count_outcomes(dataset: xr.Dataset) -> str:
     codes, counts = np.unique(dataset["result"].to_numpy(), return_counts=True)
     outcomes = ", ".join(f"{count} {OUTCOMES[code]}" for code, count in zip(codes, counts, strict=True))
     return f"{dataset['result'].size} estimates: {outcomes}"
+
+
+def error_table(dataset: xr.Dataset) -> RenderableType:
+    """The table of errors of each scenario, then the notes that explain the marks."""
+    parts: list[RenderableType] = []
+    notes: dict[str, None] = {}
+    for scenario in scenarios(dataset):
+        table = study_tables.error_table(scenario.data, digits=2)
+        parts += [Text(f"RMS error [%], {scenario.label}"), _rich(table)]
+        notes |= dict.fromkeys(table.notes)
+    return Group(*parts, *(Text(note) for note in notes))
+
+
+def _rich(table: study_tables.Table) -> Table:
+    made = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=0)  # 80 columns must do
+    rows = [row for group in table.groups for row in group.rows]
+    labels = (*(row.label for row in rows), *(group.label for group in table.groups))
+    made.add_column("", no_wrap=True, min_width=max(map(len, labels), default=0))
+    for i, heading in enumerate(table.headings):
+        cells = (row.cells[i] for row in rows)
+        widest = max(len(heading), *(len(cell.text) + len(cell.mark) for cell in cells))
+        made.add_column(Text(heading), justify="right", no_wrap=True, min_width=widest)
+    for group in table.groups:
+        made.add_row(Text(group.label, style="bold"))
+        for row in group.rows:
+            last = row is group.rows[-1] and group is not table.groups[-1]
+            made.add_row(Text(row.label), *(Text(f"{cell.text}{cell.mark}") for cell in row.cells), end_section=last)
+    return made

@@ -1,9 +1,10 @@
-"""An SVG file as a part of a page: it follows the page's theme and width, and each estimator in it can be hidden."""
+"""HTML pages that need no other file: their templates, and SVG drawings that follow a page's theme and width."""
 
 import re
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
+import jinja2
 from markupsafe import Markup, escape
 
 from .style import FAINT, GRID, INK, PAPER
@@ -21,28 +22,35 @@ class Drawing(NamedTuple):
     chosen: bool
 
 
+def render(template: str, *, filters: Mapping[str, Any] | None = None, **values: Any) -> str:
+    """The page that a template in this folder makes of `values`. `filters`: functions for the template, by name."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxos4.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= filters or {}
+    return environment.get_template(template).render(**values)
+
+
 def drawings(
-    files: Sequence[bytes],
-    labels: Sequence[str],
-    chosen: int,
-    *,
-    stem: str,
-    description: str,
-    estimators: Sequence[str] = (),
+    choices: Mapping[str, bytes], chosen: int, *, stem: str, description: str, estimators: Sequence[str] = ()
 ) -> tuple[Drawing, ...]:
-    """SVG files, one of which the page shows at a time.
+    """SVG files by label, one of which the page shows at a time.
 
     **Arguments:**
 
-    - `labels`, `chosen`: of the files in the page's list of choices; the index of the first choice.
+    - `chosen`: the index of the first choice.
     - `stem`: the ids in the elements begin with it.
     - `description`: what a screen reader says.
     - `estimators`: their names, for tooltips.
     """
     made = []
-    for i, (file, label) in enumerate(zip(files, labels, strict=True)):
-        said = escape(f"{description}, {label}" if label else description)
-        element = Markup(_inline(file, f"{stem}-{i}", said, estimators))  # noqa: S704  # names in our SVG are outlines
+    for i, (label, file) in enumerate(choices.items()):
+        described = escape(f"{description}, {label}" if label else description)
+        element = Markup(_inline(file, f"{stem}-{i}", described, estimators))  # noqa: S704  # text in our SVG is outlines
         made.append(Drawing(label, element, i == chosen))
     return tuple(made)
 
@@ -51,11 +59,12 @@ def _inline(svg: bytes, stem: str, description: str, estimators: Sequence[str]) 
     text = svg.decode()
     text = text[text.index("<svg") :]
     text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r'(?<= )(d|x|y)="[^"]*"', _rounded, text)
+    # Coordinates to a hundredth of a point: a third of the bytes.
+    text = re.sub(r'(?<= )(d|x|y)="[^"]*"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), text)
 
-    def estimator(found: re.Match[str]) -> str:
-        place = int(found[1])
-        tip = found[2] or (escape(estimators[place]) if place < len(estimators) else "")
+    def estimator(match: re.Match[str]) -> str:
+        place = int(match[1])
+        tip = match[2] or (escape(estimators[place]) if place < len(estimators) else "")
         return f'<g data-estimator="{place}">' + (f"<title>{tip}</title>" if tip else "")
 
     text = re.sub(r'<g id="estimator-(\d+)(?:: ([^"]*))?">', estimator, text)
@@ -70,8 +79,3 @@ def _inline(svg: bytes, stem: str, description: str, estimators: Sequence[str]) 
     head = re.sub(r' (width|height)="[^"]*"', "", head)
     style = f"min-width: {0.8 * pixels:.0f}px; max-width: {_GROWTH * pixels:.0f}px"
     return f'{head} role="img" aria-label="{description}" style="{style}">{rest}'
-
-
-def _rounded(attribute: re.Match[str]) -> str:
-    """Coordinates to a hundredth of a point: a third of the bytes."""
-    return re.sub(r"(\.\d\d)\d+", r"\1", attribute[0])

@@ -1,5 +1,6 @@
-"""Tables for a terminal in which no cell is ever cut."""
+"""Text for terminals and pages: numbers with significant digits, and tables in which no cell is ever cut."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,15 +9,34 @@ from rich.console import Console, ConsoleDimensions, RenderableType
 from rich.measure import Measurement
 from rich.table import Table
 
+MISSING = "–"
 _WIDEST = 10_000
 _WORDS = 20  # columns of a terminal; a narrower column of words would be hard to read
+
+
+def plain(value: float, digits: int = 3) -> str:
+    """`value` with so many significant digits, and a power of ten if it is very small or large; a dash if it is NaN."""
+    if not math.isfinite(value):
+        return MISSING if math.isnan(value) else f"{value:g}"
+    if value == 0:
+        return "0"
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    exponent = int(power)
+    if not -3 <= exponent < 6:
+        return f"{mantissa}e{exponent}"
+    return f"{round(value, digits - 1 - exponent):.{max(digits - 1 - exponent, 0)}f}"
+
+
+def percent(share: float, digits: int = 1) -> str:
+    """A share in percent, without the sign %; a dash if it is NaN."""
+    return MISSING if math.isnan(share) else f"{100 * share:.{digits}f}"
 
 
 class Listing(NamedTuple):
     """A table as text.
 
     - `right`: the headings of the columns that are aligned to the right.
-    - `notes`: one for each row, about what the first cell names; empty cells where there is none.
+    - `notes`: one for each row, about the item in its first cell; an empty string for none.
     - `wraps`: the headings of columns of words, whose cells may have several lines.
     """
 
@@ -27,11 +47,11 @@ class Listing(NamedTuple):
     wraps: Sequence[str] = ()
 
     def print_on(self, console: Console) -> None:
-        """Print the table. Notes are its last column, or lines below it if the terminal is too narrow."""
+        """Prints the table. Notes are its last column, or lines below it if the terminal is too narrow."""
         if any(self.notes):
             rows = [[*row, note] for row, note in zip(self.rows, self.notes, strict=True)]
             table = self._table(rows, last="note")
-            if needed_width(table) <= console.width:
+            if _needed_width(table) <= console.width:
                 print_whole(console, table)
                 return
         print_whole(console, self._table(self.rows))
@@ -57,17 +77,17 @@ class Listing(NamedTuple):
         return table
 
 
-def needed_width(table: RenderableType) -> int:
-    """How many columns of a terminal hold a table of which nothing is cut."""
-    console = Console(width=_WIDEST)
-    return Measurement.get(console, console.options, table).minimum
-
-
 def print_whole(console: Console, table: RenderableType) -> None:
-    """Print a table, wider than the terminal if it must be: the terminal then breaks its lines."""
+    """Prints a table, wider than the terminal if it must be: the terminal then breaks its lines."""
     size = console.size
-    console.size = ConsoleDimensions(max(needed_width(table), size.width), size.height)
+    console.size = ConsoleDimensions(max(_needed_width(table), size.width), size.height)
     try:
         console.print(table, crop=False, markup=False)
     finally:
         console.size = size
+
+
+def _needed_width(table: RenderableType) -> int:
+    """The number of terminal columns that a table needs if nothing is cut."""
+    console = Console(width=_WIDEST)
+    return Measurement.get(console, console.options, table).minimum

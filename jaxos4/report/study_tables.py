@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 
 from ..study import metrics
-from .numbers import MISSING, percent, plain
-from .scenario import bounds, names
+from .study_data import bounds, names
+from .text import MISSING, percent, plain
 
 # The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
 _MARKS = ("", "†", "‡")
@@ -57,6 +57,44 @@ class Table(NamedTuple):
     units: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
+    @property
+    def columns(self) -> list[tuple[str, str]]:
+        """The headings of all columns, each with its unit or an empty string."""
+        return [("estimator", ""), *zip(self.headings, self.units or [""] * len(self.headings), strict=True)]
+
+
+def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
+    """The tables of one scenario, by name."""
+    efficiency, coverage, levels = metrics.efficiency(data), metrics.coverage(data), metrics.mean_coverage(data)
+    level = int(np.argmin(np.abs(data["level"].values - _LEVEL)))
+    parameters, source = tuple(names(data, "parameter")), "estimate, truth, half_width, result (metrics.{})"
+    tables = (
+        error_table(data),
+        Table(
+            "efficiency",
+            "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do",
+            "estimate, truth, bound, result (metrics.efficiency)",
+            parameters,
+            _groups(data, lambda at: _with_intervals(efficiency.isel(at), "efficiency", plain)),
+        ),
+        Table(
+            "coverage",
+            f"Intervals of {100 * data['level'].values[level]:g} % that hold the truth [%], with 95 % Wilson intervals",
+            source.format("coverage"),
+            parameters,
+            _groups(data, lambda at: _with_intervals(coverage.isel(at | {"level": level}), "coverage", percent)),
+        ),
+        Table(
+            "levels",
+            "Intervals that hold the truth [%] by the level that they claim, averaged over the parameters",
+            source.format("mean_coverage"),
+            tuple(f"{100 * level:g} %" for level in data["level"].values),
+            _groups(data, lambda at: _with_intervals(levels.isel(at), "coverage", percent)),
+        ),
+        _result_table(data),
+    )
+    return {table.name: table for table in tables}
+
 
 def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
     """RMS errors in percent of the truth, with rows for the bounds and for the centre of the bracket."""
@@ -77,10 +115,8 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
     groups = []
     for place in range(data.sizes["scale"]):
         rows = [Row(f"bound, {seen}", cells(best.isel(scale=place, estimator=at))) for seen, at in bounds(data).items()]
-        rows += [
-            Row(name, cells(found.isel(scale=place, estimator=at)), at)
-            for at, name in enumerate(names(data, "estimator"))
-        ]
+        for at, name in enumerate(names(data, "estimator")):
+            rows.append(Row(name, cells(found.isel(scale=place, estimator=at)), at))
         rows.append(Row("bracket centre", cells(middle.isel(scale=place))))
         groups.append(Group(_noise(data, place), tuple(rows)))
     return Table(
@@ -98,44 +134,7 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
     )
 
 
-def efficiency_table(data: xr.Dataset) -> Table:
-    """RMSE / bound with Monte-Carlo intervals."""
-    found = metrics.efficiency(data)
-    return Table(
-        "efficiency",
-        "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do",
-        "estimate, truth, bound, result (metrics.efficiency)",
-        tuple(names(data, "parameter")),
-        _groups(data, lambda at: _with_intervals(found.isel(at), "efficiency", plain)),
-    )
-
-
-def coverage_table(data: xr.Dataset) -> Table:
-    """Coverage of each parameter at the level nearest 95 %."""
-    level = int(np.argmin(np.abs(data["level"].values - _LEVEL)))
-    found = metrics.coverage(data).isel(level=level)
-    return Table(
-        "coverage",
-        f"Intervals of {100 * data['level'].values[level]:g} % that hold the truth [%], with 95 % Wilson intervals",
-        "estimate, truth, half_width, result (metrics.coverage)",
-        tuple(names(data, "parameter")),
-        _groups(data, lambda at: _with_intervals(found.isel(at), "coverage", percent)),
-    )
-
-
-def levels_table(data: xr.Dataset) -> Table:
-    """Coverage at every level, averaged over the parameters."""
-    found = metrics.mean_coverage(data)
-    return Table(
-        "levels",
-        "Intervals that hold the truth [%] by the level that they claim, averaged over the parameters",
-        "estimate, truth, half_width, result (metrics.mean_coverage)",
-        tuple(f"{100 * level:g} %" for level in data["level"].values),
-        _groups(data, lambda at: _with_intervals(found.isel(at), "coverage", percent)),
-    )
-
-
-def result_table(data: xr.Dataset) -> Table:
+def _result_table(data: xr.Dataset) -> Table:
     """The number of flights by result, mean rollouts, and the share of seed brackets that hold the truth."""
     counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
     known = names(counts, "code")

@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from .legend import legend
-from .scenario import names
-from .style import FAINT, INK, estimator_gid, grid, label_edges, log_axis, styles
+from .study_data import names
+from .style import FAINT, INK, estimator_gid, grid, label_edges, legend, log_axis, styles
 
 # Styles of lines that belong to a parameter, not to an estimator.
 _LOOKS = ("o-", "s--", "D-.", "^:", "v-", "P--", "X-.", "*:")
@@ -78,7 +77,7 @@ def path(data: xr.Dataset) -> Figure | None:
             panel.plot(*line.T, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(place))
     for name, label in zip("xyz", (panel.set_xlabel, panel.set_ylabel, panel.set_zlabel), strict=True):
         label(f"{name} [m]")
-    legend(figure, data, markers=False)
+    legend(figure, names(data, "estimator"), markers=False)
     return figure
 
 
@@ -118,7 +117,7 @@ def _each_state(data: xr.Dataset, draw: Callable[[Axes, int], None]) -> Figure |
         one = data["state"].isel(state=state)
         panel.set_title(f"{one.item()} [{data['state_unit'].isel(state=state).item()}]")
     label_edges(axes, 3, x="time [s]")
-    legend(figure, data, markers=False)
+    legend(figure, names(data, "estimator"), markers=False)
     return figure
 
 
