@@ -23,11 +23,8 @@ UNKNOWN = ParameterEstimate(None, None, 2e6, None, INERTIA, "not identifiable: n
 SMALL = ParameterEstimate(0.0011, 0.001, 0.001, (-0.0009, 0.0031), "1/s", "below noise", 0.25)
 WHITE = ChannelFit(0.01, "rad/s", 97.53, 1.0, 0.5, 0.02, 0.4, {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}, 0.3)
 COLOURED = msgspec.structs.replace(WHITE, percent=81.26, level=4.0, correlation=0.8, white_p=1e-9, input_p=1e-5)
-BODY = RigidBody(
-    {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2", "if arms and mass are right"), "J_R": Constant(1e-8, 1e-7, "kg m^2")},
-    0.21,
-    True,
-)
+CONSTANTS = {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2"), "J_R": Constant(1e-8, 1e-7, "kg m^2")}
+NOTED = {"Ix": msgspec.structs.replace(CONSTANTS["Ix"], note="if arms and mass are right"), "J_R": CONSTANTS["J_R"]}
 COMMON = {"result": "successful", "rollouts": 812, "cost": 1234.5, "seconds": 35.4, "estimate": None, "problem": None}
 
 
@@ -37,7 +34,7 @@ def identified_flight(**changes) -> FlightIdentification:
         "estimator": "ibss",
         "model": "published",
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN, "alpha2": SMALL},
-        "rigid_body": BODY,
+        "rigid_body": RigidBody(CONSTANTS, 0.21, True),
         "fit": {"p": WHITE, "q": COLOURED},
         "validation": Validation("other.csv", 10.0, {"p": COLOURED}),
         "provenance": settings | changes.pop("provenance", {}),
@@ -62,7 +59,7 @@ def identified_vehicle(**changes) -> VehicleIdentification:
         "estimator": "ibss",
         "model": "flight",
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN},
-        "rigid_body": BODY,
+        "rigid_body": RigidBody(NOTED, 0.21, True),
         "held": {"alpha1": HeldParameter(-0.8125, "1", "not identifiable")},
         "cut": 0.22,
         "noise": {"p": 0.41},

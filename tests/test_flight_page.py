@@ -7,12 +7,11 @@ import re
 import msgspec
 import numpy as np
 import pytest
-from jaxos4.report.figures_prediction import predicted_rates
-from jaxos4.report.figures_response import frequency_responses
 from matplotlib.figure import Figure
 from rich.console import Console
 from synthetic_identification import (
     COLOURED,
+    CONSTANTS,
     WHITE,
     identified_flight,
     identified_vehicle,
@@ -22,6 +21,7 @@ from synthetic_identification import (
 
 from jaxos4.identification.results import HeldParameter, RigidBody, Validation
 from jaxos4.report import print_identification, write_flight_page
+from jaxos4.report.identification_page import frequency_responses, predicted_rates
 from jaxos4.report.style import drawing, pdf, styles, svg
 
 EVIL = "</script><script>alert(1)</script>"
@@ -153,10 +153,10 @@ def test_the_text_of_a_flight():
     [
         ({"estimator": "network", "fit": {"q": COLOURED}}, "The hybrid continues the search"),
         (
-            {"rigid_body": RigidBody(identified_flight().rigid_body.constants, 1e-4, True)},
+            {"rigid_body": RigidBody(CONSTANTS, 1e-4, True)},
             "not those of one rigid body",
         ),
-        ({"rigid_body": RigidBody(identified_flight().rigid_body.constants, 0.5, False)}, "no rigid body has such"),
+        ({"rigid_body": RigidBody(CONSTANTS, 0.5, False)}, "no rigid body has such"),
         ({"validation": Validation("other.csv", None, None)}, "trajectory diverges before the flight ends"),
     ],
 )

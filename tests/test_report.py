@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import refused
-from jaxos4.report.numbers import MISSING, plain
 from rich.console import Console
 from synthetic_study import ESTIMATORS, LEVELS, RESULTS, SCENARIO, UNITS, synthetic_study
 
-from jaxos4.report import error_table, figures, read_results, write_report, writing
+from jaxos4.report import error_table, read_results, study_page, write_report
 from jaxos4.report.style import drawing, grid, log_axis
+from jaxos4.report.text import MISSING, plain
 
 OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
 OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
@@ -247,7 +247,7 @@ def test_the_terminal_has_the_same_errors_in_80_columns():
 
 
 def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(writing, "MOST_DRAWN", 1)
+    monkeypatch.setattr(study_page, "MOST_DRAWN", 1)
     options = {"flights": 4, "estimators": ("ibss", "svsf"), "scales": (1.0,), "spoiled": False, "example": False}
     study = few(synthetic_study(models=("published", "corrected"), **options))
     written = write_report(study, tmp_path, with_pdf=False)
@@ -310,11 +310,11 @@ def test_reading_gives_what_was_written(study, tmp_path):
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
     study = study[["search_half_width", "search_estimate"]]
-    before = list(figures.of_example(study))
-    assert [drawn.stem for drawn in before] == ["search"]
+    before = study_page.draw(study_page.OF_EXAMPLE, study)
+    assert list(before) == ["search"]
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):
         settings = dict(matplotlib.rcParams)
-        assert list(figures.of_example(study)) == before
+        assert study_page.draw(study_page.OF_EXAMPLE, study) == before
         assert dict(matplotlib.rcParams) == settings
 
 

@@ -9,11 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from .study_data import names
-from .style import FAINT, INK, estimator_gid, grid, label_edges, legend, log_axis, styles
-
-# Styles of lines that belong to a parameter, not to an estimator.
-_LOOKS = ("o-", "s--", "D-.", "^:", "v-", "P--", "X-.", "*:")
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#c46a9b", "#b97f00", "#3b97ce", "#7f7f7f", "#8e5ea8")
+from .style import FAINT, INK, estimator_gid, grid, label_edges, legend, log_axis, style, styles
 
 
 def search(data: xr.Dataset) -> Figure | None:
@@ -27,9 +23,9 @@ def search(data: xr.Dataset) -> Figure | None:
     titles = ("half-width of the bracket", "distance to the last estimate")
     for panel, values, title in zip(axes, (width / first, moves.transpose("sweep", "parameter")), titles, strict=True):
         for place, name in enumerate(names(data, "parameter")):
-            y = values.isel(parameter=place).values
-            kind = {"color": _COLORS[place % 8], "label": name, "markersize": 4}
-            panel.plot(data["sweep"].values, np.where(y > 0, y, np.nan), _LOOKS[place % 8], **kind)
+            y, look = values.isel(parameter=place).values, style(place)
+            shape = {"color": look.color, "marker": look.marker, "linestyle": look.dash, "markersize": 4}
+            panel.plot(data["sweep"].values, np.where(y > 0, y, np.nan), label=name, **shape)
         panel.set_title(title)
         panel.set_xlabel("sweep")
         panel.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -89,10 +85,10 @@ def training(data: xr.Dataset) -> Figure | None:
     figure, axes = grid(len(labels), columns=3, width=3.2 * min(len(labels), 3) + 0.6, height=2.6)
     for place, (panel, label) in enumerate(zip(axes, labels, strict=True)):
         one = data.isel(training=place)
-        step = one["training_step"].values
-        panel.plot(step, one["training_loss"].values, color=_COLORS[0], marker="o", markersize=3.5, label="training")
-        panel.plot(step, one["validation_loss"].values, "s--", color=_COLORS[1], markersize=3.5, label="validation")
         losses = np.stack([one["training_loss"].values, one["validation_loss"].values])
+        for row, name in enumerate(("training", "validation")):
+            shape = {"color": style(row).color, "marker": style(row).marker, "linestyle": style(row).dash}
+            panel.plot(one["training_step"].values, losses[row], label=name, markersize=3.5, **shape)
         if not (losses <= 0).any() and np.isfinite(losses).any():
             log_axis(panel, "y")
         panel.set_title(label)

@@ -101,6 +101,11 @@ def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
     return [str(name) for name in data[dimension].values]
 
 
+def scale_labels(data: xr.Dataset) -> list[str]:
+    """The noise scales in words."""
+    return [f"noise x {scale:g}" for scale in data["scale"].values]
+
+
 def bounds(data: xr.Dataset) -> dict[str, int]:
     """The channels that estimators look at, each with the index of an estimator that has their bound."""
     found: dict[str, int] = {}

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from ..study import metrics
-from .study_data import bounds, names
+from .study_data import bounds, names, scale_labels
 from .text import MISSING, percent, plain
 
 # The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
@@ -34,66 +34,38 @@ class Row(NamedTuple):
     estimator: int | None = None
 
 
-class Group(NamedTuple):
-    """Rows of one noise scale."""
-
-    label: str
-    rows: tuple[Row, ...]
-
-
 class Table(NamedTuple):
-    """Groups of rows under headings.
+    """Rows of text, in groups of one noise scale.
 
-    - `source`: the variables and functions that the numbers come from.
-    - `units`: of the columns; empty if they have none.
+    - `headings`: of the columns after the first, each with its unit or an empty string.
+    - `groups`: the label of each group, and its rows.
     - `notes`: the meaning of the marks.
     """
 
-    name: str
-    caption: str
-    source: str
-    headings: tuple[str, ...]
-    groups: tuple[Group, ...]
-    units: tuple[str, ...] = ()
+    headings: list[tuple[str, str]]
+    groups: list[tuple[str, list[Row]]]
     notes: tuple[str, ...] = ()
-
-    @property
-    def columns(self) -> list[tuple[str, str]]:
-        """The headings of all columns, each with its unit or an empty string."""
-        return [("estimator", ""), *zip(self.headings, self.units or [""] * len(self.headings), strict=True)]
 
 
 def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     """The tables of one scenario, by name."""
-    efficiency, coverage, levels = metrics.efficiency(data), metrics.coverage(data), metrics.mean_coverage(data)
-    level = int(np.argmin(np.abs(data["level"].values - _LEVEL)))
-    parameters, source = tuple(names(data, "parameter")), "estimate, truth, half_width, result (metrics.{})"
-    tables = (
-        error_table(data),
-        Table(
-            "efficiency",
-            "RMSE / Cramer-Rao bound, with 95 % Monte-Carlo intervals; 1 is the best that an unbiased estimator can do",
-            "estimate, truth, bound, result (metrics.efficiency)",
-            parameters,
-            _groups(data, lambda at: _with_intervals(efficiency.isel(at), "efficiency", plain)),
-        ),
-        Table(
-            "coverage",
-            f"Intervals of {100 * data['level'].values[level]:g} % that hold the truth [%], with 95 % Wilson intervals",
-            source.format("coverage"),
-            parameters,
-            _groups(data, lambda at: _with_intervals(coverage.isel(at | {"level": level}), "coverage", percent)),
-        ),
-        Table(
-            "levels",
-            "Intervals that hold the truth [%] by the level that they claim, averaged over the parameters",
-            source.format("mean_coverage"),
-            tuple(f"{100 * level:g} %" for level in data["level"].values),
-            _groups(data, lambda at: _with_intervals(levels.isel(at), "coverage", percent)),
-        ),
-        _result_table(data),
-    )
-    return {table.name: table for table in tables}
+
+    def table(found: xr.Dataset, measure: str, text: Callable[[float], str], headings: list[str]) -> Table:
+        return _by_estimator(data, headings, lambda at: _with_intervals(found.isel(at), measure, text))
+
+    parameters = names(data, "parameter")
+    return {
+        "error": error_table(data),
+        "efficiency": table(metrics.efficiency(data), "efficiency", plain, parameters),
+        "coverage": table(metrics.coverage(data).isel(level=_shown_level(data)), "coverage", percent, parameters),
+        "levels": table(metrics.mean_coverage(data), "coverage", percent, [_percents(x) for x in data["level"].values]),
+        "results": _result_table(data),
+    }
+
+
+def shown_level(data: xr.Dataset) -> str:
+    """The level of the intervals in the table of coverage, in percent."""
+    return _percents(data["level"].values[_shown_level(data)])
 
 
 def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
@@ -113,66 +85,54 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         return tuple(made)
 
     groups = []
-    for place in range(data.sizes["scale"]):
+    for place, label in enumerate(scale_labels(data)):
         rows = [Row(f"bound, {seen}", cells(best.isel(scale=place, estimator=at))) for seen, at in bounds(data).items()]
         for at, name in enumerate(names(data, "estimator")):
             rows.append(Row(name, cells(found.isel(scale=place, estimator=at)), at))
-        rows.append(Row("bracket centre", cells(middle.isel(scale=place))))
-        groups.append(Group(_noise(data, place), tuple(rows)))
-    return Table(
-        "error",
-        "RMS error [% of the truth; where marked, in the parameter's unit]",
-        "estimate, truth, bound, center, result (metrics.estimator_error, bound_error, center_error)",
-        tuple(names(data, "parameter")),
-        tuple(groups),
-        units=tuple(names(data, "unit")),
-        notes=tuple(
-            f"{_MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, so a percentage "
-            "is meaningless."
-            for code in sorted(used)
-        ),
+        groups.append((label, [*rows, Row("bracket centre", cells(middle.isel(scale=place)))]))
+    notes = (
+        f"{_MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, so a percentage is "
+        "meaningless."
+        for code in sorted(used)
     )
+    return Table(list(zip(names(data, "parameter"), names(data, "unit"), strict=True)), groups, tuple(notes))
 
 
 def _result_table(data: xr.Dataset) -> Table:
     """The number of flights by result, mean rollouts, and the share of seed brackets that hold the truth."""
     counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
-    known = names(counts, "code")
-    occurs = [place for place in range(len(known)) if bool((counts.isel(code=place) > 0).any())]
+    occurs = np.flatnonzero((counts > 0).any([name for name in counts.dims if name != "code"]).values)
 
     def cells(at: dict[str, int]) -> tuple[Cell, ...]:
         hit = _with_intervals(hits.isel(at).expand_dims("parameter"), "hit_rate", percent)
-        numbers = [Cell(str(int(counts.isel(at).isel(code=place)))) for place in occurs]
+        numbers = [Cell(str(int(number))) for number in counts.isel(at).values[occurs]]
         return (*numbers, Cell(plain(float(spent.isel(at)))), *hit)
 
-    return Table(
-        "results",
-        "Flights by result, mean rollouts, and the hybrid's seed brackets that hold the truth [%]",
-        "result, rollouts, hit (metrics.result_counts, mean_rollouts, hit_rate)",
-        (*(known[place].replace("_", " ") for place in occurs), "rollouts", "seed hits"),
-        _groups(data, cells),
-    )
+    headings = [names(counts, "code")[place].replace("_", " ") for place in occurs]
+    return _by_estimator(data, [*headings, "rollouts", "seed hits"], cells)
 
 
 class Trouble(NamedTuple):
     """Flights or cells without numbers: a description of the first 20, and the total."""
 
-    listed: tuple[str, ...]
+    listed: list[str]
     total: int
 
 
 def troubled_flights(data: xr.Dataset) -> Trouble:
     """The flights that were run and did not converge."""
-    bad = (metrics.was_run(data) & ~metrics.converged(data)).transpose("scale", "estimator", "flight").values
-    known = {code: name.replace("_", " ") for name, code in metrics.codes(data).items()}
-    results = data["result"].transpose("scale", "estimator", "flight").values
-    estimators, flights = names(data, "estimator"), names(data, "flight")
-    places = np.argwhere(bad).tolist()
-    listed = tuple(
-        f"{_noise(data, scale)}, {estimators[at]}, flight {flights[flight]}: "
-        f"{known.get(int(results[scale, at, flight]), 'unknown result')}"
-        for scale, at, flight in places[:_MOST_LISTED]
+    order = ("scale", "estimator", "flight")
+    bad, results = (
+        (metrics.was_run(data) & ~metrics.converged(data)).transpose(*order),
+        data["result"].transpose(*order),
     )
+    places = np.argwhere(bad.values).tolist()
+    known = {code: name.replace("_", " ") for name, code in metrics.codes(data).items()}
+    labels = (scale_labels(data), names(data, "estimator"), names(data, "flight"))
+    listed = []
+    for place in places[:_MOST_LISTED]:
+        scale, estimator, flight = (label[i] for label, i in zip(labels, place, strict=True))
+        listed.append(f"{scale}, {estimator}, flight {flight}: {known.get(int(results[*place]), 'unknown result')}")
     return Trouble(listed, len(places))
 
 
@@ -180,10 +140,10 @@ def failed_cells(dataset: xr.Dataset) -> Trouble:
     """The cells of a study that raised an error, with the error's message."""
     failures: list[dict[str, Any]] = json.loads(dataset.attrs.get("failures", "[]"))
     shown = [name for name in metrics.SCENARIO if dataset.sizes[name] > 1] or ["estimator"]
-    listed = tuple(
+    listed = [
         f"cell {failure['cell']}, {', '.join(f'{name} {failure[name]}' for name in shown)}: {failure['message']}"
         for failure in failures[:_MOST_LISTED]
-    )
+    ]
     return Trouble(listed, len(failures))
 
 
@@ -193,25 +153,27 @@ def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
     return int(missing.sum()), missing.size
 
 
-def _noise(data: xr.Dataset, place: int) -> str:
-    return f"noise x {data['scale'].values[place]:g}"
+def _percents(level: float) -> str:
+    return f"{100 * level:g} %"
 
 
-def _groups(data: xr.Dataset, cells: Callable[[dict[str, int]], tuple[Cell, ...]]) -> tuple[Group, ...]:
-    """The groups of a table; `cells` gives those of a row, from its indices along `scale` and `estimator`."""
+def _shown_level(data: xr.Dataset) -> int:
+    return int(np.argmin(np.abs(data["level"].values - _LEVEL)))
+
+
+def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[str, int]], tuple[Cell, ...]]) -> Table:
+    """A table with a row for each noise scale and estimator; `cells` gives the row's cells from its indices."""
     estimators = list(enumerate(names(data, "estimator")))
-    return tuple(
-        Group(
-            _noise(data, place),
-            tuple(Row(name, cells({"scale": place, "estimator": at}), at) for at, name in estimators),
-        )
-        for place in range(data.sizes["scale"])
-    )
+    groups = [
+        (label, [Row(name, cells({"scale": scale, "estimator": at}), at) for at, name in estimators])
+        for scale, label in enumerate(scale_labels(data))
+    ]
+    return Table([(heading, "") for heading in headings], groups)
 
 
-def _with_intervals(one: xr.Dataset, name: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
+def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
     made = []
-    for number, *ends in zip(*(one[part].values for part in (name, "low", "high")), strict=True):
+    for number, *ends in zip(*(one[part].values for part in (measure, "low", "high")), strict=True):
         low, high = map(text, ends)
         made.append(Cell(text(number), "" if MISSING in (low, high) else f"{low} to {high}"))
     return tuple(made)

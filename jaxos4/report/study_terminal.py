@@ -65,16 +65,15 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
 
 def _rich(table: study_tables.Table) -> Table:
     made = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=0)  # 80 columns must do
-    rows = [row for group in table.groups for row in group.rows]
-    labels = (*(row.label for row in rows), *(group.label for group in table.groups))
+    rows = [row for _, rows in table.groups for row in rows]
+    labels = [*(row.label for row in rows), *(label for label, _ in table.groups)]
     made.add_column("", no_wrap=True, min_width=max(map(len, labels), default=0))
-    for i, heading in enumerate(table.headings):
-        cells = (row.cells[i] for row in rows)
-        widest = max(len(heading), *(len(cell.text) + len(cell.mark) for cell in cells))
+    for i, (heading, _) in enumerate(table.headings):
+        widest = max(len(heading), *(len(row.cells[i].text) + len(row.cells[i].mark) for row in rows))
         made.add_column(Text(heading), justify="right", no_wrap=True, min_width=widest)
-    for group in table.groups:
-        made.add_row(Text(group.label, style="bold"))
-        for row in group.rows:
-            last = row is group.rows[-1] and group is not table.groups[-1]
-            made.add_row(Text(row.label), *(Text(f"{cell.text}{cell.mark}") for cell in row.cells), end_section=last)
+    for label, group in table.groups:
+        made.add_row(Text(label, style="bold"))
+        for row in group:
+            made.add_row(Text(row.label), *(Text(f"{cell.text}{cell.mark}") for cell in row.cells))
+        made.add_section()
     return made

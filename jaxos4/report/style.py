@@ -90,10 +90,10 @@ def drawing() -> Iterator[None]:
 def styles(estimators: Sequence[str]) -> dict[str, Style]:
     """A style for each estimator: always the same for those in `_KNOWN`, an unused one for each other name."""
     free = (place for place in itertools.count() if place >= len(_KNOWN) or _KNOWN[place] not in estimators)
-    return {name: _style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
+    return {name: style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
 
 
-def _style(place: int) -> Style:
+def style(place: int) -> Style:
     """Style number `place`. Beyond the table, a colour comes with the marker and dashes of another row."""
     count = len(_STYLES)
     return _STYLES[(place + place // count) % count]._replace(color=_STYLES[place % count].color)
