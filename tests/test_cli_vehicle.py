@@ -12,7 +12,7 @@ from helpers import refused
 from test_logs_ulog import everything
 
 import jaxos4
-from jaxos4.cli._choices import VehicleModel
+from jaxos4.cli._options import VehicleModel
 from jaxos4.recording.preparation import prepare
 from jaxos4.recording.reading import read_recording, vehicle_evidence
 

@@ -11,7 +11,7 @@ from synthetic_results import AIRFRAME, INERTIA, VALUES, os4_result, vehicle_res
 
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table
-from jaxos4.cli._choices import Simulator
+from jaxos4.cli._options import Simulator
 from jaxos4.export import TARGETS, export_vehicle, read_result
 
 SUFFIXES = {"mujoco": "xml", "rotorpy": "py", "sdf": "sdf"}

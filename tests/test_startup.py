@@ -14,7 +14,7 @@ import pytest
 
 import jaxos4
 from jaxos4._xla import WHOLE_LOOPS, compile_loops_whole
-from jaxos4.cli import _choices, _jax, train
+from jaxos4.cli import _jax, _options, train
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import EXCITATIONS
@@ -148,14 +148,14 @@ import diffrax
 
 
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables():
-    assert list(_choices.Estimator) == list(ESTIMATORS)
-    assert list(_choices.Model) == list(MODELS)
-    assert list(_choices.Excitation) == list(EXCITATIONS)
-    assert list(_choices.Method) == list(METHODS)
-    assert list(_choices.Sensors) == list(LOGGED)
-    assert list(_choices.Channels) == list(CHANNELS)
-    assert list(_choices.Features) == list(FEATURES)
-    assert list(_choices.Approximator) == list(APPROXIMATORS)
+    assert list(_options.Estimator) == list(ESTIMATORS)
+    assert list(_options.Model) == list(MODELS)
+    assert list(_options.Excitation) == list(EXCITATIONS)
+    assert list(_options.Method) == list(METHODS)
+    assert list(_options.Sensors) == list(LOGGED)
+    assert list(_options.Channels) == list(CHANNELS)
+    assert list(_options.Features) == list(FEATURES)
+    assert list(_options.Approximator) == list(APPROXIMATORS)
     defaults = {name: argument.default for name, argument in inspect.signature(train.train).parameters.items()}
     assert (defaults["noise"], defaults["steps"]) == (NetworkEstimator.noise, NetworkEstimator.steps)
     assert (defaults["features"], defaults["approximator"]) == (

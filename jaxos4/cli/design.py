@@ -10,21 +10,24 @@ import typer
 
 from .._files import read_toml
 from ..errors import InputError
-from ._choices import AirframeOption, BracketOption, Channels, InitialState, Model, check_seed
-from ._loop import (
+from ._options import (
+    AirframeOption,
+    BracketOption,
+    Channels,
     DelayOption,
     DurationOption,
     GustOption,
+    InitialState,
     LagOption,
+    Model,
     SampleTimeOption,
     SensorsOption,
     check_kind,
+    check_seed,
     loop_of,
     times_of,
 )
-from ._messages import option_names
-from ._output import check_different, check_output
-from ._progress import stages
+from ._output import check_different, check_output, option_names, stages
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .._files import read_toml
 from ..errors import InputError
-from ._choices import (
+from ._options import (
     BracketOption,
     ChannelsOption,
     Estimator,
@@ -19,10 +18,10 @@ from ._choices import (
     OutOption,
     VehicleModel,
     WindowOption,
+    chosen,
+    read_bracket,
 )
-from ._messages import in_options, option_names
-from ._output import check_different, check_output, write_json
-from ._progress import stages
+from ._output import check_different, check_output, in_options, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from ..identification import Identification
@@ -30,49 +29,60 @@ if TYPE_CHECKING:
 
 _OS4, _PUBLISHED = "os4", "published"
 
+FlightsArgument = Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")]
+EstimatorOption = Annotated[
+    Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
+]
+ModelOption = Annotated[
+    VehicleModel | None,
+    typer.Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
+]
+AirframeOption = Annotated[
+    str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
+]
+NetworkOption = Annotated[
+    Path | None, typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
+]
+ValidateOption = Annotated[
+    Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
+]
+TermsOption = Annotated[
+    str | None, typer.Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")
+]
+BeginOption = Annotated[
+    float | None, typer.Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on.")
+]
+EndOption = Annotated[
+    float | None, typer.Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
+]
+AveragedTimeOption = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
+]
+HoldoutOption = Annotated[
+    float | None, typer.Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
+]
+LossOption = Annotated[Loss | None, typer.Option(help="Real vehicle: huber cuts outliers; not for filter-error.")]
+ReportOption = Annotated[Path | None, typer.Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")]
+
 
 def estimate(
-    flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
-    estimator: Annotated[
-        Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
-    ] = None,
-    model: Annotated[
-        VehicleModel | None,
-        typer.Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
-    ] = None,
-    airframe: Annotated[
-        str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
-    ] = None,
+    flights: FlightsArgument,
+    estimator: EstimatorOption = None,
+    model: ModelOption = None,
+    airframe: AirframeOption = None,
     bracket: BracketOption = None,
     channels: ChannelsOption = None,
     initial_state: InitialStateOption = InitialState["free"],
     window: WindowOption = None,
-    network: Annotated[
-        Path | None, typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
-    ] = None,
-    validate: Annotated[
-        Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
-    ] = None,
-    terms: Annotated[
-        str | None, typer.Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")
-    ] = None,
-    begin: Annotated[
-        float | None,
-        typer.Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on."),
-    ] = None,
-    end: Annotated[
-        float | None, typer.Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
-    ] = None,
-    sample_time: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
-    ] = None,
-    holdout: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
-    ] = None,
-    loss: Annotated[Loss | None, typer.Option(help="Real vehicle: huber cuts outliers; not for filter-error.")] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")
-    ] = None,
+    network: NetworkOption = None,
+    validate: ValidateOption = None,
+    terms: TermsOption = None,
+    begin: BeginOption = None,
+    end: EndOption = None,
+    sample_time: AveragedTimeOption = None,
+    holdout: HoldoutOption = None,
+    loss: LossOption = None,
+    report: ReportOption = None,
     out: OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
@@ -83,9 +93,9 @@ def estimate(
     if report is not None and model not in (None, "flight"):
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
     options: dict[str, Any] = {
-        "estimator": None if estimator is None else estimator.value,
-        "bracket": None if bracket is None else read_toml(bracket),
-        "channels": None if channels is None else channels.value,
+        "estimator": chosen(estimator),
+        "bracket": read_bracket(bracket),
+        "channels": chosen(channels),
         "initial_state": initial_state.value,
         "window": window,
         "network": network,
@@ -94,7 +104,7 @@ def estimate(
         "end": end,
         "sample_time": sample_time,
         "holdout": holdout,
-        "loss": None if loss is None else loss.value,
+        "loss": chosen(loss),
     }
     with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
         from ..airframe import load_airframe

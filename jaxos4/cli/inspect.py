@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
-from ._choices import OutOption
-from ._output import check_different, check_output, write_json, write_text
-from ._progress import stages
+from ._options import OutOption
+from ._output import check_different, check_output, stages, write_json, write_text
 
 if TYPE_CHECKING:
     from rich.console import Console

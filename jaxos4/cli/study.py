@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
-from ._progress import stages
+from ._output import stages
 
 if TYPE_CHECKING:
     from ..study import Study
