@@ -230,21 +230,6 @@ def test_a_measured_velocity_takes_the_place_of_the_simulated_one():
         )
 
 
-@pytest.mark.parametrize(
-    ("term", "need"),
-    [
-        ("velocity", "velocity, drag need `Flight.body_vel"),
-        ("flapping", "need `Flight.specific_force"),
-        ("voltage", "voltage need `Flight.voltage`"),
-    ],
-)
-def test_a_missing_measurement_is_named(term, need):
-    model = jaxos4.FlightModel(terms=(term,), battery_voltage=VOLTS)
-    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan))
-    with pytest.raises(ValueError, match=need):
-        jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates").cost(truth(model))
-
-
 @pytest.mark.parametrize("counts", [(1,), (2,), (37,), (5, 1, 20, 11), (1, 1, 1), (64, 64)])
 def test_the_filter_is_the_recursion(counts):
     samples, dt, lag = sum(counts), 0.004, 0.05
@@ -296,23 +281,20 @@ def delayed(omega, delay, dt=0.01, stretch=None):
 def test_whole_delays_are_exact(samples):
     counts = (30, 12, 1, 4)
     omega = np.random.default_rng(0).uniform(100, 400, (sum(counts), 4))
-    stretch = np.repeat(np.arange(4), counts)
-    begin = np.repeat(np.cumsum((0, *counts[:-1])), counts)
-    end = np.repeat(np.cumsum(counts), counts) - 1
+    begin, end = (np.repeat(ends, counts) for ends in (np.cumsum((0, *counts[:-1])), np.cumsum(counts) - 1))
     row = np.clip(np.arange(sum(counts)) - samples, begin, end)
-    expected = omega[row] @ np.asarray(jaxos4.OS4.rotor_spins)
-    found = delayed(omega, 0.01 * samples, stretch=jnp.asarray(stretch))
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-9)
+    found = delayed(omega, 0.01 * samples, stretch=jnp.asarray(np.repeat(np.arange(4), counts)))
+    np.testing.assert_allclose(found, omega[row] @ np.asarray(jaxos4.OS4.rotor_spins), rtol=1e-10, atol=1e-9)
 
 
-def test_parabolas_are_delayed_exactly():
+@pytest.mark.parametrize("delay", [0.0031, 0.0149, 0.0377, -0.0121])
+def test_parabolas_are_delayed_exactly(delay):
+    def speeds(t):
+        return np.stack([200 + 30 * t, 210 - 500 * t**2, 190 + 100 * t**2, 200 + 0 * t], axis=1)
+
     t = 0.01 * np.arange(60)
-    omega = np.stack([200 + 30 * t, 210 - 500 * t**2, 190 + 100 * t**2, 200 + 0 * t], axis=1)
-    for delay in (0.0031, 0.0149, 0.0377, -0.0121):
-        late = t - delay
-        exact = np.stack([200 + 30 * late, 210 - 500 * late**2, 190 + 100 * late**2, 200 + 0 * late], axis=1)
-        expected = exact @ np.asarray(jaxos4.OS4.rotor_spins)
-        np.testing.assert_allclose(delayed(omega, delay)[8:-8], expected[8:-8], rtol=1e-10, atol=1e-9)
+    expected = speeds(t - delay) @ np.asarray(jaxos4.OS4.rotor_spins)
+    np.testing.assert_allclose(delayed(speeds(t), delay)[8:-8], expected[8:-8], rtol=1e-10, atol=1e-9)
 
 
 def test_the_delay_has_a_continuous_derivative():
@@ -362,23 +344,29 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     assert two == tuple(f"{name}_{i}" for i in (1, 2) for name in NAMES["offset"])
 
 
-def test_a_thrust_curve_needs_a_full_scale_and_the_voltage_a_usual_one():
-    with pytest.raises(ValueError, match="max_rotor_speed"):
-        jaxos4.FlightModel(terms=("curve",))
-    with pytest.raises(ValueError, match="`battery_voltage` must be given for the term voltage"):
-        jaxos4.FlightModel(terms=("voltage",))
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"terms": ("curve",)}, "max_rotor_speed"),
+        ({"terms": ("voltage",)}, "`battery_voltage` must be given for the term voltage"),
+        ({"terms": ("wind",)}, "`terms` must be some of offset, center_of_mass, damping"),
+        ({"terms": ("lag", "lag")}, "`terms` must be some of"),
+        ({"terms": ("lag", "Lag")}, "`terms` must be some of"),
+        *(({"recordings": some}, "`recordings` must count from 0") for some in ((), (1,), (0, 2), (-1, 0))),
+        ({"terms": ("velocity",)}, "velocity, drag need `Flight.body_vel"),
+        ({"terms": ("flapping",)}, "need `Flight.specific_force"),
+        ({"terms": ("voltage",), "battery_voltage": VOLTS}, "voltage need `Flight.voltage`"),
+    ],
+)
+def test_impossible_models_and_missing_measurements_are_named(settings, said):
+    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan))
 
+    def cost():
+        model = jaxos4.FlightModel(**settings)
+        return jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates").cost(truth(model))
 
-@pytest.mark.parametrize("terms", [("wind",), ("lag", "lag"), ("lag", "Lag")])
-def test_terms_that_do_not_exist_are_named(terms):
-    with pytest.raises(ValueError, match="`terms` must be some of offset, center_of_mass, damping"):
-        jaxos4.FlightModel(terms=terms)
-
-
-@pytest.mark.parametrize("recordings", [(), (1,), (0, 2), (-1, 0)])
-def test_recordings_count_from_zero(recordings):
-    with pytest.raises(ValueError, match="`recordings` must count from 0"):
-        jaxos4.FlightModel(recordings=recordings)
+    with pytest.raises(ValueError, match=said):
+        cost()
 
 
 def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="rates"):

@@ -14,15 +14,15 @@ import pytest
 import xarray as xr
 from helpers import refused
 from rich.console import Console
-from synthetic_study import ESTIMATORS, LEVELS, RESULTS, SCENARIO, UNITS, synthetic_study
+from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.report import error_table, read_results, study_page, write_report
 from jaxos4.report.style import drawing, grid, log_axis
-from jaxos4.report.text import MISSING, plain
+from jaxos4.report.text import percent, plain
+from jaxos4.study import metrics
 
 OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
 OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
-ANSWERED = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
 
 
 def few(study):
@@ -80,22 +80,6 @@ def page(report):
     return tables(text)
 
 
-def rms(values):
-    values = [v for v in values if not math.isnan(v)]
-    return math.sqrt(sum(v * v for v in values) / len(values)) if values else math.nan
-
-
-def answered(study, scale, estimator):
-    cell = study.isel({name: 0 for name in SCENARIO} | {"scale": scale, "estimator": estimator})
-    return cell, [f for f, code in enumerate(cell["result"].values) if code in ANSWERED]
-
-
-def places(study):
-    for s, scale in enumerate(study["scale"].values):
-        for e, estimator in enumerate(study["estimator"].values):
-            yield f"noise x {scale:g}", s, str(estimator), e
-
-
 def test_the_files_are_those_that_it_says(report):
     folder = report[0].parent
     names = {path.relative_to(folder).as_posix() for path in report}
@@ -121,63 +105,45 @@ def test_the_command_writes_the_same_bytes_from_the_file(study, report, tmp_path
     assert left == {"notes.svg"}
 
 
-def test_every_error_in_the_table(study, page):
-    table, seen = page["error-1"], study["seen"].values[0]
-    rows = []
-    for group, s, estimator, e in places(study):
-        cell, flights = answered(study, s, e)
-        truth, bound = cell["truth"].values, cell["bound"].values
-        for p, name in enumerate(study["parameter"].values):
-            zero = (truth[:, p] == 0).any()
-            mark = "†" if zero else "‡" if (abs(truth[:, p]) < 1.96 * bound[:, p]).any() else ""
-            unit = 1 if mark else 100 / abs(truth[0, p])
-            error = rms([unit * (cell["estimate"].values[f, p] - truth[f, p]) for f in flights])
-            assert table[group, estimator, name] == (plain(error), "", mark if flights else "")
-            rows.append((group, estimator, name))
-            if (bound == bound).all():
-                assert table[group, f"bound, {seen[e]}", name] == (plain(rms(unit * bound[:, p])), "", mark)
-            if estimator == "ibss":
-                center = rms(unit * (float(cell["center"].values[p]) - truth[:, p]))
-                assert table[group, "bracket centre", name] == (plain(center), "", mark)
-    assert len(table) == len(rows) + 3 * 3 * (2 + 1)
+def test_every_number_in_the_tables(study, page):
+    """`test_metrics.py` has the metrics; here each of them stands in its place, as text."""
+    data = study.isel({name: 0 for name in SCENARIO if name not in ("scale", "estimator")})
+    errors, bounds, center = (of(data) for of in (metrics.estimator_error, metrics.bound_error, metrics.center_error))
+    efficiency, coverage = metrics.efficiency(data), metrics.coverage(data).sel(level=0.95)
+    levels, counts, hits = metrics.mean_coverage(data), metrics.result_counts(data), metrics.hit_rate(data)
+    shown = set()
 
+    def check(table, row, column, one, measure, text=plain):
+        found = page[table][row[0], row[1], column]
+        shown.add((table, row, column))
+        assert found[0] == text(float(one[measure])), (table, row, column)
+        if "low" in one and not math.isnan(one["low"]):
+            assert found[1] == f"{text(float(one['low']))} to {text(float(one['high']))}"
+        return found[2]
 
-def test_every_efficiency_and_coverage_in_the_tables(study, page):
-    efficiency, coverage, levels = (page[f"{name}-1"] for name in ("efficiency", "coverage", "levels"))
-    for group, s, estimator, e in places(study):
-        cell, flights = answered(study, s, e)
-        error = abs(cell["estimate"].values - cell["truth"].values)
-        shares = np.full((3, 4), np.nan)
-        for p, name in enumerate(study["parameter"].values):
-            ratio = rms([error[f, p] / cell["bound"].values[f, p] for f in flights])
-            text, interval, _ = efficiency[group, estimator, name]
-            assert text == plain(ratio)
-            if flights:
-                low, high = (float(x) for x in interval.split(" to "))
-                assert low < ratio < high
-                assert math.log(high / low) == pytest.approx(2 * 1.96 / math.sqrt(2 * len(flights)), rel=0.1)
-                held = [error[f, p] <= cell["half_width"].values[f, p] for f in flights]
-                shares[p] = np.mean(held, axis=0)
-            at_95 = shares[p, 2]
-            assert coverage[group, estimator, name][0] == (f"{100 * at_95:.1f}" if flights else MISSING)
+    for s, e in np.ndindex(data.sizes["scale"], data.sizes["estimator"]):
+        at, noise = {"scale": s, "estimator": e}, f"noise x {data['scale'].values[s]:g}"
+        row = noise, str(data["estimator"].values[e])
+        for p, name in enumerate(data["parameter"].values):
+            bound = f"bound, {data['seen'].values[e]}"
+            for found, label in ((errors, row[1]), (bounds, bound), (center, "bracket centre")):
+                one = found.isel({k: v for k, v in (at | {"parameter": p}).items() if k in found.dims})
+                if label == bound and math.isnan(one["absolute"]):
+                    continue  # the row shows an estimator that was run
+                unit = "absolute" if one["reason"] else "percent"
+                mark = check("error-1", (noise, label), name, one, unit)
+                assert mark == ("" if math.isnan(one[unit]) else ("", "†", "‡")[int(one["reason"])])
+            check("efficiency-1", row, name, efficiency.isel(at | {"parameter": p}), "efficiency")
+            check("coverage-1", row, name, coverage.isel(at | {"parameter": p}), "coverage", percent)
         for k, level in enumerate(LEVELS):
-            expected = f"{100 * shares[:, k].mean():.1f}" if flights else MISSING
-            assert levels[group, estimator, f"{100 * level:g} %"][0] == expected
-
-
-def test_every_count_in_the_table_of_results(study, page):
-    table = page["results-1"]
-    for group, s, estimator, e in places(study):
-        cell, _ = answered(study, s, e)
-        codes = cell["result"].values.tolist()
-        for code, name in enumerate(RESULTS):
-            if (study["result"] == code).any():
-                assert table[group, estimator, name.replace("_", " ")][0] == str(codes.count(code))
-        ran = [f for f, code in enumerate(codes) if RESULTS[code] not in ("failed", "not_run")]
-        spent = sum(int(cell["rollouts"].values[f]) for f in ran) / len(ran) if ran else math.nan
-        assert table[group, estimator, "rollouts"][0] == plain(spent)
-        hit = f"{100 * np.mean(cell['hit'].values[ran]):.1f}" if estimator == "hybrid" and ran else MISSING
-        assert table[group, estimator, "seed hits"][0] == hit
+            check("levels-1", row, f"{100 * level:g} %", levels.isel(at | {"level": k}), "coverage", percent)
+        for code in counts["code"].values[(counts > 0).any(("scale", "estimator")).values]:
+            number = page["results-1"][*row, code.replace("_", " ")][0]
+            assert number == str(int(counts.isel(at).sel(code=code)))
+            shown.add(("results-1", row, code.replace("_", " ")))
+        check("results-1", row, "seed hits", hits.isel(at), "hit_rate", percent)
+        check("results-1", row, "rollouts", {"x": metrics.mean_rollouts(data).isel(at)}, "x")
+    assert shown == {(table, place[:2], place[2]) for table, cells in page.items() for place in cells}
 
 
 def test_trouble_is_named(report):
@@ -203,8 +169,8 @@ def test_the_terminal_has_the_same_errors_in_80_columns():
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(error_table(study))
     text = console.export_text()
-    cell, flights = answered(study, 1, 0)
-    error = 100 * rms([cell["estimate"].values[f, 0] / cell["truth"].values[f, 0] - 1 for f in flights])
+    first = {name: 0 for name in SCENARIO} | {"scale": 1, "parameter": 0}
+    error = float(metrics.estimator_error(study)["percent"].isel(first))
     rows = re.split(r"noise x 1 *\n", text)[1].splitlines()
     row = next(line for line in rows if line.startswith("ibss"))
     assert row.split()[1] == plain(error, 2)
