@@ -1,4 +1,4 @@
-"""What commands write: the stage of a computation, the library's messages with names of options, and files.
+"""Output of the commands: the stage of a computation, the library's messages with names of options, and files.
 
 Files are checked before the work that fills them, are never one of the inputs, and are written whole or not at all.
 """
