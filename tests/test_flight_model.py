@@ -188,46 +188,32 @@ def test_terms_are_their_equations(terms, tolerance):
     assert errors.max() < tolerance, dict(zip(range(15), errors, strict=False))
 
 
-def test_flapping_is_the_measured_force_as_an_input():
-    model = jaxos4.FlightModel(terms=("flapping",))
-    omega, rng = commands(1.0, 0.01), np.random.default_rng(0)
-    force = rng.normal(size=(omega.shape[0], 3))
-    force[10:14, 0] = np.nan  # replaced by the previous value
-    force[:3, 1] = np.nan  # replaced by the next value
-    blank = jaxos4.Flight(0.01 * np.arange(101), omega, np.full((101, 12), np.nan), force)
-    problem = jaxos4.ShootingProblem(model, blank, sigma=np.ones(12), channels="rates", initial_state=np.zeros(12))
-    found = np.asarray(problem.predict(truth(model), jnp.zeros(3)))
-    filled = force.copy()
-    filled[10:14, 0], filled[:3, 1] = force[9, 0], force[3, 1]
-    plain = jaxos4.CorrectedOS4()
-    alpha = np.asarray(plain.alpha)
-    rates, forcing = np.zeros((101, 3)), forcing_of(plain, Inputs(jnp.asarray(omega), jnp.asarray(0.01)), plain.alpha)
-    for k in range(100):
-        at = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], forcing)
-        slope = np.array(plain.angular_acceleration(Rates(*rates[k]), at, alpha))
-        slope[:2] += VALUES["roll_flapping"] * filled[k, 1], VALUES["pitch_flapping"] * filled[k, 0]
-        rates[k + 1] = rates[k] + 0.01 * slope
-    np.testing.assert_allclose(found, rates, rtol=1e-10, atol=1e-12)
+def rates_with(term, field, measured, channels):
+    """The rates of a flight with a measured input."""
+    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan), **{field: measured})
+    given = {"sigma": np.ones(12), "channels": channels, "initial_state": np.zeros(12)}
+    problem = jaxos4.ShootingProblem(jaxos4.FlightModel(terms=(term,)), flight, **given)
+    return np.asarray(problem.predict(truth(problem.model), jnp.zeros(problem.size)))[:, :3]
 
 
-def test_a_measured_velocity_takes_the_place_of_the_simulated_one():
-    model = jaxos4.FlightModel(terms=("velocity",))
-    omega = commands(0.5, 0.01)
-    velocity = np.random.default_rng(0).normal(size=(omega.shape[0], 3))
-    rows = (0.01 * np.arange(51), omega, np.full((51, 12), np.nan))
-    for channels, size in (("rates", 3), ("all", 12)):
-        blank = jaxos4.Flight(*rows, body_velocity=velocity)
-        problem = jaxos4.ShootingProblem(model, blank, sigma=np.ones(12), channels=channels, initial_state=np.zeros(12))
-        rates = np.asarray(problem.predict(truth(model), jnp.zeros(size)))[:, :3]
-        still = eqx.tree_at(lambda p: p.flight.body_velocity, problem, jnp.zeros_like(jnp.asarray(velocity)))
-        without = np.asarray(still.predict(truth(model), jnp.zeros(size)))[:, :3]
-        # Yaw moves no velocity term; the first step is dt times the term.
-        np.testing.assert_allclose(
-            (rates - without)[1],
-            0.01 * np.array([VALUES["roll_velocity"] * velocity[0, 1], VALUES["pitch_velocity"] * velocity[0, 0], 0.0]),
-            rtol=1e-9,
-            atol=1e-15,
-        )
+@pytest.mark.parametrize("channels", ["rates", "all"])
+@pytest.mark.parametrize("measured", [("velocity", "body_velocity"), ("flapping", "specific_force")])
+def test_a_measured_input_acts_in_its_own_step(measured, channels):
+    once = np.zeros((51, 3))
+    once[7] = x, y, _ = 0.7, -0.4, 0.2
+    moved = rates_with(*measured, once, channels) - rates_with(*measured, np.zeros((51, 3)), channels)
+    assert not moved[:8].any()
+    expected = [0.01 * VALUES[f"roll_{measured[0]}"] * y, 0.01 * VALUES[f"pitch_{measured[0]}"] * x, 0.0]
+    np.testing.assert_allclose(moved[8], expected, rtol=1e-9, atol=1e-15)
+
+
+def test_gaps_of_a_measured_force_are_filled_with_the_value_before_or_after():
+    gaps = np.random.default_rng(0).normal(size=(51, 3))
+    filled = gaps.copy()
+    gaps[10:14, 0], gaps[:3, 1] = np.nan, np.nan
+    filled[10:14, 0], filled[:3, 1] = gaps[9, 0], gaps[3, 1]
+    found = [rates_with("flapping", "specific_force", force, "rates") for force in (gaps, filled)]
+    np.testing.assert_array_equal(*found)
 
 
 @pytest.mark.parametrize("counts", [(1,), (2,), (37,), (5, 1, 20, 11), (1, 1, 1), (64, 64)])
