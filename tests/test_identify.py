@@ -5,10 +5,10 @@ from pathlib import Path
 
 import jax
 import pytest
-from jaxos4.cli._messages import in_options
 from test_cli_vehicle import TERMS, vehicle  # noqa: F401
 
 import jaxos4
+from jaxos4.cli._output import in_options
 from jaxos4.recording import read_recording
 
 APART = ("seconds", "provenance")
