@@ -12,16 +12,16 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-import jaxos4.logs.csv_text as csv_module
+import jaxos4.logs.csv as csv_module
 import jaxos4.logs.table as table_module
 import jaxos4.logs.units as units_module
 from jaxos4._files import write_atomically
 from jaxos4.airframe import OS4, Airframe
 from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES, Flight
-from jaxos4.logs import read_flight, read_flight_and_notes, write_flight
+from jaxos4.logs import read_flight, read_recording, write_flight
 from jaxos4.logs.csv import COLUMN_NAMES
-from jaxos4.logs.resample import resample, unwrap
+from jaxos4.logs.sampling import resample, unwrap
 
 CRAZYFLIE = Airframe(
     mass=0.027,
@@ -36,6 +36,11 @@ CRAZYFLIE = Airframe(
 HEADER = "t,omega1,omega2,omega3,omega4,p,q,psi"
 ROWS = [f"{0.01 * k:.2f},100,101,102,103,{0.1 * k:.1f},-0.2,0.3" for k in range(6)]
 LIMITS = {"phi": 1.5, "theta": 1.5, "psi": 1.5, "p": 60, "q": 60, "r": 60, "vx": 1e3, "vy": 1e3, "vz": 1e3}
+
+
+def read_flight_and_notes(path, airframe=None):
+    found = read_recording(path, airframe)
+    return found.flight, found.notes
 
 
 def csv(header=HEADER, rows=ROWS):
@@ -519,7 +524,7 @@ def worst(n, reconstruct):
     dt = 2.0 / n
     t = uneven(n, dt, jitter=0.2)
     y = np.sin(5 * t)
-    grid, _, channels, _ = resample(t, np.ones((n, 4)), y[:, None], dt)
+    (grid, _, channels), _ = resample(t, np.ones((n, 4)), y[:, None], dt)
     got = channels[:, 0] if reconstruct is None else reconstruct(t, y, grid)
     assert not np.isnan(got).any()
     return np.abs(got - np.sin(5 * grid)).max()
@@ -543,7 +548,7 @@ def test_each_rotors_impulse_is_conserved(steps, gap, seed):
     t = np.concatenate([[0.0], np.cumsum(steps)])
     omega = np.random.default_rng(seed).uniform(0, 300, (t.size, 4))
     dt = float(np.median(steps))
-    grid, speeds, channels, _ = resample(t, omega, np.zeros((t.size, 1)), dt)
+    (grid, speeds, channels), _ = resample(t, omega, np.zeros((t.size, 1)), dt)
     ends = np.minimum(np.append(t[1:], np.inf), grid[-1])
     truth = (omega**2 * np.maximum(ends - t, 0)[:, None]).sum(axis=0)
     np.testing.assert_allclose((speeds[:-1] ** 2).sum(axis=0) * dt, truth, rtol=1e-9, atol=1e-3)
@@ -554,7 +559,7 @@ def test_each_rotors_impulse_is_conserved(steps, gap, seed):
 def test_point_sampling_would_not_conserve_it():
     t = uneven(50, 0.01)
     omega = np.random.default_rng(1).uniform(0, 300, (50, 4))
-    grid, speeds, *_ = resample(t, omega, np.zeros((50, 1)), 0.01)
+    (grid, speeds, _), _ = resample(t, omega, np.zeros((50, 1)), 0.01)
     points = omega[np.searchsorted(t, grid[:-1], side="right") - 1]
     totals = np.array([(speeds[:-1] ** 2).sum(axis=0), (points**2).sum(axis=0)])
     assert (np.abs(totals[0] / totals[1] - 1) > 1e-3).any()
@@ -570,7 +575,7 @@ def test_nothing_is_invented_across_gaps(seed, lost, slow):
     y = np.cumsum(rng.normal(size=60))
     y[rng.random(60) < lost] = np.nan
     y[np.arange(60) % slow != 0] = np.nan
-    grid, _, channels, _ = resample(t, np.ones((60, 4)), y[:, None], dt)
+    (grid, _, channels), _ = resample(t, np.ones((60, 4)), y[:, None], dt)
     ts, ys = t[np.isfinite(y)], y[np.isfinite(y)]
     for g, value in zip(grid, channels[:, 0], strict=True):
         if np.isnan(value):
@@ -597,7 +602,7 @@ def test_rows_that_are_missing_from_a_grid_are_not_measured(save):
 def test_a_slow_sensor_keeps_one_sample_for_each_of_its_own():
     t = uneven(400, 0.01)
     y = np.where(np.arange(400) % 10 == 5, np.sin(2 * t), np.nan)
-    grid, _, channels, _ = resample(t, np.ones((400, 4)), y[:, None], 0.01)
+    (grid, _, channels), _ = resample(t, np.ones((400, 4)), y[:, None], 0.01)
     got = channels[:, 0]
     measured = np.isfinite(got)
     assert abs(measured.sum() - 40) <= 2

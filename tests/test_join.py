@@ -9,8 +9,9 @@ from hypothesis import given, settings, strategies as st
 
 import jaxos4
 from jaxos4.flight import Stretches, fill_gaps
-from jaxos4.recording.averaging import average, averaged
-from jaxos4.recording.usable import Stretch, cut
+from jaxos4.logs.sampling import average
+from jaxos4.recording.pieces import averaged, cut
+from jaxos4.recording.usable import Stretch
 from jaxos4.shooting.padding import padded
 
 

@@ -28,7 +28,7 @@ JSON_LOG = LogFormat("JSON", "two-line JSON", lambda begin: begin.startswith(b'{
 
 @pytest.fixture
 def log(save, monkeypatch):
-    monkeypatch.setattr("jaxos4.logs.formats.FORMATS", (JSON_LOG, *FORMATS))  # the new line
+    monkeypatch.setattr("jaxos4.logs.FORMATS", (JSON_LOG, *FORMATS))  # the new line
     t = 0.01 * np.arange(300)
     columns = {"t": t, **{f"omega{i}": np.full(300, 226.0) for i in range(1, 5)}, "p": np.sin(t)}
     return save('{"log": 1}\n' + json.dumps({name: column.tolist() for name, column in columns.items()}), "log")

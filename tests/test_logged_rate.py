@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from jaxos4.logs.facts import held_regularly
+from jaxos4.logs.sampling import held_regularly
 from jaxos4.recording import read_recording
 
 ROWS = 1000

@@ -6,8 +6,8 @@ from recorded_logs import GRAVITY
 from test_airframe_draft import drafted
 
 from jaxos4.logs import blackbox_frames, blackbox_raw, read_log
-from jaxos4.logs.blackbox_numbers import Numbers
-from jaxos4.recording.layout import RotorSigns
+from jaxos4.logs.blackbox_frames import Numbers
+from jaxos4.recording.motion import RotorSigns
 from jaxos4.recording.usable import usable_stretches
 
 

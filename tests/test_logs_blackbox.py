@@ -24,7 +24,7 @@ from test_flight_csv import CRAZYFLIE
 from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.logs import log_format, read_log
-from jaxos4.logs.blackbox_numbers import Numbers
+from jaxos4.logs.blackbox_frames import Numbers
 from jaxos4.recording import usable_stretches
 
 RATES = ("p", "q", "r")

@@ -10,11 +10,11 @@ import test_logs_ulog as ulog
 from helpers import same
 from hypothesis import example, given, settings, strategies as st
 from recorded_logs import damaged, outcome
-from test_flight_csv import CRAZYFLIE, csv
+from test_flight_csv import CRAZYFLIE, csv, read_flight_and_notes
 
-import jaxos4.logs.csv_text as csv_module
+import jaxos4.logs.csv as csv_module
 from jaxos4.flight import Flight
-from jaxos4.logs import FORMATS, log_format, read_flight_and_notes, read_log
+from jaxos4.logs import FORMATS, log_format, read_log
 from jaxos4.logs.csv import COLUMN_NAMES
 
 NAMES = ("t", "omega1", "omega2", "omega3", "omega4", "p", "q", "r", "phi", "theta", "psi", "x", "az")

@@ -14,7 +14,7 @@ from test_flight_csv import CRAZYFLIE
 
 from jaxos4.errors import InputError
 from jaxos4.logs import read_log
-from jaxos4.logs.series import Series, at_rows, rotor_rms
+from jaxos4.logs.sampling import Series, at_rows, root_mean_square
 
 T = 2500.0  # the test airframe's full scale [rad/s]
 ESC = b"esc_report:uint64_t timestamp;int32_t esc_rpm;uint8_t actuator_function;uint8_t[3] _padding0;"
@@ -279,7 +279,7 @@ def test_impulse_is_conserved_whatever_the_rates(seed, measured):
     t = np.cumsum(rng.uniform(0.001, 0.1, 60))
     rows = np.sort(rng.uniform(t[0], t[-1], 40))
     values = rng.uniform(0, 900, (60, 4))
-    got = rotor_rms(rows, Series(t, values), measured=measured)
+    got = root_mean_square(Series(t, values), rows, linear=measured)
     fine = np.linspace(rows[0], rows[-1], 400_001)
     held = values[np.searchsorted(t, fine, side="right") - 1] ** 2
     if measured:

@@ -23,11 +23,16 @@ from test_logs_ulog import (
 )
 
 from jaxos4.errors import InputError
-from jaxos4.logs import read_log, read_log_and_facts
-from jaxos4.logs.facts import SLOWEST_RATE, LogFacts, Sampling, logged_rate
-from jaxos4.logs.series import Series, at_rows, gyro_rows
+from jaxos4.logs import read_log, read_recording
+from jaxos4.logs.sampling import Series, at_rows, logged_rate
+from jaxos4.logs.table import SLOWEST_RATE, LogFacts, Sampling, gyro_rows
 
 T = 2500.0  # the test airframe's full scale [rad/s]
+
+
+def read_log_and_facts(path, airframe=None):
+    found = read_recording(path, airframe)
+    return found.flight, found.notes, found.facts
 
 
 def log(*topics, **parameters):
@@ -176,7 +181,7 @@ def test_a_gyro_beyond_a_kilohertz_is_averaged_to_one():
     t = grid(0.00025, 2.0)
     noise = np.random.default_rng(0).normal(0, 0.1, (t.size, 3))
     motor = Series(grid(0.01, 2.2, offset=-0.1), np.full((220, 4), 0.5))
-    rows, columns = gyro_rows("", Series(t, rates(t) + noise), motor, measured=False)
+    rows, columns = gyro_rows("", Series(t, rates(t) + noise), motor, measured=False, others={})
     assert np.median(np.diff(rows)) == pytest.approx(0.001)
     off = np.column_stack([columns[name] for name in "pqr"]) - rates(rows)
     assert np.std(off) == pytest.approx(0.1 / 2, rel=0.15)  # of four samples each

@@ -10,8 +10,9 @@ from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.logs import read_log
 from jaxos4.recording import stretches
-from jaxos4.recording.excited import excitation, gyro_noise
-from jaxos4.recording.usable import Stretch, cut, nothing_usable, usable_stretches
+from jaxos4.recording.motion import excitation, gyro_noise
+from jaxos4.recording.pieces import cut
+from jaxos4.recording.usable import Stretch, nothing_usable, usable_stretches
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)

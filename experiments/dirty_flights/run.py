@@ -22,8 +22,8 @@ from rich.table import Table
 
 import jaxos4
 from jaxos4.identification.vehicle import SECONDARY
+from jaxos4.logs.sampling import average
 from jaxos4.models.vehicle import DEFAULT_TERMS
-from jaxos4.recording.averaging import average
 from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)

@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..logs import write_flight
 from ..logs.assemble import SPEED_NAMES
-from ..logs.csv_text import read_table
+from ..logs.csv import read_table
 from ..logs.table import printable
 from .fitting import DesignedInput
 

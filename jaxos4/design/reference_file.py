@@ -7,7 +7,7 @@ import numpy as np
 
 from .._files import write_atomically
 from ..errors import InputError
-from ..logs.csv_text import read_table
+from ..logs.csv import read_table
 from ..logs.table import printable
 from .closed_loop import DesignedReferences
 from .input_file import PRECISION

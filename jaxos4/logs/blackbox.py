@@ -43,9 +43,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .blackbox_raw import MAGIC, gyro_unit, read_sessions, settings_beside
-from .csv_text import read_table
-from .table import LogFormat, Path, Table, opened, opened_bytes, refuse
+from .blackbox_raw import MAGIC, gyro_unit, is_raw, read_sessions, settings_beside
+from .csv import read_table
+from .table import LogFormat, Path, Table, opened, order_note, refuse
 
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
 _MOST_SETTINGS = 5000  # lines above the header
@@ -99,7 +99,7 @@ class _Log(NamedTuple):
 
 def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
-    log, table = _decoded(path) if _is_raw(path) else _csv(path)
+    log, table = _decoded(path) if is_raw(path) else _csv(path)
     raw = log.raw
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
@@ -113,8 +113,7 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
         if name in raw:
             values = sign * raw[name]
             log.add(column, name, values * 0.1 * _DEGREE if name.startswith("attitude") else values / 100)
-    what = f"rotors keep the log's order ({log.names.get('omega1', log.names.get('command1'))} is rotor 1)"
-    log.notes.append(f"{what}: rotor_positions and rotor_spins must be in the same order")
+    log.notes.append(order_note(log.names.get("omega1", log.names.get("command1", ""))))
     return table._replace(columns=log.columns, unknown=(), names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
@@ -134,11 +133,6 @@ def _csv(path: Path) -> tuple[_Log, Table]:
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
     return _Log(path, skip + 1, settings, raw, {}, {}, notes), table
-
-
-def _is_raw(path: Path) -> bool:
-    with opened_bytes(path) as file:
-        return file.seekable() and file.read(len(MAGIC)) == MAGIC
 
 
 def _recognises(begin: bytes) -> bool:

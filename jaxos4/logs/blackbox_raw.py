@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .blackbox_frames import BadHeader, decode_frames
-from .series import in_order
-from .table import Path, opened_bytes, refuse
+from .sampling import in_order
+from .table import Path, opened, read_bytes, refuse
 
 MAGIC = b"H Product:Blackbox"
 DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
@@ -46,15 +46,17 @@ class Sessions(NamedTuple):
     notes: list[str]
 
 
+def is_raw(path: Path) -> bool:
+    """Whether a file is a blackbox log that was not decoded."""
+    with opened(path, "rb") as file:
+        return file.seekable() and file.read(len(MAGIC)) == MAGIC
+
+
 def sessions(path: Path) -> list[Session]:
     """The sessions of a file, in order; none if it is no blackbox log. Raises `InputError`."""
-    with opened_bytes(path) as file:
-        content = file.read(len(MAGIC))
-        if content != MAGIC:
-            return []
-        content += file.read(_LARGEST)
-    if len(content) > _LARGEST:
-        refuse(path, f"has more than {_LARGEST:,} bytes, far more than one flight; cut it into flights")
+    if not is_raw(path):
+        return []
+    content = read_bytes(path, _LARGEST)
     places = [match.start() for match in re.finditer(re.escape(MAGIC), content)]
     return [_session(content[begin:end]) for begin, end in zip(places, [*places[1:], len(content)], strict=True)]
 

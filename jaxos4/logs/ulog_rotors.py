@@ -25,9 +25,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .facts import fast_enough, logged_rate
-from .series import Series
-from .ulog_topics import Topics
+from .sampling import Series, logged_rate
+from .table import fast_enough
+from .ulog_file import Topics
 
 TOPICS = ("esc_status", "actuator_motors", "actuator_outputs")
 
