@@ -4,9 +4,8 @@ import equinox as eqx
 import numpy as np
 import pytest
 import tomlkit
-from helpers import refused
+from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
-from test_flight_csv import CRAZYFLIE
 from test_inspect import LOGS
 from test_signs import flown, turned
 

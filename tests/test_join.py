@@ -167,32 +167,6 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("ratio", [2, 3, 4, 2.5])
-def test_a_straight_line_is_averaged_without_a_delay(ratio):
-    t, omega, _, dt = rows(100, ratio, 0)
-    lines = np.column_stack([2.0 * (t - 3), 1 - (t - 3), np.ones_like(t)])
-    grid, _, found = average(t, omega, lines, dt)
-    expected = np.column_stack([2.0 * (grid - 3), 1 - (grid - 3), np.ones_like(grid)])
-    # Half-covered ends see one side only.
-    inside = slice(1, -1)
-    within = 1e-9 if float(ratio).is_integer() else 0.25 * 0.001 * 2
-    np.testing.assert_allclose(found[inside], expected[inside], atol=within)
-
-
-@pytest.mark.parametrize("ratio", [2, 4, 2.5, 5.7])
-def test_no_impulse_is_lost(ratio):
-    t, omega, channels, dt = rows(83, ratio, 1)
-    grid, speeds, _ = average(t, omega, channels, dt)
-    for k in range(grid.size - 1):
-        begin, end = grid[k], grid[k + 1]
-        impulse = np.zeros(4)
-        for at, row in zip(t[:-1], omega[:-1], strict=True):
-            impulse += max(min(at + 0.001, end) - max(at, begin), 0.0) * row**2
-        np.testing.assert_allclose(speeds[k] ** 2 * dt, impulse, rtol=1e-9)
-    constant = np.full_like(omega, 250.0)
-    np.testing.assert_allclose(average(t, constant, channels, dt)[1], 250.0, rtol=1e-12)
-
-
 def test_a_sample_with_less_than_half_measured_is_missing():
     t, omega, _, dt = rows(81, 4, 0)
     y = np.ones((81, 1))

@@ -6,9 +6,9 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers import CRAZYFLIE
 from recorded_logs import GRAVITY, RPM, attitude, check, crazyflie, force, outcome, position, rates, speeds, velocity
 from scipy.spatial.transform import Rotation
-from test_flight_csv import CRAZYFLIE
 
 from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log

@@ -1,10 +1,11 @@
 """A vehicle that turns against its airframe is found, whatever its controller does against gusts."""
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
+from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
-from test_flight_csv import CRAZYFLIE
 
 from jaxos4.errors import InputError
 from jaxos4.logs import read_recording, write_flight
@@ -115,3 +116,21 @@ def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():
     partly = flight._replace(omega=flight.omega * (flight.time[:, None] > 2))
     assert "(`begin` and `end` override)" in prepare([partly], CRAZYFLIE, **options).notes[-1]
     assert "override" not in prepare([partly], CRAZYFLIE, **options, predicted=True).notes[-1]
+
+
+@pytest.mark.parametrize("name", ["arpl_crazyflie_yaw_a.csv", "nanobench/B2_circle_fast_rep2.csv"])
+def test_single_precision_rounds_the_cleaned_data_once(name, shared_flights):
+    """Reading, cutting, averaging and joining compute in double precision; only the flight to fit is rounded."""
+
+    def cleaned():
+        prepared = prepare([read_recording(shared_flights / name, CRAZYFLIE)], CRAZYFLIE, begin=1.0, end=6.0)
+        return [x for x in jax.tree.leaves((prepared.fitted, prepared.tested)) if x.dtype != int], prepared.seconds
+
+    double, seconds = cleaned()
+    with jax.enable_x64(False):
+        single, same_seconds = cleaned()
+    assert seconds == same_seconds
+    assert len(single) == len(double) > 6
+    for one, two in zip(single, double, strict=True):
+        assert one.dtype in (np.float32, np.int32)
+        np.testing.assert_array_equal(one, np.asarray(two).astype(one.dtype))

@@ -3,8 +3,9 @@
 import equinox as eqx
 import numpy as np
 import pytest
+from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
-from test_flight_csv import CRAZYFLIE, identical
+from test_flight_csv import identical
 
 from jaxos4.errors import InputError
 from jaxos4.flight import Flight
