@@ -36,8 +36,7 @@ _IN_14_OR_22 = {
     _TAG2_3_V: (((9, 5), (4, 5), (0, 4)), ((14, 8), (7, 7), (0, 7))),
 }
 
-(_PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT) = range(1, 7)
-(_1500, _VBATREF, _MINMOTOR) = (8, 9, 11)
+_PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT, _1500, _VBATREF, _MINMOTOR = *range(1, 7), 8, 9, 11
 
 
 class BadHeader(Exception):

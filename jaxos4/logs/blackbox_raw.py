@@ -34,16 +34,10 @@ class Session(NamedTuple):
     settings: dict[str, str]
     frames: bytes
 
-
-class Sessions(NamedTuple):
-    """The sessions of a file one after the other: columns by their names in the log, settings and notes.
-
-    The columns include `time (us)`, from 0.
-    """
-
-    columns: dict[str, np.ndarray]
-    settings: dict[str, str]
-    notes: list[str]
+    @property
+    def used(self) -> list[str | None]:
+        """The settings that say what the numbers mean."""
+        return [self.settings.get(name) for name in _USED]
 
 
 def is_raw(path: Path) -> bool:
@@ -76,8 +70,11 @@ def _session(content: bytes) -> Session:
     return Session(settings, content[at:])
 
 
-def read_sessions(path: Path, wanted: Collection[str]) -> Sessions:
-    """Decode the columns `wanted` of all sessions. Raises `InputError`."""
+def read_sessions(path: Path, wanted: Collection[str]) -> tuple[dict[str, np.ndarray], dict[str, str], list[str]]:
+    """Decode the columns `wanted` of all sessions, one after the other. Raises `InputError`.
+
+    **Returns:** the columns by their names in the log, with `time (us)` from 0; the settings; notes.
+    """
     notes: list[str] = []
     found: list[tuple[Session, dict[str, np.ndarray]]] = []
     every = sessions(path)
@@ -91,7 +88,7 @@ def read_sessions(path: Path, wanted: Collection[str]) -> Sessions:
         why = f" ({notes[0]})" if notes else ""
         refuse(path, f"no frame of it can be decoded{why}: it is corrupt, or of another kind; {DECODE}")
     longest = max(found, key=lambda each: each[1]["time"][-1])[0]
-    same = [columns for session, columns in found if _used(session) == _used(longest)]
+    same = [columns for session, columns in found if session.used == longest.used]
     if len(same) < len(found):
         what = f"{len(found) - len(same)} of {len(found)} sessions are ignored"
         notes.append(f"{what}: their settings are not those of the longest one")
@@ -104,11 +101,7 @@ def read_sessions(path: Path, wanted: Collection[str]) -> Sessions:
         begin = columns["time"][-1] + 1e6 * BETWEEN
     joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
     joined["time (us)"] = joined.pop("time")
-    return Sessions(joined, longest.settings, notes)
-
-
-def _used(session: Session) -> list[str | None]:
-    return [session.settings.get(name) for name in _USED]
+    return joined, longest.settings, notes
 
 
 def _columns(session: Session, wanted: Collection[str]) -> tuple[dict[str, np.ndarray] | None, str]:
