@@ -68,13 +68,6 @@ class Stretch(NamedTuple):
         return self.end - self.begin
 
 
-class _Saturation(NamedTuple):
-    rotor: int
-    what: str
-    begin: int
-    end: int
-
-
 def stretches(
     flight: Flight | Recording, airframe: Airframe | None = None, *, landed: Sequence[tuple[float, float]] = ()
 ) -> tuple[Stretch, ...]:
@@ -95,13 +88,10 @@ def stretches(
     for begin, end in landed:
         ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
     saturations = _saturations(omega, airframe, dt)
-    saturated = np.zeros(time.size, dtype=bool)
-    for each in saturations:
-        saturated[each.begin : each.end] = True
     labels = np.zeros(time.size, dtype=int)
     for label, where in (
         (_CLIPPING, _clipped(rates)),
-        (_SATURATED, saturated),
+        (_SATURATED, np.any([where.any(axis=1) for where in saturations.values()], axis=0)),
         (_LOST, _lost(recording.states, dt)),
         (_CRASHED, _crashed(rates, force, share, ground, dt)),
         (_GROUND, ground),
@@ -176,24 +166,22 @@ def _clipped(rates: np.ndarray) -> np.ndarray:
     return out
 
 
-def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> list[_Saturation]:
-    """The runs in which a rotor rests, or is at its limit, for longer than a moment."""
-    found, full_scale = [], math.inf if airframe is None else float(airframe.max_rotor_speed)
+def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dict[str, np.ndarray]:
+    """The samples of each rotor in which it is at its limit, or rests, for longer than a moment."""
+    full_scale = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    found = {what: np.zeros(omega.shape, dtype=bool) for what in ("at full speed", "at rest or idle")}
     for i, speed in enumerate(omega.T):
         largest, least, usual = float(speed.max()), float(speed.min()), float(np.median(speed))
         same = _LIMIT * largest
         if largest <= 0:
             continue
-        full = np.asarray(speed >= _FULL * full_scale)
+        full, rest = np.asarray(speed >= _FULL * full_scale), np.asarray(speed <= same)
         if largest > 1.3 * usual > 0:
             full |= _steady(speed, same) & (speed >= largest - same)
-        rest = np.asarray(speed <= same)
         if least < 0.5 * usual:
             rest |= _steady(speed, same) & (speed <= least + same)
-        for where, what in ((full, "at full speed"), (rest, "at rest or idle")):
-            found += [
-                _Saturation(i + 1, what, begin, end) for begin, end in _runs(where) if (end - begin) * dt > MOMENT
-            ]
+        for where, lasting in zip((full, rest), found.values(), strict=True):
+            lasting[:, i] = _lasting(where, MOMENT / dt)
     return found
 
 
@@ -209,9 +197,7 @@ def _lost(states: np.ndarray, dt: float) -> np.ndarray:
     for measured in [seen[:, c] for c in RATE_COLUMNS if seen[:, c].any()] or [seen.any(axis=1)]:
         at = np.flatnonzero(measured)
         usual = float(np.median(np.diff(at))) * dt if at.size > 1 else 0.0
-        for begin, end in _runs(np.asarray(~measured)):
-            if (end - begin + 1) * dt > max(_GAP, 5 * usual):
-                out[begin:end] = True
+        out |= _lasting(np.asarray(~measured), max(_GAP, 5 * usual) / dt - 1)
     return out
 
 
@@ -301,20 +287,22 @@ def _tilted(means: np.ndarray, step: float) -> np.ndarray:
     size = np.linalg.norm(means[:, 1:4], axis=1)
     with np.errstate(invalid="ignore"):
         lies = (np.abs(size - 1) < _ONE_G) & (means[:, 3] < _TILTED) & (means[:, 4] < _STILL)
-    for begin, end in _runs(lies):
-        if end - begin < math.ceil(_SHORTEST_REST / step):
-            lies[begin:end] = False
-    return np.asarray(lies)
+    return _lasting(np.asarray(lies), math.ceil(_SHORTEST_REST / step) - 1)
 
 
-def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) -> str:
-    if label == _SATURATED:
-        rotors: dict[str, set[int]] = {}
-        for each in saturations:
-            if each.begin < end and each.end > begin:
-                rotors.setdefault(each.what, set()).add(each.rotor)
-        return "; ".join(f"rotor {', '.join(map(str, sorted(which)))} {what}" for what, which in rotors.items())
-    return _NAMES[label]
+def _reason(label: int, begin: int, end: int, saturations: dict[str, np.ndarray]) -> str:
+    if label != _SATURATED:
+        return _NAMES[label]
+    rotors = {what: np.flatnonzero(where[begin:end].any(axis=0)) + 1 for what, where in saturations.items()}
+    return "; ".join(f"rotor {', '.join(map(str, which))} {what}" for what, which in rotors.items() if which.size)
+
+
+def _lasting(where: np.ndarray, most: float) -> np.ndarray:
+    """`where`, without runs of at most so many samples."""
+    out = np.zeros_like(where)
+    for begin, end in _runs(where):
+        out[begin:end] = end - begin > most
+    return out
 
 
 def _samples(seconds: float, dt: float) -> int:
