@@ -5,7 +5,10 @@ A file gives a usable flight or an `InputError` of one line, whatever it contain
 
 import json
 import math
+import time
+import tracemalloc
 
+import equinox as eqx
 import numpy as np
 import pytest
 import recorded_logs
@@ -15,11 +18,11 @@ import test_logs_crazyflie as crazyflie
 import test_logs_ulog as ulog
 from helpers import CRAZYFLIE, refused, same
 from hypothesis import given, settings, strategies as st
-from recorded_logs import VEHICLE, damaged, outcome, rates
+from recorded_logs import RPM, VEHICLE, blackbox_csv, check, damaged, outcome, rates, speeds
 
 import jaxos4.logs.csv as csv_module
 from jaxos4.errors import InputError
-from jaxos4.flight import Flight
+from jaxos4.flight import STATE_NAMES, Flight
 from jaxos4.logs import FORMATS, LogFacts, LogFormat, Sampling, Table, log_format, read_log, read_recording
 from jaxos4.logs.csv import COLUMN_NAMES
 from jaxos4.logs.sampling import held_regularly, logged_rate
@@ -208,6 +211,62 @@ def test_the_law_fails_a_naive_reader(row, cell, junk, path):
     with pytest.raises((AssertionError, ValueError)):
         outcome(naive, path)
     outcome(read, path)
+
+
+# Frame, units and truncation
+
+# Each whole log: its content, its states, the time at which it begins, the tolerances of states and rotor speeds.
+WHOLE = {
+    "ULog": (ulog.everything(), STATE_NAMES, 0.0, 2e-3, 0.5),
+    "Crazyflie, version 1": (crazyflie.one_event(crazyflie.T, version=1), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
+    "Crazyflie": (crazyflie.one_event(crazyflie.T), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
+    "blackbox": (blackbox_csv(blackbox.recorded(blackbox.T)), blackbox.RATES, 0.0, 5e-3, 100 / 7 * RPM),
+    "INAV": (blackbox_csv(blackbox.recorded(blackbox.T) | blackbox.inav(blackbox.T)), STATE_NAMES, 0.0, 5e-3, 9.0),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_flight_comes_back_in_our_frame_and_units(name, save):
+    content, states, start, atol, of_speeds = WHOLE[name]
+    flight, notes = read_log(save(content))
+    options = {"names": states, "start": start, "atol": atol}
+    assert check(flight, **options) >= 0.95 * 3 / 0.02  # each sample of the slowest sensor is one sample
+    assert flight.time[0] == 0
+    middle = np.asarray(flight.time)[:-1] + start + (0.0 if name in ("blackbox", "INAV") else float(flight.dt) / 2)
+    np.testing.assert_allclose(flight.omega[:-1], speeds(middle), atol=of_speeds)
+    assert any("is rotor 1" in note for note in notes) == (not name.startswith("Crazyflie"))
+    for column in {STATE_NAMES.index(each) for each in ("q", "theta", "psi", "y", "vz") if each in states}:
+        wrong = eqx.tree_at(lambda f: f.states, flight, flight.states.at[:, column].multiply(-1))
+        with pytest.raises(AssertionError):
+            check(wrong, **options)
+
+
+@pytest.mark.parametrize("name", ["ULog", "Crazyflie"])
+def test_a_log_cut_by_a_loss_of_power_is_read_to_there(name, save):
+    content, _, start, *_ = WHOLE[name]
+    part, words = content[: len(content) * 2 // 3], "ends abruptly" if name == "ULog" else "no valid checksum"
+    for cut in (part, part + bytes(5000)) if name == "ULog" else (part, content[:-4]):
+        flight, notes = read_log(save(cut))
+        assert any(words in note for note in notes)
+        check(flight, start=start, seconds=1.9)
+    assert not any(words in note for note in read_log(save(content))[1])
+
+
+COSTLY = {name: ulog.announced(formats) for name, formats in ulog.BOMBS.items()}
+COSTLY["empty events"] = crazyflie.EMPTY_EVENTS
+
+
+@pytest.mark.parametrize("name", COSTLY)
+def test_a_few_bytes_cost_little_whatever_they_announce(name, save):
+    path = save(COSTLY[name])
+    tracemalloc.start()
+    begin = time.perf_counter()
+    result = outcome(read_log, path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert isinstance(result, str)
+    assert peak < (100e6 if name == "empty events" else 20e6)
+    assert time.perf_counter() - begin < 10
 
 
 # A new log format is one file and one line in the registry
