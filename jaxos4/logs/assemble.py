@@ -149,7 +149,7 @@ def recording_of(
 
 
 def _facts(table: Table) -> LogFacts:
-    """What the log says beside its columns. Cells that hold no value were not logged, also those of a rotor."""
+    """The facts beside the columns. Cells that hold no value were not logged, also those of a rotor."""
     facts = table.facts
     speeds = any(name in table.columns for name in SPEED_NAMES)
     motors = facts.motors or _slowest(table, SPEED_NAMES if speeds else COMMAND_NAMES)

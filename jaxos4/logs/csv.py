@@ -207,7 +207,7 @@ def _numbers(path: Path, column: str, cells: list[str], row: int) -> np.ndarray:
 
 
 def _complaint(cell: str) -> str:
-    """What is wrong with a cell that is no finite number."""
+    """The fault of a cell that is no finite number, and the remedy."""
     if cell.lower().lstrip("+-") in _NO_NUMBER:
         return f"contains {quoted(cell)}; {_EMPTY}"
     if _NUMBER.fullmatch(cell):

@@ -1,4 +1,4 @@
-"""What all log formats share: columns as a `Table`, facts beside them, the description of a format, refusing a file."""
+"""Shared by all log formats: columns as a `Table`, facts beside them, the description of a format, refusing a file."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ MAX_ROWS = 5_000_000  # 83 minutes at 1 kHz; a longer flight does not fit in the
 SLOWEST_RATE = 40.0
 """The fewest samples a second of motors and gyro that identify a vehicle [Hz].
 
-Rotors follow their commands with a lag of 20 to 80 ms. Commands one lag apart or further tell too little of the speeds
+Rotors follow their commands with a lag of 20 to 80 ms. Commands one lag apart or further say too little about speeds
 between them. In closed loop, with the lag and delay that fit best, commands at 10 Hz make inertias 1.4 to 2.1 times too
 large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 """
@@ -37,7 +37,7 @@ class Sampling(NamedTuple):
 
 
 class LogFacts(NamedTuple):
-    """What a log says beside the flight. `None`: the log does not say it.
+    """Facts that a log states beside the flight. `None`: the log does not state it.
 
     - `motors`, `gyro`: how often rotor speeds or commands, and body rates, were written, before any resampling.
     - `faster`: what to do so that the vehicle writes them more often.
@@ -85,7 +85,7 @@ class Table(NamedTuple):
     - `first_row`: the row of the file, counted from 1, that holds entry 0; `None` if the format has no rows.
     - `names`: the log's own name of a column, if it is another.
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
-    - `facts`: what the log says beside its columns. How often motors and gyro were written follows from the cells, if
+    - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
     """
 
@@ -163,7 +163,7 @@ def gyro_rows(
 
 
 def needed(path: Path, found: Found | None, what: str, remedy: str) -> Found:
-    """What a reader found. Raises `InputError` if it found nothing."""
+    """Return `found`, or raise `InputError` if the reader found nothing."""
     if found is None:
         refuse(path, f"holds no {what}; {remedy}")
     return found

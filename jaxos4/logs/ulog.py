@@ -156,7 +156,7 @@ def _refuse(log: Topics, what: str, name: str, kind: str = "field") -> None:
 
 
 def _facts(log: Topics, rows: np.ndarray, motors: Sampling, gyro: Sampling) -> LogFacts:
-    """What the log says beside its columns; `rows`: the times of the flight's samples [s], in the log's time."""
+    """The facts of the log; `rows`: the times of the flight's samples [s], in the log's time."""
     positions = [[log.parameters.get(f"CA_ROTOR{i}_P{axis}", math.nan) for axis in "XY"] for i in range(4)]
     moments = [log.parameters.get(f"CA_ROTOR{i}_KM", math.nan) for i in range(4)]
     known = log.parameters.get("CA_ROTOR_COUNT") == 4
@@ -207,7 +207,7 @@ def _landed(log: Topics, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
 
 
 def _faster(log: Topics) -> str:
-    """What to do so that PX4 logs faster. Reference: `logged_topics.cpp` of PX4, `add_high_rate_topics`."""
+    """Advice to make PX4 log faster. Reference: `logged_topics.cpp` of PX4, `add_high_rate_topics`."""
     profile, high_rate = int(log.parameters.get("SDLOG_PROFILE", 1.0)), 16
     if profile & high_rate:
         return "log esc_status or actuator_motors at full rate (logger_topics.txt on the card), and fly again"

@@ -1,4 +1,4 @@
-"""What happens to a recorded flight before it is fitted."""
+"""Steps from a recorded flight to one that can be fitted: usable parts, averages, joined pieces, drafts, inspection."""
 
 from .motion import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
 from .pieces import averaged as averaged, cut as cut, join as join

@@ -95,7 +95,7 @@ def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> list[str]:
 
 
 def opposite_note(axes: Sequence[str]) -> str:
-    """What is wrong if the vehicle turns against the torque about these axes, and what to do."""
+    """The fault and the remedy, if the vehicle turns against the torque about these axes; empty without axes."""
     if not axes:
         return ""
     if list(axes) == ["yaw"]:

@@ -121,7 +121,7 @@ def prepare(
 
 
 def _available_inputs(whole: Recording, pieces: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
-    """What the recording joined from these pieces offers to `Term.needs`; a force, if every piece measured it."""
+    """The inputs for `Term.needs` that the joined recording offers. A force counts if every piece measured it."""
     force = np.all([~np.isnan(piece.channels[:, len(STATE_NAMES) :]).all(axis=0) for piece in pieces], axis=0)
     offers = {
         COMMANDS: whole.commanded,

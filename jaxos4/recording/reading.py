@@ -8,7 +8,7 @@ from ..logs import FORMATS, Recording as Recording, log_format, read_recording a
 
 
 def vehicle_evidence(recording: Recording) -> str:
-    """What shows that a file is the log of a real vehicle, as the end of a sentence; empty if nothing does.
+    """The evidence that a file is the log of a real vehicle, as the end of a sentence; empty if there is none.
 
     A simulation of the OS4 has rotor speeds and states. A vehicle logs commands, or has an accelerometer, or writes a
     format of its own.
