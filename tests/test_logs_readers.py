@@ -24,7 +24,6 @@ import jaxos4.logs.csv as csv_module
 from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES, Flight
 from jaxos4.logs import FORMATS, LogFacts, LogFormat, Sampling, Table, log_format, read_log, read_recording
-from jaxos4.logs.csv import COLUMN_NAMES
 from jaxos4.logs.sampling import held_regularly, logged_rate
 from jaxos4.logs.table import opened, refuse
 
@@ -109,17 +108,6 @@ def test_any_bytes_after_a_part_of_the_header(name, path):
 
 
 # The flight CSV
-
-
-@given(
-    header=st.lists(st.sampled_from((*COLUMN_NAMES, "T", "P", "mode", "")), max_size=12),
-    rows=st.lists(st.lists(JUNK, max_size=12), max_size=6),
-)
-@settings(max_examples=200)
-def test_tables_of_junk(header, rows, path):
-    text = "\n".join(",".join(row) for row in [header, *rows])
-    path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    outcome(read, path)
 
 
 def good(rows, dt, start, wide):
