@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
@@ -65,9 +64,12 @@ def with_body_velocity(recording: Recording) -> Recording:
     # Gaps get the value before them, or the first one.
     measured, index = ~np.isnan(values), np.arange(len(values))[:, None]
     source = np.maximum(np.maximum.accumulate(np.where(measured, index, -1)), measured.argmax(axis=0))
-    filled = np.take_along_axis(values, source, axis=0)
-    velocity = Rotation.from_euler("ZYX", filled[:, :3]).apply(filled[:, 3:], inverse=True)
-    return recording._replace(body_velocity=velocity)
+    psi, theta, phi, x, y, z = np.take_along_axis(values, source, axis=0).T
+    # The inverse of R_z(psi) R_y(theta) R_x(phi).
+    x, y = x * np.cos(psi) + y * np.sin(psi), y * np.cos(psi) - x * np.sin(psi)
+    x, z = x * np.cos(theta) - z * np.sin(theta), z * np.cos(theta) + x * np.sin(theta)
+    y, z = y * np.cos(phi) + z * np.sin(phi), z * np.cos(phi) - y * np.sin(phi)
+    return recording._replace(body_velocity=np.column_stack([x, y, z]))
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:
