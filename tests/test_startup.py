@@ -8,12 +8,13 @@ import pathlib
 import shutil
 import subprocess
 import sys
+import warnings
 
 import jax
 import pytest
 
 import jaxos4
-from jaxos4._xla import WHOLE_LOOPS, compile_loops_whole
+from jaxos4._xla import NATIVE_LOOPS, NO_OPTIONS, make_loops_native
 from jaxos4.cli import _choices, _jax, train
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
@@ -270,38 +271,85 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
     assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52
 
 
-def test_commands_that_compute_little_compile_quickly(run, save, monkeypatch):
-    asked, wrong = [], str(save("wrong = 1", "wrong.toml"))
-    monkeypatch.setattr("jaxos4.cli._app.prepare", asked.append)
-    for command in ("study", wrong, "--out", "out"), ("estimate", wrong), ("compare", "--quick", "--out", wrong):
-        assert run(*command)[0] == 2
-    assert asked == [WHOLE_LOOPS, _jax.QUICK_TO_COMPILE, _jax.QUICK_TO_COMPILE]
+# The options of XLA.
 
 
 @pytest.mark.parametrize(
-    ("version", "own", "flags"),
+    ("variables", "flags"),
     [
-        ("0.10.2", None, _jax.QUICK_TO_COMPILE),
-        ("1.0.0", None, WHOLE_LOOPS),
-        ("0.10.2", "--own=1", f"--own=1 {WHOLE_LOOPS}"),
-        ("0.10.2", "--xla_backend_extra_options=own=1", f"--xla_backend_extra_options=own=1 {WHOLE_LOOPS}"),
-        ("0.10.2", WHOLE_LOOPS.replace("1000000000", "1000"), WHOLE_LOOPS.replace("1000000000", "1000")),
-        ("0.10.2", "flags.txt", "flags.txt"),
+        ({}, NATIVE_LOOPS),
+        ({"XLA_FLAGS": "--own=1"}, f"--own=1 {NATIVE_LOOPS}"),
+        ({"XLA_FLAGS": "--xla_backend_extra_options=own=1"}, f"--xla_backend_extra_options=own=1 {NATIVE_LOOPS}"),
+        ({"XLA_FLAGS": NATIVE_LOOPS.replace("1000000000", "1000")}, NATIVE_LOOPS.replace("1000000000", "1000")),
+        ({"XLA_FLAGS": "flags.txt"}, "flags.txt"),
+        ({"XLA_FLAGS": "--own=1", NO_OPTIONS: "1"}, "--own=1"),
+        ({NO_OPTIONS: "1"}, None),
     ],
 )
-def test_flags_of_xla_are_set_for_versions_that_know_them_and_never_replaced(version, own, flags, monkeypatch):
-    monkeypatch.setattr("jaxlib.version.__version__", version)
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
-    if own is not None:
-        monkeypatch.setenv("XLA_FLAGS", own)
-    compile_loops_whole()
-    _jax.set_flags(_jax.QUICK_TO_COMPILE)
+def test_the_import_makes_loops_native_and_replaces_no_flag(variables, flags, monkeypatch):
+    for name in ("XLA_FLAGS", NO_OPTIONS):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # JAX has computed in this process
+        make_loops_native()
     assert os.environ.get("XLA_FLAGS") == flags
 
 
-def test_the_import_makes_loops_native():
-    """In a process of its own: the flags of this one are set for tests."""
-    code = "import os, jaxos4; print(os.environ['XLA_FLAGS'])"
-    unset = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=unset, check=True)
-    assert done.stdout.strip() == WHOLE_LOOPS
+@pytest.mark.parametrize(
+    ("before", "variables", "warned"),
+    [
+        ("import jax", {}, 0),
+        ("import jax; jax.devices()", {}, 1),
+        ("import jax; jax.devices()", {NO_OPTIONS: "1"}, 0),
+        ("import jax; jax.devices()", {"XLA_FLAGS": NATIVE_LOOPS}, 0),
+    ],
+)
+def test_one_warning_says_that_the_import_comes_too_late(before, variables, warned):
+    code = f"{before}; import jaxos4; from jaxos4 import IBSS, _xla; _xla.make_loops_native()"
+    process = start(code=code, **{"XLA_FLAGS": ""} | variables)
+    assert process.returncode == 0
+    assert process.stderr.count("RuntimeWarning: JAX has computed before `import jaxos4`") == warned
+
+
+# Prints the options of each program that is compiled: the whole key of the cache would be private to JAX.
+QUICKLY = """
+import json, os, sys
+import jax, jax.numpy as jnp, numpy as np
+from jax._src import compiler
+from jaxos4._xla import NATIVE_LOOPS, quick_jit
+
+seen, original = [], compiler.get_compile_options
+def spy(*args, **kwargs):
+    seen.append(bool(kwargs.get("env_options_overrides")))
+    return original(*args, **kwargs)
+compiler.get_compile_options = spy
+
+twice = quick_jit(lambda x, *, scale: 2 * x * scale)
+x, xs = np.ones(3), np.ones((2, 3))
+uses = {
+    "alone": lambda: twice(x, scale=1.0),
+    "jit": lambda: jax.jit(lambda x: twice(x, scale=1.0))(x),
+    "constant": lambda: jax.jit(lambda: twice(x, scale=1.0))(),
+    "vmap": lambda: jax.vmap(lambda x: twice(x, scale=1.0))(xs),
+    "grad": lambda: jax.grad(lambda x: twice(x, scale=1.0).sum())(x),
+    "loop": lambda: jax.lax.scan(lambda c, _: (twice(c, scale=1.0), None), x, None, 1)[0],
+}
+for name, use in uses.items():
+    seen.clear()
+    value = np.asarray(use())
+    assert np.all(value == 2), name
+    print(name, any(seen))
+print(os.environ.get("XLA_FLAGS") in (NATIVE_LOOPS, ""))
+"""
+
+
+@pytest.mark.parametrize("off", [False, True])
+def test_only_a_program_that_is_called_alone_is_compiled_quickly_and_no_flag_of_the_process_says_so(off):
+    process = start(code=QUICKLY, XLA_FLAGS="", **{NO_OPTIONS: "1"} if off else {})
+    *programs, untouched = process.stdout.splitlines()
+    assert process.returncode == 0, process.stderr
+    alone = [f"alone {not off}", "jit False", "constant False", "vmap False", "grad False", "loop False"]
+    assert programs == alone
+    assert untouched == "True"

@@ -15,7 +15,7 @@ import msgspec
 
 from ..errors import InputError
 from ..networks import TrainedNetwork, load_network, save_network
-from .network_jobs import job_number, jobs, train_network
+from .cell import train_network
 from .run import FAILURES, Step, compute, label_of
 from .specification import Study
 from .store import Store
@@ -38,7 +38,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
     from distributed import as_completed
 
     study = store.study
-    specification, needed = msgspec.json.encode(study).decode(), jobs(study)
+    specification = msgspec.json.encode(study).decode()
+    numbers = {job: number for number, job in enumerate(study.jobs())}
     waiting = collections.deque(store.missing())
     done = study.count - len(waiting)
     networks: dict[int, Any] = {}
@@ -61,7 +62,7 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         room = _AHEAD * max(_threads(client), 1) - len(running)
         for _ in range(min(room, len(waiting))):
             index = waiting.popleft()
-            number = job_number(study, study.cell(index), needed)
+            number = numbers.get(study.job(study.cell(index).scenario))
             network = None if number is None else network_of(number)
             future = client.submit(remote_cell, specification, index, network, retries=_RETRIES, pure=False)
             running[future] = index, number
@@ -94,7 +95,7 @@ def remote_training(specification: str, number: int) -> bytes | str:
     """The bytes of a network's file, or a message that says why there is none."""
     study = msgspec.json.decode(specification, type=Study)
     try:
-        network = train_network(study, jobs(study)[number])
+        network = train_network(study, number)
     except FAILURES as error:
         return str(error)
     with tempfile.TemporaryDirectory() as folder, jax.enable_x64(study.double):

@@ -20,8 +20,8 @@ import numpy as np
 from .._files import BROKEN, write_atomically
 from ..errors import InputError
 from ..networks import TrainedNetwork, load_network
-from .cell_file import decode
-from .specification import Study, differences
+from .cell import decode
+from .specification import Study
 
 RESULTS_FILE = "results.nc"
 _SPECIFICATION, _LOCK, _LOG = "study.json", "lock", "log.jsonl"
@@ -40,7 +40,7 @@ class Store:
         return self.directory / "cells" / f"{index:08d}.npz"
 
     def network_file(self, number: int) -> Path:
-        """The file of a network, by its place in `jobs`."""
+        """The file of a network, by its place in `Study.jobs`."""
         return self.directory / "networks" / f"{number:04d}.net"
 
     def missing(self) -> list[int]:
@@ -184,5 +184,12 @@ def _check_folder(directory: Path) -> None:
 
 
 def _check_same(directory: Path, wanted: Study, stored: Study) -> None:
-    if changed := differences(wanted, stored):
+    now, before = msgspec.to_builtins(wanted), msgspec.to_builtins(stored)
+    changed = [f"`{key}` was {_short(before[key])}, now {_short(now[key])}" for key in now if now[key] != before[key]]
+    if changed:
         raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")
+
+
+def _short(value: Any) -> str:
+    text = msgspec.json.encode(value).decode()
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -10,7 +10,7 @@ from benchmarks.case import Case
 
 import jaxos4
 from jaxos4.estimators import make_estimator
-from jaxos4.study.devices import use_all_cores
+from jaxos4.study import use_all_cores
 
 jax.config.update("jax_enable_x64", True)
 
