@@ -12,7 +12,8 @@ import warnings
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 NO_OPTIONS = "JAXOS4_NO_XLA_OPTIONS"
 """The environment variable that switches off all options of this file."""
@@ -68,7 +69,8 @@ def quick_jit(function: Callable[P, R]) -> Callable[P, R]:
     import jax.numpy as jnp
     from jax.core import Tracer
 
-    inner, outer = eqx.filter_jit(function), eqx.filter_jit(function, compiler_options=QUICK)
+    inner = eqx.filter_jit(function)
+    outer = eqx.filter_jit(function, compiler_options=QUICK)  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

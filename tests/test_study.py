@@ -204,7 +204,7 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
     study = Study(channels=("rates", "attitude"), estimators=("network", "hybrid", "ibss"), flights=250, batch=100)
     with open_store(tmp_path, study, "these tests") as store:
         for cell in (cell for cell in study.cells() if cell.scenario.estimator == "ibss" and cell.first == 0):
-            store.write(store.cell_file(cell.number), b"", cell=cell.number, seconds=2.0 + cell.scenario.scale)
+            store.write_cell(cell.number, b"", 2.0 + cell.scenario.scale)
     network, hybrid, ibss = plan(study, tmp_path)
     assert network == ("network", 18, 1500, 1, 1, None)
     # One more network, for the attitude. Three programs: that network and two searches.

@@ -15,6 +15,7 @@ default terms and the whole flight fitted.
 
 import itertools
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -27,8 +28,11 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.design import standard_references
-from jaxos4.report.experiment import count_results, in_words, table_of
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 

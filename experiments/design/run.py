@@ -6,6 +6,7 @@ standard inputs. Then IBSS identifies simulated flights of the designed input. T
 """
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,10 @@ import jaxos4
 from jaxos4.design import Envelope, InputDesign, design_and_compare
 from jaxos4.design.fitting import VEHICLES, drawn, fly_finely
 from jaxos4.models import MODELS
-from jaxos4.report.experiment import brackets_around, count_results, identify, in_words, measure, table_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import brackets_around, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -5,6 +5,7 @@ with the model that is fitted (the inverse crime), so that the bound applies.
 """
 
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -17,8 +18,11 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.report.experiment import PARAMETERS, count_results, in_words, table_of
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import PARAMETERS, count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -11,6 +11,7 @@ deviation; 99 % of such figures should be below 2.58.
 import itertools
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,8 +21,11 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.recording import Recording, read_recording
-from jaxos4.report.experiment import table_of
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -13,19 +13,17 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
-from .._custom_types import Key, Numeric, Scalar, as_float
+from .._custom_types import Key, Scalar, as_float
+from .._xla import quick_jit
 from ..bracket import UNIFORM_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Calibration, Estimate, check_bracket, check_count, check_positive
 from ..flight import STATE_NAMES
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem, in_blocks
-from .architecture import Regressor, Scaling
-from .calibration import LEVELS, ErrorTable, calibrate, calibrated_scales, uncalibrated
+from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales, uncalibrated
 from .features import FEATURES, AbstractFeatures, Coordinates
-from .first_weights import first_regressor, linear_samples, scaling_and_linear_map
-from .progress_bar import training_bar
-from .training import Pair, Progress, Purpose, train
+from .training import Progress, calibrate, train, training_bar, untrained
 
 APPROXIMATORS = ("mlp", "cmac")
 
@@ -103,9 +101,7 @@ class NetworkEstimator(eqx.Module):
         self._check(problem, bracket)
         scales = np.asarray(self.noise, float)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
-        scaling, regressor = _first(
-            features, linear_samples(features, scales, key), scales, key, self.approximator, self.width, self.depth
-        )
+        scaling, regressor = untrained(features, scales, key, self.approximator, self.width, self.depth)
         bar = training_bar(self.steps) if progress is True else contextlib.nullcontext(progress or None)
         with bar as report:
             regressor, history = train(
@@ -149,27 +145,9 @@ class NetworkEstimator(eqx.Module):
             raise ValueError(f'`features` "raw" {what}: use "score".')
 
 
-@eqx.filter_jit
+@quick_jit
 def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> AbstractFeatures:
     return FEATURES[features].of(problem, Coordinates.of(problem, bracket, as_float(noise)))
-
-
-@eqx.filter_jit
-def _first(
-    features: AbstractFeatures,
-    samples: list[Pair],
-    scales: Float[Numeric, "2"],
-    key: Key,
-    approximator: str,
-    width: int,
-    depth: int,
-) -> tuple[Scaling, Regressor]:
-    """Scaling and regressor before training, with the linear map fitted to `samples`."""
-    scaling, linear_map = scaling_and_linear_map(features, scales, samples)
-    place = Purpose.WEIGHTS.place(0)
-    return scaling, first_regressor(
-        linear_map, approximator, width=width, depth=depth, key=jax.random.fold_in(key, place)
-    )
 
 
 class TrainedNetwork(AbstractEstimator):
@@ -298,7 +276,7 @@ class TrainedNetwork(AbstractEstimator):
             "start": ~(jnp.abs(first_state - own_start) <= allowed).all(),
         }
 
-    @eqx.filter_jit
+    @quick_jit
     def _identify(self, problem: ShootingProblem, bracket: Bracket) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
         return in_blocks(self._answer, problem, bracket)
 

@@ -28,7 +28,7 @@ from ..networks import TrainedNetwork
 from ..results import NAMES, result_names
 from ..shooting import ShootingProblem
 from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly, key_of, problem_of
-from .specification import Cell, Scenario, Study
+from .specification import Cell, Job, Scenario, Study
 
 OUTCOMES = (*NAMES, "failed", "not_run")
 """How an estimate ended. `failed`: its cell could not be computed; `not_run`: not yet. Files hold the place in here."""
@@ -90,7 +90,7 @@ def _answers(
 ) -> dict[str, Any]:
     """The attributes in `_KEPT` of each flight's estimate, and its `half_width` at `LEVELS`, by name."""
     few = math.prod(study.shape[:-1]) * study.flights <= _FEW_FLIGHTS
-    identify, search = (quick if few else optimised for quick, optimised in (_IDENTIFY, _SEARCH))
+    identify, search = _COMPILED_QUICKLY if few else _OPTIMISED
     if network is not None:  # a history of another length would be another program
         network = eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
     estimator, channels = make_estimator(cell.scenario.estimator, network), study.seed_channels(cell.scenario)
@@ -136,9 +136,8 @@ def _kept(found: Estimate) -> dict[str, Any]:
     return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width}
 
 
-# A program that is compiled quickly, and one that is fully optimised.
-_IDENTIFY = quick_jit(_identify), eqx.filter_jit(_identify)
-_SEARCH = quick_jit(_search), eqx.filter_jit(_search)
+_COMPILED_QUICKLY = quick_jit(_identify), quick_jit(_search)
+_OPTIMISED = eqx.filter_jit(_identify), eqx.filter_jit(_search)
 
 
 def _results(
@@ -187,13 +186,13 @@ def decode(data: bytes) -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files}
 
 
-def train_network(study: Study, number: int) -> TrainedNetwork:
-    """Trains a network of `Study.jobs` for all noises and scales of a study. Raises as `NetworkEstimator.fit` does.
+def train_network(study: Study, job: Job) -> TrainedNetwork:
+    """Trains a network for all noises and scales of a study. Raises as `NetworkEstimator.fit` does.
 
     The numbers are the same bit for bit only on the same number of cores, which share the products of matrices.
     """
     with jax.enable_x64(study.double):
-        job, scales = study.jobs()[number], [scale or 1.0 for scale in study.scales]
-        settings, fleet = study.network.estimator(job.channels, (min(scales), max(scales))), fleet_of(study, job)
+        scales, fleet = [scale or 1.0 for scale in study.scales], fleet_of(study, job)
+        settings = study.network.estimator(job.channels, (min(scales), max(scales)))
         problem = blank_problem(study, fleet, 1.0, job.channels)
-        return settings.fit(problem, fleet.bracket, key=key_of(study.network.seed, number))
+        return settings.fit(problem, fleet.bracket, key=key_of(study.network.seed, study.jobs()[job]))

@@ -154,7 +154,7 @@ def fly_again(study: Study, cell: Cell, answers: list[dict[str, np.ndarray]]) ->
             start[CASCADE_ORDER[: known.size]] = known
         fleet = fleet_of(study, cell.scenario)
         states = _fly_from(fleet, as_float(starts), as_float(parameters), method=study.fit_method)
-        return np.where(np.isfinite(parameters).all(axis=1)[:, None, None], states, np.nan)
+        return np.where(np.isfinite(parameters).all(axis=1).reshape(-1, 1, 1), states, np.nan)
 
 
 @quick_jit

@@ -7,7 +7,7 @@ import itertools
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,10 +16,10 @@ import numpy as np
 import xarray as xr
 
 from ..errors import InputError, TrainingError
-from ..networks import TrainedNetwork, save_network
+from ..networks import TrainedNetwork, encode_network
 from .cell import encode, programs_of, run_cell, train_network
 from .dataset import assemble, save_dataset
-from .specification import Cell, Study
+from .specification import Cell, Job, Study
 from .store import Store, check_store, open_store
 
 # Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
@@ -78,7 +78,7 @@ def plan(study: Study, directory: Path) -> list[Plan]:
         if "cell" in entry:
             seconds[study.cell(entry["cell"]).scenario.estimator].append(entry["seconds"])
     remaining = [study.cell(index) for index in store.missing()]
-    trained = {job for number, job in enumerate(study.jobs()) if store.network_file(number).exists()}
+    trained = {job for job, number in study.jobs().items() if store.network_file(number).exists()}
     compiled: set[tuple] = set()
     for estimator in study.estimators:
         cells = [cell for cell in remaining if cell.scenario.estimator == estimator]
@@ -93,74 +93,12 @@ def plan(study: Study, directory: Path) -> list[Plan]:
     return rows
 
 
-class _Task(NamedTuple):
-    """A task for a device: its name, the call with the device, and what to do with the result."""
-
-    label: str
-    call: Callable[[Any], Any]
-    keep: Callable[[Any], None]
-
-
 class _Program:
     """A program: the devices that run it, and the waiting cells that end with it."""
 
     def __init__(self) -> None:
         self.devices: set[Any] = set()
-        self.waiting: deque[tuple[Cell, int | None]] = deque()  # with the number of the network that the cell needs
-
-
-class _Work:
-    """The remaining work of a study, and the choice of the next task for a free device."""
-
-    def __init__(self, store: Store):
-        self.store, self.study, missing = store, store.study, store.missing()
-        self.done, self.jobs = self.study.count - len(missing), self.study.jobs()
-        numbers = {job: number for number, job in enumerate(self.jobs)}
-        cells = [(cell, numbers.get(self.study.job(cell.scenario))) for cell in map(self.study.cell, missing)]
-        self.untrained = deque(dict.fromkeys(number for _, number in cells if number is not None))
-        # A cell without a network never waits for one.
-        self.networks: dict[int | None, TrainedNetwork | str | None] = {None: None}
-        self.programs: defaultdict[tuple, _Program] = defaultdict(_Program)
-        # Cells of IBSS first: those of the hybrid, which end with the same program, wait for a network.
-        for cell, number in sorted(cells, key=lambda one: one[1] is not None):
-            self.programs[programs_of(self.study, cell.scenario)[-1]].waiting.append((cell, number))
-
-    def task(self, device: Any) -> _Task | None:
-        """The next task for a free device, or `None` if all remaining work waits for other tasks."""
-        if self.untrained:
-            return self._training(self.untrained.popleft())
-        program = self._ready(device)
-        if program is None:
-            return None
-        program.devices.add(device)
-        return self._cell(*program.waiting.popleft())
-
-    def _ready(self, device: Any) -> _Program | None:
-        """The program that the device runs already, else one that no device runs, else the one with most cells."""
-        ready = [p for p in self.programs.values() if p.waiting and p.waiting[0][1] in self.networks]
-        own = [p for p in ready if device in p.devices]
-        new = [p for p in ready if not p.devices]
-        long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
-        return next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
-
-    def _training(self, number: int) -> _Task:
-        return _Task(
-            f"training for {self.jobs[number].channels}",
-            lambda device: _train(self.store, number, device),
-            lambda network: self.networks.update({number: network}),
-        )
-
-    def _cell(self, cell: Cell, number: int | None) -> _Task:
-        def call(device: Any) -> tuple[bytes, float]:
-            with jax.default_device(device):
-                return compute(self.study, cell, self.networks[number])
-
-        def keep(result: tuple[bytes, float]) -> None:
-            data, seconds = result
-            self.store.write(self.store.cell_file(cell.number), data, cell=cell.number, seconds=seconds)
-            self.done += 1
-
-        return _Task(label_of(self.study, cell), call, keep)
+        self.waiting: deque[Cell] = deque()
 
 
 def run_here(store: Store) -> Iterator[Step]:
@@ -168,16 +106,30 @@ def run_here(store: Store) -> Iterator[Step]:
 
     A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
-    work, free = _Work(store), deque(jax.local_devices())
-    running: dict[concurrent.futures.Future, tuple[Any, _Task]] = {}
+    study, cells = store.study, [store.study.cell(index) for index in store.missing()]
+    done, programs = study.count - len(cells), defaultdict(_Program)
+    # Cells of IBSS first: those of the hybrid, which end with the same program, wait for a network.
+    for cell in sorted(cells, key=lambda cell: study.job(cell.scenario) is not None):
+        programs[programs_of(study, cell.scenario)[-1]].waiting.append(cell)
+    untrained = deque(dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None))
+    # A cell without a network never waits for one.
+    networks: dict[Job | None, TrainedNetwork | str | None] = {None: None}
+    free = deque(jax.local_devices())
+    running: dict[concurrent.futures.Future, tuple[Any, Job | Cell]] = {}
     pool = concurrent.futures.ThreadPoolExecutor(len(free))
     try:
         while True:
             for device in tuple(free):
-                if (task := work.task(device)) is not None:
-                    free.remove(device)
-                    running[pool.submit(task.call, device)] = device, task
-            yield Step(work.done, ", ".join(dict.fromkeys(task.label for _, task in running.values())))
+                if untrained:
+                    task = untrained.popleft()
+                    future = pool.submit(_train, store, task, device)
+                elif task := _next_cell(study, list(programs.values()), networks, device):
+                    future = pool.submit(_compute_on, device, study, task, networks[study.job(task.scenario)])
+                else:  # all remaining cells wait for networks
+                    continue
+                free.remove(device)
+                running[future] = device, task
+            yield Step(done, ", ".join(dict.fromkeys(label_of(study, task) for _, task in running.values())))
             if not running:
                 return
             finished, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
@@ -185,10 +137,32 @@ def run_here(store: Store) -> Iterator[Step]:
                 device, task = running.pop(future)
                 free.append(device)
                 _give_memory_back()
-                task.keep(future.result())
+                if isinstance(task, Job):
+                    networks[task] = future.result()
+                else:
+                    store.write_cell(task.number, *future.result())
+                    done += 1
     finally:
         # An interrupt does not wait for running tasks, which may last minutes; their results are lost.
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _next_cell(study: Study, programs: list[_Program], networks: Container[Job | None], device: Any) -> Cell | None:
+    """A cell of the program that the device runs already, else of one that no device runs, else of the longest."""
+    ready = [p for p in programs if p.waiting and study.job(p.waiting[0].scenario) in networks]
+    own = [p for p in ready if device in p.devices]
+    new = [p for p in ready if not p.devices]
+    long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
+    program = next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
+    if program is None:
+        return None
+    program.devices.add(device)
+    return program.waiting.popleft()
+
+
+def _compute_on(device: Any, study: Study, cell: Cell, network: TrainedNetwork | str | None) -> tuple[bytes, float]:
+    with jax.default_device(device):
+        return compute(study, cell, network)
 
 
 def _give_memory_back() -> None:
@@ -197,20 +171,26 @@ def _give_memory_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _train(store: Store, number: int, device: Any) -> TrainedNetwork | str | None:
+def _train(store: Store, job: Job, device: Any) -> TrainedNetwork | str | None:
     """The network, read from its file as in a resumed run; or a message that says why there is none."""
-    begin = time.perf_counter()
+    begin, number = time.perf_counter(), store.study.jobs()[job]
     with jax.default_device(device):
         if (network := store.read_network(number)) is not None:
             return network
-        try:
-            network = train_network(store.study, number)
-        except FAILURES as error:
-            return str(error)
-        with jax.enable_x64(store.study.double):
-            save_network(network, store.network_file(number))
-        store.log(network=number, seconds=round(time.perf_counter() - begin, 3))
+        data = train(store.study, job)
+        if isinstance(data, str):
+            return data
+        store.write_network(number, data, seconds=round(time.perf_counter() - begin, 3))
         return store.read_network(number)
+
+
+def train(study: Study, job: Job) -> bytes | str:
+    """The bytes of a network's file, or a message that says why there is none."""
+    try:
+        with jax.enable_x64(study.double):
+            return encode_network(train_network(study, job))
+    except FAILURES as error:
+        return str(error)
 
 
 def compute(study: Study, cell: Cell, network: TrainedNetwork | str | None) -> tuple[bytes, float]:
@@ -229,9 +209,11 @@ def compute(study: Study, cell: Cell, network: TrainedNetwork | str | None) -> t
     return encode(results), round(time.perf_counter() - begin, 3)
 
 
-def label_of(study: Study, cell: Cell) -> str:
-    """The name of a cell: its estimator, and its values on the axes that have more than one."""
-    *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in cell.scenario)
+def label_of(study: Study, task: Job | Cell) -> str:
+    """The name of a task: for a cell its estimator, and its values on the axes that have more than one."""
+    if isinstance(task, Job):
+        return f"training for {task.channels}"
+    *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in task.scenario)
     return " ".join([estimator, *itertools.compress(shared, (length > 1 for length in study.shape))])
 
 

@@ -242,10 +242,10 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         """The channels that a hybrid's network looks at: it only says where to shoot."""
         return min(scenario.seen, self.network.hybrid_channels, key=CHANNELS.__getitem__)
 
-    def jobs(self) -> list[Job]:
-        """The networks that the study needs. Their places are their numbers."""
+    def jobs(self) -> dict[Job, int]:
+        """The networks that the study needs, with their numbers."""
         needed = (self.job(self.cell(index).scenario) for index in range(0, self.count, self.blocks))
-        return list(dict.fromkeys(job for job in needed if job is not None))
+        return {job: number for number, job in enumerate(dict.fromkeys(job for job in needed if job))}
 
     @property
     def double(self) -> bool:

@@ -59,11 +59,15 @@ class Store:
             what = " ".join(str(error).split())[:120]
             raise InputError(f"{path}: not a whole cell ({what}); delete it, and run the study again.") from None
 
-    def write(self, path: Path, data: bytes, **entry: Any) -> None:
-        """Writes a file of the study, and an entry of the log."""
-        with write_atomically(path) as beside:
-            beside.write_bytes(data)
-        self.log(**entry)
+    def write_cell(self, index: int, data: bytes, seconds: float) -> None:
+        """Writes the file of a cell, and an entry of the log with the seconds that it took."""
+        _write(self.cell_file(index), data)
+        self.log(cell=index, seconds=seconds)
+
+    def write_network(self, number: int, data: bytes, **entry: Any) -> None:
+        """Writes the file of a network, and an entry of the log."""
+        _write(self.network_file(number), data)
+        self.log(network=number, **entry)
 
     def log(self, **entry: Any) -> None:
         """Adds an entry to the log."""
@@ -124,8 +128,7 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
         else:
             store = Store(directory, study, device, importlib.metadata.version("jaxos4"))
             header = {"version": store.version, "device": device, "study": study}
-            with write_atomically(specification) as beside:
-                beside.write_bytes(msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
+            _write(specification, msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
         for folder in (directory, directory / "cells", directory / "networks"):
             folder.mkdir(exist_ok=True)
             for unfinished in folder.glob(_UNFINISHED):
@@ -193,3 +196,8 @@ def _check_same(directory: Path, wanted: Study, stored: Study) -> None:
 def _short(value: Any) -> str:
     text = msgspec.json.encode(value).decode()
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _write(path: Path, data: bytes) -> None:
+    with write_atomically(path) as beside:
+        beside.write_bytes(data)

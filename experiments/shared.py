@@ -1,4 +1,4 @@
-"""Functions that the scripts in `experiments/` share: batched identification, tables, Datasets and figure files."""
+"""Functions that the experiments share: batched identification, tables, Datasets and figure files."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -12,17 +12,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from .._custom_types import Key, States
-from .._files import write_atomically
-from ..bracket import Bracket
-from ..estimate import AbstractEstimator, Estimate
-from ..flight import Flight
-from ..models.abstract import AbstractModel
-from ..noise import AbstractNoise
-from ..shooting import ShootingProblem
-from ..study import RESULTS_FILE, Study, device_name, provenance, save_dataset, use_all_cores as use_all_cores
-from .progress import run_with_bar
-from .style import Style, drawing, pdf, svg
+from jaxos4._custom_types import Key, States
+from jaxos4._files import write_atomically
+from jaxos4.bracket import Bracket
+from jaxos4.estimate import AbstractEstimator, Estimate
+from jaxos4.flight import Flight
+from jaxos4.models.abstract import AbstractModel
+from jaxos4.noise import AbstractNoise
+from jaxos4.report.progress import run_with_bar
+from jaxos4.report.style import Style, drawing, pdf, svg
+from jaxos4.shooting import ShootingProblem
+from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset, use_all_cores as use_all_cores
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""
