@@ -1,4 +1,4 @@
-"""How XLA compiles this library for a CPU: loops as native functions, and the program of one flight quickly.
+"""Options of XLA for a CPU: loops become native functions, and the program of one flight compiles quickly.
 
 By default, XLA calls one compiled function for every few operations of a loop, in each step. A step of a flight is so
 short that the calls take ten times as long as the operations. The option that changes this cannot be set for a program,
@@ -52,7 +52,7 @@ def make_loops_native() -> None:
 
 
 def _computes_on_cpu() -> bool:
-    """Whether JAX has started to compute on a CPU. This imports nothing, and starts nothing."""
+    """True if JAX has started to compute on a CPU. The check imports nothing and starts nothing."""
     bridge = sys.modules.get("jax._src.xla_bridge")
     started = getattr(bridge, "backends_are_initialized", lambda: False)
     return started() and sys.modules["jax"].default_backend() == "cpu"

@@ -57,7 +57,7 @@ LARGEST = np.array([0.3, 0.3, 0.3, 1.5])
 
 
 def known_airframe(i: int, wrong: float) -> jaxos4.Airframe:
-    """What the estimator and the controller are told of flight i."""
+    """The data of flight i that the estimator and the controller know."""
     return eqx.tree_at(lambda a: a.inertia, VEHICLE, VEHICLE.inertia * (1 + wrong * (-1) ** i))
 
 
@@ -86,7 +86,7 @@ def fly(
 
 
 def turned_over(flight: jaxos4.Flight) -> bool:
-    """Whether the gusts threw the vehicle on its side: then it is lost, and nobody has its log."""
+    """True if the gusts threw the vehicle on its side: then it is lost, and nobody has its log."""
     angles = np.asarray(flight.states)[:, [jaxos4.STATE_NAMES.index(name) for name in ("phi", "theta")]]
     return bool(flight.result != jaxos4.RESULTS.successful) or bool((np.abs(angles) > np.pi / 2).any())
 

@@ -28,7 +28,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 class Case(NamedTuple):
-    """What is identified from what. Several windows have free starts."""
+    """The model and the data of a case. Several windows have free starts."""
 
     model: type[jaxos4.AbstractModel]
     channels: str

@@ -47,7 +47,7 @@ def skill_ahead(skill: dict[str, Any] | None) -> dict[str, tuple[float, float]]:
 
 
 def identified(recordings: list[Recording], estimator: str, *, end: float | None) -> dict[str, Any]:
-    """What `jaxos4 estimate` writes, and the skill `AHEAD`."""
+    """The JSON of `jaxos4 estimate`, and the skill `AHEAD`."""
     found = jaxos4.identify(recordings, AIRFRAME, estimator=estimator, end=end)
     print(f"{estimator}, {', '.join(one.name for one in recordings)}: {found.seconds:.0f} s", flush=True)
     row = found.to_dict()

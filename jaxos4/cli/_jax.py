@@ -1,4 +1,4 @@
-"""What is set before the library computes: double precision, and compiled programs kept for the next command."""
+"""Preparation of JAX for a command: double precision, and a cache of compiled programs for the next command."""
 
 import gc
 import os

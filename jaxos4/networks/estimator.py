@@ -204,7 +204,7 @@ class TrainedNetwork(AbstractEstimator):
         return answer
 
     def mismatch(self, problem: ShootingProblem) -> str | None:
-        """How a problem differs from the problem of training, in words; `None` if it does not.
+        """Compares a problem with the problem of training: the difference in words, or `None`.
 
         Inside `jit` or `vmap` numbers cannot be compared here; `__call__` compares them there.
         """
@@ -223,7 +223,7 @@ class TrainedNetwork(AbstractEstimator):
         return estimate
 
     def _other_kind(self, problem: ShootingProblem) -> str | None:
-        """How a problem differs in anything but its numbers, in words; `None` if it does not."""
+        """The difference from the problem of training, apart from its numbers, in words; `None` if there is none."""
         own = self.problem
         if CHANNELS[self.channels] > problem.size:
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"

@@ -27,7 +27,7 @@ CHUNK = 1000
 
 
 class Purpose(enum.IntEnum):
-    """What random numbers are for. They are drawn from a key and a place, and each purpose has places of its own."""
+    """Purposes of random numbers. Numbers are drawn from a key and a place; each purpose has its own places."""
 
     WEIGHTS = 0
     LINEAR_MAP = 1
@@ -104,7 +104,7 @@ class AbstractFeatures(eqx.Module):
 
     @abc.abstractmethod
     def noise(self, normal: Float[Array, " features"]) -> Float[Array, " features"]:
-        """What white noise adds to the features. `normal`: standard normal numbers, times the noise scale."""
+        """The effect of white noise on the features. `normal`: standard normal numbers, times the noise scale."""
 
     def _deviation(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
         """W (x(u) - x(0)); 0 in samples that are not measured, NaN everywhere if the flight at `u` diverges."""

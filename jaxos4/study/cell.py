@@ -31,7 +31,7 @@ from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fl
 from .specification import Cell, Job, Scenario, Study
 
 OUTCOMES = (*NAMES, "failed", "not_run")
-"""How an estimate ended. `failed`: its cell could not be computed; `not_run`: not yet. Files hold the place in here."""
+"""Outcomes of an estimate. `failed`: its cell could not be computed; `not_run`: not yet. Files hold the index."""
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 """The levels of the intervals that are kept."""
@@ -110,7 +110,7 @@ def _answers(
 def _identify(
     estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"]
 ) -> tuple[dict[str, Any], Seed]:
-    """What `_answers` returns, and the seed that each answer is for a search."""
+    """The results as in `_answers`, and for each answer the seed of a search."""
 
     def one(states: States) -> tuple[dict[str, Any], Seed]:
         found = estimator(problem_of(blank, states), bracket)
@@ -122,7 +122,7 @@ def _identify(
 def _search(
     ibss: IBSS, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"], seeds: Seed
 ) -> dict[str, Any]:
-    """What `_answers` returns, from a search near the seeds. Its sweeps are recorded."""
+    """The results as in `_answers`, of a search near the seeds. Its sweeps are recorded."""
     ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
 
     def one(states: States, seed: Seed) -> dict[str, Any]:

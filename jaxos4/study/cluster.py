@@ -91,7 +91,7 @@ def _threads(client: Any) -> int:
 
 
 def remote_training(specification: str, number: int) -> bytes | str:
-    """What `train` returns."""
+    """The bytes of a network's file, or a message that says why there is none."""
     study = msgspec.json.decode(specification, type=Study)
     return train(study, list(study.jobs())[number])
 

@@ -27,7 +27,7 @@ _LARGEST_OFFSET = 0.8
 
 
 class Fleet(NamedTuple):
-    """What the flights of a scenario have in common at all noises."""
+    """Model, bracket and inputs of a scenario. They are the same for all noises."""
 
     model: AbstractModel
     bracket: Bracket

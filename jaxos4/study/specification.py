@@ -46,7 +46,7 @@ _MOST_SAMPLES = 1_000_000
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the networks of a study are trained: the table `network` of the specification. See `NetworkEstimator`.
+    """Training of a study's networks: the table `network` of the specification. See `NetworkEstimator`.
 
     - `hybrid_channels`: the channels that the hybrid's network looks at, at most those of the scenario. A network
       alone looks at the rates.
@@ -249,7 +249,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @property
     def double(self) -> bool:
-        """Whether the study is computed in double precision."""
+        """True if the study is computed in double precision."""
         return self.precision == "float64"
 
     @property

@@ -5,6 +5,7 @@ ends with its process, even if the process is killed.
 """
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -29,11 +30,14 @@ _SPECIFICATION, _LOCK, _LOG = "study.json", "lock", "log.jsonl"
 _UNFINISHED = ".*.part*"
 
 
+@dataclasses.dataclass(frozen=True)
 class Store:
     """A study's folder, made by `open_store`, or by `read_store` to read only."""
 
-    def __init__(self, directory: Path, study: Study, device: str, version: str):
-        self.directory, self.study, self.device, self.version = directory, study, device, version
+    directory: Path
+    study: Study
+    device: str
+    version: str
 
     def cell_file(self, index: int) -> Path:
         """The file of a cell."""
@@ -113,7 +117,6 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
     run is computing; `OSError` if it cannot be written to.
     """
     _check_folder(directory)
-    specification = directory / _SPECIFICATION
     directory.mkdir(parents=True, exist_ok=True)
     lock = filelock.FileLock(directory / _LOCK, timeout=0)
     try:
@@ -122,13 +125,10 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
         what = "another run is at work on this study; wait for its end, or give another folder."
         raise InputError(f"{directory}: {what}") from None
     try:
-        if specification.exists():
-            store = read_store(directory)
-            _check_same(directory, study, store.study)
-        else:
-            store = Store(directory, study, device, importlib.metadata.version("jaxos4"))
+        store = check_store(directory, study, device)
+        if not (directory / _SPECIFICATION).exists():
             header = {"version": store.version, "device": device, "study": study}
-            _write(specification, msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
+            _write(directory / _SPECIFICATION, msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
         for folder in (directory, directory / "cells", directory / "networks"):
             folder.mkdir(exist_ok=True)
             for unfinished in folder.glob(_UNFINISHED):
@@ -166,13 +166,16 @@ class _Header(_Version):
     study: Study
 
 
-def check_store(directory: Path, study: Study) -> Store:
+def check_store(directory: Path, study: Study, device: str = "") -> Store:
     """The folder of a study as a run would find it; nothing is written. Raises `InputError` as `open_store` does."""
     _check_folder(directory)
     if not (directory / _SPECIFICATION).exists():
-        return Store(directory, study, "", "")
+        return Store(directory, study, device, importlib.metadata.version("jaxos4"))
     store = read_store(directory)
-    _check_same(directory, study, store.study)
+    now, before = msgspec.to_builtins(study), msgspec.to_builtins(store.study)
+    changed = [f"`{key}` was {_short(before[key])}, now {_short(now[key])}" for key in now if now[key] != before[key]]
+    if changed:
+        raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")
     return store
 
 
@@ -184,13 +187,6 @@ def _check_folder(directory: Path) -> None:
     names = {path.name for path in directory.iterdir()} - {path.name for path in directory.glob(_UNFINISHED)}
     if _SPECIFICATION not in names and names - {_LOCK}:
         raise InputError(f"{directory}: holds {min(names)} and no study; give an empty or a new folder.")
-
-
-def _check_same(directory: Path, wanted: Study, stored: Study) -> None:
-    now, before = msgspec.to_builtins(wanted), msgspec.to_builtins(stored)
-    changed = [f"`{key}` was {_short(before[key])}, now {_short(now[key])}" for key in now if now[key] != before[key]]
-    if changed:
-        raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")
 
 
 def _short(value: Any) -> str:
