@@ -58,8 +58,8 @@ from .closed_loop import (
     random_references as random_references,
 )
 from .design import (
-    DesignedInput as DesignedInput,
-    DesignedReferences as DesignedReferences,
+    Design as Design,
+    Designed as Designed,
     Envelope as Envelope,
     design_input as design_input,
     design_references as design_references,

@@ -64,7 +64,7 @@ def references_of(kind: str, gust: float, duration: float, seed: int) -> np.ndar
     if kind == "designed":
         loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=DELAY, gust=gust)
         settings = {"angle": LARGEST[0], "acceleration": LARGEST[3], "duration": duration, "dt": DT}
-        return jaxos4.design_references(loop, **settings, key=jax.random.key(seed)).references
+        return jaxos4.design_references(loop, **settings, key=jax.random.key(seed)).designed.inputs
     return standard_references(round(duration / DT) + 1, DT, LARGEST)[kind]
 
 

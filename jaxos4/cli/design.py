@@ -1,10 +1,9 @@
-"""`jaxos4 design`: the input, or the references of a controller, that tell the most within an envelope."""
+"""`jaxos4 design`: the rotor speeds, or the references of a controller, that tell the most within an envelope."""
 
 import time
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -26,11 +25,6 @@ from ._messages import option_names
 from ._output import check_different, check_output
 from ._progress import stages
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from ..closed_loop import ClosedLoop
-
 
 class Criterion(StrEnum):
     """The values of --criterion, in the spelling of the library."""
@@ -38,10 +32,6 @@ class Criterion(StrEnum):
     D = "D"
     A = "A"
     worst = "worst"
-
-
-# What prints the result, and the number of samples that were written.
-Written = tuple[Callable[["Console"], None], int]
 
 
 def design(
@@ -107,92 +97,47 @@ def design(
     accuracy = (5.0 if closed_loop else 1.0) if accuracy is None else accuracy
     if not 0 < accuracy < 1e6:
         raise InputError(f"--accuracy: must be positive and finite, got {accuracy:g}.")
-    limits = {
-        "slowest": slowest,
-        "fastest": fastest,
-        "slew": slew,
-        "angle": angle,
-        "rate": rate,
-        "velocity": velocity,
-        "distance": distance,
-    }
-    limits = {name: value for name, value in limits.items() if value is not None}
+    limits = {"slowest": slowest, "fastest": fastest, "slew": slew, "rate": rate}
+    limits |= {"velocity": velocity, "distance": distance} | ({} if closed_loop else {"angle": angle})
     duration, dt = times_of(closed_loop, duration, dt)
     begin = time.perf_counter()
     with stages("loading the library") as progress, option_names(bracket=bracket):
+        from ..airframe import load_airframe
+        from ..design import design_input, design_references, model_of
+        from ..identification.problem import bracket_of
+        from ..models import MODELS
+
+        intervals = None if bracket is None else read_toml(bracket)
         settings = {
-            "limits": limits,
+            "limits": {name: value for name, value in limits.items() if value is not None},
             "duration": duration,
             "dt": dt,
             "criterion": criterion.value,
-            "bandwidth": (6.0 if closed_loop else 4.0) if bandwidth is None else bandwidth,
-            "seed": seed,
+            "compare": True,
+            "key": seed,
             "progress": progress,
         }
-        intervals = None if bracket is None else read_toml(bracket)
+        settings |= {} if bandwidth is None else {"bandwidth": bandwidth}
         if closed_loop:
             loop = loop_of(airframe, gust, lag, delay, sensors)
-            show, samples = _references(loop, intervals, settings, accuracy / 100, out, figure)
-            what = "references"
+            settings |= {} if angle is None else {"angle": angle}
+            found = design_references(loop, bracket=bracket_of(intervals, model_of(loop)), **settings)
+            described = found.task.kind
         else:
-            settings |= {"start_is_known": initial_state is InitialState["known"]}
-            settings |= {"channels": (channels or Channels["all"]).value}
             model = model or Model["published"]
-            show, samples = _rotor_speeds(airframe, model, intervals, settings, accuracy / 100, out, figure)
-            what = f"{model.value} model"
+            subject = MODELS[model](load_airframe(airframe))
+            settings["start_is_known"] = initial_state is InitialState["known"]
+            settings["channels"] = (channels or Channels["all"]).value
+            found = design_input(subject, bracket=bracket_of(intervals, subject), **settings)
+            described = f"{model.value} model"
+        progress("writing")
+        found.task.write(found.designed, out)
+        from ..report.design_page import print_design, write_design
+
+        if figure is not None:
+            write_design(found, accuracy / 100, figure)
     from rich.console import Console
 
-    show(Console(highlight=False))
-    typer.echo(f"{out}: {samples} samples of {dt:g} s, {what}, {time.perf_counter() - begin:.0f} s")
-
-
-def _rotor_speeds(
-    airframe: str,
-    model: Model,
-    intervals: dict[str, Any] | None,
-    settings: dict[str, Any],
-    accuracy: float,
-    out: Path,
-    figure: Path | None,
-) -> Written:
-    """Design rotor speeds, and write them."""
-    from ..airframe import load_airframe
-    from ..design import design_and_compare, write_input
-    from ..identification.problem import bracket_of
-    from ..models import MODELS
-    from ..report.design_page import print_design
-
-    subject = MODELS[model](load_airframe(airframe))
-    found = design_and_compare(subject, bracket=bracket_of(intervals, subject), **settings)
-    settings["progress"]("writing")
-    write_input(found.designed, out)
-    if figure is not None:
-        from ..report.figures_design import write_design
-
-        write_design(found, figure)
-    return lambda console: print_design(console, found, accuracy), found.designed.omega.shape[0]
-
-
-def _references(
-    loop: "ClosedLoop",
-    intervals: dict[str, Any] | None,
-    settings: dict[str, Any],
-    accuracy: float,
-    out: Path,
-    figure: Path | None,
-) -> Written:
-    """Design references, and write them. The largest angle is that of the references."""
-    from ..design import design_and_compare_references, model_of, write_references
-    from ..identification.problem import bracket_of
-    from ..report.references_page import print_references
-
-    angle = settings["limits"].pop("angle", 0.3)
-    bracket = bracket_of(intervals, model_of(loop))
-    found = design_and_compare_references(loop, angle=angle, bracket=bracket, **settings)
-    settings["progress"]("writing")
-    write_references(found.designed, out)
-    if figure is not None:
-        from ..report.figures_references import write_references_figure
-
-        write_references_figure(found, accuracy, figure)
-    return lambda console: print_references(console, found, accuracy), found.designed.references.shape[0]
+    print_design(Console(highlight=False), found, accuracy / 100)
+    samples = found.designed.inputs.shape[0]
+    typer.echo(f"{out}: {samples} samples of {dt:g} s, {described}, {time.perf_counter() - begin:.0f} s")
