@@ -153,7 +153,7 @@ class References(AbstractTask):
     vehicles: ClassVar[int] = LANES
     starts: ClassVar[int] = 8
     first: ClassVar[float] = 0.85
-    steps: ClassVar[int] = 120
+    steps: ClassVar[int] = 80
 
     envelope: Envelope
     scale: Float[Numeric, "3"]
