@@ -14,7 +14,7 @@ def rotorpy_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
     """The effects that RotorPy does not have, or has differently."""
     return differences(
         (vehicle.rotor_inertia, NO_ROTOR_INERTIA),
-        (vehicle.thrust_share, vehicle.speed_curve("rotor_speed_max")),
+        (vehicle.thrust_share, vehicle.curve("rotor speed = rotor_speed_max x sqrt({})")),
         (vehicle.torque.any(), "offsets: not carried: RotorPy has no constant torque"),
         (vehicle.damping.any(), "damping: not carried: RotorPy has no torque against the body rates"),
         (vehicle.drag.any(), DRAG_OF_ROTORS),

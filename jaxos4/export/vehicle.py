@@ -86,9 +86,9 @@ class RigidVehicle(NamedTuple):
             return f"max(0, {curve:.4g} u^2 - {curve - 1:.4g} u)"
         return "" if curve == 1 else f"{curve:.4g} u^2 + {1 - curve:.4g} u"
 
-    def speed_curve(self, largest: str) -> str:
-        """The note on the thrust curve in a simulator that calls the largest rotor speed `largest`."""
-        return f"thrust_curve: for the u-th part of a full command, rotor speed = {largest} x sqrt({self.thrust_share})"
+    def curve(self, formula: str) -> str:
+        """The note on the thrust curve, with the simulator's `formula` for a function {} of the command."""
+        return f"thrust_curve: for the u-th part of a full command, {formula.format(self.thrust_share)}"
 
     @property
     def rotor_drag(self) -> float:
