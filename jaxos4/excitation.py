@@ -198,8 +198,8 @@ def _check_flyable(hover: np.ndarray, change: np.ndarray, fastest: float, dt: fl
             f"`airframe` cannot hover: it needs squared rotor speeds of {np.round(hover).tolist()} rad^2/s^2, but its "
             f"`max_rotor_speed` is {fastest:g} rad/s; correct its mass, thrust coefficient or largest speed."
         )
-    room = np.where(change > 0, fastest**2 - hover, hover)
-    share = np.divide(room, np.abs(change), out=np.full_like(change, np.inf), where=change != 0)
+    reserve = np.where(change > 0, fastest**2 - hover, hover)
+    share = np.divide(reserve, np.abs(change), out=np.full_like(change, np.inf), where=change != 0)
     row, rotor = np.unravel_index(np.argmin(share), share.shape)
     largest = share[row, rotor]
     if largest >= 1:

@@ -124,7 +124,7 @@ def test_what_is_replaced_and_what_does_not_vary_is_noted(write):
     held = {"alpha1": {"value": -0.7}, "alpha8": {"value": 3.5e4}, "yaw_damping": {"value": 0.0}}
     notes = export_vehicle(read_result(write(vehicle_result(values, held=held))), "mujoco").notes
     assert "alpha4: replaced by the values that follow from Ix, Iy, Iz" in notes
-    assert "do not vary in samples, because the flights do not tell them: alpha8, yaw_damping" in notes
+    assert "do not vary in samples, because the flights do not identify them: alpha8, yaw_damping" in notes
     (of_rotors,) = [note for note in notes if "alpha2" in note]
     assert of_rotors.startswith("rotor inertia: not carried")
 

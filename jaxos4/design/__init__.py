@@ -1,4 +1,4 @@
-"""What to fly: rotor speeds or references that make the estimate as accurate as possible within an envelope."""
+"""Design of flights: rotor speeds or references that make the estimate as accurate as possible within an envelope."""
 
 from ..excitation import standard_references as standard_references
 from .envelope import Envelope as Envelope

@@ -42,8 +42,8 @@ class Envelope(eqx.Module):
 
     - `slowest`, `fastest`: rotor speed [rad/s].
     - `slew`: the change of a rotor's speed from sample to sample, divided by the sample time [rad/s^2].
-    - `angle`: of phi, theta and psi, to either side [rad]; one number or three.
-    - `rate`: of p, q and r, to either side [rad/s]; one number or three.
+    - `angle`: phi, theta and psi, to either side [rad]; one number or three.
+    - `rate`: p, q and r, to either side [rad/s]; one number or three.
     - `velocity`: the speed of flight [m/s].
     - `distance`: from the start [m].
 

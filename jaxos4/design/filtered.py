@@ -1,4 +1,4 @@
-"""What flights in closed loop tell filter error: the Fisher information of the innovations that it compares."""
+"""The information of flights in closed loop: that of the innovations that filter error compares."""
 
 from typing import Any, NamedTuple
 
@@ -37,7 +37,7 @@ class Informations(NamedTuple):
     """The Fisher information of flights.
 
     - `whole`: about all unknowns: the parameters, then the noise of each channel, with its weak prior.
-    - `channels`: of each channel about the parameters.
+    - `channels`: that of each channel about the parameters.
     """
 
     whole: Float[Array, "*flights unknowns unknowns"]
@@ -47,8 +47,7 @@ class Informations(NamedTuple):
 class Filters(eqx.Module):
     """The filters of one vehicle, which know its true parameters, gusts and noise.
 
-    Parameters and noise are estimated together: a controller answers gusts, so what a flight tells about both is
-    correlated.
+    Parameters and noise are estimated together: a controller answers gusts, so their errors are correlated.
 
     - `prior`: the information of the bracket, of which the half-widths are standard deviations.
     """
@@ -111,7 +110,7 @@ class Filters(eqx.Module):
 
     @eqx.filter_jit
     def informations(self, flights: Flight) -> Informations:
-        """What each of a batch of flights tells."""
+        """The information of each of a batch of flights."""
 
         def one(omega: Array, states: Array, force: Array | None) -> Informations:
             flight = Flight(flights.time[0], omega, states, specific_force=force, commanded=flights.commanded)

@@ -21,13 +21,11 @@ from ..simulation import euler_step, simulate
 from .envelope import Envelope, hover_squares
 from .task import Coefficients
 
-# The fewest and the most samples of a flight.
-SAMPLES = 50, 2500
 # Vehicles that must stay within the envelope, and the finer step at which they are flown.
 VEHICLES, FINER = 200, 10
 # The amplitude of tones below this frequency [Hz] is that at this frequency: angles would allow almost none.
 _SLOWEST = 0.3
-# Squared rotor speeds stay above this, where the envelope is left anyway [rad^2/s^2].
+# Squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
 _LEAST = 1e-6
 
 

@@ -31,16 +31,16 @@ from .task import (
     Designed,
     Flown,
     Progress,
-    check_settings,
+    Ranges,
     criterion_of,
     solve,
 )
 
-_SAMPLES = 250, 20_000
+_RANGES = Ranges(samples=(250, 20_000), cycles=2, fastest=0.1, remedy="; longer flights repeat the references")
 _LARGEST_ANGLE, _LARGEST_ACCELERATION = 1.0, 5.0
 # References that need too much are reduced: to about this share of a limit, so often, each time not below this factor.
 _TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.97, 8, 0.7
-# A bound above this share of the bracket's standard deviation says that the flight adds little.
+# A parameter counts as excited if its bound is below this share of the bracket's standard deviation.
 _LITTLE = 0.9
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
 _SMALL = np.array([0.02, 0.02, 0.02, 0.2])
@@ -83,8 +83,8 @@ def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
 class Response(NamedTuple):
     """The response of a vehicle under its controller to small tones. Coefficients are cosines, then sines.
 
-    - `base`: information of a flight in gusts without references, with the prior. `tones`: what a unit of each tone of
-      each reference adds. Both are about the inertias first.
+    - `base`: information of a flight in gusts without references, with the prior.
+    - `tones`: the information that a unit of each tone of each reference adds. Both are about the inertias first.
     - `signals`: the change of the angles and rates of an axis by a unit of the coefficients of its reference, as a
       share of the part of the limit that gusts leave; by the name of the limit.
     """
@@ -131,12 +131,12 @@ class Response(NamedTuple):
         last = np.conj(turns[-tones.period :]) * 2 / tones.period
         signals = {}
         for name, columns in (("angle", ANGLES), ("rate", RATES)):
-            room = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
-            if (room <= 0).any():
+            left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
+            if (left <= 0).any():
                 raise _too_gusty(name)
             answers = np.einsum("kta,tk->ak", states[:count, -tones.period :, columns], last) / _SMALL[:3, None]
             moving = _parts(answers[:, None] * tones.turns(_POINTS))
-            signals[name] = jnp.asarray(moving * (largest[:3] / room)[:, None, None])
+            signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
         relative = np.square(largest / _SMALL)[:, None, None, None]
         return cls(jnp.asarray(base / unit), jnp.asarray(relative * each / unit), signals)
 
@@ -144,7 +144,7 @@ class Response(NamedTuple):
 class References(AbstractTask):
     """References for a controller. The targets are Ix, Iy and Iz; a coefficient of 1 is a tone of the largest value.
 
-    - `scale`: the moments of inertia [kg m^2]. `unexcited`: almost what the bracket says, as standard deviations.
+    - `scale`: the moments of inertia [kg m^2]. `unexcited`: almost the standard deviations of the bracket.
     - `largest`: the largest value of each reference.
     - `basis`: the tones at the points of a period.
     """
@@ -241,7 +241,7 @@ def design_references(
     key: Key | int,
     progress: Progress = lambda _: None,
 ) -> Design:
-    """Design the references that tell filter error the most about the moments of inertia of a vehicle in closed loop.
+    """Design the references with which filter error identifies the moments of inertia of a vehicle most accurately.
 
     Each reference is a sum of tones, which repeats. The simulator flies each tone once; the search for the amplitudes
     and phases is then algebra. At the end 64 vehicles with moments of inertia from the bracket fly the references
@@ -254,28 +254,19 @@ def design_references(
       [m/s^2].
     - `limits`: an `Envelope`, or some of its limits by name, but not `slew`. The others are those that 3-2-1-1
       references with the same largest values need; those of rotor speeds are the airframe's.
-    - `bracket`: what is known of the parameters of a `FlightModel` before the flight; by default the model's.
+    - `bracket`: the knowledge of the parameters of a `FlightModel` before the flight; by default the model's.
     - `duration`, `dt`: length and sample time [s].
     - `criterion`: as of `design_input`, for the logarithms of Ix, Iy and Iz.
     - `bandwidth`: the highest frequency [Hz].
     - `compare`: whether to judge the standard references too.
-    - `key`: of the draws, the gusts and the starts, or a seed. `progress`: called with the name of each stage.
+    - `key`: for the draws, the gusts and the starts, or a seed. `progress`: called with the name of each stage.
 
     **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
     """
     for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
         if not 0 < value <= most:
             raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
-    check_settings(
-        duration=duration,
-        dt=dt,
-        bandwidth=bandwidth,
-        criterion=criterion,
-        samples=_SAMPLES,
-        cycles=2,
-        fastest=0.1,
-        remedy="; longer flights repeat the references",
-    )
+    _RANGES.check(duration, dt, bandwidth, criterion)
     progress("limits")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model_of(loop)) if bracket is None else bracket

@@ -21,7 +21,7 @@ from ..noise import SENSOR_SIGMA
 from ..simulation import simulate
 from .envelope import Envelope, Uses, hover_squares, largest
 from .files import write_input
-from .open_loop import FINER, SAMPLES, VEHICLES, Multisine, drawn, envelope_of, fly_finely, sense
+from .open_loop import FINER, VEHICLES, Multisine, drawn, envelope_of, fly_finely, sense
 from .task import (
     AbstractTask,
     Coefficients,
@@ -30,12 +30,13 @@ from .task import (
     Flown,
     Inputs,
     Progress,
+    Ranges,
     bounds_of,
-    check_settings,
     criterion_of,
     solve,
 )
 
+_RANGES = Ranges(samples=(50, 2500), cycles=1, fastest=0.25)
 # The number of vehicles that keep the limits during the search; at the end all of them do.
 _LIMITED = 64
 # The number of vehicles over which the criterion is averaged.
@@ -173,45 +174,37 @@ def design_input(
     key: Key | int,
     progress: Progress = lambda _: None,
 ) -> Design:
-    """Design the rotor speeds that tell the most about a vehicle's parameters within an envelope.
+    """Design the rotor speeds that identify a vehicle's parameters most accurately within an envelope.
 
-    The input is a multisine. Its amplitudes are searched from several random starts, by the gradient of the simulator.
-    The criterion is the mean over vehicles that are drawn from the bracket. At the end 200 vehicles fly the input with
-    a tenth of the step, and its amplitude is reduced until all of them stay within the envelope.
+    The input is a multisine. Its amplitudes are searched from random starts, by the gradient of the simulator. The
+    criterion is the mean over vehicles from the bracket. At the end 200 vehicles fly the input with a tenth of the
+    step, and its amplitude is reduced until all of them stay within the envelope.
 
     **Arguments:**
 
     - `limits`: an `Envelope`, or some of its limits by name. The others are those that the standard multisine needs
       (`envelope_of`).
-    - `bracket`: what is known of the parameters before the flight; by default the model's.
+    - `bracket`: the knowledge of the parameters before the flight; by default the model's.
     - `duration`, `dt`: length and sample time [s].
-    - `channels`: what will be measured: `"rates"`, `"attitude"` or `"all"`. `sigma`: its noise, in the order of
-      `STATE_NAMES`.
+    - `channels`: the channels that will be measured: `"rates"`, `"attitude"` or `"all"`.
+    - `sigma`: their noise, in the order of `STATE_NAMES`.
     - `start_is_known`: whether the flight starts exactly at rest. If not, the initial state will be estimated too.
     - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
       bound. Bounds are shares of the bracket's half-widths.
     - `bandwidth`: the highest frequency [Hz].
     - `compare`: whether to judge the standard inputs in the same envelope too.
-    - `key`: of the draws and the starts, or a seed. `progress`: called with the name of each stage.
+    - `key`: for the draws and the starts, or a seed. `progress`: called with the name of each stage.
 
     **Raises:** `InputError` if an argument is out of range, the vehicle cannot hover within the envelope, or no input
-    within it tells anything.
+    within it excites a parameter.
     """
-    check_settings(
-        duration=duration, dt=dt, bandwidth=bandwidth, criterion=criterion, samples=SAMPLES, cycles=1, fastest=0.25
-    )
-    if channels not in CHANNELS:
-        raise InputError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
-    if model.forcing_parameters or model.force_axes:
-        raise InputError(
-            "`model` must be an OS4 model: a real vehicle needs its controller, and a design of references."
-        )
+    _RANGES.check(duration, dt, bandwidth, criterion)
+    _check(model, channels)
     progress("envelope")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
-    if isinstance(limits, Envelope):
-        envelope = limits
-    else:
+    envelope = limits
+    if not isinstance(envelope, Envelope):
         envelope = envelope_of(model, bracket=bracket, duration=duration, dt=dt, key=key).limited(limits or {})
     center, others = np.asarray(bracket.center)[None], drawn(bracket, jax.random.fold_in(key, 1), _DRAWS - 1)
     make = Multisine.within(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
@@ -233,8 +226,15 @@ def design_input(
     )
     found = solve(task, compare=compare, key=key, progress=progress)
     if not (found.designed.bounds < task.unexcited).any():
-        raise InputError("the limits are too narrow: no input within them tells anything; widen them.")
+        raise InputError("the limits are too narrow: no input within them excites a parameter; widen them.")
     return found
+
+
+def _check(model: AbstractModel, channels: str) -> None:
+    if channels not in CHANNELS:
+        raise InputError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
+    if model.forcing_parameters or model.force_axes:
+        raise InputError("`model` must be an OS4 model: a real vehicle needs its controller, and `design_references`.")
 
 
 @eqx.filter_jit

@@ -1,7 +1,7 @@
-"""A design: the search for what to fly within an envelope, and its comparison with the standard inputs.
+"""A design: the search for the most informative inputs within an envelope, and a comparison with standard inputs.
 
 The search minimises criterion + penalty by BFGS. The penalty grows from stage to stage, so that the limits hold better
-and better. They hold exactly only after the task has flown what was found, and has reduced its amplitude.
+and better. They hold exactly only after the task has flown the inputs and has reduced their amplitude.
 
 Reference: Nocedal and Wright, Numerical Optimization, ch. 6 (BFGS) and 17 (penalty).
 """
@@ -26,7 +26,7 @@ from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]
 Inputs = Float[np.ndarray, "samples 4"]
-# What is flown, and the largest share of each limit that a vehicle uses.
+# Inputs, and the largest share of each limit that a vehicle uses.
 Flown = tuple[Inputs, dict[str, float]]
 Progress = Callable[[str], None]
 
@@ -41,7 +41,7 @@ _TOLERANCE = 1e-6
 
 
 class Designed(NamedTuple):
-    """What to fly, and what a flight with it tells.
+    """Inputs of a flight, and the accuracy of an estimate from it.
 
     - `inputs`: rotor speeds [rad/s], held from sample to sample; or references of roll, pitch and yaw angle [rad] and
       vertical acceleration [m/s^2], as `fly_closed_loop` takes them.
@@ -81,14 +81,14 @@ class Designed(NamedTuple):
 
 
 class AbstractTask(eqx.Module):
-    """How coefficients become a flight, what limits the flight, what it tells, and how it is written.
+    """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
-    - `kind`: what is designed, in a word. `vehicles`: the number of vehicles that stay within the envelope.
+    - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
     - `size`: the number of coefficients. `starts`: the number of searches. `first`: the length of their first
       coefficients. `steps`: the number of steps of BFGS in a stage.
-    - `names`, `units`: of the parameters. The targets of the design come first.
+    - `names`, `units`: those of the parameters. The targets of the design come first.
     - `scale`: for each target, a size of which accuracies are shares.
-    - `unexcited`: from this bound on, a flight counts as telling nothing about the parameter.
+    - `unexcited`: a parameter whose bound is not below this counts as not excited.
     """
 
     kind: ClassVar[str]
@@ -113,7 +113,7 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
-        """What to fly, with an amplitude at which all vehicles keep the limits."""
+        """The inputs, with an amplitude at which all vehicles keep the limits."""
 
     @abc.abstractmethod
     def standard(self) -> dict[str, Flown]:
@@ -121,7 +121,7 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
-        """What flights with several inputs tell."""
+        """The bounds of several inputs."""
 
     @abc.abstractmethod
     def write(self, designed: Designed, path: str | PathLike[str]) -> None:
@@ -129,9 +129,9 @@ class AbstractTask(eqx.Module):
 
 
 class Design(NamedTuple):
-    """What to fly, and the standard inputs of the same length.
+    """Designed inputs, and the standard inputs of the same length.
 
-    - `task`: what was designed; its `envelope` has the limits, its `names` and `units` the parameters.
+    - `task`: its `envelope` has the limits, its `names` and `units` are those of the parameters.
     - `standard`: by name; empty if they were not to be compared. One that does not fit into the time is missing.
     """
 
@@ -153,7 +153,7 @@ class Design(NamedTuple):
 
 
 def solve(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -> Design:
-    """Search what to fly, fit it into the envelope, and judge it, beside the standard inputs if `compare`."""
+    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`."""
     progress("compiling the search")
     directions = jax.random.normal(jax.random.fold_in(key, 2), (task.starts, task.size), dtype=float)
     starts = task.first / math.sqrt(task.size) * directions
@@ -173,7 +173,7 @@ def solve(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) ->
 def _minimise(
     task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar
 ) -> tuple[Float[Array, "starts coefficients"], Float[Array, " starts"]]:
-    """One stage of all searches: where they end, and the cost there. A trial whose simulation fails is rejected."""
+    """One stage of all searches: their last coefficients and costs. A trial whose simulation fails is rejected."""
 
     def cost(scaled: Coefficients, penalty: Scalar) -> Scalar:
         uses = jax.tree.leaves(task.uses(_UNIT * scaled))
@@ -220,33 +220,31 @@ def criterion_of(
     return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (_NORM / 2)).sum()) / _NORM
 
 
-def check_settings(
-    *,
-    duration: float,
-    dt: float,
-    bandwidth: float,
-    criterion: str,
-    samples: tuple[int, int],
-    cycles: float,
-    fastest: float,
-    remedy: str = "",
-) -> None:
-    """Refuse settings that cannot be designed for.
+class Ranges(NamedTuple):
+    """The settings that can be designed for.
 
-    - `samples`: the fewest and the most. `remedy`: what to do if a flight is too long.
+    - `samples`: the fewest and the most. `remedy`: the remedy if a flight is too long.
     - `cycles`: the least number of cycles of the fastest tone. `fastest`: its largest frequency over the sample rate.
     """
-    for name, value in (("duration", duration), ("dt", dt)):
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"`{name}` must be positive and finite [s], got {value:g}.")
-    if not samples[0] <= duration / dt <= samples[1]:
-        allowed = f"{samples[0]} to {samples[1]} samples of {dt:g} s (`dt`)"
-        raise InputError(f"`duration` must be {allowed}, got {duration:g} s{remedy}.")
-    if criterion not in CRITERIA:
-        raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
-    low, high = cycles / duration, fastest / dt
-    if not low <= bandwidth <= high:
-        raise InputError(
-            f"`bandwidth` must lie between {cycles:g} / `duration` and {fastest:g} / `dt`, {low:.3g} to {high:.3g} Hz, "
-            f"got {bandwidth:g} Hz."
-        )
+
+    samples: tuple[int, int]
+    cycles: int
+    fastest: float
+    remedy: str = ""
+
+    def check(self, duration: float, dt: float, bandwidth: float, criterion: str) -> None:
+        """Raise `InputError` for settings that are out of range."""
+        for name, value in (("duration", duration), ("dt", dt)):
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"`{name}` must be positive and finite [s], got {value:g}.")
+        if not self.samples[0] <= duration / dt <= self.samples[1]:
+            allowed = f"{self.samples[0]} to {self.samples[1]} samples of {dt:g} s (`dt`)"
+            raise InputError(f"`duration` must be {allowed}, got {duration:g} s{self.remedy}.")
+        if criterion not in CRITERIA:
+            raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
+        low, high = self.cycles / duration, self.fastest / dt
+        if not low <= bandwidth <= high:
+            raise InputError(
+                f"`bandwidth` must lie between {self.cycles} / `duration` and {self.fastest:g} / `dt`, {low:.3g} to "
+                f"{high:.3g} Hz, got {bandwidth:g} Hz."
+            )

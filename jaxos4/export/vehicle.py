@@ -33,7 +33,7 @@ class RigidVehicle(NamedTuple):
     - `thrust_coefficient`: b [N s^2/rad^2]. `drag_coefficient`: d, yaw torque = -spin d omega^2 [N m s^2/rad^2].
     - `rotor_inertia`: J_R [kg m^2].
     - `max_rotor_speed`: full scale [rad/s].
-    - `lag`, `delay`: of the rotors behind their commands [s].
+    - `lag`, `delay`: lag and delay of the rotors behind their commands [s].
     - `torque`: constant, about each axis [N m].
     - `damping`: torque against the body rate about each axis [N m s].
     - `drag`: force against the body velocity along x and y [N s/m].

@@ -16,7 +16,7 @@ _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. R
 class Target(NamedTuple):
     """A simulator's format.
 
-    - `label`: the name of the format. `suffix`: of its files.
+    - `label`: the name of the format. `suffix`: that of its files.
     - `text`: the file for a vehicle, with lines of comment at its top.
     - `limits`: the effects that the simulator does not have, or has differently; one line each.
     """
@@ -61,7 +61,7 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
     - `found`: a result, from `read_result`.
     - `to`: the simulator, a name in `TARGETS`.
     - `samples`: the number of vehicles to draw from the covariance of the estimate. Constants that were not estimated,
-      such as the mass, do not change. `seed`: of the draws. Sample i does not depend on the number of samples.
+      such as the mass, do not change. `seed`: for the draws. Sample i does not depend on the number of samples.
 
     **Raises:** `InputError` for an unknown simulator, if `samples` or `seed` is not an integer of at least 0, or if
     hardly any draw is a possible vehicle.

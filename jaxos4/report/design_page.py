@@ -21,7 +21,7 @@ _PERIODS, _LONGER = 2, 10
 
 
 class _Words(NamedTuple):
-    """How a kind of design is described.
+    """Descriptions of a kind of design.
 
     - `relative`: whether bounds of the targets are shown in percent of their scale.
     - `panels`: titles of the panels of the inputs.
@@ -87,7 +87,7 @@ def _gain(found: Design, name: str) -> str:
 
 
 def _lengths(found: Design, accuracy: float) -> str:
-    """How long to fly for an accuracy of the targets."""
+    """The flight time for an accuracy of the targets."""
     task, designed = found.task, found.designed
     times = designed.shortest(accuracy * task.scale)
     longest = float(np.max(times))
