@@ -39,7 +39,7 @@ from .task import (
 _RANGES = Ranges(samples=(250, 20_000), cycles=2, fastest=0.1, remedy="; longer flights repeat the references")
 _LARGEST_ANGLE, _LARGEST_ACCELERATION = 1.0, 5.0
 # References that need too much are reduced: to about this share of a limit, so often, each time not below this factor.
-_TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.97, 8, 0.7
+_TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
 # A parameter counts as excited if its bound is below this share of the bracket's standard deviation.
 _LITTLE = 0.9
 # Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
