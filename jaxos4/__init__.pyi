@@ -46,7 +46,6 @@ from .analysis.frequency_response import (
     FrequencyResponse as FrequencyResponse,
     frequency_response as frequency_response,
 )
-from .analysis.huber import winsorised as winsorised
 from .analysis.identifiability import Identifiability as Identifiability, identifiability as identifiability
 from .analysis.inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia
 from .analysis.prediction import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
@@ -58,8 +57,8 @@ from .closed_loop import (
     random_references as random_references,
 )
 from .design import (
-    DesignedInput as DesignedInput,
-    DesignedReferences as DesignedReferences,
+    Design as Design,
+    Designed as Designed,
     Envelope as Envelope,
     design_input as design_input,
     design_references as design_references,
@@ -82,19 +81,16 @@ from .estimators import (
 from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
 from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
 from .identification import (
-    FlightIdentification as FlightIdentification,
     FlightInformation as FlightInformation,
+    FlightSettings as FlightSettings,
     Identification as Identification,
-    VehicleFit as VehicleFit,
-    VehicleIdentification as VehicleIdentification,
+    VehicleSettings as VehicleSettings,
     assess as assess,
-    fit_vehicle as fit_vehicle,
     identify as identify,
 )
 from .logs import read_flight as read_flight, read_log as read_log, write_flight as write_flight
 from .models.abstract import DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH, AbstractModel as AbstractModel
 from .models.corrected import CorrectedOS4 as CorrectedOS4
-from .models.held import HeldParameters as HeldParameters, hold as hold
 from .models.inertial import InertialOS4 as InertialOS4
 from .models.published import PublishedOS4 as PublishedOS4
 from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
@@ -112,5 +108,5 @@ from .noise import (
 )
 from .recording import Recording as Recording, join as join
 from .results import RESULTS as RESULTS, result_names as result_names
-from .shooting import ShootingProblem as ShootingProblem
+from .shooting import InnovationsProblem as InnovationsProblem, ShootingProblem as ShootingProblem, Unknowns as Unknowns
 from .simulation import simulate as simulate

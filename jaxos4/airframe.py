@@ -212,7 +212,7 @@ def airframe_table(airframe: Airframe) -> dict[str, Any]:
 
 
 def _thrust_coefficient(hover_speed: Any, constants: dict[str, np.ndarray]) -> np.ndarray:
-    """With which four rotors at `hover_speed` carry the weight."""
+    """The thrust coefficient with which four rotors at `hover_speed` carry the weight."""
     speed = _numbers("hover_speed", hover_speed, ()).item()
     if not 1e-3 < speed < 1e6:
         raise InputError(f"`hover_speed` must be positive and of a rotor's size in rad/s, got {_short(hover_speed)}.")

@@ -7,12 +7,14 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ._custom_types import Numeric, Parameters, as_float
+from ._xla import quick_jit
 from .models.abstract import AbstractModel
 
 # The largest standard deviation of an identifiable parameter, in half-widths of a bracket that is used as ...
 NO_PRIOR = 1.0  # a region to search: the flight must contain more information than the bracket
 GAUSSIAN_PRIOR = 0.5**0.5  # a prior with a standard deviation of 1: the flight must contain no less than the prior
 UNIFORM_PRIOR = 0.5  # a prior with a standard deviation of 0.577
+PROPER_PRIOR = float("inf")  # a prior of the likelihood itself, which has an answer for every parameter
 
 
 def is_identifiable(
@@ -88,6 +90,6 @@ def _numpy_if_known(a: Array, b: Array) -> tuple[Numeric, Numeric]:
     return (a, b) if isinstance(a, Tracer) or isinstance(b, Tracer) else (np.asarray(a), np.asarray(b))
 
 
-@eqx.filter_jit  # one compiled program instead of one for each operation
+@quick_jit  # one compiled program instead of one for each operation
 def _default(model: AbstractModel) -> Bracket:
     return Bracket.around(model.alpha, model.half_width)

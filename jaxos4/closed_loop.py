@@ -16,6 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ._custom_types import Key, Numeric, RotorSpeeds, Scalar, as_float
+from ._xla import quick_jit
 from .airframe import Airframe
 from .flight import Flight
 from .models.state import CASCADE_ORDER, Forcing, stack, unstack
@@ -75,7 +76,7 @@ class ClosedLoop(eqx.Module):
 
     - `airframe`: the true constants. Rotor speeds lie between 0 and its `max_rotor_speed`. Its `rotor_inertia` makes
       the gyroscopic torque and the yaw moment of rotors that accelerate.
-    - `rotor_lag`, `rotor_delay`: of the rotors behind their commands [s]. Any number: they need not be whole samples.
+    - `rotor_lag`, `rotor_delay`: lag and delay of the rotors behind their commands [s], not only whole samples.
     - `offset`: a constant torque over the inertia, for each axis [rad/s^2].
     - `damping`: a moment against the body rate, for each axis [1/s].
 
@@ -180,7 +181,7 @@ def fly_closed_loop(
     - `references`: roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, of shape
       (samples, 4); `random_references` makes some.
     - `dt`: the sample time of the controller and of the log [s].
-    - `key`: of the gusts and the noise.
+    - `key`: for the gusts and the noise.
     - `substeps`: Runge-Kutta steps of the physics in each sample.
 
     **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands from
@@ -215,7 +216,7 @@ def fly_standard(
 
 
 class _Carry(NamedTuple):
-    """What passes from sample to sample; `commands`: row k + 1 is the command of sample k, row 0 that before."""
+    """The state from sample to sample. Row k + 1 of `commands` is the command of sample k, row 0 the one before."""
 
     motion: Motion
     speeds: Float[Array, "4"]
@@ -223,7 +224,7 @@ class _Carry(NamedTuple):
     commands: RotorSpeeds
 
 
-@eqx.filter_jit
+@quick_jit
 def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substeps: int) -> Flight:
     samples, h = references.shape[0], dt / substeps
     airframe, gust_key, noise_key = loop.airframe, *jax.random.split(key)

@@ -2,7 +2,8 @@
 
 import abc
 import functools
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -12,10 +13,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import LARGEST, Parameters, Scalar
-from .bracket import NO_PRIOR, Bracket
+from .bracket import Bracket
 from .linalg import invert
 from .results import RESULTS
-from .shooting import ShootingProblem
+from .shooting import AbstractProblem, Parts, ShootingProblem
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar  # what type checkers understand
@@ -43,7 +44,8 @@ class Calibration(eqx.Module):
 class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
-    - `parameters`: the estimate. If `result` says that there is no estimate: the bracket's center, or 0 if the bracket
+    - `parameters`: the estimate of all unknowns that the problem's windows share; a held one has its value, and a
+      variance of 0. If `result` says that there is no estimate: the bracket's center, or 0 if the bracket
       is invalid.
     - `covariance`: of `parameters`; infinite without an estimate. An estimator that shoots takes it from the Fisher
       information at the estimate and the problem's `sigma`, a network from its errors on simulated flights.
@@ -59,6 +61,7 @@ class Estimate(eqx.Module):
     - `history`: the parameters after each sample, from a recursive estimator.
     - `brackets`: the lower and upper end of each parameter's bracket in each sweep, from an estimator that records
       them; NaN after the last sweep.
+    - `parts`: the likelihood of each part of the flight, from a problem whose parts are compared.
     """
 
     parameters: Parameters
@@ -72,6 +75,7 @@ class Estimate(eqx.Module):
     seed: Bracket | None = None
     history: Float[Array, "samples parameters"] | None = None
     brackets: Float[Array, "sweeps 2 parameters"] | None = None
+    parts: Parts | None = None
 
     @property
     def std(self) -> Float[Array, "*batch parameters"]:
@@ -107,8 +111,8 @@ def _deviations(level: Float[Array, "*levels"]) -> Float[Array, "*levels"]:
     return jax.scipy.special.ndtri((1 + level) / 2)
 
 
-def conclude(
-    bracket: Bracket,
+def as_estimate(
+    problem: AbstractProblem,
     *,
     parameters: Parameters,
     covariance: Float[Array, "parameters parameters"],
@@ -119,25 +123,32 @@ def conclude(
     sound: Bool[Array, ""],
     done: Bool[Array, ""],
     reach: Scalar | float = REACH,
-    prior: float = NO_PRIOR,
+    prior: float | None = None,
     history: Float[Array, "samples parameters"] | None = None,
+    brackets: Float[Array, "sweeps 2 parameters"] | None = None,
+    parts: Parts | None = None,
 ) -> Estimate:
-    """Make an `Estimate` with its result code from the answer of an algorithm. All its parameters are finite.
+    """The answer of an algorithm as an `Estimate`, with its result code. All its parameters are finite.
 
     **Arguments:**
 
     - `sound`: whether the trajectory is sound to its end.
     - `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
-    - `prior`: how the estimator uses the bracket, see `Bracket.identifies`.
+    - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`; by default as the problem does.
     """
-    valid, center = bracket.valid, jnp.where(bracket.valid, bracket.center, 0.0)
-    std, limit = jnp.sqrt(jnp.diagonal(covariance)), (reach - 1e-2) * jnp.where(valid, bracket.half_width, 1.0)
+    unknowns, own = problem.unknowns, len(problem.model.parameter_names)
+    valid, free = unknowns.valid, unknowns.free
+    center, half_width = jnp.where(valid, unknowns.center, 0.0), jnp.where(valid, unknowns.half_width, 1.0)
+    covariance = jnp.where(free & free[:, None], covariance, 0.0)
+    std = jnp.sqrt(jnp.diagonal(covariance))
+    far = (jnp.abs(parameters - center) > (reach - 1e-2) * half_width) & free
+    identifiable = unknowns.identifiable(std, problem.prior if prior is None else prior)
     finite = jnp.isfinite(parameters).all() & jnp.isfinite(std).all() & jnp.isfinite(covariance).all()
     sound = sound & jnp.isfinite(cost) & finite
     result = RESULTS.where(done, RESULTS.successful, RESULTS.max_sweeps)
-    result = RESULTS.where((jnp.abs(parameters - center) > limit).any(), RESULTS.at_bound, result)
-    result = RESULTS.where(~bracket.identifies(std, prior).all(), RESULTS.unidentifiable, result)
+    result = RESULTS.where(far[:own].any(), RESULTS.at_bound, result)
+    result = RESULTS.where(~identifiable[:own].all(), RESULTS.unidentifiable, result)
     result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
     result = RESULTS.where(valid, result, RESULTS.bracket_invalid)
     answered = sound & valid
@@ -150,7 +161,35 @@ def conclude(
         sweeps=jnp.asarray(sweeps, dtype=int),
         result=result,
         history=None if history is None else jnp.where(answered, history, center),
+        brackets=brackets,
+        parts=parts,
     )
+
+
+def from_starts(
+    problem: AbstractProblem, start: Float[Array, " unknowns"] | None, search: Callable[[Parameters], Estimate]
+) -> Estimate:
+    """The best answer of searches from each of the problem's starts, one after the other; equal starts count once.
+
+    `start`: where to start instead, unless it is NaN.
+    """
+    starts, own = problem.starts, len(problem.model.parameter_names)
+    firsts = starts if start is None else jnp.where(jnp.isnan(start), starts, start)
+    if starts.shape[0] == 1:
+        return search(firsts[0])
+    shapes = jax.eval_shape(search, firsts[0])
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def better(i: Int[Array, ""], found: Estimate) -> Estimate:
+        """A later search starts from the parameters of the best one so far."""
+        first = jnp.where((i > 0) & (np.arange(firsts.shape[1]) < own), found.parameters, firsts[i])
+        other = search(first)
+        best = jax.tree.map(lambda a, b: jnp.where((i == 0) | (other.cost < found.cost), a, b), other, found)
+        total = found.rollouts + other.rollouts, found.sweeps + other.sweeps
+        return eqx.tree_at(lambda e: (e.rollouts, e.sweeps), best, total)
+
+    searches = jnp.where((firsts == firsts[0]).all(), 1, firsts.shape[0])
+    return jax.lax.fori_loop(0, searches, better, nothing)
 
 
 def fit_start(
@@ -178,7 +217,7 @@ def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[
         return first, 0
 
     def improve(start: Float[Array, " starts"], _) -> tuple[Float[Array, " starts"], None]:
-        _, gradient, information = problem.curvatures(parameters, start)
+        _, gradient, information, _ = problem.curvatures(parameters, start)
         known = 1 / jnp.square(problem.split(off))
         covariance = jax.vmap(invert)(information[:, count:, count:] + jax.vmap(jnp.diag)(known))
         slope = gradient[:, count:] + known * problem.split(start - first)
@@ -187,9 +226,8 @@ def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[
     return jax.lax.scan(improve, first, length=_START_STEPS)[0], _START_STEPS * (count + free)
 
 
-def check_recursive(problem: ShootingProblem, bracket: Bracket) -> None:
-    """Raises `ValueError` for a problem that a filter cannot process sample by sample, or as `check_bracket` does."""
-    check_bracket(problem, bracket)
+def check_recursive(problem: ShootingProblem) -> None:
+    """Raises `ValueError` for a problem that a filter cannot process sample by sample."""
     if problem.windows > 1:
         got = problem.windows
         raise ValueError(f"`problem.windows` must be 1 for this estimator, got {got}: use an estimator that shoots.")
@@ -198,13 +236,6 @@ def check_recursive(problem: ShootingProblem, bracket: Bracket) -> None:
             "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
             "use an estimator that shoots."
         )
-
-
-def check_bracket(problem: ShootingProblem, bracket: Bracket) -> None:
-    """Raises `ValueError` for a bracket of another length than the model's parameters."""
-    names = problem.model.parameter_names
-    if bracket.lower.shape != (len(names),):
-        raise ValueError(f"`bracket` must hold {len(names)} parameters, got {bracket.lower.shape[0]}.")
 
 
 def check_dynamic_count(name: str, value: Any, least: int) -> None:
@@ -242,12 +273,15 @@ class AbstractEstimator(eqx.Module):
       noise.
     - `prior`: how it uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
     - `needs_network`: whether it needs a trained network.
+    - `in_closed_loop`: whether it searches a likelihood of innovations too, and so serves a vehicle that a controller
+      flies.
     """
 
     looks_at: AbstractClassVar[str]
     shoots: AbstractClassVar[bool]
     prior: AbstractClassVar[float]
     needs_network: AbstractClassVar[bool]
+    in_closed_loop: ClassVar[bool] = False
 
     @classmethod
     def of(cls, network: "AbstractEstimator | None" = None) -> "AbstractEstimator":
@@ -262,5 +296,9 @@ class AbstractEstimator(eqx.Module):
         return network if isinstance(network, cls) else cls(**{"network": network})
 
     @abc.abstractmethod
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        """Identifies one flight. For a batch use `eqx.filter_vmap`: a lane that fails does not change the others."""
+    def __call__(self, problem: Any, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight, in the problem's own bracket or in another.
+
+        `problem`: a `ShootingProblem`, or any other `AbstractProblem`. For a batch use `eqx.filter_vmap`: a lane that
+        fails does not change the others.
+        """

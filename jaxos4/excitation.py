@@ -133,10 +133,8 @@ def chirp(
     if span * (first + last) / 2 < 1:
         least = len(order) * (2 / (first + last) + 2 * dt)
         raise ValueError(f"`duration` must be at least {least:.3g} s for one cycle on each axis, got {duration:g} s.")
-    share = np.linspace(0, 1, samples)
-    phase = 2 * math.pi * span * (first * share + (last - first) * share**2 / 2)
-    fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / TAPER, 0, 1)) ** 2
-    angle = np.pad(fade * np.sin(phase) / (2 * math.pi * (first + (last - first) * share)), 1)
+    sine, frequency = _sweep(samples, span, frequencies)
+    angle = np.pad(sine / (2 * math.pi * frequency), 1)
     rate = np.diff(angle) / dt
     shape = np.diff(rate) / dt / np.abs(rate).max()
     return _rotor_speeds(airframe, _in_turn(shape, intervals, order, _peak_rates(amplitude)), dt)
@@ -200,8 +198,8 @@ def _check_flyable(hover: np.ndarray, change: np.ndarray, fastest: float, dt: fl
             f"`airframe` cannot hover: it needs squared rotor speeds of {np.round(hover).tolist()} rad^2/s^2, but its "
             f"`max_rotor_speed` is {fastest:g} rad/s; correct its mass, thrust coefficient or largest speed."
         )
-    room = np.where(change > 0, fastest**2 - hover, hover)
-    share = np.divide(room, np.abs(change), out=np.full_like(change, np.inf), where=change != 0)
+    reserve = np.where(change > 0, fastest**2 - hover, hover)
+    share = np.divide(reserve, np.abs(change), out=np.full_like(change, np.inf), where=change != 0)
     row, rotor = np.unravel_index(np.argmin(share), share.shape)
     largest = share[row, rotor]
     if largest >= 1:
@@ -252,3 +250,53 @@ def _check_frequency(name: str, frequency: float, dt: float) -> None:
     limit = 0.5 / dt
     if not 0 < frequency < limit:
         raise ValueError(f"`{name}` must lie between 0 and half the sample rate, {limit:g} Hz, got {frequency:g} Hz.")
+
+
+# Pulses of a reference last about 0.3 periods of the controlled vehicle's attitude [s]. Each is as high as the others.
+_WIDTH = 0.3
+_REFERENCE_PULSES = (("doublet", DOUBLET), ("3211", (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)))
+_VERTICAL_TONES = (0.4, 0.8, 1.2)
+_SWEPT = (0.2, 3.0)
+
+
+def standard_references(
+    samples: int, dt: float, largest: Float[np.ndarray, "4"]
+) -> dict[str, Float[np.ndarray, "samples 4"]]:
+    """Multisine, doublet, 3-2-1-1 and chirp as references for a controller.
+
+    References are roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, as
+    `fly_closed_loop` takes them. A multisine excites them at once, the others in turn.
+
+    - `largest`: the largest value of each reference. References are 0 if a shape does not fit into the time.
+    """
+    time = dt * np.arange(samples)[:, None]
+    sines = [np.sin(2 * math.pi * time * np.asarray(some)).sum(axis=1) for some in (*STANDARD_TONES, _VERTICAL_TONES)]
+    swept, _ = _sweep(samples // 4, samples // 4 * dt, _SWEPT)
+    pulses = {name: np.repeat([*heights, 0.0], max(round(_WIDTH / dt), 1)) for name, heights in _REFERENCE_PULSES}
+    shapes = {"multisine": np.stack(sines, axis=1)}
+    shapes |= {name: _references_in_turn([once, -once], samples) for name, once in pulses.items()}
+    shapes["chirp"] = _references_in_turn([swept], samples)
+    return {name: with_largest(shape, largest) for name, shape in shapes.items()}
+
+
+def with_largest(
+    shape: Float[np.ndarray, "samples 4"], largest: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "samples 4"]:
+    """References with these largest values."""
+    return largest * shape / np.maximum(np.abs(shape).max(axis=0), 1e-9)
+
+
+def _references_in_turn(shapes: Sequence[np.ndarray], samples: int) -> np.ndarray:
+    """One reference after another, with the next of `shapes` after all four, as often as they fit."""
+    found, length = np.zeros((samples, 4)), len(shapes[0])
+    for slot in range(samples // length):
+        found[slot * length : (slot + 1) * length, slot % 4] = shapes[slot // 4 % len(shapes)]
+    return found
+
+
+def _sweep(samples: int, span: float, frequencies: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """A sine whose frequency rises linearly in `span` seconds, faded in and out; and the frequency at each sample."""
+    share, (first, last) = np.linspace(0, 1, samples), frequencies
+    phase = 2 * math.pi * span * (first * share + (last - first) * share**2 / 2)
+    fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / TAPER, 0, 1)) ** 2
+    return fade * np.sin(phase), first + (last - first) * share

@@ -37,7 +37,7 @@ class Stretches(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What drives a vehicle, on the time grid of its flight: rotor speeds [rad/s], and the sample time [s].
+    """The inputs of a vehicle on the time grid of its flight: rotor speeds [rad/s], and the sample time [s].
 
     - `velocity`: along the body's axes [m/s]. `None`: unknown.
     - `force`: the measured specific force along the body's axes [m/s^2], an input of some models. `None`: not measured.
@@ -105,7 +105,7 @@ class Flight(eqx.Module):
 
     @property
     def inputs(self) -> Inputs:
-        """What drives the vehicle, with gaps in the specific force filled."""
+        """The inputs of the vehicle, with gaps in the specific force filled."""
         stretches = None if self.stretch is None else Stretches.of(self.stretch)
         force = None if self.specific_force is None else fill_gaps(self.specific_force, stretches)
         return Inputs(self.omega, self.dt, self.body_velocity, force, stretches, self.voltage)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float
+from ._xla import quick_jit
 from .flight import STATE_NAMES, Flight, Inputs
 from .models.abstract import AbstractModel
 from .models.state import CASCADE_ORDER, Forcing, State, stack, unstack
@@ -104,7 +104,7 @@ def simulate(
     return _simulate(model, as_float(parameters), as_float(omega), as_float(dt), as_float(start), method)
 
 
-@eqx.filter_jit
+@quick_jit
 def _simulate(
     model: AbstractModel, parameters: Parameters, omega: RotorSpeeds, dt: Scalar, start: StateVector, method: str
 ) -> Flight:

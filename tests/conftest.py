@@ -27,16 +27,20 @@ UNCHECKED = ("__init__", "blackbox_frames", "blackbox_numbers")
 modules = [path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("*.py") if path.stem not in UNCHECKED]
 jaxtyping.install_import_hook([".".join(module.with_suffix("").parts) for module in modules], "typechecker.check")
 
-from jaxos4.cli._jax import QUICK_TO_COMPILE, rarely_collect_garbage, set_flags  # noqa: E402
+from jaxos4 import _xla  # noqa: E402
+from jaxos4.cli._jax import rarely_collect_garbage  # noqa: E402
 
 rarely_collect_garbage()
-set_flags(QUICK_TO_COMPILE)  # before JAX starts to compute: the programs of the command line
-# The other cores have workers: a program compiled in parts takes a tenth more time of all cores together.
-IN_ONE_PART = f"{QUICK_TO_COMPILE} --xla_cpu_parallel_codegen_split_count=1"
-if os.environ.get("XLA_FLAGS") == QUICK_TO_COMPILE:
-    os.environ["XLA_FLAGS"] = IN_ONE_PART
+# Before JAX starts to compute: all programs compile as the program of one flight does, because tests compile for longer
+# than they compute. The other cores have workers: a program compiled in parts takes a tenth more time of all cores.
+OURS = " ".join(
+    [_xla.NATIVE_LOOPS, *(f"--{name}={value}".lower() for name, value in _xla.QUICK.items())]
+    + ["--xla_cpu_parallel_codegen_split_count=1"]
+)
+if os.environ.get("XLA_FLAGS") == _xla.NATIVE_LOOPS and jax.__version__.startswith(_xla.KNOWN_TO):
+    os.environ |= {"XLA_FLAGS": OURS, _xla.NO_OPTIONS: "1"}
 # In a worker, the controller has set them.
-FLAGS_ARE_OURS = os.environ.get("XLA_FLAGS") == IN_ONE_PART
+FLAGS_ARE_OURS = os.environ.get("XLA_FLAGS") == OURS
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
@@ -44,10 +48,10 @@ hypothesis.settings.load_profile("ci")
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
     *("experiments", "network", "estimators", "experiment_studies", "study_resume", "filter_error", "ibss", "cli"),
-    *("study_cluster", "design_references", "multiple_shooting", "flight_model", "shooting", "design", "study"),
-    *("report_browser", "checks", "equation_error", "startup", "report", "held", "programs", "compare", "simulate"),
+    *("study_cluster", "vehicle", "multiple_shooting", "flight_model", "shooting", "design", "study"),
+    *("report_browser", "judge", "equation_error", "startup", "report", "unknowns", "programs", "compare", "simulate"),
     *("new_estimator", "diagnostics", "identifiability", "models", "kalman", "output_error", "identify", "svsf"),
-    *("closed_loop", "logs_fuzz", "cli_vehicle", "ant_colony", "vehicle", "noise", "stretches", "inertia", "robust"),
+    *("closed_loop", "logs_readers", "flight_model_fits", "cli_vehicle", "ant_colony", "noise", "stretches", "inertia"),
 )
 
 

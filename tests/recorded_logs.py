@@ -13,6 +13,15 @@ from scipy.spatial.transform import Rotation
 from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES, Flight
 
+VEHICLE = """
+mass = 0.65
+inertia = [7.5e-3, 7.5e-3, 1.3e-2]
+arm = 0.23
+thrust_coefficient = 4.0e-6
+drag_coefficient = 1e-7
+rotor_inertia = 6e-5
+max_rotor_speed = 1200
+"""
 GRAVITY = 9.80665
 FRD = np.diag([1.0, -1.0, -1.0])  # x forward, y right, z down; north, east, down
 RPM = 2 * np.pi / 60

@@ -3,12 +3,15 @@
 import importlib.util
 import json
 import pathlib
+import sys
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import run_studies
 from jaxos4.study import load_study
 
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
+sys.path.append(str(EXPERIMENTS))
+
+from shared import load_results as load_results, run_studies  # noqa: E402
 
 
 def load(name: str, script: str = "run"):

@@ -7,14 +7,14 @@ from jaxos4 import AxisResponse, FrequencyResponse, Predictions
 from jaxos4.identification.results import (
     ChannelFit,
     Constant,
-    FlightIdentification,
     HeldParameter,
+    Identification,
     ParameterEstimate,
     PredictionSkill,
+    Provenance,
     RateSkill,
     RigidBody,
     Validation,
-    VehicleIdentification,
 )
 
 INERTIA = "1/(kg m^2)"
@@ -23,29 +23,36 @@ UNKNOWN = ParameterEstimate(None, None, 2e6, None, INERTIA, "not identifiable: n
 SMALL = ParameterEstimate(0.0011, 0.001, 0.001, (-0.0009, 0.0031), "1/s", "below noise", 0.25)
 WHITE = ChannelFit(0.01, "rad/s", 97.53, 1.0, 0.5, 0.02, 0.4, {"roll": 0.0, "pitch": 0.0, "yaw": 0.0}, 0.3)
 COLOURED = msgspec.structs.replace(WHITE, percent=81.26, level=4.0, correlation=0.8, white_p=1e-9, input_p=1e-5)
-BODY = RigidBody(
-    {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2", "if arms and mass are right"), "J_R": Constant(1e-8, 1e-7, "kg m^2")},
-    0.21,
-    True,
-)
-COMMON = {"result": "successful", "rollouts": 812, "cost": 1234.5, "seconds": 35.4, "estimate": None, "problem": None}
+CONSTANTS = {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2"), "J_R": Constant(1e-8, 1e-7, "kg m^2")}
+NOTED = {"Ix": msgspec.structs.replace(CONSTANTS["Ix"], note="if arms and mass are right"), "J_R": CONSTANTS["J_R"]}
+COMMON = {
+    "estimator": "ibss",
+    "result": "successful",
+    "rollouts": 812,
+    "cost": 1234.5,
+    "seconds": 35.4,
+    "covariance": None,
+    "estimate": None,
+    "problem": None,
+}
+VERSIONS = {"airframe": "os4", "version": "0", "jax": "0", "device": "cpu", "precision": "float64"}
 
 
-def identified_flight(**changes) -> FlightIdentification:
-    settings = {"channels": "rates", "windows": 1}
+def identified_flight(*, provenance=None, **changes) -> Identification:
+    settings = {"flight": "flight.csv", "channels": "rates", "windows": 1, "sample_time": 0.01}
     given = {
-        "estimator": "ibss",
         "model": "published",
+        "is_vehicle": False,
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN, "alpha2": SMALL},
-        "rigid_body": BODY,
+        "rigid_body": RigidBody(CONSTANTS, 0.21, True),
         "fit": {"p": WHITE, "q": COLOURED},
         "validation": Validation("other.csv", 10.0, {"p": COLOURED}),
-        "provenance": settings | changes.pop("provenance", {}),
+        "provenance": Provenance(**VERSIONS | settings | (provenance or {})),
     }
-    return FlightIdentification(**COMMON | given | changes)
+    return Identification(**COMMON | given | changes)
 
 
-def identified_vehicle(**changes) -> VehicleIdentification:
+def identified_vehicle(*, provenance=None, **changes) -> Identification:
     rate = RateSkill(
         [0.91, 0.731, None], [0.02, 0.14, None], [0.2, 0.4, None], [0.7, 0.8, 0.9], equation_error=[0.5, 0.41, None]
     )
@@ -53,28 +60,23 @@ def identified_vehicle(**changes) -> VehicleIdentification:
         "command": "jaxos4 estimate flight.csv --model flight --report flight.html",
         "flights": ["flight.csv"],
         "sample_time": 0.004,
-        "window": 0.25,
         "terms": ["offset", "damping"],
         "fitted_seconds": 32.0,
         "notes": ["t is not uniform"],
     }
     given = {
-        "estimator": "ibss",
         "model": "flight",
+        "is_vehicle": True,
         "parameters": {"alpha3": KNOWN, "alpha6": UNKNOWN},
-        "rigid_body": BODY,
+        "rigid_body": RigidBody(NOTED, 0.21, True),
         "held": {"alpha1": HeldParameter(-0.8125, "1", "not identifiable")},
-        "cut": 0.22,
         "noise": {"p": 0.41},
         "skill": PredictionSkill([0.1, 0.248, 0.5], 377, rate, rate, rate),
         "predictions": synthetic_predictions(),
         "response": synthetic_response(),
-        "doubts": (),
-        "disturbances": {},
-        "widened": {},
-        "provenance": settings | changes.pop("provenance", {}),
+        "provenance": Provenance(**VERSIONS | settings | (provenance or {})),
     }
-    return VehicleIdentification(**COMMON | given | changes)
+    return Identification(**COMMON | given | changes)
 
 
 def synthetic_response() -> FrequencyResponse:

@@ -5,8 +5,9 @@ import pytest
 import xarray as xr
 from helpers import compiled_programs, refused
 
+from jaxos4.cli import compare as command
 from jaxos4.report import write_report
-from jaxos4.study import OUTCOMES, comparison as command
+from jaxos4.study import OUTCOMES, Training
 
 SMALL = {
     "durations": (0.5,),
@@ -14,7 +15,7 @@ SMALL = {
     "batch": 16,
     "channels": ("rates",),
     "estimators": ("ibss", "network", "hybrid"),
-    "network": msgspec.structs.replace(command.QUICK.network, steps=20),
+    "network": Training(steps=20, held_out=1000),
 }
 
 
@@ -26,8 +27,8 @@ def draw_few(dataset, directory, **options):
 @pytest.fixture(autouse=True)
 def cut(monkeypatch):
     monkeypatch.setattr("jaxos4.report.write_report", draw_few)
-    for name in ("QUICK", "STANDARD"):
-        monkeypatch.setattr(command, name, msgspec.structs.replace(getattr(command, name), **SMALL))
+    whole = command.comparison
+    monkeypatch.setattr(command, "comparison", lambda *, quick: msgspec.structs.replace(whole(quick=quick), **SMALL))
 
 
 def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monkeypatch):

@@ -1,14 +1,19 @@
-"""Designed inputs: what they tell, the limits that they keep, and the command."""
+"""Designs of rotor speeds and of references: what they tell, the limits that they keep, and the command."""
 
 import contextlib
+import dataclasses
 import io
+import shutil
 import sys
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import (
+    CRAZYFLIE,
+    CRAZYFLIE_TOML,
     DT,
     euler_trajectory,
     measured,
@@ -21,55 +26,81 @@ from helpers import (
 from lanes import HALF, LANES, identify
 
 import jaxos4
+from jaxos4 import design
 from jaxos4.cli import main
 from jaxos4.cli.design import Criterion
-from jaxos4.design import Envelope, design_and_compare, read_input, write_input
-from jaxos4.design.criterion import CRITERIA, bounds_of, criterion_of
+from jaxos4.design import Envelope
 from jaxos4.design.envelope import largest
-from jaxos4.design.fitting import VEHICLES, drawn, fly_finely
+from jaxos4.design.filtered import Filters
+from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
+from jaxos4.design.open_loop import VEHICLES, drawn, fly_finely
+from jaxos4.design.task import CRITERIA, bounds_of, criterion_of
 
 MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
-
-
 SECONDS = 2.0
-# What `jaxos4 design --initial-state known --duration 2` asks of the library.
-ASKED = {
-    "limits": {},
-    "duration": SECONDS,
-    "dt": 0.01,
-    "channels": "all",
-    "start_is_known": True,
-    "criterion": "D",
-    "bandwidth": 4.0,
-    "seed": 0,
-}
+LOOP = jaxos4.ClosedLoop(CRAZYFLIE, gust=5.0)
+LOOP_BRACKET = jaxos4.Bracket.default(design.model_of(LOOP))
+LOOP_DT, LOOP_SECONDS = 0.004, 10.0
+CLOSED = ("--closed-loop", "--airframe", "mine.toml")
 
 
-@pytest.fixture(scope="module")
-def commanded(tmp_path_factory):
+class Commanded(NamedTuple):
     """A run of the command: its folder, what it prints, what it asks of the library, and what the library finds."""
-    folder, printed, calls = tmp_path_factory.mktemp("design"), io.StringIO(), []
 
-    def seen(model, **asked):
-        calls.append((asked, design_and_compare(model, **asked)))
-        return calls[0][1]
+    folder: Any
+    printed: str
+    subject: Any
+    asked: dict[str, Any]
+    found: design.Design
 
-    options = ["--initial-state", "known", "--duration", "2", "--out", "input.csv", "--figure", "input.svg"]
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+
+def command(folder, function, *options) -> Commanded:
+    """Runs `jaxos4 design` once for a module."""
+    printed, failed, calls, original = io.StringIO(), io.StringIO(), [], getattr(design, function)
+    (folder / "mine.toml").write_text(CRAZYFLIE_TOML)
+
+    def seen(subject, **asked):
+        calls.append((subject, asked, original(subject, **asked)))
+        return calls[0][-1]
+
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(printed),
+        contextlib.redirect_stderr(failed),
+    ):
         patch.chdir(folder)
-        patch.setattr("jaxos4.design.design_and_compare", seen)
-        patch.setattr(sys, "argv", ["jaxos4", "design", *options])
+        patch.setattr(design, function, seen)
+        patch.setattr(sys, "argv", ["jaxos4", "design", *options, "--out", "new.csv", "--figure", "new.svg"])
         with pytest.raises(SystemExit) as stop:
             main()
-    assert not stop.value.code
-    return folder, printed.getvalue(), *calls[0]
+    assert (stop.value.code or 0, failed.getvalue()) == (0, "")
+    assert (folder / "new.svg").read_text().count("<svg") == 1
+    return Commanded(folder, printed.getvalue(), *calls[0])
 
 
 @pytest.fixture(scope="module")
-def found(commanded):
-    """The input that the command designs."""
-    return commanded[-1]
+def speeds(tmp_path_factory):
+    """Rotor speeds of 2 s."""
+    return command(tmp_path_factory.mktemp("a"), "design_input", "--initial-state", "known", "--duration", "2")
+
+
+@pytest.fixture(scope="module")
+def references(tmp_path_factory):
+    """References of 10 s."""
+    return command(tmp_path_factory.mktemp("b"), "design_references", *CLOSED, "--duration", "10")
+
+
+def asked_for(commanded, bracket, **settings):
+    """Whether the command asks the library for these settings, and no others."""
+    assert set(commanded.asked) == {*settings, "bracket", "progress", "compare", "key"}
+    assert {name: commanded.asked[name] for name in settings} == settings
+    assert (commanded.asked["compare"], commanded.asked["key"]) == (True, 0)
+    np.testing.assert_array_equal(commanded.asked["bracket"].lower, bracket.lower)
+    np.testing.assert_array_equal(commanded.asked["bracket"].upper, bracket.upper)
+
+
+# Rotor speeds.
 
 
 def numpy_bounds(omega):
@@ -89,94 +120,192 @@ def geometric_mean(bounds):
     return np.exp(np.log(bounds).mean())
 
 
-def test_the_bounds_are_those_of_an_independent_fisher_information(found):
-    for one in (found.designed, found.standard["multisine"]):
-        np.testing.assert_allclose(one.bounds[-1], numpy_bounds(one.omega), rtol=1e-3)
+def test_the_bounds_are_those_of_an_independent_fisher_information(speeds):
+    for one in (speeds.found.designed, speeds.found.standard["multisine"]):
+        np.testing.assert_allclose(one.bounds, numpy_bounds(one.inputs), rtol=1e-3)
+        np.testing.assert_array_equal(one.bounds, one.history[-1])
 
 
-def test_a_designed_input_tells_more_than_the_standard_inputs(found):
-    own = geometric_mean(numpy_bounds(found.designed.omega))
+def test_a_designed_input_tells_more_than_the_standard_inputs(speeds):
+    own = geometric_mean(numpy_bounds(speeds.found.designed.inputs))
     standard = np.asarray(standard_flight(duration=SECONDS).omega)  # its own envelope, at its full amplitude
-    assert own < 0.6 * geometric_mean(numpy_bounds(standard))
-    assert own < 0.6 * min(geometric_mean(one.bounds[-1]) for one in found.standard.values())
+    assert own < 0.5 * geometric_mean(numpy_bounds(standard))
+    assert own < 0.5 * min(geometric_mean(one.bounds) for one in speeds.found.standard.values())
 
 
-def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(found):
-    others = drawn(BRACKET, jax.random.key(77), VEHICLES)
-    states = fly_finely(MODEL, others, jnp.asarray(found.designed.omega), jnp.asarray(DT, float))
-    needed = Envelope.of(found.designed.omega, states, float(DT))
-    assert float(needed.slowest) >= float(found.envelope.slowest)
-    for name in ("fastest", "slew", "angle", "rate", "velocity", "distance"):
-        assert (np.asarray(getattr(needed, name)) <= np.asarray(getattr(found.envelope, name))).all(), name
-    assert 0.9 < max(found.designed.uses.values()) <= 1
+def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(speeds):
+    others, designed, limits = drawn(BRACKET, jax.random.key(77), VEHICLES), speeds.found.designed, speeds.found.task
+    states = fly_finely(MODEL, others, jnp.asarray(designed.inputs), jnp.asarray(DT, float))
+    shares = limits.envelope.shares_of(Envelope.of(designed.inputs, states, float(DT)))
+    assert max(shares.values()) <= 1
+    assert 0.9 < max(designed.uses.values()) <= 1
+
+
+def test_the_shortest_flight_is_the_first_sample_at_which_the_bounds_are_small_enough(speeds):
+    designed = speeds.found.designed
+    np.testing.assert_allclose(designed.shortest(designed.history[120, :3]), 1.2, rtol=1e-9)
+    np.testing.assert_allclose(designed.shortest(designed.bounds / 3), 9 * SECONDS, rtol=1e-9)
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_many_flights_reach_the_bounds(found):
+def test_many_flights_reach_the_bounds(speeds):
     """RMSE / bound of each parameter by IBSS, within four standard errors of 1."""
-    omega = jnp.asarray(found.designed.omega)
+    omega = jnp.asarray(speeds.found.designed.inputs)
     exact = jaxos4.simulate(MODEL, MODEL.alpha, omega, dt=DT)
     states = measured(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), exact, jax.random.split(jax.random.key(5), LANES))
     problem, center = standard_problem(duration=SECONDS), random_starts(MODEL, LANES, seed=150)
     inputs = jnp.asarray(np.tile(omega, (LANES, 1, 1)))
     estimates = identify(jaxos4.IBSS(), problem, states, inputs, center - HALF, center + HALF)
     assert (np.asarray(jaxos4.result_names(estimates.result)) == "successful").all()
-    error = np.asarray(estimates.parameters - MODEL.alpha) / found.designed.bounds[-1]
+    error = np.asarray(estimates.parameters - MODEL.alpha) / speeds.found.designed.bounds
     assert np.abs(np.square(error).mean(axis=0) - 1).max() < 4 * np.sqrt(2 / LANES)
 
 
-def test_the_command_writes_an_input_that_simulate_and_a_study_fly(commanded, run):
-    folder, out, asked, found = commanded
-    assert {name: asked[name] for name in ASKED} == ASKED
-    np.testing.assert_array_equal(asked["bracket"].lower, BRACKET.lower)
-    np.testing.assert_array_equal(asked["bracket"].upper, BRACKET.upper)
-    np.testing.assert_allclose(read_input(folder / "input.csv", 0.01), found.designed.omega, rtol=1e-9)
-    assert "x multisine" in out
-    assert "x chirp" in out
-    assert (folder / "input.svg").read_text().count("<svg") == 1
-    assert run("simulate", "--speeds", str(folder / "input.csv"), "--out", "flight.csv")[0] == 0
-    refused(run("simulate", "--speeds", str(folder / "input.csv"), "--out", "x.csv", "--duration", "5"), "--duration: ")
-    flown = jaxos4.read_flight("flight.csv")
-    np.testing.assert_allclose(np.asarray(flown.omega), found.designed.omega, rtol=1e-6)
+def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, run):
+    settings = {"limits": {}, "duration": SECONDS, "dt": 0.01, "channels": "all", "criterion": "D"}
+    asked_for(speeds, BRACKET, start_is_known=True, **settings)
+    folder, omega, path = speeds.folder, speeds.found.designed.inputs, speeds.folder / "new.csv"
+    np.testing.assert_allclose(design.read_input(path, 0.01), omega, rtol=1e-9)
+    for words in ("x multisine", "x chirp", "of 200 vehicles", "fly it"):
+        assert words in speeds.printed
+    assert run("simulate", "--speeds", str(path), "--out", "flight.csv")[0] == 0
+    refused(run("simulate", "--speeds", str(path), "--out", "x.csv", "--duration", "5"), "--duration: ")
+    np.testing.assert_allclose(np.asarray(jaxos4.read_flight("flight.csv").omega), omega, rtol=1e-6)
     from jaxos4.study import load_study
     from jaxos4.study.flights import fleet_of
 
-    (folder / "study.toml").write_text('excitations = ["best"]\ndurations = [2]\n[input]\nbest = "input.csv"\n')
-    study = load_study(folder / "study.toml")
-    np.testing.assert_allclose(fleet_of(study, study.cell(0).scenario).omega, found.designed.omega, rtol=1e-9)
-    (folder / "study.toml").write_text('excitations = ["best"]\ndurations = [3]\n[input]\nbest = "input.csv"\n')
+    study = 'excitations = ["best"]\ndurations = [{}]\n[input]\nbest = "new.csv"\n'
+    (folder / "study.toml").write_text(study.format(2))
+    loaded = load_study(folder / "study.toml")
+    np.testing.assert_allclose(fleet_of(loaded, loaded.cell(0).scenario).omega, omega, rtol=1e-9)
+    (folder / "study.toml").write_text(study.format(3))
     with pytest.raises(jaxos4.InputError, match="its file lasts 2 s; correct `durations`"):
         load_study(folder / "study.toml")
 
 
+# References.
+
+
+def test_designed_references_tell_twice_as_much_as_3211(references):
+    """With the same length and the same largest values; the bounds are standard deviations."""
+    found = references.found
+    assert found.gain("3211")[0] < 0.5
+    assert max(found.gain(name)[0] for name in found.standard) < 0.6
+    for one in (found.designed, found.standard["3211"]):
+        np.testing.assert_allclose(np.abs(one.inputs).max(axis=0), [0.3, 0.3, 0.3, 1.5], rtol=1e-9)
+        assert one.inputs.shape == (2501, 4)
+    period = round(found.designed.period / LOOP_DT)
+    np.testing.assert_allclose(found.designed.inputs[period:], found.designed.inputs[:-period], atol=1e-9)
+
+
+def test_other_vehicles_in_other_gusts_keep_the_limits(references):
+    """The limits of rates and angles are mostly used by gusts, whose largest value is random."""
+    assert max(references.found.designed.uses.values()) <= 1
+    others = Fleet.of(LOOP, LOOP_BRACKET, LOOP_DT, jax.random.key(77))
+    uses = others.uses(references.found.designed.inputs, references.found.task.envelope)
+    assert max(uses[name] for name in ("fastest", "slowest", "velocity", "distance")) <= 1
+    assert max(uses[name] for name in ("angle", "rate")) < 1.15
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_the_bounds_are_those_of_filter_error(references):
+    """The bounds of an identified flight, whose filters know neither the noise nor the parameters."""
+    designed = references.found.designed
+    flight = jaxos4.fly_closed_loop(LOOP, jnp.asarray(designed.inputs), dt=LOOP_DT, key=jax.random.key(5))
+    settings = jaxos4.VehicleSettings(holdout=0.0, begin=0.0, end=LOOP_SECONDS)
+    estimate = jaxos4.identify(flight, CRAZYFLIE, settings=settings)
+    constants = [estimate.rigid_body.constants[name] for name in ("Ix", "Iy", "Iz")]
+    known = [estimate.parameters[name] for name in ("alpha3", "alpha6", "alpha8")]
+    # An interval is wider than the bound if parts of the flight disagree by chance.
+    bounds = np.array([one.std * alpha.bound / alpha.std for one, alpha in zip(constants, known, strict=True)])
+    errors = np.array([one.estimate for one in constants]) - np.asarray(CRAZYFLIE.inertia)
+    np.testing.assert_allclose(bounds / designed.bounds[:3], 1, atol=0.35)
+    assert np.abs(errors / designed.bounds[:3]).max() < 4
+
+
+def test_repeated_references_add_the_same_information(references):
+    """Half of the flight without references leaves half of what they add: bounds fall with the root of the duration."""
+    filters, designed = Filters.of(LOOP, LOOP_BRACKET.half_width), references.found.designed
+    quiet = dataclasses.replace(LOOP, gust=0.0, gyro_noise=0.0, attitude_noise=0.0, force_noise=0.0)
+    period = round(designed.period / LOOP_DT)
+    some = np.zeros((BATCH, *designed.inputs.shape))
+    whole = designed.inputs.shape[0] // period
+    for repeats in range(1, whole + 1):
+        some[repeats, : repeats * period] = designed.inputs[: repeats * period]
+    flights = fly_batch(batch_of(quiet), jnp.asarray(some), jnp.asarray(LOOP_DT), jax.random.key(0))
+    information = np.asarray(filters.informations(flights).channels)[: whole + 1].sum(axis=1)
+    added = np.diff(np.stack([np.diagonal(one)[[2, 5, 7]] for one in information]), axis=0)
+    # The first period begins, and the last one ends, with a step.
+    np.testing.assert_allclose(added / added.mean(axis=0), 1, atol=0.1)
+    np.testing.assert_allclose(designed.shortest(designed.bounds[:3] / 2), 4 * LOOP_SECONDS, rtol=1e-9)
+
+
+def test_the_command_writes_references_that_simulate_flies(references, run, tmp_path):
+    asked_for(references, LOOP_BRACKET, limits={}, duration=LOOP_SECONDS, dt=LOOP_DT, criterion="D")
+    assert jax.tree.structure(references.subject) == jax.tree.structure(LOOP)
+    for one, other in zip(jax.tree.leaves(references.subject), jax.tree.leaves(LOOP), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    shutil.copytree(references.folder, tmp_path, dirs_exist_ok=True)
+    written, dt = design.read_references(tmp_path / "new.csv")
+    assert dt == pytest.approx(LOOP_DT)
+    np.testing.assert_allclose(written, references.found.designed.inputs, atol=1e-6)
+    for words in ("x 3211", "of 64 vehicles", "known to 5 %: Ix after"):
+        assert words in references.printed
+    code, out, err = run("simulate", *CLOSED, "--references", "new.csv", "--out", "flight.csv")
+    assert (code, err) == (0, "")
+    assert "2501 samples of 0.004 s" in out
+
+
+# Mistakes.
+
+OPEN = ("--initial-state", "known")
+
+
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("options", "line", "said"),
     [
-        ("--duration 0", ("--duration", "must be positive")),
-        ("--duration 1000", ("--duration", "50 to 2500 samples")),
-        ("--duration 2 --fastest 150", ("cannot hover", "225.7")),
-        ("--duration 2 --slowest 230", ("cannot hover",)),
-        ("--duration 2 --rate -1", ("--rate must be positive",)),
-        ("--accuracy 0", ("--accuracy",)),
-        ("--bandwidth 100", ("--bandwidth", "0.2 to 25 Hz")),  # by default 5 s, sampled every 0.01 s
-        ("--airframe none", ("none",)),
-        ("--figure input.csv", ("--figure", "--out")),
-        ("--figure input.png", ("--figure input.png", ".svg")),
+        (OPEN, "--duration 0", ("--duration", "must be positive")),
+        (OPEN, "--duration 1000", ("--duration", "50 to 2500 samples")),
+        (OPEN, "--duration 2 --fastest 150", ("cannot hover", "225.7")),
+        (OPEN, "--duration 2 --rate -1", ("--rate must be positive",)),
+        (OPEN, "--accuracy 0", ("--accuracy",)),
+        (OPEN, "--bandwidth 100", ("--bandwidth", "0.2 to 25 Hz")),  # by default 5 s, sampled every 0.01 s
+        (OPEN, "--figure new.csv", ("--figure", "--out")),
+        (OPEN, "--figure new.png", ("--figure new.png", ".svg")),
+        (OPEN, "--gust 5", ("--gust", "with --closed-loop; add that")),
+        (CLOSED, "--duration 1000", ("--duration", "250 to 20000 samples")),
+        (CLOSED, "--angle 2", ("--angle", "at most 1")),
+        (CLOSED, "--fastest 300", ("cannot hover",)),
+        (CLOSED, "--slew 5", ("--slew", "without --closed-loop")),
+        (CLOSED, "--channels rates", ("--channels", "without --closed-loop")),
+        (CLOSED, "--sensors commands --airframe os4", ("--sensors", "max_rotor_speed")),
     ],
 )
-def test_mistakes_are_one_line_and_write_nothing(run, tmp_path, line, said):
-    refused(run("design", "--initial-state", "known", "--out", "input.csv", *line.split()), *said)
-    assert list(tmp_path.iterdir()) == []
+def test_mistakes_are_one_line_and_write_nothing(run, tmp_path, options, line, said):
+    (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
+    refused(run("design", *options, "--out", "new.csv", *line.split()), *said)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]
 
 
-def test_an_input_file_is_refused_in_one_line(found, tmp_path):
-    path = tmp_path / "input.csv"
-    write_input(found.designed, path)
-    with pytest.raises(jaxos4.InputError, match=r"is not sampled every 0.02 s"):
-        read_input(path, 0.02)
-    path.write_text("t,omega1,omega2,omega3\n0,1,1,1\n0.01,1,1,1\n")
-    with pytest.raises(jaxos4.InputError, match=r"column omega4 is missing"):
-        read_input(path, 0.01)
+@pytest.mark.parametrize(
+    ("read", "text", "said"),
+    [
+        ("input", "t,omega1,omega2,omega3,omega4\n0,1,1,1,1\n0.01,1,1,1,1\n", r"is not sampled every 0.02 s"),
+        ("input", "t,omega1,omega2,omega3\n0,1,1,1\n0.02,1,1,1\n", r"column omega4 is missing"),
+        ("input", "t,omega1,omega2,omega3,omega4\n0,1,1,1,1\n0.02,1,1,,1\n", r"a cell is empty or negative"),
+        ("references", "t,roll_reference\n0,0\n1,0\n", r"column pitch_reference is missing"),
+        ("references", "t,{}\n0,0,0,0,0\n1,0,0,,0\n", r"a cell is empty"),
+        ("references", "t,{}\n0,0,0,0,0\n1,0,0,0,0\n3,0,0,0,0\n", r"not sampled at equal times"),
+    ],
+)
+def test_a_file_is_refused_in_one_line(tmp_path, read, text, said):
+    path = tmp_path / "new.csv"
+    path.write_text(text.replace("{}", "roll_reference,pitch_reference,yaw_reference,az_reference"))
+    with pytest.raises(jaxos4.InputError, match=f"new.csv: .*{said}"):
+        design.read_input(path, 0.02) if read == "input" else design.read_references(path)
+
+
+# Criteria and envelopes.
 
 
 def test_criteria_are_means_of_the_relative_bounds_without_the_nuisances():
@@ -189,12 +318,12 @@ def test_criteria_are_means_of_the_relative_bounds_without_the_nuisances():
     found, determinant = jax.jit(bounds_of, static_argnums=1)(information, 3)
     np.testing.assert_allclose(found, covariance, rtol=1e-9)
     np.testing.assert_allclose(determinant, np.log(np.linalg.det(covariance)), rtol=1e-9)
-    value = {name: float(criterion(information, half_width, name)) for name in "DA"}
+    value = {name: float(criterion(information, half_width, name)) for name in CRITERIA}
     np.testing.assert_allclose(value["D"], np.log(np.linalg.det(relative)) / 6, rtol=1e-9)
     np.testing.assert_allclose(value["A"], np.log(np.trace(relative) / 3) / 2, rtol=1e-9)
-    largest = np.log(np.diagonal(relative).max()) / 2
-    worst = float(criterion(information, half_width, "worst"))
-    assert largest <= worst <= largest + np.log(3) / 16
+    worst = np.log(np.diagonal(relative).max()) / 2
+    assert worst <= value["worst"] <= worst + np.log(3) / 16
+    assert [str(one) for one in Criterion] == list(CRITERIA)
 
 
 @jax.jit
@@ -202,19 +331,19 @@ def largest_uses(envelope, omega, states):
     return largest(envelope.uses_of_rotors(omega, jnp.asarray(DT)) | envelope.uses_of_states(states))
 
 
-def test_a_limit_must_be_a_positive_number():
+def test_an_envelope_is_just_kept_by_its_flight_and_a_limit_must_be_a_positive_number():
     flight = standard_flight()
     envelope = Envelope.of(flight.omega, flight.states, float(DT))
+    uses = largest_uses(envelope, flight.omega, flight.states)
+    np.testing.assert_allclose(np.concatenate(list(uses.values())).max(), 1, rtol=1e-6)
+    assert set(envelope.shares_of(envelope).values()) == {1.0}
+    half = envelope.limited({"slowest": 2 * float(envelope.slowest), "angle": 0.5 * envelope.angle, "velocity": 1e-3})
+    shares = envelope.shares_of(half)
+    assert (shares["slowest"], shares["angle"], shares["rate"]) == pytest.approx((0.5, 0.5, 1))
     for name, value, message in (
         ("angle", [0.1, 0.2], "one number or three"),
         ("distance", np.inf, "positive and finite"),
         ("slowest", 300.0, "below `fastest`"),
     ):
-        with pytest.raises(ValueError, match=message):
-            Envelope(**{n: value if n == name else getattr(envelope, n) for n in Envelope.__annotations__})
-    uses = largest_uses(envelope, flight.omega, flight.states)
-    np.testing.assert_allclose(np.concatenate(list(uses.values())).max(), 1, rtol=1e-6)
-
-
-def test_the_criteria_of_the_command_are_those_of_the_library():
-    assert [str(one) for one in Criterion] == list(CRITERIA)
+        with pytest.raises(jaxos4.InputError, match=message):
+            envelope.limited({name: value})

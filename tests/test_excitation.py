@@ -1,3 +1,5 @@
+"""Excitations: the standard flight, shapes, limits, and the references of a controller."""
+
 import re
 
 import equinox as eqx
@@ -5,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxos4.airframe import OS4, OS4_SIMULATOR, VOOS
-from jaxos4.excitation import EXCITATIONS, chirp, doublet, multisine, step3211
+from jaxos4.excitation import EXCITATIONS, chirp, doublet, multisine, standard_references, step3211
 
 X_LAYOUT = eqx.tree_at(
     lambda a: a.rotor_positions, OS4, np.array([[0.16, -0.16], [-0.16, -0.16], [-0.16, 0.16], [0.16, 0.16]])
@@ -14,6 +16,10 @@ AIRFRAMES = {"os4": OS4, "simulator": OS4_SIMULATOR, "voos": VOOS, "x": X_LAYOUT
 IN_TURN = {"doublet": doublet, "3211": step3211, "chirp": chirp}
 every_excitation = pytest.mark.parametrize("excite", EXCITATIONS.values(), ids=EXCITATIONS)
 every_in_turn = pytest.mark.parametrize("excite", IN_TURN.values(), ids=IN_TURN)
+
+
+def with_largest_speed(speed):
+    return eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(speed))
 
 
 def accelerations(airframe, omega):
@@ -27,19 +33,13 @@ def rates_and_angles(airframe, omega, dt=0.01):
     return rates, np.cumsum(np.pad(rates[:-1], ((1, 0), (0, 0))), axis=0) * dt
 
 
-def standard_acceleration(time):
-    tones = {"roll": (0.6, 1.1, 1.9), "pitch": (0.7, 1.3, 2.3), "yaw": (0.5, 0.9, 1.7)}
-    return np.stack(
-        [sum(2 * np.pi * f * np.cos(2 * np.pi * f * time) / 3 for f in tones[axis]) for axis in tones], axis=1
-    )
-
-
 def test_multisine_is_the_standard_flight():
     omega = np.asarray(multisine(OS4, duration=5.0, dt=0.01))
     assert omega.shape == (501, 4)
     assert omega.dtype == np.float64
     assert (int(omega.min()), int(omega.max())) == (134, 289)
-    designed = standard_acceleration(0.01 * np.arange(501))
+    tones, time = ((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), (0.5, 0.9, 1.7)), 0.01 * np.arange(501)[:, None]
+    designed = np.stack([(2 * np.pi * np.array(f) * np.cos(2 * np.pi * time * f) / 3).sum(axis=1) for f in tones], 1)
     torque = omega**2 @ np.asarray(OS4.mixer)[:3].T
     np.testing.assert_allclose(torque, np.asarray(OS4.inertia) * designed, rtol=0, atol=1e-12)
     assert np.abs(torque - np.asarray(OS4.inertia) * designed[:, [1, 0, 2]]).max() > 1e-3  # a reference can be wrong
@@ -79,7 +79,7 @@ def test_axes_are_flown_in_the_order_given(excite):
     assert first[1].size == 0
 
 
-def test_pulses_have_their_shapes():
+def test_pulses_have_their_shapes_and_repeat_as_often_as_they_fit():
     """Pulse by pulse: the height of each in units of the first, and how long it lasts."""
     doublets = accelerations(OS4, doublet(OS4, width=0.3))[:150, 0]
     np.testing.assert_allclose(doublets[::30], np.array([1, -1, -1, 1, 0]) / 0.3, atol=1e-9)
@@ -87,9 +87,6 @@ def test_pulses_have_their_shapes():
     once = np.array([0.8, 0.8, 0.8, -1.2, -1.2, 1.1, -1.1]) / (2.4 * 0.1)
     np.testing.assert_allclose(steps[::10], np.concatenate([once, -once, [0]]), atol=1e-9)
     np.testing.assert_allclose(steps.reshape(15, 10), steps[::10, None] * np.ones(10), atol=1e-9)
-
-
-def test_pulses_repeat_as_often_as_they_fit():
     roll = accelerations(OS4, doublet(OS4, duration=10.0))[:, 0]
     np.testing.assert_allclose(roll[450:900], roll[:450], atol=1e-9)
     np.testing.assert_allclose(roll[900:], 0, atol=1e-9)
@@ -106,13 +103,15 @@ def test_chirp_sweeps_its_frequencies():
     assert len(crossings) == pytest.approx(2 * 1.5 * 20, abs=3)
 
 
-def test_axes_of_the_multisine_are_uncorrelated():
+def test_axes_of_the_multisine_are_uncorrelated_or_still():
     """Over the common period of the tones, 10 s."""
     designed = accelerations(OS4, multisine(OS4, duration=10.0))[:1000]
     gram = designed.T @ designed
-    off_diagonal = gram - np.diag(np.diag(gram))
-    assert np.abs(off_diagonal).max() < 1e-10 * np.diag(gram).min()
+    assert np.abs(gram - np.diag(np.diag(gram))).max() < 1e-10 * np.diag(gram).min()
     assert multisine(OS4, tones=((0.6,), (0.6,), (0.5,))).shape == (501, 4)  # the same tone twice is allowed
+    designed = accelerations(OS4, multisine(OS4, tones=((1.0,), (), (0.5, 1.5))))
+    np.testing.assert_allclose(designed[:, 1], 0, atol=1e-9)
+    np.testing.assert_allclose(designed[:, 0], 2 * np.pi * np.cos(2 * np.pi * 0.01 * np.arange(501)), atol=1e-9)
 
 
 @every_excitation
@@ -126,19 +125,14 @@ def test_amplitude_scales_every_axis_by_itself(excite):
     np.testing.assert_allclose(no_yaw, full * np.array([1, 0.5, 0]), atol=1e-9)
 
 
-def test_an_axis_without_tones_is_still():
-    designed = accelerations(OS4, multisine(OS4, tones=((1.0,), (), (0.5, 1.5))))
-    np.testing.assert_allclose(designed[:, 1], 0, atol=1e-9)
-    np.testing.assert_allclose(designed[:, 0], 2 * np.pi * np.cos(2 * np.pi * 0.01 * np.arange(501)), atol=1e-9)
-
-
-LIMITED = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.array(260.0))
-
-
 @every_excitation
 @pytest.mark.parametrize(
     ("airframe", "amplitude", "reason"),
-    [(OS4, (0.0, 0.0, 9.0), "below zero"), (OS4, 30.0, "below zero"), (LIMITED, 4.0, "max_rotor_speed")],
+    [
+        (OS4, (0.0, 0.0, 9.0), "below zero"),
+        (OS4, 30.0, "below zero"),
+        (with_largest_speed(260.0), 4.0, "max_rotor_speed"),
+    ],
 )
 def test_unflyable_amplitudes_name_the_scale_that_flies(airframe, amplitude, reason, excite):
     with pytest.raises(ValueError, match="`amplitude` is too large to fly") as caught:
@@ -157,44 +151,33 @@ def test_unflyable_amplitudes_name_the_scale_that_flies(airframe, amplitude, rea
 
 
 def test_exceeding_the_rotor_speed_says_by_how_much():
-    omega = multisine(OS4, amplitude=0.5)
-    limited = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(omega.max() - 2.0))
+    fastest = float(multisine(OS4, amplitude=0.5).max())
     with pytest.raises(ValueError, match=r"rotor \d would exceed the `max_rotor_speed` .* by 2 rad/s at t = "):
-        multisine(limited, amplitude=0.5)
-    assert multisine(eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(omega.max() + 1e-6)), amplitude=0.5).size
-
-
-def test_an_airframe_that_cannot_hover():
+        multisine(with_largest_speed(fastest - 2), amplitude=0.5)
+    assert multisine(with_largest_speed(fastest + 1e-6), amplitude=0.5).size
     with pytest.raises(ValueError, match="`airframe` cannot hover"):
-        multisine(eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.array(200.0)), amplitude=0.0)
-
-
-@every_excitation
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [("duration", (0.0, -1.0, np.nan, np.inf, 0.001)), ("dt", (0.0, np.nan)), ("amplitude", (np.nan, (1.0, 1.0)))],
-)
-def test_arguments_out_of_range_are_named(excite, name, values):
-    for value in values:
-        with pytest.raises(ValueError, match=f"`{name}`"):
-            excite(OS4, **{name: value})
+        multisine(with_largest_speed(200.0), amplitude=0.0)
 
 
 @pytest.mark.parametrize(
-    ("excite", "name", "values"),
+    ("excitations", "name", "values"),
     [
-        (multisine, "tones", [((1.0,), (1.0,)), ((50.0,), (1.0,), (1.0,)), ((0.0,), (1.0,), (1.0,))]),
-        (doublet, "duration", [4.0]),
-        (doublet, "width", [0.001, np.nan]),
-        (doublet, "axes", [(), "roll"]),
-        (step3211, "duration", [4.0]),
-        (step3211, "axes", [("roll", "heave")]),
-        (chirp, "duration", [1.0]),
-        (chirp, "frequencies", [(1.0, 60.0), (0.0, 3.0)]),
+        (EXCITATIONS.values(), "duration", (0.0, -1.0, np.nan, np.inf, 0.001)),
+        (EXCITATIONS.values(), "dt", (0.0, np.nan)),
+        (EXCITATIONS.values(), "amplitude", (np.nan, (1.0, 1.0))),
+        ([multisine], "tones", [((1.0,), (1.0,)), ((50.0,), (1.0,), (1.0,)), ((0.0,), (1.0,), (1.0,))]),
+        ([doublet, step3211], "duration", [4.0]),
+        ([doublet], "width", [0.001, np.nan]),
+        ([doublet, step3211, chirp], "axes", [(), "roll", ("roll", "heave")]),
+        ([chirp], "duration", [1.0]),
+        ([chirp], "frequencies", [(1.0, 60.0), (0.0, 3.0)]),
     ],
 )
-def test_shapes_that_do_not_fit_are_named(excite, name, values):
-    test_arguments_out_of_range_are_named(excite, name, values)
+def test_arguments_out_of_range_are_named(excitations, name, values):
+    for excite in excitations:
+        for value in values:
+            with pytest.raises(ValueError, match=f"`{name}`"):
+                excite(OS4, **{name: value})
 
 
 @every_in_turn
@@ -204,3 +187,11 @@ def test_the_shortest_duration_it_names_is_enough(excite):
     found = re.search(r"at least (\S+) s", str(caught.value))
     assert found is not None
     assert np.isfinite(excite(OS4, duration=float(found[1]), amplitude=0.2)).all()
+
+
+def test_standard_references_have_the_largest_values_that_are_asked_for():
+    largest = np.array([0.1, 0.2, 0.3, 2.0])
+    for name, references in standard_references(5001, 0.004, largest).items():
+        np.testing.assert_allclose(np.abs(references).max(axis=0), largest, rtol=1e-9)
+        assert (np.count_nonzero(references, axis=1).max() == 1) == (name != "multisine")  # one after another
+    assert np.all(standard_references(500, 0.004, largest)["3211"] == 0)  # no room for one axis

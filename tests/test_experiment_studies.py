@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from small_experiments import EXPERIMENTS, load, plot, small, study
+from small_experiments import EXPERIMENTS, load, load_results, plot, small, study
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import load_results
 from jaxos4.study import load_study, metrics
 
 # The experiments that are a study without a script of their own.

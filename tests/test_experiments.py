@@ -119,17 +119,22 @@ def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
 def test_closed_loop(tmp_path, monkeypatch):
     def load_with_small_chunks(name, script="run"):
         module = load(name, script)
-        module.CHUNK = 3  # two calls of the regression, the second of them padded
+        module.CHUNK = 3  # two calls of each estimator, the second of them padded
         return module
 
     monkeypatch.setattr("small_experiments.load", load_with_small_chunks)
-    cases = {"flights": 4, "gusts": [10.0], "duration": 6.0, "seed": 16, "estimators": ["equation-error"]}
+    cases = {
+        "flights": 4,
+        "gusts": [10.0],
+        "duration": 6.0,
+        "seed": 16,
+        "estimators": ["equation-error", "output-error"],
+    }
     report = report_of("closed_loop", tmp_path, **cases)
     plot("closed_loop", tmp_path / "out.json", tmp_path / "figures")
-    (regression,) = report["cases"]
-    assert len(regression["flights"]) == 4
-    # A controller that answers gusts makes regression biased by tens of percent, and its intervals do not know it.
-    for row in regression["summary"].values():
+    assert [len(case["flights"]) for case in report["cases"]] == [4, 4]
+    # A controller that answers gusts makes both biased by tens of percent, and their intervals do not know it.
+    for row in (row for case in report["cases"] for row in case["summary"].values()):
         assert row["bias"] > 0.2
         assert row["covered"] == 0
     # An interrupted study is continued: the flights that are there are not identified again.

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from synthetic_results import AIRFRAME, VALUES, os4_result, vehicle_result
 
 import jaxos4
@@ -29,15 +30,15 @@ def mujoco():
     return pytest.importorskip("mujoco", reason="pip install mujoco")
 
 
-@pytest.fixture(scope="module")
-def multirotor():
-    return pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy").Multirotor
-
-
 def read(tmp_path, result):
     path = tmp_path / "found.json"
     path.write_text(json.dumps(result), encoding="utf-8")
     return jaxos4.export.read_result(path)
+
+
+def exported(found, target):
+    """The text of the file for a simulator."""
+    return jaxos4.export.export_vehicle(found, target).text
 
 
 def random_states(slowest, fastest):
@@ -47,21 +48,9 @@ def random_states(slowest, fastest):
     return scale * generator.uniform(-1, 1, (STATES, 12)), generator.uniform(slowest, fastest, (STATES, 4))
 
 
-def rotation(states):
-    """R_z(psi) R_y(theta) R_x(phi) of each state."""
-    (c, b, a) = (np.cos(states[:, [6, 8, 10]]).T, np.sin(states[:, [6, 8, 10]]).T, np.ones(len(states)))
-    zero = 0 * a
-    x = np.array([[a, zero, zero], [zero, c[0], -b[0]], [zero, b[0], c[0]]])
-    y = np.array([[c[1], zero, b[1]], [zero, a, zero], [-b[1], zero, c[1]]])
-    z = np.array([[c[2], -b[2], zero], [b[2], c[2], zero], [zero, zero, a]])
-    return np.einsum("ijn,jkn,kln->nil", z, y, x)
-
-
 def quaternions(states):
-    """w, x, y, z of each state."""
-    from scipy.spatial.transform import Rotation
-
-    return np.roll(Rotation.from_matrix(rotation(states)).as_quat(), 1, axis=1)
+    """w, x, y, z of R_z(psi) R_y(theta) R_x(phi) of each state."""
+    return np.roll(Rotation.from_euler("ZYX", states[:, [10, 8, 6]]).as_quat(), 1, axis=1)
 
 
 def modelled(model, parameters, states, omega):
@@ -87,10 +76,11 @@ def vehicle_acceleration(values, states, omega):
     return modelled(model, jnp.array([given.get(name, 0.0) for name in model.parameter_names]), states, omega)
 
 
-def mujoco_acceleration(mujoco, text, thrusts, states):
-    model = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(model)
-    found = []
+def mujoco_acceleration(found, states, omega):
+    mujoco = pytest.importorskip("mujoco", reason="pip install mujoco")
+    model = mujoco.MjModel.from_xml_string(exported(found, "mujoco"))
+    data, accelerations = mujoco.MjData(model), []
+    thrusts = found.vehicle.thrust_coefficient * omega**2
     for state, quaternion, thrust in zip(states, quaternions(states), thrusts, strict=True):
         data.qpos[:] = np.append(state[[0, 2, 4]], quaternion)
         data.qvel[:] = state[[1, 3, 5, 7, 9, 11]]
@@ -98,16 +88,20 @@ def mujoco_acceleration(mujoco, text, thrusts, states):
         if model.na:
             data.act[:] = thrust
         mujoco.mj_forward(model, data)
-        found.append(data.qacc.copy())
-    return np.array(found)
+        accelerations.append(data.qacc.copy())
+    return np.array(accelerations)
 
 
-def rotorpy_acceleration(multirotor, text, states, speeds):
+def rotorpy_vehicle(found):
+    multirotor = pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy").Multirotor
     defined = {}
-    exec(text, defined)  # noqa: S102
-    vehicle = multirotor(defined["quad_params"])
-    found = []
-    for state, quaternion, speed in zip(states, quaternions(states), speeds, strict=True):
+    exec(exported(found, "rotorpy"), defined)  # noqa: S102
+    return multirotor(defined["quad_params"])
+
+
+def rotorpy_acceleration(found, states, omega):
+    vehicle, accelerations = rotorpy_vehicle(found), []
+    for state, quaternion, speed in zip(states, quaternions(states), omega, strict=True):
         now = {
             "x": state[[0, 2, 4]],
             "v": state[[1, 3, 5]],
@@ -117,8 +111,12 @@ def rotorpy_acceleration(multirotor, text, states, speeds):
             "rotor_speeds": speed,
         }
         derivative = vehicle.statedot(now, {"cmd_motor_speeds": speed}, 0.01)
-        found.append(np.append(derivative["vdot"], derivative["wdot"]))
-    return np.array(found)
+        accelerations.append(np.append(derivative["vdot"], derivative["wdot"]))
+    return np.array(accelerations)
+
+
+SIMULATORS = {"mujoco": mujoco_acceleration, "rotorpy": rotorpy_acceleration}
+every_simulator = pytest.mark.parametrize("target", SIMULATORS)
 
 
 def agree(found, expected):
@@ -132,53 +130,37 @@ def effective(speeds, values):
     return np.sqrt(curve * speeds**2 + (1 - curve) * full * speeds)
 
 
-def test_an_os4_accelerates_in_mujoco_as_the_model(mujoco, tmp_path):
-    found = read(tmp_path, os4_result())
+@every_simulator
+def test_an_os4_accelerates_as_the_model(target, tmp_path):
     states, omega = random_states(100, 300)
-    text, thrusts = jaxos4.export.export_vehicle(found, "mujoco").text, found.vehicle.thrust_coefficient * omega**2
     expected = os4_acceleration(states, omega)
-    assert agree(mujoco_acceleration(mujoco, text, thrusts, states), expected)
+    assert agree(SIMULATORS[target](read(tmp_path, os4_result()), states, omega), expected)
     # The comparison can fail: rotors that turn the other way, or a heavier vehicle.
     for change in ({"rotor_spins": [-1, 1, -1, 1]}, {"mass": 0.6501}):
         other = read(tmp_path, os4_result(airframe=airframe_table(jaxos4.OS4) | change))
-        text = jaxos4.export.export_vehicle(other, "mujoco").text
-        assert not agree(mujoco_acceleration(mujoco, text, thrusts, states), expected)
+        assert not agree(SIMULATORS[target](other, states, omega), expected)
 
 
-def test_an_os4_accelerates_in_rotorpy_as_the_model(multirotor, tmp_path):
-    text = jaxos4.export.export_vehicle(read(tmp_path, os4_result()), "rotorpy").text
-    states, omega = random_states(100, 300)
-    assert agree(rotorpy_acceleration(multirotor, text, states, omega), os4_acceleration(states, omega))
-
-
-def test_a_vehicle_accelerates_in_mujoco_as_the_model(mujoco, tmp_path):
-    """With offsets, centre of mass, damping, drag, thrust gain and thrust curve."""
-    found = read(tmp_path, vehicle_result())
+@every_simulator
+def test_a_vehicle_accelerates_as_the_model(target, tmp_path):
+    """With all effects that the simulator has: RotorPy has no offsets, no damping and, except in hover, no drag."""
+    values = VALUES
+    if target == "rotorpy":
+        # An offset that cancels the constant part of the torque of the centre of mass.
+        values = VALUES | dict.fromkeys((*NOT_ROTORPY, *DRAG), 0.0)
+        values |= {f"{axis}_offset": 9.81 * VALUES[f"{axis}_thrust"] for axis in ("roll", "pitch")}
     states, omega = random_states(500, 2500)
-    thrusts = found.vehicle.thrust_coefficient * effective(omega, VALUES) ** 2
-    simulated = mujoco_acceleration(mujoco, jaxos4.export.export_vehicle(found, "mujoco").text, thrusts, states)
-    assert agree(simulated, vehicle_acceleration(VALUES, states, omega))
-
-
-def test_a_vehicle_accelerates_in_rotorpy_as_the_model(multirotor, tmp_path):
-    """With centre of mass, thrust gain and thrust curve: RotorPy has no offsets and no damping."""
-    # An offset that cancels the constant part of the torque of the centre of mass.
-    values = VALUES | dict.fromkeys((*NOT_ROTORPY, *DRAG), 0.0)
-    values |= {f"{axis}_offset": 9.81 * VALUES[f"{axis}_thrust"] for axis in ("roll", "pitch")}
-    text = jaxos4.export.export_vehicle(read(tmp_path, vehicle_result(values)), "rotorpy").text
-    states, omega = random_states(500, 2500)
-    simulated = rotorpy_acceleration(multirotor, text, states, effective(omega, values))
+    simulated = SIMULATORS[target](read(tmp_path, vehicle_result(values)), states, effective(omega, values))
     assert agree(simulated, vehicle_acceleration(values, states, omega))
 
 
-def test_the_drag_of_rotorpy_is_right_at_the_hover_speed(multirotor, tmp_path):
+def test_the_drag_of_rotorpy_is_right_at_the_hover_speed(tmp_path):
     values = VALUES | dict.fromkeys(NOT_ROTORPY, 0.0) | {"x_drag": 0.3, "y_drag": 0.3, "thrust_curve": 1.0}
     found = read(tmp_path, vehicle_result(values))
     states, _ = random_states(0, 1)
     states[:, [7, 9, 11]] = 0.0
     hover = np.full((STATES, 4), found.vehicle.hover_speed)
-    text = jaxos4.export.export_vehicle(found, "rotorpy").text
-    simulated = rotorpy_acceleration(multirotor, text, states, hover)[:, :3]
+    simulated = rotorpy_acceleration(found, states, hover)[:, :3]
     assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
 
 
@@ -190,7 +172,7 @@ def test_the_drag_of_rotorpy_is_right_at_the_hover_speed(multirotor, tmp_path):
 def test_the_rotors_of_mujoco_lag_and_are_late(mujoco, tmp_path, step, delay, error):
     """Also in a scene with another time step, and with a delay of 5.1 time steps."""
     found = read(tmp_path, vehicle_result(VALUES | {"rotor_delay": delay}))
-    model = mujoco.MjModel.from_xml_string(jaxos4.export.export_vehicle(found, "mujoco").text)
+    model = mujoco.MjModel.from_xml_string(exported(found, "mujoco"))
     model.opt.timestep = step
     data = mujoco.MjData(model)
     data.ctrl[:4] = 0.1
@@ -202,11 +184,8 @@ def test_the_rotors_of_mujoco_lag_and_are_late(mujoco, tmp_path, step, delay, er
     np.testing.assert_allclose(thrust, 0.1 * -np.expm1(-late / VALUES["rotor_lag"]), atol=error)
 
 
-def test_the_rotors_of_rotorpy_lag(multirotor, tmp_path):
-    found = read(tmp_path, vehicle_result())
-    defined = {}
-    exec(jaxos4.export.export_vehicle(found, "rotorpy").text, defined)  # noqa: S102
-    vehicle = multirotor(defined["quad_params"])
+def test_the_rotors_of_rotorpy_lag(tmp_path):
+    vehicle = rotorpy_vehicle(read(tmp_path, vehicle_result()))
     rest = {"x": np.zeros(3), "v": np.zeros(3), "q": np.array([0, 0, 0, 1.0]), "w": np.zeros(3), "wind": np.zeros(3)}
     state = vehicle.step(rest | {"rotor_speeds": np.zeros(4)}, {"cmd_motor_speeds": np.full(4, 1000.0)}, 0.05)
     np.testing.assert_allclose(state["rotor_speeds"], -1000 * np.expm1(-1.0), rtol=1e-3)
@@ -214,9 +193,7 @@ def test_the_rotors_of_rotorpy_lag(multirotor, tmp_path):
 
 def test_the_vehicle_rests_in_the_hover_of_mujoco(mujoco, tmp_path):
     """The thrusts of the keyframe balance the weight and the constant torques."""
-    model = mujoco.MjModel.from_xml_string(
-        jaxos4.export.export_vehicle(read(tmp_path, vehicle_result()), "mujoco").text
-    )
+    model = mujoco.MjModel.from_xml_string(exported(read(tmp_path, vehicle_result()), "mujoco"))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
@@ -224,9 +201,9 @@ def test_the_vehicle_rests_in_the_hover_of_mujoco(mujoco, tmp_path):
 
 
 @pytest.mark.parametrize(("target", "suffix"), [("mujoco", "xml"), ("rotorpy", "py")])
-def test_the_programs_of_the_page_run(run, mujoco, multirotor, monkeypatch, tmp_path, target, suffix):
+def test_the_programs_of_the_page_run(run, monkeypatch, tmp_path, target, suffix):
     """The vehicle hovers in each simulator, and every sample of it too, by the programs that the page prints."""
-    del multirotor
+    pytest.importorskip(target)
     read(tmp_path, vehicle_result())
     code, _, err = run("export", "found.json", "--to", target, "--out", f"vehicle.{suffix}", "--samples", "3")
     assert code == 0, err

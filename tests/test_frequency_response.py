@@ -95,13 +95,8 @@ def flown():
     return jaxos4.ShootingProblem(MODEL, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", method="rk4"), values
 
 
-@pytest.mark.parametrize("held", [False, True])
-def test_the_right_model_has_gain_one_and_phase_zero(flown, held):
-    problem, values = flown
-    if held:
-        model = jaxos4.hold(MODEL, {"rotor_lag": 0.05, "alpha7": values[6]})
-        problem, values = eqx.tree_at(lambda p: p.model, problem, model), model.without(values)
-    found = jaxos4.frequency_response(problem, values)
+def test_the_right_model_has_gain_one_and_phase_zero(flown):
+    found = jaxos4.frequency_response(*flown)
     for axis in found[:2]:
         agreement = axis.agreement()
         assert abs(math.log(agreement.ratio)) < 4 * agreement.error + 2e-3

@@ -37,9 +37,12 @@ def not_excited(problem):
 
 def test_a_hover_excites_nothing():
     omega = jnp.full((301, 4), jaxos4.OS4.hover_speed)
-    notes = notes_of(problem_of(omega, channels="all"))
-    assert list(notes) == [f"alpha{i}" for i in range(1, 9)]
-    assert set(notes.values()) == {"not identifiable: not excited"}
+    problem = problem_of(omega, channels="all")
+    for one in (problem, eqx.tree_at(lambda p: p.initial_state, problem, None)):
+        assert notes_of(one) == {f"alpha{i}": "not identifiable: not excited" for i in range(1, 9)}
+        bound = np.asarray(jaxos4.cramer_rao_bound(one, one.model.alpha))
+        assert np.isfinite(bound).all()
+        assert (np.sqrt(np.diagonal(bound)) > jaxos4.DEFAULT_HALF_WIDTH).all()
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,8 @@ def identify(estimator, problem, states):
 @pytest.mark.parametrize("estimator", [jaxos4.IBSS(), OutputError()])
 def test_constants_are_estimated_directly_and_know_more_than_alphas(estimator):
     flights, problem = 64, standard_problem(jaxos4.CorrectedOS4, "rates")
-    inertial = eqx.tree_at(lambda p: p.model, problem, jaxos4.InertialOS4(problem.model))
+    arguments = {"sigma": problem.sigma, "initial_state": problem.initial_state, "channels": "rates"}
+    inertial = jaxos4.ShootingProblem(jaxos4.InertialOS4(problem.model), problem.flight, **arguments)
     found = identify(estimator, inertial, noisy_states(flights, jaxos4.CorrectedOS4))
     assert set(jaxos4.result_names(found.result)) == {"successful"}
     errors = (found.parameters - constants()) / found.std

@@ -5,22 +5,13 @@ import json
 import numpy as np
 import pytest
 from helpers import refused
-from recorded_logs import blackbox_csv, crazyflie
+from recorded_logs import VEHICLE, blackbox_csv, crazyflie
 from test_logs_blackbox import T as BLACKBOX_TIME, recorded
 from test_logs_crazyflie import one_event
 from test_logs_ulog import everything
 
 import jaxos4
 
-VEHICLE = """
-mass = 0.65
-inertia = [7.5e-3, 7.5e-3, 1.3e-2]
-arm = 0.23
-thrust_coefficient = 4.0e-6
-drag_coefficient = 1e-7
-rotor_inertia = 6e-5
-max_rotor_speed = 1200
-"""
 LOGS = {
     "ULog": everything(),
     "blackbox": blackbox_csv(recorded(BLACKBOX_TIME)).encode(),
@@ -74,15 +65,11 @@ def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
     assert "usable" in out
 
 
+# The mistakes of each format: `test_logs_readers.py`.
 BAD = {
     "missing": (None, "there is no such file"),
     "empty": (b"", "is empty"),
-    "text": (b"hello world\n", "row 1"),
-    "bytes": (bytes(range(256)), "not text in UTF-8"),
     "ulog": (LOGS["ULog"][:14], "ends within its header"),
-    "raw blackbox": (b"H Product:Blackbox flight data recorder\n", "blackbox_decode"),
-    "blackbox": (LOGS["blackbox"][:-9], "row 1501"),
-    "crazyflie": (LOGS["Crazyflie"][:40], "ends within its header"),
     "nothing flown": (crazyflie([("e", ["a.b(f)"], [0.0, 1.0], np.zeros((2, 1)))]), "no body rates"),
 }
 

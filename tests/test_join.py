@@ -6,11 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import Stretches, fill_gaps
-from jaxos4.recording.averaging import average, averaged
-from jaxos4.recording.usable import Stretch, cut
+from jaxos4.logs.sampling import average
+from jaxos4.recording import Recording
+from jaxos4.recording.pieces import averaged, cut, with_body_velocity
+from jaxos4.recording.usable import Stretch
 from jaxos4.shooting.padding import padded
 
 
@@ -166,32 +169,6 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("ratio", [2, 3, 4, 2.5])
-def test_a_straight_line_is_averaged_without_a_delay(ratio):
-    t, omega, _, dt = rows(100, ratio, 0)
-    lines = np.column_stack([2.0 * (t - 3), 1 - (t - 3), np.ones_like(t)])
-    grid, _, found = average(t, omega, lines, dt)
-    expected = np.column_stack([2.0 * (grid - 3), 1 - (grid - 3), np.ones_like(grid)])
-    # Half-covered ends see one side only.
-    inside = slice(1, -1)
-    within = 1e-9 if float(ratio).is_integer() else 0.25 * 0.001 * 2
-    np.testing.assert_allclose(found[inside], expected[inside], atol=within)
-
-
-@pytest.mark.parametrize("ratio", [2, 4, 2.5, 5.7])
-def test_no_impulse_is_lost(ratio):
-    t, omega, channels, dt = rows(83, ratio, 1)
-    grid, speeds, _ = average(t, omega, channels, dt)
-    for k in range(grid.size - 1):
-        begin, end = grid[k], grid[k + 1]
-        impulse = np.zeros(4)
-        for at, row in zip(t[:-1], omega[:-1], strict=True):
-            impulse += max(min(at + 0.001, end) - max(at, begin), 0.0) * row**2
-        np.testing.assert_allclose(speeds[k] ** 2 * dt, impulse, rtol=1e-9)
-    constant = np.full_like(omega, 250.0)
-    np.testing.assert_allclose(average(t, constant, channels, dt)[1], 250.0, rtol=1e-12)
-
-
 def test_a_sample_with_less_than_half_measured_is_missing():
     t, omega, _, dt = rows(81, 4, 0)
     y = np.ones((81, 1))
@@ -218,3 +195,18 @@ def test_gaps_are_filled_from_their_own_stretch():
     found = fill_gaps(values, Stretches.of(number))[:, 0]
     np.testing.assert_array_equal(found, [1, 1, 1, 2, 0, 0, 5, 5, 5, 5])
     np.testing.assert_array_equal(fill_gaps(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])
+
+
+def test_the_bodys_velocity_is_that_of_the_earth_turned_by_the_attitude():
+    flight = Recording.of(stretch(50, 0))
+    flight = flight._replace(states=flight.states.copy())
+    flight.states[[0, 20], 6] = np.nan
+    states = flight.states.copy()
+    for column in states.T:  # the value before a gap, or the first one
+        measured = np.flatnonzero(np.isfinite(column))
+        column[:] = column[measured[np.maximum(np.searchsorted(measured, np.arange(50), side="right") - 1, 0)]]
+    angles, velocity = states[:, [10, 8, 6]], states[:, [1, 3, 5]]
+    expected = Rotation.from_euler("ZYX", angles).apply(velocity, inverse=True)
+    np.testing.assert_allclose(with_body_velocity(flight).body_velocity, expected, atol=1e-12)
+    flight.states[:, 1] = np.nan
+    assert with_body_velocity(flight) is flight

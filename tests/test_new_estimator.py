@@ -11,7 +11,7 @@ TOY = """
 import sys
 import equinox as eqx, jax.numpy as jnp
 from jaxos4.bracket import GAUSSIAN_PRIOR
-from jaxos4.estimate import AbstractEstimator, check_bracket, conclude, fit_start
+from jaxos4.estimate import AbstractEstimator, as_estimate, fit_start
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.linalg import invert
 
@@ -25,16 +25,16 @@ class OneStep(AbstractEstimator):
     needs_network = False
 
     @eqx.filter_jit
-    def __call__(self, problem, bracket):
-        check_bracket(problem, bracket)
-        box, count = bracket.usable, bracket.lower.size
+    def __call__(self, problem, bracket=None):
+        problem = problem.within(bracket)
+        box, count = problem.unknowns.usable, problem.unknowns.count
         view = problem.curvatures(box.center, problem.first_state()[0])
         information = view.information.sum(axis=0)[:count, :count] + jnp.diag(1 / box.half_width**2)
         covariance = invert(information)
         parameters = box.center - covariance @ view.gradient.sum(axis=0)[:count]
         initial_state, cost, sound, rollouts = fit_start(problem, parameters)
-        return conclude(
-            bracket, parameters=parameters, covariance=covariance, initial_state=initial_state, cost=cost,
+        return as_estimate(
+            problem, parameters=parameters, covariance=covariance, initial_state=initial_state, cost=cost,
             rollouts=rollouts + count, sweeps=1, sound=sound, done=jnp.asarray(True), prior=self.prior,
         )
 
@@ -42,9 +42,9 @@ class OneStep(AbstractEstimator):
 ESTIMATORS["toy"] = OneStep  # the line in the registry
 
 from jaxos4.cli import main
-from jaxos4.study.comparison import STANDARD
+from jaxos4.cli.compare import comparison
 
-assert STANDARD.estimators[-1] == "toy"
+assert comparison(quick=False).estimators[-1] == "toy"
 for line in open(sys.argv[1]):
     sys.argv = ["jaxos4", *line.split()]
     try:

@@ -8,7 +8,6 @@ from helpers import folded, measured, same
 from jaxos4.flight import STATE_NAMES, Flight
 from jaxos4.noise import (
     SENSOR_SIGMA,
-    AbstractNoise,
     Chain,
     ConstantBias,
     Dropouts,
@@ -69,20 +68,14 @@ def test_sensor_sigma_is_in_the_order_of_the_states():
 
 
 @every_noise
-def test_same_key_same_numbers(noise):
+def test_the_key_decides_the_states_and_nothing_else_changes(noise):
     flight = make_flight()
-    first, again, other = (noise(flight, key=jax.random.key(seed)).states for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert isinstance(noise, Quantisation) == np.array_equal(first, other, equal_nan=True)
-    assert not np.array_equal(first, flight.states)
-
-
-@every_noise
-def test_only_states_change(noise):
-    flight = make_flight()
-    noisy = noise(flight, key=jax.random.key(0))
-    assert same(eqx.tree_at(lambda f: f.states, noisy, flight.states), flight)
-    assert noisy.states.dtype == flight.states.dtype
+    first, again, other = (noise(flight, key=jax.random.key(seed)) for seed in (1, 1, 2))
+    assert same(first, again)
+    assert isinstance(noise, Quantisation) == np.array_equal(first.states, other.states, equal_nan=True)
+    assert not np.array_equal(first.states, flight.states)
+    assert same(eqx.tree_at(lambda f: f.states, first, flight.states), flight)
+    assert first.states.dtype == flight.states.dtype
 
 
 @every_noise
@@ -115,7 +108,7 @@ def test_a_channel_without_noise_does_not_change(kind):
     assert (np.asarray(noisy[:, 1::2]) != np.asarray(flight.states[:, 1::2])).any(axis=0).all()
 
 
-def test_numbers_of_any_kind_share_a_trace():
+def test_numbers_of_any_kind_share_a_trace_and_can_be_a_batch():
     @eqx.filter_jit
     @eqx.debug.assert_max_traces(max_traces=1)
     def apply(noise, flight, key):
@@ -124,13 +117,8 @@ def test_numbers_of_any_kind_share_a_trace():
     flight, key = make_flight(), jax.random.key(0)
     for sigma in (0.1, 0.2, 1, SENSOR_SIGMA, np.float32(0.5), jnp.ones(12)):
         apply(WhiteNoise(sigma), flight, key)
-
-
-def test_noise_batches_over_its_numbers():
-    flight, key = make_flight(), jax.random.key(0)
     scales = jnp.array([0.0, 1.0, 10.0])
-    states = jax.vmap(lambda s: WhiteNoise(s * SENSOR_SIGMA)(flight, key=key).states)(scales)
-    added = states - flight.states
+    added = jax.vmap(lambda s: WhiteNoise(s * SENSOR_SIGMA)(flight, key=key).states)(scales) - flight.states
     np.testing.assert_array_equal(added[0], 0)
     np.testing.assert_allclose(added[2], 10 * added[1], rtol=1e-9, atol=1e-15)
 
@@ -263,8 +251,3 @@ def test_chain_is_one_after_the_other():
 def test_numbers_out_of_range_are_named(make, name):
     with pytest.raises(ValueError, match=f"`{name}`"):
         make()
-
-
-def test_the_abstract_noise_is_abstract():
-    with pytest.raises(TypeError, match="abstract"):
-        AbstractNoise()  # pyright: ignore[reportAbstractUsage]

@@ -1,22 +1,22 @@
 """A vehicle that turns against its airframe is found, whatever its controller does against gusts."""
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
+from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
-from test_flight_csv import CRAZYFLIE
 
 from jaxos4.errors import InputError
-from jaxos4.flight import Flight
-from jaxos4.logs import read_log, write_flight
+from jaxos4.logs import read_recording, write_flight
 from jaxos4.recording import Recording, cut, usable_stretches
+from jaxos4.recording.motion import opposite_axes, opposite_note
 from jaxos4.recording.preparation import prepare
-from jaxos4.recording.signs import opposite_axes, opposite_note
 
 DT = 0.004
 
 
-def flown(airframe, seed, *, gust=20.0, reference=2.0, lag=0.04, seconds=15.0):
+def flown(airframe, seed, *, gust=20.0, reference=2.0, lag=0.04, seconds=15.0, name="a.bbl"):
     """Rates of a vehicle under a rate controller with damping, references and gusts; the rotors lag their commands."""
     rng, samples = np.random.default_rng(seed), round(seconds / DT)
     inertia, mixer = np.asarray(airframe.inertia, dtype=float), np.asarray(airframe.mixer, dtype=float)
@@ -37,7 +37,7 @@ def flown(airframe, seed, *, gust=20.0, reference=2.0, lag=0.04, seconds=15.0):
         rate = rate + DT * ((mixer @ real)[:3] / inertia + disturbance)
     states = np.full((samples, 12), np.nan)
     states[:, [7, 9, 11]] = rates
-    return Flight(DT * np.arange(samples), np.sqrt(squared), states, commanded=True)
+    return Recording(DT * np.arange(samples), np.sqrt(squared), states, commanded=True, name=name)
 
 
 def turned(airframe, what):
@@ -62,14 +62,14 @@ def test_gusts_alone_do_not_change_the_sign(seed, reference):
 
 def test_a_vehicle_that_does_not_turn_is_not_judged():
     flight = flown(CRAZYFLIE, 0)
-    still = Flight(flight.time, flight.omega, 0.001 * np.asarray(flight.states), commanded=True)
+    still = flight._replace(states=0.001 * flight.states)
     assert opposite_axes([still], turned(CRAZYFLIE, "rotor_spins")) == []
     assert opposite_axes([], CRAZYFLIE) == []
     assert opposite_note([]) == ""
 
 
 def test_a_fit_is_refused_with_the_remedy():
-    recording = Recording(flown(CRAZYFLIE, 0), "a.bbl")
+    recording = flown(CRAZYFLIE, 0)
     with pytest.raises(InputError, match=r"a.bbl: yaw answers .* \(props in or out\); change all four signs"):
         prepare([recording], turned(CRAZYFLIE, "rotor_spins"))
     with pytest.raises(
@@ -81,7 +81,7 @@ def test_a_fit_is_refused_with_the_remedy():
 
 @pytest.mark.parametrize("name", ["rollpitch", "yaw_a", "hover"])
 def test_real_flights(name, shared_flights):
-    flight, _ = read_log(shared_flights / f"arpl_crazyflie_{name}.csv", CRAZYFLIE)
+    flight = read_recording(shared_flights / f"arpl_crazyflie_{name}.csv", CRAZYFLIE)
     parts = [cut(flight, stretch) for stretch in usable_stretches(flight, CRAZYFLIE)]
     assert opposite_axes(parts, CRAZYFLIE) == []
     assert opposite_axes(parts, turned(CRAZYFLIE, "rotor_spins")) == ["yaw"]
@@ -89,7 +89,7 @@ def test_real_flights(name, shared_flights):
 
 
 def test_inspect_questions_the_spins(run, tmp_path):
-    write_flight(flown(CRAZYFLIE, 0), tmp_path / "flight.csv")
+    write_flight(flown(CRAZYFLIE, 0).flight, tmp_path / "flight.csv")
     lines = [f"{name} = {np.asarray(getattr(CRAZYFLIE, name)).tolist()}" for name in CRAZYFLIE.__dataclass_fields__]
     good = "\n".join(lines)
     (tmp_path / "good.toml").write_text(good)
@@ -101,19 +101,36 @@ def test_inspect_questions_the_spins(run, tmp_path):
 
 
 def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():
-    flight = flown(CRAZYFLIE, 0, seconds=6.0)
-    resting = Recording(Flight(flight.time, 0.1 * np.asarray(flight.omega), flight.states, commanded=True), "other.csv")
+    flight = flown(CRAZYFLIE, 0, seconds=6.0, name="other.csv")
+    resting = flight._replace(omega=0.1 * flight.omega)
     options = {"sample_time": 0.004, "holdout": 0.0}
     with pytest.raises(InputError, match="the vehicle never flew .* or `begin` and `end`"):
         prepare([resting], CRAZYFLIE, **options)
     with pytest.raises(InputError, match="the vehicle never flew") as predicted:
         prepare([resting], CRAZYFLIE, **options, predicted=True)
-    slow = Recording(Flight(*(np.asarray(x)[::5] for x in (flight.time, flight.omega, flight.states))), "other.csv")
+    slow = flight.rows(slice(None, None, 5))._replace(commanded=False)
     with pytest.raises(InputError, match="other.csv: has one sample every 0.02 s.* or another `validate`") as slower:
         prepare([slow], CRAZYFLIE, **options, predicted=True)
     for error in (predicted, slower):
         assert "`begin`" not in str(error.value)
-    rest = np.asarray(flight.omega) * (np.asarray(flight.time)[:, None] > 2)
-    partly = Recording(Flight(flight.time, rest, flight.states, commanded=True), "other.csv")
+    partly = flight._replace(omega=flight.omega * (flight.time[:, None] > 2))
     assert "(`begin` and `end` override)" in prepare([partly], CRAZYFLIE, **options).notes[-1]
     assert "override" not in prepare([partly], CRAZYFLIE, **options, predicted=True).notes[-1]
+
+
+@pytest.mark.parametrize("name", ["arpl_crazyflie_yaw_a.csv", "nanobench/B2_circle_fast_rep2.csv"])
+def test_single_precision_rounds_the_cleaned_data_once(name, shared_flights):
+    """Reading, cutting, averaging and joining compute in double precision; only the flight to fit is rounded."""
+
+    def cleaned():
+        prepared = prepare([read_recording(shared_flights / name, CRAZYFLIE)], CRAZYFLIE, begin=1.0, end=6.0)
+        return jax.tree.leaves((prepared.fitted, prepared.tested)), prepared.seconds
+
+    double, seconds = cleaned()
+    with jax.enable_x64(False):
+        single, same_seconds = cleaned()
+    assert seconds == same_seconds
+    assert len(single) == len(double) > 6
+    for one, two in zip(single, double, strict=True):
+        assert one.dtype in (np.float32, np.int32)
+        np.testing.assert_array_equal(one, np.asarray(two).astype(one.dtype))

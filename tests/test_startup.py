@@ -8,13 +8,14 @@ import pathlib
 import shutil
 import subprocess
 import sys
+import warnings
 
 import jax
 import pytest
 
 import jaxos4
-from jaxos4._xla import WHOLE_LOOPS, compile_loops_whole
-from jaxos4.cli import _choices, _jax, train
+from jaxos4._xla import NATIVE_LOOPS, NO_OPTIONS, make_loops_native
+from jaxos4.cli import _jax, _options, train
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import EXCITATIONS
@@ -25,19 +26,8 @@ from jaxos4.simulation import METHODS
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 # Libraries that only some commands need, and that are slow to import.
-HEAVY = {
-    "diffrax",
-    "lineax",
-    "optax",
-    "optimistix",
-    "xarray",
-    "h5netcdf",
-    "h5py",
-    "matplotlib",
-    "jinja2",
-    "pandas",
-    "dask",
-}
+HEAVY = set("diffrax lineax optax optimistix xarray h5netcdf h5py matplotlib jinja2 pandas dask".split())
+CORE = {"jax", "equinox", "jaxtyping", "numpy", "msgspec"}
 COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
 # Prints the loaded packages when the process ends, however it ends.
 LIST = "import atexit, sys; atexit.register(lambda: print('\\nloaded', *{name.split('.')[0] for name in sys.modules}));"
@@ -101,14 +91,14 @@ def test_help_and_mistakes_import_no_library():
     for (line, code, said), (answered, ended, printed, packages) in zip(LINES, answers, strict=True):
         assert (answered, ended) == (line, code)
         assert said in printed, line
-        assert not set(packages) & (HEAVY | {"jax", "equinox", "jaxtyping", "numpy", "msgspec"}), line
+        assert not set(packages) & (HEAVY | CORE), line
 
 
 def test_shell_completion_offers_estimators_and_imports_no_library():
     line = {"COMP_WORDS": "jaxos4 estimate flight.csv --estimator ", "COMP_CWORD": "4"}
     process, packages = loaded(_JAXOS4_COMPLETE="complete_bash", **line)
     assert process.stdout.split()[: len(ESTIMATORS)] == list(ESTIMATORS)
-    assert not packages & (HEAVY | {"jax", "equinox", "jaxtyping", "numpy", "msgspec"})
+    assert not packages & (HEAVY | CORE)
 
 
 def test_the_package_imports_what_is_used():
@@ -148,20 +138,13 @@ import diffrax
 
 
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables():
-    assert list(_choices.Estimator) == list(ESTIMATORS)
-    assert list(_choices.Model) == list(MODELS)
-    assert list(_choices.Excitation) == list(EXCITATIONS)
-    assert list(_choices.Method) == list(METHODS)
-    assert list(_choices.Sensors) == list(LOGGED)
-    assert list(_choices.Channels) == list(CHANNELS)
-    assert list(_choices.Features) == list(FEATURES)
-    assert list(_choices.Approximator) == list(APPROXIMATORS)
+    tables = {"Estimator": ESTIMATORS, "Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
+    tables |= {"Channels": CHANNELS, "Features": FEATURES, "Approximator": APPROXIMATORS}
+    for name, table in tables.items():
+        assert list(getattr(_options, name)) == list(table)
     defaults = {name: argument.default for name, argument in inspect.signature(train.train).parameters.items()}
-    assert (defaults["noise"], defaults["steps"]) == (NetworkEstimator.noise, NetworkEstimator.steps)
-    assert (defaults["features"], defaults["approximator"]) == (
-        NetworkEstimator.features,
-        NetworkEstimator.approximator,
-    )
+    for name in ("noise", "steps", "features", "approximator"):
+        assert defaults[name] == getattr(NetworkEstimator, name)
 
 
 # The cache of compiled programs.
@@ -187,26 +170,20 @@ def filled(tmp_path_factory):
     return home, misses
 
 
-def test_the_second_command_finds_the_programs_of_the_first(filled, tmp_path):
+def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwise(filled, tmp_path):
     home, count = filled
     assert programs(*SIMULATE, cwd=tmp_path, **home) == (count, 0)
-
-
-def test_the_cache_can_be_switched_off_or_put_elsewhere(filled, tmp_path):
-    home, count = filled
     assert programs(*SIMULATE, cwd=tmp_path, JAXOS4_NO_CACHE="1", **home) == (0, 0)
     chosen = tmp_path / "chosen"
     assert programs(*SIMULATE, cwd=tmp_path, JAX_COMPILATION_CACHE_DIR=str(chosen), **home) == (0, count)
     assert len(list(chosen.iterdir())) >= count
-
-
-def test_a_program_that_was_cut_off_is_compiled_again_in_silence(filled, tmp_path):
-    shutil.copytree(filled[0]["XDG_CACHE_HOME"], tmp_path / "cache")
+    # A program that was cut off is compiled again, in silence.
+    shutil.copytree(home["XDG_CACHE_HOME"], tmp_path / "cache")
     for path in (tmp_path / "cache").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[:100])
-    home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    assert programs(*SIMULATE, cwd=tmp_path, **home)[0] == 0
+    cut = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    assert programs(*SIMULATE, cwd=tmp_path, **cut)[0] == 0
 
 
 def test_a_cache_folder_that_cannot_be_used_is_no_error(tmp_path):
@@ -215,21 +192,17 @@ def test_a_cache_folder_that_cannot_be_used_is_no_error(tmp_path):
     assert (process.returncode, process.stderr) == (0, "")
 
 
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="needs a user who may not write everywhere")
-def test_a_read_only_cache_folder_is_not_used(tmp_path, monkeypatch):
-    for name in ("HOME", "XDG_CACHE_HOME"):
-        monkeypatch.setenv(name, str(tmp_path))
-    folder = _jax._usable_folder()
-    assert folder is not None
-    folder.chmod(0o500)
-    assert _jax._usable_folder() is None
+@pytest.mark.skipif(not pathlib.Path("/proc").is_dir(), reason="no /proc, which is read-only for everybody")
+def test_a_folder_that_cannot_hold_programs_is_not_used(tmp_path, monkeypatch):
+    def usable(home):
+        for name in ("HOME", "XDG_CACHE_HOME"):
+            monkeypatch.setenv(name, str(home))
+        return _jax._usable_folder() is not None
 
-
-@pytest.mark.skipif(not pathlib.Path("/proc").is_dir(), reason="/proc is read-only for everybody")
-def test_a_cache_on_a_read_only_disk_is_not_used(monkeypatch):
-    for name in ("HOME", "XDG_CACHE_HOME"):
-        monkeypatch.setenv(name, "/proc/none")
-    assert _jax._usable_folder() is None
+    assert usable(tmp_path)
+    assert not usable("/proc/none")
+    monkeypatch.setattr(_jax.shutil, "disk_usage", lambda path: type("usage", (), {"free": 0})())
+    assert not usable(tmp_path)
 
 
 def test_the_cache_is_limited_and_keeps_what_was_used_last(tmp_path):
@@ -240,14 +213,6 @@ def test_the_cache_is_limited_and_keeps_what_was_used_last(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
     _jax._remove_oldest(tmp_path, 39)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a"]
-
-
-def test_a_full_disk_is_not_filled_further(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert _jax._usable_folder() is not None
-    monkeypatch.setattr(_jax.shutil, "disk_usage", lambda path: type("usage", (), {"free": 0})())
-    assert _jax._usable_folder() is None
 
 
 def test_a_command_keeps_the_settings_of_its_process(run):
@@ -270,38 +235,85 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
     assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52
 
 
-def test_commands_that_compute_little_compile_quickly(run, save, monkeypatch):
-    asked, wrong = [], str(save("wrong = 1", "wrong.toml"))
-    monkeypatch.setattr("jaxos4.cli._app.prepare", asked.append)
-    for command in ("study", wrong, "--out", "out"), ("estimate", wrong), ("compare", "--quick", "--out", wrong):
-        assert run(*command)[0] == 2
-    assert asked == [WHOLE_LOOPS, _jax.QUICK_TO_COMPILE, _jax.QUICK_TO_COMPILE]
+# The options of XLA.
 
 
 @pytest.mark.parametrize(
-    ("version", "own", "flags"),
+    ("variables", "flags"),
     [
-        ("0.10.2", None, _jax.QUICK_TO_COMPILE),
-        ("1.0.0", None, WHOLE_LOOPS),
-        ("0.10.2", "--own=1", f"--own=1 {WHOLE_LOOPS}"),
-        ("0.10.2", "--xla_backend_extra_options=own=1", f"--xla_backend_extra_options=own=1 {WHOLE_LOOPS}"),
-        ("0.10.2", WHOLE_LOOPS.replace("1000000000", "1000"), WHOLE_LOOPS.replace("1000000000", "1000")),
-        ("0.10.2", "flags.txt", "flags.txt"),
+        ({}, NATIVE_LOOPS),
+        ({"XLA_FLAGS": "--own=1"}, f"--own=1 {NATIVE_LOOPS}"),
+        ({"XLA_FLAGS": "--xla_backend_extra_options=own=1"}, f"--xla_backend_extra_options=own=1 {NATIVE_LOOPS}"),
+        ({"XLA_FLAGS": NATIVE_LOOPS.replace("1000000000", "1000")}, NATIVE_LOOPS.replace("1000000000", "1000")),
+        ({"XLA_FLAGS": "flags.txt"}, "flags.txt"),
+        ({"XLA_FLAGS": "--own=1", NO_OPTIONS: "1"}, "--own=1"),
+        ({NO_OPTIONS: "1"}, None),
     ],
 )
-def test_flags_of_xla_are_set_for_versions_that_know_them_and_never_replaced(version, own, flags, monkeypatch):
-    monkeypatch.setattr("jaxlib.version.__version__", version)
-    monkeypatch.delenv("XLA_FLAGS", raising=False)
-    if own is not None:
-        monkeypatch.setenv("XLA_FLAGS", own)
-    compile_loops_whole()
-    _jax.set_flags(_jax.QUICK_TO_COMPILE)
+def test_the_import_makes_loops_native_and_replaces_no_flag(variables, flags, monkeypatch):
+    for name in ("XLA_FLAGS", NO_OPTIONS):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # JAX has computed in this process
+        make_loops_native()
     assert os.environ.get("XLA_FLAGS") == flags
 
 
-def test_the_import_makes_loops_native():
-    """In a process of its own: the flags of this one are set for tests."""
-    code = "import os, jaxos4; print(os.environ['XLA_FLAGS'])"
-    unset = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=unset, check=True)
-    assert done.stdout.strip() == WHOLE_LOOPS
+@pytest.mark.parametrize(
+    ("before", "variables", "warned"),
+    [
+        ("import jax", {}, 0),
+        ("import jax; jax.devices()", {}, 1),
+        ("import jax; jax.devices()", {NO_OPTIONS: "1"}, 0),
+        ("import jax; jax.devices()", {"XLA_FLAGS": NATIVE_LOOPS}, 0),
+    ],
+)
+def test_one_warning_says_that_the_import_comes_too_late(before, variables, warned):
+    code = f"{before}; import jaxos4; from jaxos4 import IBSS, _xla; _xla.make_loops_native()"
+    process = start(code=code, **{"XLA_FLAGS": ""} | variables)
+    assert process.returncode == 0
+    assert process.stderr.count("RuntimeWarning: JAX has computed before `import jaxos4`") == warned
+
+
+# Prints the options of each program that is compiled: the whole key of the cache would be private to JAX.
+QUICKLY = """
+import json, os, sys
+import jax, jax.numpy as jnp, numpy as np
+from jax._src import compiler
+from jaxos4._xla import NATIVE_LOOPS, quick_jit
+
+seen, original = [], compiler.get_compile_options
+def spy(*args, **kwargs):
+    seen.append(bool(kwargs.get("env_options_overrides")))
+    return original(*args, **kwargs)
+compiler.get_compile_options = spy
+
+twice = quick_jit(lambda x, *, scale: 2 * x * scale)
+x, xs = np.ones(3), np.ones((2, 3))
+uses = {
+    "alone": lambda: twice(x, scale=1.0),
+    "jit": lambda: jax.jit(lambda x: twice(x, scale=1.0))(x),
+    "constant": lambda: jax.jit(lambda: twice(x, scale=1.0))(),
+    "vmap": lambda: jax.vmap(lambda x: twice(x, scale=1.0))(xs),
+    "grad": lambda: jax.grad(lambda x: twice(x, scale=1.0).sum())(x),
+    "loop": lambda: jax.lax.scan(lambda c, _: (twice(c, scale=1.0), None), x, None, 1)[0],
+}
+for name, use in uses.items():
+    seen.clear()
+    value = np.asarray(use())
+    assert np.all(value == 2), name
+    print(name, any(seen))
+print(os.environ.get("XLA_FLAGS") in (NATIVE_LOOPS, ""))
+"""
+
+
+@pytest.mark.parametrize("off", [False, True])
+def test_only_a_program_that_is_called_alone_is_compiled_quickly_and_no_flag_of_the_process_says_so(off):
+    process = start(code=QUICKLY, XLA_FLAGS="", **{NO_OPTIONS: "1"} if off else {})
+    *programs, untouched = process.stdout.splitlines()
+    assert process.returncode == 0, process.stderr
+    alone = [f"alone {not off}", "jit False", "constant False", "vmap False", "grad False", "loop False"]
+    assert programs == alone
+    assert untouched == "True"

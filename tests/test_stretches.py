@@ -3,15 +3,16 @@
 import equinox as eqx
 import numpy as np
 import pytest
+from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
-from test_flight_csv import CRAZYFLIE, identical
 
 from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.logs import read_log
-from jaxos4.recording import stretches
-from jaxos4.recording.excited import excitation, gyro_noise
-from jaxos4.recording.usable import Stretch, cut, nothing_usable, usable_stretches
+from jaxos4.recording import Recording, stretches
+from jaxos4.recording.motion import excitation, gyro_noise
+from jaxos4.recording.pieces import cut
+from jaxos4.recording.usable import Stretch, nothing_usable, usable_stretches
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)
@@ -28,101 +29,92 @@ def hovering(seconds=20.0, *, dt=DT, noise=0.01, start=0.0, rest=()):
     force = np.tile([0.0, 0.0, 9.81], (time.size, 1)) + rng.normal(0, 0.3, (time.size, 3))
     for begin, end in rest:
         omega[(time >= begin) & (time <= end)] = 0.0
-    return time, omega, states, force
+    return Recording(time, omega, states, force)
 
 
-def flight_of(parts):
-    return Flight(*parts)
+def reasons(recording, airframe=CRAZYFLIE):
+    return [part.reason for part in stretches(recording, airframe)]
 
 
-def reasons(flight, airframe=CRAZYFLIE):
-    return [(round(part.begin, 2), round(part.end, 2), part.reason) for part in stretches(flight, airframe)]
+def changed(rows, *, omega=None, states=None, force=None, **options):
+    """A hover in which these values of rotors, states or force are replaced in some rows."""
+    flight = hovering(**options)
+    for array, change in ((flight.omega, omega), (flight.states, states), (flight.specific_force, force)):
+        if change is not None:
+            columns, values = change
+            array[rows, columns] = values
+    return flight
 
 
-def test_a_flight_without_faults_is_one_stretch():
-    flight = flight_of(hovering())
-    assert usable_stretches(flight, CRAZYFLIE) == (Stretch(0.0, pytest.approx(20.0)),)
+def at(begin, end):
+    return slice(round(begin / DT), round(end / DT))
 
 
+IDLE = "rotor 1, 2, 3, 4 at rest or idle"
+RAMP = -34.9 + 0.01 * np.arange(20)
+CASES = {
+    "no fault": (hovering(), [""]),
+    "ground": (hovering(rest=((0, 3), (17, 20))), ["on the ground", "", "on the ground"]),
+    "a burst on the ground": (hovering(rest=((0, 3), (3.3, 6))), ["on the ground", ""]),
+    "a pause in the air": (hovering(rest=((10, 10.3),)), ["", IDLE, ""]),
+    "full speed": (changed(at(5, 5.4), omega=(2, 2500.0)), ["", "rotor 3 at full speed", ""]),
+    "clipped below full speed": (changed(at(5, 5.4), omega=(2, 2300.0)), ["", "rotor 3 at full speed", ""]),
+    "full speed for a moment": (changed(at(12, 12.05), omega=(2, 2500.0)), [""]),
+    "constant rotors": (changed(slice(None), omega=(slice(None), HOVER)), [""]),
+    "clipped gyro": (changed(slice(1000, 1020), states=(R, -34.9)), ["", "the gyro is clipped", ""]),
+    "fast gyro": (changed(slice(1000, 1020), states=(R, RAMP)), [""]),
+    "a gap": (changed(slice(1000, 1100), states=(slice(None), np.nan)), ["", "nothing was measured", ""]),
+    "a gap of a moment": (changed(slice(2000, 2004), states=(P, np.nan)), [""]),
+    "crash, by the force": (
+        changed(slice(3000, 3003), force=(slice(None), [90, 0, 40]), rest=((15.2, 20),)),
+        ["", "an impact", "on the ground"],
+    ),
+    "crash, by the rates": (
+        changed(slice(3000, None), states=(Q, 25.0), rest=((15.2, 20),)),
+        ["", "an impact", "on the ground"],
+    ),
+    "a bump in flight": (changed(2000, force=(slice(None), [90, 0, 40])), [""]),
+    "a bump where the record ends": (changed(-40, force=(slice(None), [90, 0, 40])), ["", "an impact"]),
+    "a short part": (
+        hovering(rest=((5, 5.3), (6, 6.3))),
+        ["", IDLE, "less than 1 s between others", IDLE, ""],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_reason_to_leave_a_part_out(case):
+    flight, expected = CASES[case]
+    assert reasons(flight) == expected
+    assert all(part.length >= 0.99 for part in usable_stretches(flight, CRAZYFLIE))
+
+
+@pytest.mark.parametrize(
+    ("case", "ends"),
+    [
+        ("ground", (3.3, 16.7)),
+        ("a burst on the ground", (6.3, 20.0)),
+        ("full speed", (0.0, 5.0)),
+        ("crash, by the force", (0.0, 14.5)),
+        ("crash, by the rates", (0.0, 14.5)),
+    ],
+)
 @pytest.mark.parametrize("airframe", [CRAZYFLIE, None])
-def test_the_ground_is_left_out_with_a_margin(airframe):
-    flight = flight_of(hovering(rest=((0, 3), (17, 20))))
-    assert [reason for *_, reason in reasons(flight, airframe)] == ["on the ground", "", "on the ground"]
-    (usable,) = usable_stretches(flight, airframe)
-    assert (usable.begin, usable.end) == (pytest.approx(3.3, abs=0.02), pytest.approx(16.7, abs=0.02))
+def test_parts_end_with_a_margin(case, ends, airframe):
+    usable = usable_stretches(CASES[case][0], airframe)[0]
+    assert (usable.begin, usable.end) == (pytest.approx(ends[0], abs=0.02), pytest.approx(ends[1], abs=0.02))
 
 
 def test_another_vehicles_airframe_does_not_ground_a_flight():
     heavy = eqx.tree_at(lambda a: a.mass, CRAZYFLIE, np.asarray(2.7))
-    assert len(usable_stretches(flight_of(hovering()), heavy)) == 1
+    assert len(usable_stretches(hovering(), heavy)) == 1
 
 
-def test_a_burst_on_the_ground_is_no_flight_and_a_pause_in_the_air_no_landing():
-    parts = hovering(rest=((0, 3), (3.3, 6)))
-    found = reasons(flight_of(parts))
-    assert found[0][2] == "on the ground"
-    assert found[0][1] == pytest.approx(6.3, abs=0.02)
-    parts = hovering(rest=((10, 10.3),))
-    assert [reason for *_, reason in reasons(flight_of(parts))] == ["", "rotor 1, 2, 3, 4 at rest or idle", ""]
-
-
-@pytest.mark.parametrize("clipped", [2500.0, 2300.0])
-def test_a_rotor_at_its_limit_is_left_out_if_for_longer_than_a_moment(clipped):
-    """At full scale, or clipped at another value."""
-    parts = hovering()
-    assert clipped > 1.3 * np.median(parts[1])
-    for begin, length in ((5.0, 0.4), (12.0, 0.05)):
-        parts[1][round(begin / DT) : round((begin + length) / DT), 2] = clipped
-    found = reasons(flight_of(parts))
-    assert [reason for *_, reason in found] == ["", "rotor 3 at full speed", ""]
-    assert found[1][:2] == (pytest.approx(5.0, abs=0.02), pytest.approx(5.4, abs=0.02))
-
-
-def test_constant_rotors_are_not_clipped():
-    time, omega, states, force = hovering()
-    omega[:] = HOVER
-    assert len(stretches(Flight(time, omega, states, force), CRAZYFLIE)) == 1
-
-
-def test_a_clipped_gyro_is_left_out():
-    parts = hovering()
-    parts[2][1000:1020, R] = -34.9
-    found = reasons(flight_of(parts))
-    assert [reason for *_, reason in found] == ["", "the gyro is clipped", ""]
-    parts[2][1000:1020, R] = -34.9 + 0.01 * np.arange(20)
-    assert len(reasons(flight_of(parts))) == 1
-
-
-def test_gaps_are_left_out():
-    parts = hovering()
-    parts[2][1000:1100] = np.nan
-    parts[2][2000:2004, P] = np.nan  # a moment
-    found = reasons(flight_of(parts))
-    assert [reason for *_, reason in found] == ["", "nothing was measured", ""]
-    states = np.full_like(parts[2], np.nan)
-    states[::10, PHI] = 0.1  # a slow sensor alone has no gaps
-    assert len(reasons(Flight(parts[0], parts[1], states))) == 1
-
-
-@pytest.mark.parametrize("sign", ["force", "rate"])
-def test_a_crash_is_left_out_from_before_it(sign):
-    time, omega, states, force = hovering(rest=((15.2, 20),))
-    at = round(15 / DT)
-    if sign == "force":
-        force[at : at + 3] = [90, 0, 40]
-    else:
-        states[at:, Q] += 25
-    found = reasons(Flight(time, omega, states, force))
-    assert [reason for *_, reason in found] == ["", "an impact", "on the ground"]
-    assert found[0][1] == pytest.approx(14.5, abs=0.02)
-
-
-def test_a_bump_in_flight_is_no_crash():
-    time, omega, states, force = hovering()
-    force[2000] = [90, 0, 40]
-    assert len(reasons(Flight(time, omega, states, force))) == 1
-    force[-40] = [90, 0, 40]  # and where the record ends, it is one
-    assert reasons(Flight(time, omega, states, force))[-1][2] == "an impact"
+def test_a_slow_sensor_alone_has_no_gaps():
+    flight = hovering()
+    flight.states[:] = np.nan
+    flight.states[::10, PHI] = 0.1
+    assert len(reasons(flight._replace(specific_force=None))) == 1
 
 
 # Ground and flight by the accelerometer
@@ -207,13 +199,6 @@ def test_idle_commands_are_no_flight(command, flies):
     assert usable_stretches(measured)
 
 
-def test_short_parts_between_others_are_left_out():
-    parts = hovering(rest=((5, 5.3), (6, 6.3)))
-    found = reasons(flight_of(parts))
-    assert [reason for *_, reason in found].count("less than 1 s between others") == 1
-    assert all(stretch.length >= 0.99 for stretch in usable_stretches(flight_of(parts), CRAZYFLIE))
-
-
 @given(seed=st.integers(0, 999))
 @settings(max_examples=40)
 def test_parts_are_the_flight(seed):
@@ -241,18 +226,19 @@ def test_parts_are_the_flight(seed):
 
 
 def test_a_cut_keeps_time_and_rows():
-    flight = flight_of(hovering(start=100.0))
+    flight = hovering(start=100.0)
     part = cut(flight, Stretch(103.0, 104.0))
     assert (float(part.time[0]), float(part.time[-1])) == (pytest.approx(103.0), pytest.approx(104.0))
-    assert identical(part.omega, flight.omega[600:801])
-    assert identical(part.specific_force, flight.specific_force[600:801])
-    bare = cut(Flight(flight.time, flight.omega, flight.states), Stretch(0, 200))
+    np.testing.assert_array_equal(part.omega, flight.omega[600:801])
+    np.testing.assert_array_equal(part.specific_force, flight.specific_force[600:801])
+    bare = cut(Flight(flight.time, flight.omega, flight.states), Stretch(0, 200))  # a `Flight` gives a `Flight`
+    assert isinstance(bare, Flight)
     assert bare.specific_force is None
     assert bare.time.size == flight.time.size
 
 
 def test_a_part_beyond_the_flight_is_refused():
-    flight = flight_of(hovering())
+    flight = hovering()
     with pytest.raises(
         InputError, match="from 30 s to 40 s: fewer than two samples; the flight lasts from 0 s to 20 s"
     ):
@@ -263,7 +249,7 @@ def test_a_part_beyond_the_flight_is_refused():
 
 
 def test_excitation_is_the_spread_of_torque_and_rate():
-    flight = flight_of(hovering())
+    flight = hovering()
     roll, pitch, yaw = excitation(flight, CRAZYFLIE)
     assert (roll.verdict, pitch.verdict, yaw.verdict) == ("good", "weak", "none")
     assert roll.rate == pytest.approx(1 / np.sqrt(2), rel=0.02)
@@ -275,10 +261,10 @@ def test_excitation_is_the_spread_of_torque_and_rate():
 
 
 def test_angles_stand_in_for_rates():
-    time, omega, states, _ = hovering()
-    only = np.full_like(states, np.nan)
-    only[::4, PHI] = -0.2 * np.cos(5 * time[::4])
-    roll, pitch, _ = excitation(Flight(time, omega, only), CRAZYFLIE)
+    flight = hovering()
+    flight.states[:] = np.nan
+    flight.states[::4, PHI] = -0.2 * np.cos(5 * flight.time[::4])
+    roll, pitch, _ = excitation(flight, CRAZYFLIE)
     assert roll.rate == pytest.approx(1 / np.sqrt(2), rel=0.02)
     assert pitch.verdict == "not measured"
 

@@ -31,7 +31,6 @@ from jaxos4.study import (
     run as run_module,
 )
 from jaxos4.study.cell import run_cell
-from jaxos4.study.run import _Work as Work
 from jaxos4.study.specification import AXES
 
 SPECIFICATION = """
@@ -205,52 +204,13 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
     study = Study(channels=("rates", "attitude"), estimators=("network", "hybrid", "ibss"), flights=250, batch=100)
     with open_store(tmp_path, study, "these tests") as store:
         for cell in (cell for cell in study.cells() if cell.scenario.estimator == "ibss" and cell.first == 0):
-            store.write(store.cell_file(cell.number), b"", cell=cell.number, seconds=2.0 + cell.scenario.scale)
+            store.write_cell(cell.number, b"", 2.0 + cell.scenario.scale)
     network, hybrid, ibss = plan(study, tmp_path)
     assert network == ("network", 18, 1500, 1, 1, None)
     # One more network, for the attitude. Three programs: that network and two searches.
     assert hybrid == ("hybrid", 18, 1500, 3, 1, None)
     assert ibss[:5] == ("ibss", 12, 900, 0, 0)  # the same searches
     assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / len(jax.local_devices()))
-
-
-def labels(work, device, count):
-    """The labels of the next tasks for a device; `None` if it must wait."""
-    return [task and task.label for task in (work.task(device) for _ in range(count))]
-
-
-@pytest.mark.parametrize(
-    ("estimators", "channels", "compiled"),
-    [
-        (("ibss", "network", "hybrid"), "rates", {"hybrid": "rates"}),
-        (("network", "ibss"), "rates", {"network": "rates"}),
-        (("ibss", "hybrid"), "all", {"hybrid": "all"}),
-        (("ibss", "network", "hybrid"), "all", {"network": "rates", "hybrid": "all"}),
-    ],
-)
-def test_programs_of_each_network_are_compiled_while_it_is_trained_before_any_cell(
-    tmp_path, estimators, channels, compiled
-):
-    """`compiled`: the estimators whose programs are compiled, and the channels of their networks."""
-    study = Study(channels=(channels,), estimators=estimators, flights=20)
-    with open_store(tmp_path, study, "these tests") as store:
-        work = Work(store)
-        assert labels(work, "one", len(compiled)) == [f"training for {seen}" for seen in compiled.values()]
-        expected = [*(f"compiling {name}" for name in compiled), "ibss 0.1", "ibss 1", "ibss 10", None]
-        assert labels(work, "another", len(expected)) == expected
-
-
-def test_after_its_training_a_device_takes_what_no_other_one_runs(tmp_path):
-    study = Study(channels=("rates",), estimators=("ibss", "network", "hybrid"), flights=20)
-    with open_store(tmp_path, study, "these tests") as store:
-        store.network_file(0).touch()  # of a finished training: it is only read
-        work = Work(store)
-        assert labels(work, "one", 1) == ["training for rates"]
-        assert labels(work, "another", 4) == ["ibss 0.1", "ibss 1", "ibss 10", None]
-        work.networks[0] = "training diverged"
-        assert labels(work, "one", 4) == ["network 0.1", "network 1", "network 10", None]
-        # The search of the hybrid is that of IBSS.
-        assert labels(work, "another", 4) == ["hybrid 0.1", "hybrid 1", "hybrid 10", None]
 
 
 # The grid.
@@ -415,7 +375,7 @@ def test_all_brackets_are_off_the_airframe_by_one_draw():
     model = jaxos4.PublishedOS4(jaxos4.OS4)
     u = jax.random.uniform(jax.random.fold_in(jax.random.key(7), 0), (8,), minval=-0.8, maxval=0.8)
     for width in study.widths:
-        bracket = flights_module.bracket_of(study, "published", "os4", width)
+        bracket = flights_module.fleet_of(study, study.cell(0).scenario._replace(width=width)).bracket
         same(bracket.center, model.alpha + u * width * model.half_width, model.half_width)
         same(bracket.half_width, width * model.half_width)
         assert np.all((bracket.lower < model.alpha) & (model.alpha < bracket.upper))

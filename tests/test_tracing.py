@@ -6,7 +6,6 @@
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -71,17 +70,6 @@ def test_shoots_at_another_problem_without_another_trace(counted, what):
         eqx.filter_eval_shape(shoot, problem, 1.1 * problem.model.alpha, problem.first_state()[0])
         counts.append(count[0])
     assert counts[0] == counts[-1]
-
-
-def test_a_callers_own_function_is_traced_once():
-    @eqx.filter_jit
-    @once
-    def slope(problem, parameters):
-        return jax.jacfwd(problem.cost)(parameters)
-
-    for trial in range(3):
-        problem = problem_of(jaxos4.PublishedOS4, trial)
-        eqx.filter_eval_shape(slope, problem, problem.model.alpha)
 
 
 def test_identifies_another_flight_with_other_settings_without_another_trace():

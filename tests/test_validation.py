@@ -133,24 +133,28 @@ def test_missing_measurements_do_not_count():
     assert np.all(skill.skill > 1 - 1e-3)
 
 
+NEVER = np.where(np.arange(3) == 2, np.nan, 1.0)
+# Errors and changes of rates, and the skill of each rate.
+SKILLS = {
+    "nothing moves": (np.full((30, 1, 3), 0.1), 0.0, -np.inf),
+    "a rate that was never measured": (np.zeros((30, 1, 3)), NEVER, [1.0, 1.0, np.nan]),
+    "one start": (np.full((1, 1, 3), 0.1), 1.0, 0.99),
+}
+
+
+@pytest.mark.parametrize(("errors", "changes", "expected"), SKILLS.values(), ids=SKILLS)
+def test_the_skill_compares_errors_with_changes(errors, changes, expected):
+    skill = jaxos4.skill(synthetic(errors, changes))
+    np.testing.assert_allclose(skill.skill, np.broadcast_to(expected, (1, 3)))
+    assert skill.starts == len(errors)
+    assert np.isnan(skill.std).all() or skill.starts > 1
+
+
 def test_a_prediction_that_diverges_has_a_very_bad_skill():
     skill = jaxos4.skill(synthetic(np.where(np.arange(40) == 7, np.nan, 0.1)[:, None, None], 1.0))
     # It counts as an error that no gyro could measure.
     assert np.all(np.isfinite(skill.skill) & (skill.skill < -1e4))
     np.testing.assert_allclose(skill.rmse, np.sqrt((1e6 + 39 * 0.01) / 40), rtol=1e-2)
-
-
-def test_any_error_is_worse_than_persistence_if_nothing_moves():
-    skill = jaxos4.skill(synthetic(np.full((30, 1, 3), 0.1), 0.0))
-    assert np.all(np.isneginf(skill.skill))
-
-
-def test_a_rate_that_was_never_measured_has_no_skill():
-    nothing = synthetic(np.zeros((30, 1, 3)), 1.0)
-    measured = np.ones((30, 1, 3))
-    measured[:, :, 2] = np.nan
-    skill = jaxos4.skill(nothing._replace(measured=measured))
-    np.testing.assert_array_equal(skill.skill, [[1.0, 1.0, np.nan]])
 
 
 def test_the_jackknife_is_the_spread_of_the_skill():
@@ -173,26 +177,14 @@ def test_the_jackknife_is_the_spread_of_the_skill():
     np.testing.assert_allclose(jaxos4.skill(one).std, expected, rtol=1e-10)
 
 
-def test_a_single_start_has_a_skill_without_a_spread():
-    skill = jaxos4.skill(synthetic(np.full((1, 1, 3), 0.1), 1.0))
-    np.testing.assert_allclose(skill.skill, 0.99)
-    assert np.isnan(skill.std).all()
-    assert skill.starts == 1
-
-
 def test_flights_that_are_too_short_or_without_rates_are_refused():
     model = jaxos4.CorrectedOS4()
-    flight = flown(model, seconds=0.4)
-    with pytest.raises(ValueError, match=r"`flight` has no stretch .* longer than 0.5 s"):
-        spread(model, flight)
-    long = flown(model, seconds=3.0)
-    with pytest.raises(ValueError, match="no stretch with measured rates"):
-        spread(model, jaxos4.Flight(long.time, long.omega, jnp.full_like(long.states, jnp.nan)))
-    with pytest.raises(ValueError, match="longer than 0.5 s"):
-        spread(model, short_stretches(long))
-
-
-def short_stretches(flight):
-    """0.45 s each, none of which is long enough."""
-    samples = flight.time.shape[0]
-    return jaxos4.Flight(flight.time, flight.omega, flight.states, stretch=jnp.arange(samples) // 45)
+    long, short = flown(model, seconds=3.0), flown(model, seconds=0.4)
+    stretches = jnp.arange(long.time.shape[0]) // 45  # of 0.45 s
+    for flight, said in (
+        (short, r"`flight` has no stretch .* longer than 0.5 s"),
+        (jaxos4.Flight(long.time, long.omega, jnp.full_like(long.states, jnp.nan)), "no stretch with measured rates"),
+        (jaxos4.Flight(long.time, long.omega, long.states, stretch=stretches), "longer than 0.5 s"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            spread(model, flight)

@@ -6,6 +6,7 @@ that the cost of coloured and biased noise is visible. Without noise, errors are
 """
 
 import json
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,10 @@ from rich.console import Console
 import jaxos4
 from jaxos4.estimators import ESTIMATORS as ALL
 from jaxos4.noise import NOISES
-from jaxos4.report.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -1,6 +1,7 @@
 """The benchmark as a figure: time of one flight by contender, growth, and the roofline."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,11 @@ import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxos4.report.experiment import write_figure
 from jaxos4.report.style import FAINT, INK, log_axis, styles
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 _AXES = {"flights": "flights in one call", "steps": "steps (rates alone)", "unknowns": "unknowns"}
 

@@ -3,8 +3,7 @@
 from typing import Any
 
 from rich.console import Console
-
-from jaxos4.report.experiment import table_of
+from shared import table_of
 
 _RATIO = "times faster"
 

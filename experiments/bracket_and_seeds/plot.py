@@ -1,5 +1,6 @@
 """Plots RMSE / bound, hit rate and rollouts against the width of the bracket, with one line for each seed."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,13 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import dodged
+from jaxos4.report.study_figures import dodged
 from jaxos4.report.style import INK, grid, log_axis, styles
 from jaxos4.study import metrics
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 
 def draw(studies: list[xr.Dataset]) -> Figure:

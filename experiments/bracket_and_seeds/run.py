@@ -1,13 +1,17 @@
 """How do the network and the hybrid depend on the width of the bracket and on the random seed of the training?"""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from msgspec.structs import replace
 
-from jaxos4.report.experiment import run_studies, use_all_cores
 from jaxos4.study import load_study
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import run_studies, use_all_cores
 
 
 def main(

@@ -1,13 +1,17 @@
 """Bias and interval coverage of the moments of inertia against the strength of gusts, a line for each estimator."""
 
 import json
+import sys
 from pathlib import Path
 
 import typer
 from matplotlib.figure import Figure
 
-from jaxos4.report.experiment import write_figure
 from jaxos4.report.style import INK, grid, styles
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 INERTIAS = ("Ix", "Iy", "Iz")
 

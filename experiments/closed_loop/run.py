@@ -6,8 +6,9 @@ gusts with a correlation time of 0.25 s, rotors with a lag of 50 ms and a delay 
 gets an airframe whose moments of inertia are 25 % too large (even flights) or too small (odd flights); its mass, arms
 and thrust are right. The controller uses the same wrong moments.
 
-`equation-error` is a regression that knows the lag and the delay. All others are those of `jaxos4.identify`, with its
-default terms and the whole flight fitted.
+`equation-error` and `output-error` know the lag and the delay. `jaxos4.identify` refuses both for a vehicle, because
+they take a disturbance for noise of the sensors. All others are those of `jaxos4.identify`, with its default terms and
+the whole flight fitted.
 
 `--references` says what is flown: random steps, the standard 3-2-1-1 references, or those that
 `jaxos4.design_references` finds for the true airframe. All have the same length and the same largest angle.
@@ -15,6 +16,7 @@ default terms and the whole flight fitted.
 
 import itertools
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -27,8 +29,11 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.design import standard_references
-from jaxos4.report.experiment import count_results, in_words, table_of
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -46,14 +51,17 @@ VEHICLE = jaxos4.Airframe(
 LAG, DELAY = 0.05, 0.01
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 DT, WINDOW = 0.004, 62
-# Flights of one call of the regression, and its memory: the best on real flights.
-CHUNK, MEMORY = 25, 0.9
+# Standard deviation of the gyro's noise [rad/s].
+SIGMA = 0.02
+# Without a disturbance in their model. The regression's memory is the best on real flights.
+WITHOUT_DISTURBANCE = {"equation-error": jaxos4.EquationError(memory=0.9), "output-error": jaxos4.OutputError()}
+CHUNK = 25  # flights of one call
 # The largest references of all flights: angles [rad] and vertical acceleration [m/s^2].
 LARGEST = np.array([0.3, 0.3, 0.3, 1.5])
 
 
 def known_airframe(i: int, wrong: float) -> jaxos4.Airframe:
-    """What the estimator and the controller are told of flight i."""
+    """The data of flight i that the estimator and the controller know."""
     return eqx.tree_at(lambda a: a.inertia, VEHICLE, VEHICLE.inertia * (1 + wrong * (-1) ** i))
 
 
@@ -64,7 +72,7 @@ def references_of(kind: str, gust: float, duration: float, seed: int) -> np.ndar
     if kind == "designed":
         loop = jaxos4.ClosedLoop(VEHICLE, rotor_lag=LAG, rotor_delay=DELAY, gust=gust)
         settings = {"angle": LARGEST[0], "acceleration": LARGEST[3], "duration": duration, "dt": DT}
-        return jaxos4.design_references(loop, **settings, key=jax.random.key(seed)).references
+        return jaxos4.design_references(loop, **settings, key=jax.random.key(seed)).designed.inputs
     return standard_references(round(duration / DT) + 1, DT, LARGEST)[kind]
 
 
@@ -82,22 +90,25 @@ def fly(
 
 
 def turned_over(flight: jaxos4.Flight) -> bool:
-    """Whether the gusts threw the vehicle on its side: then it is lost, and nobody has its log."""
+    """True if the gusts threw the vehicle on its side: then it is lost, and nobody has its log."""
     angles = np.asarray(flight.states)[:, [jaxos4.STATE_NAMES.index(name) for name in ("phi", "theta")]]
     return bool(flight.result != jaxos4.RESULTS.successful) or bool((np.abs(angles) > np.pi / 2).any())
 
 
-@eqx.filter_jit
-def _regressions(flights: jaxos4.Flight, airframes: jaxos4.Airframe) -> jaxos4.Estimate:
-    def one(flight: jaxos4.Flight, airframe: jaxos4.Airframe) -> jaxos4.Estimate:
+def _fit(
+    estimator: jaxos4.AbstractEstimator, flights: jaxos4.Flight, airframes: jaxos4.Airframe
+) -> tuple[jaxos4.Estimate, jax.Array]:
+    """Estimates, and their standard deviations."""
+
+    def one(flight: jaxos4.Flight, airframe: jaxos4.Airframe) -> tuple[jaxos4.Estimate, jax.Array]:
         model = jaxos4.FlightModel(airframe, terms=("offset", "damping", "lag", "delay", "reaction"))
-        model = jaxos4.hold(model, {"rotor_lag": LAG, "rotor_delay": DELAY})
         windows = flight.time.shape[0] // WINDOW
         flight = jax.tree.map(lambda x: x[: windows * WINDOW] if x.ndim else x, flight)
         problem = jaxos4.ShootingProblem(
-            model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4", windows=windows
+            model, flight, sigma=np.full(12, SIGMA), channels="rates", method="rk4", windows=windows
         )
-        return jaxos4.EquationError(memory=MEMORY)(problem, jaxos4.Bracket.default(model))
+        found = estimator(problem.hold({"rotor_lag": LAG, "rotor_delay": DELAY}))
+        return found, found.std
 
     return eqx.filter_vmap(one)(flights, airframes)
 
@@ -107,22 +118,24 @@ def stacked(modules: list) -> object:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *modules)
 
 
-def regress(flights: list[tuple[int, jaxos4.Flight]], wrong: float) -> list[dict]:
-    """The rows of many flights by equation error. Their standard deviations are those of white gyro noise alone."""
+def fit(name: str, flights: list[tuple[int, jaxos4.Flight]], wrong: float) -> list[dict]:
+    """The rows of many flights without a disturbance. Their standard deviations are those of white gyro noise alone."""
     rows = []
     for first in range(0, len(flights), CHUNK):
         some = flights[first : first + CHUNK]
         padded = some + some[-1:] * (CHUNK - len(some))  # one program
+        batch = (stacked([f for _, f in padded]), stacked([known_airframe(i, wrong) for i, _ in padded]))
         begin = time.perf_counter()
-        found = _regressions(stacked([f for _, f in padded]), stacked([known_airframe(i, wrong) for i, _ in padded]))
-        results, seconds = jaxos4.result_names(jax.block_until_ready(found).result), time.perf_counter() - begin
-        alphas, stds = np.asarray(found.parameters), np.asarray(found.std)
+        found, stds = jax.block_until_ready(_fit(WITHOUT_DISTURBANCE[name], *batch))
+        results, seconds = jaxos4.result_names(found.result), time.perf_counter() - begin
+        alphas = np.asarray(found.parameters)
         for k, (i, _) in enumerate(some):
             row: dict = {"flight": i, "result": str(results[k]), "seconds": seconds / len(some)}
-            for name, alpha in INERTIAS.items():
+            for inertia, alpha in INERTIAS.items():
                 place = jaxos4.CorrectedOS4().parameter_names.index(alpha)
-                value, relative = 1 / alphas[k, place], stds[k, place] / alphas[k, place]
-                row[name] = {"estimate": value, "std": value * relative, "bound": value * relative}
+                value = 1 / alphas[k, place]
+                std = float(value * stds[k, place] / alphas[k, place])
+                row[inertia] = {"estimate": float(value), "std": std, "bound": std}
             rows.append(row)
     return rows
 
@@ -130,10 +143,11 @@ def regress(flights: list[tuple[int, jaxos4.Flight]], wrong: float) -> list[dict
 def search(estimator: str, flight: jaxos4.Flight, i: int, wrong: float) -> dict:
     """The row of one flight by an estimator of `jaxos4.identify`."""
     begin = time.perf_counter()
-    whole = {"begin": float(flight.time[0]), "end": float(flight.time[-1])}  # one length of all flights: one program
-    found = jaxos4.identify(flight, known_airframe(i, wrong), estimator=estimator, holdout=0.0, **whole)
+    # One length of all flights: one program.
+    whole = jaxos4.VehicleSettings(begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0)
+    found = jaxos4.identify(flight, known_airframe(i, wrong), settings=whole, estimator=estimator)
     row: dict = {"flight": i, "result": found.result, "seconds": time.perf_counter() - begin}
-    constants = {} if found.rigid_body is None else found.rigid_body.constants
+    constants = found.rigid_body.constants
     for name, alpha in INERTIAS.items():
         if name in constants:
             known, value = found.parameters[alpha], constants[name]
@@ -196,7 +210,6 @@ def print_table(report: dict, duration: float) -> None:
 
 def main(
     flights: Annotated[int, typer.Option(help="Number of flights for each strength.")] = 200,
-    searches: Annotated[int, typer.Option(help="The most flights for output error, which takes longest.")] = 50,
     gusts: Annotated[list[float], typer.Option(help="Standard deviations of the gusts [rad/s^2].")] = (5.0, 10.0, 20.0),
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
     seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 16,
@@ -206,7 +219,7 @@ def main(
     references: Annotated[list[str], typer.Option(help="random, designed, or a standard: 3211, doublet, ...")] = (
         "random",
     ),
-    wrong: Annotated[float, typer.Option(help="Error of the moments of inertia that are told, as a share.")] = 0.25,
+    wrong: Annotated[float, typer.Option(help="Error of the given moments of inertia, as a share.")] = 0.25,
     out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
 ) -> None:
     """Measure bias and coverage of moments of inertia over the strength of gusts."""
@@ -241,9 +254,9 @@ def main(
                 case = {**what, "flights": []}
                 report["cases"].append(case)
             done = {row["flight"] for row in case["flights"]}
-            wanted = [(i, flight) for i, flight in flown if i not in done and (i < searches or name != "output-error")]
-            if name == "equation-error":
-                case["flights"] += regress(wanted, wrong)
+            wanted = [(i, flight) for i, flight in flown if i not in done]
+            if name in WITHOUT_DISTURBANCE:
+                case["flights"] += fit(name, wanted, wrong)
                 save()
                 continue
             for i, flight in wanted:

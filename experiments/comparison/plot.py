@@ -1,5 +1,6 @@
 """The comparison as a coloured table: rows are estimators, columns are parameters, panels are noise scales."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,14 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import error_unit
-from jaxos4.report.numbers import plain
+from jaxos4.report.study_figures import error_unit
 from jaxos4.report.style import INK, PAPER, grid
+from jaxos4.report.text import plain
 from jaxos4.study import metrics
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 WORST = 30.0
 

@@ -6,6 +6,7 @@ flight and their covariance.
 """
 
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -18,8 +19,11 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.models import MODELS
-from jaxos4.report.experiment import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import PARAMETERS, brackets_around, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -6,6 +6,7 @@ standard inputs. Then IBSS identifies simulated flights of the designed input. T
 """
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -16,10 +17,13 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.design import Envelope, InputDesign, design_and_compare
-from jaxos4.design.fitting import VEHICLES, drawn, fly_finely
+from jaxos4.design import Design, Envelope
+from jaxos4.design.open_loop import VEHICLES, drawn, fly_finely
 from jaxos4.models import MODELS
-from jaxos4.report.experiment import brackets_around, count_results, identify, in_words, measure, table_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import brackets_around, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -30,36 +34,31 @@ WIDTHS = {"default": 1.0, "airframe": 1e-3}
 ONLY_AIRFRAME = ("corrected",)
 
 
-def designed(model: jaxos4.AbstractModel, channels: str, width: float, duration: float, seed: int) -> InputDesign:
+def designed(model: jaxos4.AbstractModel, channels: str, width: float, duration: float, seed: int) -> Design:
     """The input, and the standard inputs in the same envelope."""
-    return design_and_compare(
+    return jaxos4.design_input(
         model,
-        limits={},
         bracket=jaxos4.Bracket.around(model.alpha, width * np.asarray(model.half_width)),
         duration=duration,
         dt=DT,
         channels=channels,
         start_is_known=True,
-        criterion="D",
-        bandwidth=4.0,
-        seed=seed,
+        compare=True,
+        key=seed,
     )
 
 
-def excess(model: jaxos4.AbstractModel, found: InputDesign, width: float, seed: int) -> float:
+def excess(model: jaxos4.AbstractModel, found: Design, width: float, seed: int) -> float:
     """The largest share of a limit that other vehicles from the bracket use, at a tenth of the step."""
     bracket = jaxos4.Bracket.around(model.alpha, width * np.asarray(model.half_width))
     others = drawn(bracket, jax.random.key(seed + 1000), VEHICLES)
-    states = fly_finely(model, others, jnp.asarray(found.designed.omega), jnp.asarray(DT))
-    needed, limits = Envelope.of(found.designed.omega, states, DT), found.envelope
-    shares = [np.max(np.asarray(getattr(needed, name)) / getattr(limits, name)) for name in Envelope.__annotations__]
-    shares[0] = 1 / shares[0]  # the slowest rotor
-    return float(max(shares))
+    states = fly_finely(model, others, jnp.asarray(found.designed.inputs), jnp.asarray(DT))
+    return max(found.task.envelope.shares_of(Envelope.of(found.designed.inputs, states, DT)).values())
 
 
-def efficiency(model: jaxos4.AbstractModel, found: InputDesign, channels: str, flights: int, seed: int) -> dict:
+def efficiency(model: jaxos4.AbstractModel, found: Design, channels: str, flights: int, seed: int) -> dict:
     """RMSE / bound of each parameter over simulated flights, by IBSS."""
-    exact = jaxos4.simulate(model, model.alpha, jnp.asarray(found.designed.omega), dt=DT)
+    exact = jaxos4.simulate(model, model.alpha, jnp.asarray(found.designed.inputs), dt=DT)
     keys = jax.random.split(jax.random.key(seed), (2, flights))
     problem = jaxos4.ShootingProblem(
         model, exact, channels=channels, sigma=jaxos4.SENSOR_SIGMA, initial_state=exact.states[0]
@@ -69,7 +68,7 @@ def efficiency(model: jaxos4.AbstractModel, found: InputDesign, channels: str, f
     errors = np.asarray(estimates.parameters) - np.asarray(model.alpha)
     rmse = np.sqrt(np.square(errors).mean(axis=0))
     results = count_results(jaxos4.result_names(estimates.result))
-    return {"efficiency": (rmse / found.designed.bounds[-1]).tolist(), "results": results, "flights": flights}
+    return {"efficiency": (rmse / found.designed.bounds).tolist(), "results": results, "flights": flights}
 
 
 def main(
@@ -94,7 +93,7 @@ def main(
                         "channels": some,
                         "vehicles": vehicles,
                         "gains": {key: found.gain(key) for key in found.standard},
-                        "bounds": found.designed.bounds[-1].tolist(),
+                        "bounds": found.designed.bounds.tolist(),
                         "uses": found.designed.uses,
                         "others": excess(model, found, WIDTHS[vehicles], seed),
                         **efficiency(model, found, some, flights, seed),

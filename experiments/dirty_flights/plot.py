@@ -1,14 +1,18 @@
 """A row a parameter: the share of 95 % intervals that hold the truth, with two Monte-Carlo errors, of each airframe."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import typer
 from matplotlib.figure import Figure
 
-from jaxos4.report.experiment import write_figure
 from jaxos4.report.style import INK, grid, styles
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 
 def draw(report: dict) -> Figure:

@@ -3,8 +3,8 @@
 Each flight is simulated at 1 kHz by Runge-Kutta with its own true parameters: rotors follow their commands with a lag
 of 60 ms and a delay of 8 ms, thrust is between linear and quadratic in the rotor speed, and there are offsets and
 damping. Gyro and accelerometer show coloured noise, vibration and rounding, and lose samples, alone and in bursts. The
-recording is averaged to 4 ms, cut into windows of a quarter of a second, and fitted by `fit_vehicle`. Parameters that a
-fit holds are not counted.
+recording is averaged to 4 ms and fitted by the likelihood of its innovations. Parameters that a fit holds are not
+counted.
 """
 
 import json
@@ -21,9 +21,10 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxos4
-from jaxos4.identification.vehicle import SECONDARY
+from jaxos4.estimators import make_estimator
+from jaxos4.identification.fit import fit_innovations
+from jaxos4.logs.sampling import average
 from jaxos4.models.vehicle import DEFAULT_TERMS
-from jaxos4.recording.averaging import average
 from jaxos4.results import NINETY_FIVE
 
 jax.config.update("jax_enable_x64", True)
@@ -43,10 +44,11 @@ CRAZYFLIE = jaxos4.Airframe(
 FAST_OS4 = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, 450.0)
 AIRFRAMES = {"os4": FAST_OS4, "crazyflie": CRAZYFLIE}
 TERMS = (*DEFAULT_TERMS, "curve", "accelerometer")
+# Parameters whose true values are those that follow from the airframe.
+FROM_AIRFRAME = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7", "rotor_reaction", "az_bias")
 LAG, DELAY, CURVE = 0.06, 0.008, (0.4, 1.0)
 # Sample times of the simulation and of the fit [s]; a new command comes every other millisecond.
 FINE, COARSE, COMMANDED = 1e-3, 4e-3, 2
-WINDOW = 0.25
 # Designed rates [rad/s] and tones [Hz] of roll, pitch and yaw; amplitude of the thrust as a share of the weight.
 AMPLITUDE, TONES, HEAVE = (1.6, 1.6, 0.5), ((0.5, 5.0), (0.5, 5.0), (0.3, 2.0)), 0.15
 # Coloured noise, vibration, rounding: of the gyro [rad/s] and of the accelerometer [m/s^2].
@@ -57,11 +59,11 @@ LOST, BURSTS, BURST = 0.02, 0.5, (0.005, 0.03)
 
 
 def truth_of(model: jaxos4.FlightModel, rng: np.random.Generator) -> np.ndarray:
-    """A flight's true parameters: the secondary ones as the airframe implies, the others random around it."""
+    """A flight's true parameters: some follow from the airframe, the others are random around it."""
     center, half_width = np.asarray(model.alpha), np.asarray(model.half_width)
     values = center + half_width * rng.uniform(-0.4, 0.4, center.size)
     for i, name in enumerate(model.parameter_names):
-        if name in SECONDARY:
+        if name in FROM_AIRFRAME:
             values[i] = center[i]
         elif name.endswith("damping"):
             values[i] = rng.uniform(0.5, 3.0)
@@ -124,44 +126,40 @@ def dirty(exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def recorded(omega: np.ndarray, seen: np.ndarray) -> jaxos4.Flight:
-    """The averaged recording in whole windows."""
+    """The averaged recording."""
     t = FINE * np.arange(omega.shape[0])
     grid, speeds, channels = average(t, omega, seen, COARSE)
     states, force = np.full((grid.size, 12), np.nan), np.full((grid.size, 3), np.nan)
     states[:, [7, 9, 11]], force[:, 2] = channels[:, :3], channels[:, 3]
-    return jaxos4.join([jaxos4.Flight(grid, speeds, states, force)], length=int(WINDOW / COARSE))
+    return jaxos4.Flight(grid, speeds, states, force)
 
 
-def problem_of(model: jaxos4.FlightModel, flight: jaxos4.Flight) -> jaxos4.ShootingProblem:
-    """The problem of fitting it."""
-    windows = flight.time.shape[0] // int(WINDOW / COARSE)
-    sigma = np.append(3 * jaxos4.SENSOR_SIGMA, np.full(3, 0.3))
-    return jaxos4.ShootingProblem(model, flight, sigma=sigma, channels="rates", method="rk4", windows=windows)
-
-
-def identify(airframe: jaxos4.Airframe, duration: float, seed: int, i: int, *, clean: bool = False) -> dict:
-    """One flight: its true parameters, their estimates, and why others are held. `clean`: without noise."""
+def identify(airframe: jaxos4.Airframe, estimator: str, duration: float, seed: int, i: int) -> dict:
+    """One flight: its true parameters, their estimates, and why others are held."""
     rng = np.random.default_rng([seed, i])
     model = jaxos4.FlightModel(airframe, terms=TERMS)
     truth = truth_of(model, rng)
     omega = commands(model, truth, duration, rng)
     exact = np.asarray(fly(model, jnp.asarray(truth), jnp.asarray(omega)))
-    flight = recorded(omega, exact if clean else dirty(exact, rng))
+    flight = recorded(omega, dirty(exact, rng))
+    sigma = np.append(3 * jaxos4.SENSOR_SIGMA, np.full(3, 0.3))
+    problem = jaxos4.ShootingProblem(model, flight, sigma=sigma, channels="rates", method="rk4")
     begin = time.perf_counter()
-    fit = jaxos4.fit_vehicle(problem_of(model, flight), jaxos4.Bracket.default(model))
-    names = fit.problem.model.parameter_names
+    one_recording = np.zeros(flight.time.shape[0], dtype=int)
+    fit = fit_innovations(make_estimator(estimator), jaxos4.InnovationsProblem(problem), one_recording)
+    seconds, values = time.perf_counter() - begin, np.asarray(fit.estimate.parameters)
     half_width = np.asarray(fit.estimate.half_width(0.95))
+    free = {model.parameter_names[i]: i for i in fit.free}
     return {
         "flight": i,
         "fastest": float(np.abs(exact[:, :3]).max()),
         "result": str(jaxos4.result_names(fit.estimate.result)),
         "truth": dict(zip(model.parameter_names, truth.tolist(), strict=True)),
-        "estimate": dict(zip(names, np.asarray(fit.estimate.parameters).tolist(), strict=True)),
-        "half_width": dict(zip(names, half_width.tolist(), strict=True)),
-        "bound": dict(zip(names, np.asarray(fit.bound).tolist(), strict=True)),
-        "held": {name: why for name, (_, why) in fit.held.items()},
-        "cut": fit.cut,
-        "seconds": time.perf_counter() - begin,
+        "estimate": {name: float(values[i]) for name, i in free.items()},
+        "half_width": {name: float(half_width[i]) for name, i in free.items()},
+        "bound": {name: float(fit.bound[i]) for name, i in free.items()},
+        "held": {name: held.note for name, held in fit.held.items()},
+        "seconds": seconds,
     }
 
 
@@ -196,6 +194,7 @@ def main(
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 15.0,
     seed: Annotated[int, typer.Option(help="Random seed of parameters, commands and noise.")] = 17,
     airframes: Annotated[list[str], typer.Option(help="Names of airframes.")] = tuple(AIRFRAMES),
+    estimator: Annotated[str, typer.Option(help="filter-error or ibss.")] = "filter-error",
     out: Annotated[Path | None, typer.Option(help="JSON file for the figures.")] = None,
 ) -> None:
     """Coverage of 95 % intervals on dirty flights."""
@@ -203,7 +202,7 @@ def main(
     for name in airframes:
         found = []
         for i in range(flights):
-            found.append(identify(AIRFRAMES[name], duration, seed, i))
+            found.append(identify(AIRFRAMES[name], estimator, duration, seed, i))
             rows[name] = {"summary": summary(found), "flights": found}
             if out is not None:
                 report = {
@@ -211,6 +210,7 @@ def main(
                     "precision": "float64",
                     "seed": seed,
                     "duration": duration,
+                    "estimator": estimator,
                     "airframes": rows,
                 }
                 out.write_text(json.dumps(report, indent=2) + "\n")

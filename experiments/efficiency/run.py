@@ -5,6 +5,7 @@ with the model that is fitted (the inverse crime), so that the bound applies.
 """
 
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -17,14 +18,17 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.report.experiment import PARAMETERS, count_results, in_words, table_of
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import PARAMETERS, count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 
 
 class Case(NamedTuple):
-    """What is identified from what. Several windows have free starts."""
+    """The model and the data of a case. Several windows have free starts."""
 
     model: type[jaxos4.AbstractModel]
     channels: str

@@ -4,6 +4,7 @@ One panel for each model and input, one row for each parameter. The vertical lin
 a parameter to its left cannot be distinguished from 0 with them.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,11 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxos4.report.experiment import load_results, write_figure
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import load_results, write_figure
 
 
 def draw(data: xr.Dataset) -> Figure:

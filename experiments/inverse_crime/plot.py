@@ -3,6 +3,7 @@
 One column for each method of the fit, one line for each method of the simulation.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,12 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import draw_spread, write_figure
 from jaxos4.report.style import FAINT, INK, grid, log_axis, scale_axis, styles
 from jaxos4.study import metrics
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import draw_spread, write_figure
 
 # 95 % quantile of the largest of eight Gaussian magnitudes, in standard deviations.
 LARGEST_OF_EIGHT = 2.73

@@ -6,6 +6,7 @@ a window.
 """
 
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +19,10 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.report.experiment import PARAMETERS, count_results, in_words, table_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import PARAMETERS, count_results, in_words, table_of
 
 jax.config.update("jax_enable_x64", True)
 

@@ -7,6 +7,7 @@ import functools
 import json
 import os
 import resource
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,8 +21,11 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.report.experiment import PARAMETERS, count_results, identify, in_words, measure, table_of
 from jaxos4.study import metrics
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import PARAMETERS, count_results, identify, in_words, measure, table_of
 
 jax.config.update("jax_enable_x64", True)
 

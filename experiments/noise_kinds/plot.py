@@ -1,5 +1,6 @@
 """RMSE / bound of white noise, and coverage of 95 % intervals, for each kind of noise."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,12 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import draw_spread, write_figure
 from jaxos4.report.style import INK, grid, log_axis, styles
 from jaxos4.study import metrics
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import draw_spread, write_figure
 
 LEVEL = 0.95
 

@@ -1,13 +1,17 @@
 """RMS error and bound of each parameter, and RMSE / bound, against the noise scale."""
 
+import sys
 from pathlib import Path
 
 import typer
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import efficiency, errors
+from jaxos4.report.study_figures import efficiency, errors
 from jaxos4.study import metrics
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 
 def main(results: Path, figures: Path) -> None:

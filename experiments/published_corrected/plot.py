@@ -1,5 +1,6 @@
 """Plots what each model can identify, the errors of its fits, and the tests of their residuals."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,12 @@ import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxos4.report.experiment import load_results, write_figure
 from jaxos4.report.style import FAINT, INK, grid, log_axis, styles
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import load_results, write_figure
 
 LEVEL = 0.01
 TESTS = {"white_p": "white", "input_p": "free of\ninputs", "level_p": "of the\nnoise's size"}

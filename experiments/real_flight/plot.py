@@ -1,15 +1,19 @@
 """The moments of inertia that each flight says, with 95 % intervals, and how well what was not fitted is predicted."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import typer
 from matplotlib.figure import Figure
 
-from jaxos4.report.experiment import write_figure
 from jaxos4.report.style import BOUND_DASHES, INK, grid, styles
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 INERTIAS, RATES = ("Ix", "Iy"), ("p", "q")
 

@@ -1,8 +1,9 @@
 """A real Crazyflie: do its flights agree on the moments of inertia, and how well is what was not fitted predicted?
 
-Each flight is identified alone, and all of them together, by filter error and by output error. The last quarter of each
-flight is not fitted but predicted. Commands are not rotor speeds: thrust as a function of the command is fitted to the
-accelerometer (`thrust_curve`, `thrust_gain`), and torques, and therefore inertias, are proportional to this thrust.
+Each flight is identified alone, and all of them together, by filter error and by IBSS on the same likelihood. The last
+quarter of each flight is not fitted but predicted. Commands are not rotor speeds: thrust as a function of the command
+is fitted to the accelerometer (`thrust_curve`, `thrust_gain`), and torques, and therefore inertias, are proportional to
+this thrust.
 
 The moments of inertia of two flights should differ by chance alone. `z` is their difference over its standard
 deviation; 99 % of such figures should be below 2.58.
@@ -11,6 +12,7 @@ deviation; 99 % of such figures should be below 2.58.
 import itertools
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,8 +22,11 @@ from rich.console import Console
 
 import jaxos4
 from jaxos4.recording import Recording, read_recording
-from jaxos4.report.experiment import table_of
 from jaxos4.results import NINETY_FIVE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import table_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -43,8 +48,8 @@ def skill_ahead(skill: dict[str, Any] | None) -> dict[str, tuple[float, float]]:
 
 
 def identified(recordings: list[Recording], estimator: str, *, end: float | None) -> dict[str, Any]:
-    """What `jaxos4 estimate` writes, and the skill `AHEAD`."""
-    found = jaxos4.identify(recordings, AIRFRAME, estimator=estimator, end=end)
+    """The JSON of `jaxos4 estimate`, and the skill `AHEAD`."""
+    found = jaxos4.identify(recordings, AIRFRAME, settings=jaxos4.VehicleSettings(end=end), estimator=estimator)
     print(f"{estimator}, {', '.join(one.name for one in recordings)}: {found.seconds:.0f} s", flush=True)
     row = found.to_dict()
     return row | {"ahead": skill_ahead(row["skill"])}
@@ -87,7 +92,7 @@ def main(
     flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
     end: Annotated[float | None, typer.Option(help="Use the flights up to this time [s].")] = None,
     names: Annotated[list[str], typer.Option(help="The flights.")] = FLIGHTS,
-    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = ("filter-error", "output-error"),
+    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = ("filter-error", "ibss"),
 ) -> None:
     """Identify each flight alone, and all together."""
     folder = flights or (Path(os.environ["JAXOS4_FLIGHTS"]) if os.environ.get("JAXOS4_FLIGHTS") else None)

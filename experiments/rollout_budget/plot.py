@@ -1,5 +1,6 @@
 """Plots RMSE / bound, averaged over the parameters, against rollouts. One line for each search."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,11 @@ import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxos4.report.experiment import load_results, write_figure
 from jaxos4.report.style import INK, grid, log_axis, styles
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import load_results, write_figure
 
 SEARCHES = ("IBSS, whitened", "IBSS, coordinate", "output error", "hybrid")
 LOOKS = dict(zip(SEARCHES, styles(["ibss", "kalman", "output-error", "hybrid"]).values(), strict=True))

@@ -1,14 +1,17 @@
 """RMSE / bound and coverage against the noise scale; with 10,000 flights their error is below 0.01."""
 
+import sys
 from pathlib import Path
 
 import typer
 
 from jaxos4.report import read_results
-from jaxos4.report.experiment import write_figure
-from jaxos4.report.figures_noise import efficiency
-from jaxos4.report.figures_spread import coverage
+from jaxos4.report.study_figures import coverage, efficiency
 from jaxos4.study import metrics
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import write_figure
 
 
 def main(results: Path, figures: Path) -> None:

@@ -2,16 +2,16 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Parameters, Scalar, as_float
+from .._xla import quick_jit
 from ..models.state import CASCADE_ORDER
 from ..shooting import ShootingProblem
-from ..shooting.filtering import Noise, Observed, gains_of, transition
+from ..shooting.filters import LogNoise, Observed, gains_of, transition
 from .frequency_response import modelled_acceleration
 
 
@@ -26,7 +26,7 @@ class Disturbances(NamedTuple):
     time_constant: Float[np.ndarray, "3"]
 
 
-def disturbances(problem: ShootingProblem, parameters: Parameters, noise: Noise) -> Disturbances:
+def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Disturbances:
     """The disturbance of each body rate by Kalman filters, for the noise that `FilterError` found.
 
     The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r.
@@ -34,7 +34,7 @@ def disturbances(problem: ShootingProblem, parameters: Parameters, noise: Noise)
     rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
     modelled = np.zeros(rates.shape)
     modelled[:-1] = modelled_acceleration(problem, parameters)
-    own = Noise(*(as_float(np.asarray(leaf)[:3]) for leaf in noise))
+    own = LogNoise(*(as_float(np.asarray(leaf)[:3]) for leaf in noise))
     begins = np.arange(rates.shape[0]) == 0
     if problem.flight.stretch is not None:
         begins = np.diff(np.asarray(problem.flight.stretch), prepend=-1) != 0
@@ -42,9 +42,9 @@ def disturbances(problem: ShootingProblem, parameters: Parameters, noise: Noise)
     return Disturbances(np.asarray(value), np.exp(np.asarray(own.time_constant)))
 
 
-@eqx.filter_jit
+@quick_jit
 def _filtered(
-    noise: Noise,
+    noise: LogNoise,
     rates: Float[Array, "samples 3"],
     modelled: Float[Array, "samples 3"],
     begins: Bool[Array, " samples"],

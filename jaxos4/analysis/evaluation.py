@@ -6,13 +6,13 @@ diagnostics and noise levels need no program of their own.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import InitialStates, Parameters, as_float
+from .._xla import quick_jit
 from ..models.state import CHANNELS
 from ..shooting import FASTEST, ShootingProblem, padded
 
@@ -109,7 +109,7 @@ def evaluate(
     )
 
 
-@eqx.filter_jit
+@quick_jit
 def _fly(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
 ) -> tuple[

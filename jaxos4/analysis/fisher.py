@@ -2,11 +2,11 @@
 
 import functools
 
-import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
 from .._custom_types import Covariance, InitialStates, Parameters, as_float
+from .._xla import quick_jit
 from ..linalg import covariance_of_shared, gram, joint_factor
 from ..shooting import ShootingProblem
 
@@ -33,7 +33,7 @@ def cramer_rao_bound(
 
 
 # A program of its own: information and bound share it, and the simulation is what takes long to compile.
-@eqx.filter_jit
+@quick_jit
 def _information(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
 ) -> Float[Array, "windows unknowns unknowns"]:

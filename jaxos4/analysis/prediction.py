@@ -1,18 +1,19 @@
 """Predictions of the body rates some tenths of a second ahead, and their skill."""
 
+import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import Parameters, as_float
+from .._xla import quick_jit
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
-from ..shooting.filtering import transition
+from ..shooting.filters import transition
 from .disturbance import Disturbances
 
 HORIZONS = (0.1, 0.25, 0.5)
@@ -76,7 +77,7 @@ def predictions(
     dt, ahead = float(flight.dt), _ahead(flight, horizons)
     start, initial = starts(flight, horizons)
     rates = np.asarray(flight.states)[:, RATES]
-    rate_problem = ShootingProblem(problem.model, flight, sigma=problem.sigma, channels="rates", method=problem.method)
+    rate_problem = dataclasses.replace(problem, channels="rates", windows=1, initial_state=None, length=None)
     if disturbance is None:
         disturbance = Disturbances(np.zeros(rates.shape), np.ones(3))
     first, fading = as_float(disturbance.value[start]), as_float(disturbance.time_constant)
@@ -108,7 +109,7 @@ def _ahead(flight: Flight, horizons: tuple[float, ...]) -> Int[np.ndarray, " hor
     return np.maximum(np.rint(np.asarray(horizons) / float(flight.dt)).astype(int), 1)
 
 
-@eqx.filter_jit
+@quick_jit
 def _predict(
     problem: ShootingProblem,
     parameters: Parameters,

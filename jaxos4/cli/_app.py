@@ -8,9 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from .._xla import WHOLE_LOOPS
 from ..errors import InputError, TrainingError
-from ._jax import NO_CACHE, QUICK_TO_COMPILE, prepare
+from ._jax import NO_CACHE, prepare
 from .compare import compare
 from .design import design
 from .estimate import estimate
@@ -31,7 +30,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*args, **kwargs) -> None:
-        prepare(WHOLE_LOOPS if command is study else QUICK_TO_COMPILE)  # a study computes for longer than it compiles
+        prepare()
         command(*args, **kwargs)
 
     return run

@@ -1,4 +1,4 @@
-"""What is set before the library computes: double precision, and compiled programs kept for the next command."""
+"""Preparation of JAX for a command: double precision, and a cache of compiled programs for the next command."""
 
 import gc
 import os
@@ -6,13 +6,6 @@ import shutil
 import tempfile
 import warnings
 from pathlib import Path
-
-from .._xla import WHOLE_LOOPS
-
-QUICK_TO_COMPILE = f"{WHOLE_LOOPS} --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
-"""XLA's older way to write loops, and fewer optimisations: half of the compile time; a batch takes a quarter longer."""
-
-_KNOWS_IT = ("0.10.",)  # versions of jaxlib: a flag that XLA does not know would end the process
 
 NO_CACHE = "JAXOS4_NO_CACHE"
 """The environment variable that switches off the cache of compiled programs."""
@@ -22,13 +15,9 @@ _LEAST_FREE_BYTES = 200 << 20  # with less space on the disk, programs might be 
 _JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in less than this [s]
 
 
-def prepare(flags: str) -> None:
-    """Prepares this process for JAX, with `flags` for XLA.
-
-    A cache folder that was chosen before is kept, unless the cache is off.
-    """
+def prepare() -> None:
+    """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off."""
     rarely_collect_garbage()
-    set_flags(flags)
 
     import jax
 
@@ -50,14 +39,6 @@ def prepare(flags: str) -> None:
 def rarely_collect_garbage() -> None:
     """Tracing makes millions of small objects that stay."""
     gc.set_threshold(100_000, 20, 100)
-
-
-def set_flags(flags: str) -> None:
-    """Sets XLA's flags, unless the user has set some; an empty `XLA_FLAGS` counts as unset."""
-    import jaxlib.version
-
-    if os.environ.get("XLA_FLAGS") == WHOLE_LOOPS and jaxlib.version.__version__.startswith(_KNOWS_IT):
-        os.environ["XLA_FLAGS"] = flags
 
 
 def _usable_folder() -> Path | None:

@@ -1,13 +1,67 @@
-"""Output files: checked before the work that fills them, never one of the inputs, and written whole or not at all."""
+"""Output of the commands: the stage of a computation, the library's messages with names of options, and files.
 
+Files are checked before the work that fills them, are never one of the inputs, and are written whole or not at all.
+"""
+
+import contextlib
 import json
+import re
 import secrets
 import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from .._files import check_writable, write_atomically
 from ..errors import InputError
+
+_PHRASES = {
+    "an `Airframe` as `subject`": "--model flight",
+    "`subject`": "--model",
+    "`begin`": "--from",
+    "`end`": "--to",
+}
+_OPTIONS = (
+    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|gust|holdout|initial_state|"
+    "network|rate|sample_time|samples|seed|slew|slowest|terms|validate|velocity|window"
+)
+
+
+def in_options(text: str, **files: Path | None) -> str:
+    """A message with options for the library's arguments: `--from` for `` `begin` ``.
+
+    `files`: file names to print behind an option.
+    """
+    for phrase, option in _PHRASES.items():
+        text = text.replace(phrase, option)
+
+    def option_of(match: re.Match[str]) -> str:
+        path = files.get(match[1])
+        return f"--{match[1].replace('_', '-')}{'' if path is None else f' {path}'}"
+
+    return re.sub(f"`({_OPTIONS})`", option_of, text)
+
+
+@contextlib.contextmanager
+def option_names(**files: Path | None) -> Iterator[None]:
+    """Raises an `InputError` of the library again, in the words of the command line; `files` as of `in_options`."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(in_options(str(error), **files)) from None
+
+
+@contextlib.contextmanager
+def stages(first: str) -> Iterator[Callable[[str], None]]:
+    """Shows a stage and the time; gives a function that changes the stage. Shows nothing if stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(first, total=None)
+        yield lambda stage: bar.update(task, description=stage)
 
 
 def check_output(out: Path, *inputs: Path | None) -> None:

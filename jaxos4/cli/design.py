@@ -1,7 +1,6 @@
-"""`jaxos4 design`: the input, or the references of a controller, that tell the most within an envelope."""
+"""`jaxos4 design`: the most informative rotor speeds, or references of a controller, within an envelope."""
 
 import time
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,26 +9,28 @@ import typer
 
 from .._files import read_toml
 from ..errors import InputError
-from ._choices import AirframeOption, BracketOption, Channels, InitialState, Model, check_seed
-from ._loop import (
+from ._options import (
+    AirframeOption,
+    BracketOption,
+    Channels,
     DelayOption,
     DurationOption,
     GustOption,
+    InitialState,
     LagOption,
+    Model,
     SampleTimeOption,
     SensorsOption,
     check_kind,
+    check_seed,
     loop_of,
     times_of,
 )
-from ._messages import option_names
-from ._output import check_different, check_output
-from ._progress import stages
+from ._output import check_different, check_output, option_names, stages
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from ..closed_loop import ClosedLoop
+    from ..design import Design
 
 
 class Criterion(StrEnum):
@@ -40,8 +41,35 @@ class Criterion(StrEnum):
     worst = "worst"
 
 
-# What prints the result, and the number of samples that were written.
-Written = tuple[Callable[["Console"], None], int]
+SlowestOption = Annotated[float | None, typer.Option(help="Slowest rotor speed [rad/s].")]
+FastestOption = Annotated[float | None, typer.Option(help="Fastest rotor speed [rad/s].")]
+SlewOption = Annotated[float | None, typer.Option(help="Fastest change of a rotor speed [rad/s^2].")]
+AngleOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Largest roll, pitch and yaw angle [rad]; with --closed-loop: that of the references. Default: 0.3."
+    ),
+]
+RateOption = Annotated[float | None, typer.Option(help="Largest body rate [rad/s].")]
+VelocityOption = Annotated[float | None, typer.Option(help="Largest velocity [m/s].")]
+DistanceOption = Annotated[float | None, typer.Option(help="Largest distance from the start [m].")]
+BandwidthOption = Annotated[
+    float | None, typer.Option(help="Highest frequency [Hz]. Default: 4; with --closed-loop: 6.", metavar="HERTZ")
+]
+StartOption = Annotated[
+    InitialState | None, typer.Option(help="free: estimated too; known: equal to the first sample. Default: free.")
+]
+CriterionOption = Annotated[
+    Criterion, typer.Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound.")
+]
+AccuracyOption = Annotated[
+    float | None,
+    typer.Option(
+        help="Wanted standard deviation [% of the bracket's half-width]. Default: 1; "
+        "with --closed-loop: 5 % of Ix, Iy and Iz.",
+        metavar="PERCENT",
+    ),
+]
 
 
 def design(
@@ -53,37 +81,19 @@ def design(
     model: Annotated[Model | None, typer.Option(help="Equations of motion. Default: published.")] = None,
     duration: DurationOption = None,
     dt: SampleTimeOption = None,
-    slowest: Annotated[float | None, typer.Option(help="Slowest rotor speed [rad/s].")] = None,
-    fastest: Annotated[float | None, typer.Option(help="Fastest rotor speed [rad/s].")] = None,
-    slew: Annotated[float | None, typer.Option(help="Fastest change of a rotor speed [rad/s^2].")] = None,
-    angle: Annotated[
-        float | None,
-        typer.Option(
-            help="Largest roll, pitch and yaw angle [rad]; with --closed-loop: that of the references. Default: 0.3."
-        ),
-    ] = None,
-    rate: Annotated[float | None, typer.Option(help="Largest body rate [rad/s].")] = None,
-    velocity: Annotated[float | None, typer.Option(help="Largest velocity [m/s].")] = None,
-    distance: Annotated[float | None, typer.Option(help="Largest distance from the start [m].")] = None,
-    bandwidth: Annotated[
-        float | None, typer.Option(help="Highest frequency [Hz]. Default: 4; with --closed-loop: 6.", metavar="HERTZ")
-    ] = None,
+    slowest: SlowestOption = None,
+    fastest: FastestOption = None,
+    slew: SlewOption = None,
+    angle: AngleOption = None,
+    rate: RateOption = None,
+    velocity: VelocityOption = None,
+    distance: DistanceOption = None,
+    bandwidth: BandwidthOption = None,
     bracket: BracketOption = None,
     channels: Annotated[Channels | None, typer.Option(help="Channels that will be measured. Default: all.")] = None,
-    initial_state: Annotated[
-        InitialState | None, typer.Option(help="free: estimated too; known: equal to the first sample. Default: free.")
-    ] = None,
-    criterion: Annotated[
-        Criterion, typer.Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound.")
-    ] = Criterion["D"],
-    accuracy: Annotated[
-        float | None,
-        typer.Option(
-            help="Wanted standard deviation [% of the bracket's half-width]. Default: 1; "
-            "with --closed-loop: 5 % of Ix, Iy and Iz.",
-            metavar="PERCENT",
-        ),
-    ] = None,
+    initial_state: StartOption = None,
+    criterion: CriterionOption = Criterion["D"],
+    accuracy: AccuracyOption = None,
     gust: GustOption = None,
     lag: LagOption = None,
     delay: DelayOption = None,
@@ -91,13 +101,8 @@ def design(
     figure: Annotated[Path | None, typer.Option(help="SVG file: what to fly, and the bounds over time.")] = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
 ) -> None:
-    """Design what to fly, within limits: the rotor speeds, or the references of a controller, that tell the most."""
-    check_output(out, Path(airframe), bracket)
-    check_different(out=out, figure=figure)
-    if figure is not None:
-        check_output(figure, Path(airframe), bracket)
-        if figure.suffix != ".svg":
-            raise InputError(f"--figure {figure}: the figure is an SVG file; give it a name that ends in .svg.")
+    """Design the most informative flight within limits: rotor speeds, or the references of a controller."""
+    _check_files(out, figure, Path(airframe), bracket)
     check_kind(
         closed_loop,
         of_open={"model": model, "slew": slew, "channels": channels, "initial-state": initial_state},
@@ -107,92 +112,62 @@ def design(
     accuracy = (5.0 if closed_loop else 1.0) if accuracy is None else accuracy
     if not 0 < accuracy < 1e6:
         raise InputError(f"--accuracy: must be positive and finite, got {accuracy:g}.")
-    limits = {
-        "slowest": slowest,
-        "fastest": fastest,
-        "slew": slew,
-        "angle": angle,
-        "rate": rate,
-        "velocity": velocity,
-        "distance": distance,
-    }
-    limits = {name: value for name, value in limits.items() if value is not None}
+    limits = {"slowest": slowest, "fastest": fastest, "slew": slew, "rate": rate}
+    limits |= {"velocity": velocity, "distance": distance} | ({} if closed_loop else {"angle": angle})
     duration, dt = times_of(closed_loop, duration, dt)
+    settings = {"duration": duration, "dt": dt, "criterion": criterion.value, "compare": True, "key": seed}
+    settings |= {"limits": {name: value for name, value in limits.items() if value is not None}}
+    settings |= {} if bandwidth is None else {"bandwidth": bandwidth}
     begin = time.perf_counter()
     with stages("loading the library") as progress, option_names(bracket=bracket):
-        settings = {
-            "limits": limits,
-            "duration": duration,
-            "dt": dt,
-            "criterion": criterion.value,
-            "bandwidth": (6.0 if closed_loop else 4.0) if bandwidth is None else bandwidth,
-            "seed": seed,
-            "progress": progress,
-        }
+        settings["progress"] = progress
         intervals = None if bracket is None else read_toml(bracket)
         if closed_loop:
-            loop = loop_of(airframe, gust, lag, delay, sensors)
-            show, samples = _references(loop, intervals, settings, accuracy / 100, out, figure)
-            what = "references"
+            settings |= {} if angle is None else {"angle": angle}
+            found = _references(loop_of(airframe, gust, lag, delay, sensors), intervals, settings)
+            described = found.task.kind
         else:
-            settings |= {"start_is_known": initial_state is InitialState["known"]}
-            settings |= {"channels": (channels or Channels["all"]).value}
-            model = model or Model["published"]
-            show, samples = _rotor_speeds(airframe, model, intervals, settings, accuracy / 100, out, figure)
-            what = f"{model.value} model"
+            model, channels = model or Model["published"], channels or Channels["all"]
+            settings |= {"channels": channels.value, "start_is_known": initial_state is InitialState["known"]}
+            found = _rotor_speeds(airframe, model, intervals, settings)
+            described = f"{model.value} model"
+        progress("writing")
+        found.task.write(found.designed, out)
+        from ..report.design_page import print_design, write_design
+
+        if figure is not None:
+            write_design(found, accuracy / 100, figure)
     from rich.console import Console
 
-    show(Console(highlight=False))
-    typer.echo(f"{out}: {samples} samples of {dt:g} s, {what}, {time.perf_counter() - begin:.0f} s")
+    print_design(Console(highlight=False), found, accuracy / 100)
+    samples = found.designed.inputs.shape[0]
+    typer.echo(f"{out}: {samples} samples of {dt:g} s, {described}, {time.perf_counter() - begin:.0f} s")
 
 
-def _rotor_speeds(
-    airframe: str,
-    model: Model,
-    intervals: dict[str, Any] | None,
-    settings: dict[str, Any],
-    accuracy: float,
-    out: Path,
-    figure: Path | None,
-) -> Written:
-    """Design rotor speeds, and write them."""
+def _check_files(out: Path, figure: Path | None, *inputs: Path | None) -> None:
+    """Refuse files that cannot be written, or that would overwrite an input or each other."""
+    check_output(out, *inputs)
+    check_different(out=out, figure=figure)
+    if figure is not None:
+        check_output(figure, *inputs)
+        if figure.suffix != ".svg":
+            raise InputError(f"--figure {figure}: the figure is an SVG file; give it a name that ends in .svg.")
+
+
+def _rotor_speeds(airframe: str, model: Model, intervals: dict[str, Any] | None, settings: dict[str, Any]) -> "Design":
+    """Design rotor speeds. An angle is a limit."""
     from ..airframe import load_airframe
-    from ..design import design_and_compare, write_input
+    from ..design import design_input
     from ..identification.problem import bracket_of
     from ..models import MODELS
-    from ..report.design_page import print_design
 
     subject = MODELS[model](load_airframe(airframe))
-    found = design_and_compare(subject, bracket=bracket_of(intervals, subject), **settings)
-    settings["progress"]("writing")
-    write_input(found.designed, out)
-    if figure is not None:
-        from ..report.figures_design import write_design
-
-        write_design(found, figure)
-    return lambda console: print_design(console, found, accuracy), found.designed.omega.shape[0]
+    return design_input(subject, bracket=bracket_of(intervals, subject), **settings)
 
 
-def _references(
-    loop: "ClosedLoop",
-    intervals: dict[str, Any] | None,
-    settings: dict[str, Any],
-    accuracy: float,
-    out: Path,
-    figure: Path | None,
-) -> Written:
-    """Design references, and write them. The largest angle is that of the references."""
-    from ..design import design_and_compare_references, model_of, write_references
+def _references(loop: "ClosedLoop", intervals: dict[str, Any] | None, settings: dict[str, Any]) -> "Design":
+    """Design references. An angle is the largest one of the references."""
+    from ..design import design_references, model_of
     from ..identification.problem import bracket_of
-    from ..report.references_page import print_references
 
-    angle = settings["limits"].pop("angle", 0.3)
-    bracket = bracket_of(intervals, model_of(loop))
-    found = design_and_compare_references(loop, angle=angle, bracket=bracket, **settings)
-    settings["progress"]("writing")
-    write_references(found.designed, out)
-    if figure is not None:
-        from ..report.figures_references import write_references_figure
-
-        write_references_figure(found, accuracy, figure)
-    return lambda console: print_references(console, found, accuracy), found.designed.references.shape[0]
+    return design_references(loop, bracket=bracket_of(intervals, model_of(loop)), **settings)

@@ -7,22 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .._files import read_toml
 from ..errors import InputError
-from ._choices import (
+from ._options import (
     BracketOption,
     ChannelsOption,
     Estimator,
     InitialState,
     InitialStateOption,
-    Loss,
     OutOption,
     VehicleModel,
     WindowOption,
+    chosen,
+    read_bracket,
 )
-from ._messages import in_options, option_names
-from ._output import check_different, check_output, write_json
-from ._progress import stages
+from ._output import check_different, check_output, in_options, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from ..identification import Identification
@@ -30,49 +28,58 @@ if TYPE_CHECKING:
 
 _OS4, _PUBLISHED = "os4", "published"
 
+FlightsArgument = Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")]
+EstimatorOption = Annotated[
+    Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
+]
+ModelOption = Annotated[
+    VehicleModel | None,
+    typer.Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
+]
+AirframeOption = Annotated[
+    str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
+]
+NetworkOption = Annotated[
+    Path | None, typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
+]
+ValidateOption = Annotated[
+    Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
+]
+TermsOption = Annotated[
+    str | None, typer.Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")
+]
+BeginOption = Annotated[
+    float | None, typer.Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on.")
+]
+EndOption = Annotated[
+    float | None, typer.Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
+]
+AveragedTimeOption = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
+]
+HoldoutOption = Annotated[
+    float | None, typer.Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
+]
+ReportOption = Annotated[Path | None, typer.Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")]
+
 
 def estimate(
-    flights: Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
-    estimator: Annotated[
-        Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
-    ] = None,
-    model: Annotated[
-        VehicleModel | None,
-        typer.Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
-    ] = None,
-    airframe: Annotated[
-        str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
-    ] = None,
+    flights: FlightsArgument,
+    estimator: EstimatorOption = None,
+    model: ModelOption = None,
+    airframe: AirframeOption = None,
     bracket: BracketOption = None,
     channels: ChannelsOption = None,
     initial_state: InitialStateOption = InitialState["free"],
     window: WindowOption = None,
-    network: Annotated[
-        Path | None, typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
-    ] = None,
-    validate: Annotated[
-        Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
-    ] = None,
-    terms: Annotated[
-        str | None, typer.Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")
-    ] = None,
-    begin: Annotated[
-        float | None,
-        typer.Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on."),
-    ] = None,
-    end: Annotated[
-        float | None, typer.Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
-    ] = None,
-    sample_time: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
-    ] = None,
-    holdout: Annotated[
-        float | None, typer.Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
-    ] = None,
-    loss: Annotated[Loss | None, typer.Option(help="Real vehicle: huber cuts outliers; not for filter-error.")] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")
-    ] = None,
+    network: NetworkOption = None,
+    validate: ValidateOption = None,
+    terms: TermsOption = None,
+    begin: BeginOption = None,
+    end: EndOption = None,
+    sample_time: AveragedTimeOption = None,
+    holdout: HoldoutOption = None,
+    report: ReportOption = None,
     out: OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
@@ -82,23 +89,19 @@ def estimate(
     check_different(out=out, report=report)
     if report is not None and model not in (None, "flight"):
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
-    options: dict[str, Any] = {
-        "estimator": None if estimator is None else estimator.value,
-        "bracket": None if bracket is None else read_toml(bracket),
-        "channels": None if channels is None else channels.value,
+    asked: dict[str, Any] = {
+        "channels": chosen(channels),
         "initial_state": initial_state.value,
         "window": window,
-        "network": network,
         "terms": None if terms is None else [name.strip() for name in terms.split(",") if name.strip()],
         "begin": begin,
         "end": end,
         "sample_time": sample_time,
         "holdout": holdout,
-        "loss": None if loss is None else loss.value,
     }
     with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
         from ..airframe import load_airframe
-        from ..identification import identify
+        from ..identification import identify, settings_for
         from ..models import MODELS
         from ..recording import read_recording
 
@@ -117,7 +120,16 @@ def estimate(
             raise InputError(f"--report: is for real vehicles, and {flights[0]} has no sign of one; leave it out.")
         other = None if validate is None else read_recording(validate, vehicle)
         subject = vehicle if is_vehicle else MODELS[model or _PUBLISHED](vehicle)
-        found = identify(recordings, subject, validate=other, progress=progress, **options)
+        found = identify(
+            recordings,
+            subject,
+            settings=settings_for(subject, asked),
+            estimator=chosen(estimator),
+            bracket=read_bracket(bracket),
+            network=network,
+            validate=other,
+            progress=progress,
+        )
     notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
     title = ", ".join(path.name for path in flights)
     _publish(_with_command(found, airframe or _OS4, notes), out, report, title=title)
@@ -134,25 +146,22 @@ def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "
     """The identification with the command in its provenance, all notes and doubts in the words of the command line."""
     import msgspec
 
-    from ..identification import VehicleIdentification
     from ..identification.results import Doubt
 
-    asked = {
-        "airframe": airframe,
-        "notes": [*notes, *(in_options(note) for note in found.provenance["notes"])],
-        "command": shlex.join(["jaxos4", *sys.argv[1:]]),
-    }
-    if isinstance(found, VehicleIdentification):
-        doubts = (Doubt(doubt.result, doubt.cause, in_options(doubt.remedy)) for doubt in found.doubts)
-        found = msgspec.structs.replace(found, doubts=tuple(doubts))
-    return msgspec.structs.replace(found, provenance=found.provenance | asked)
+    provenance = msgspec.structs.replace(
+        found.provenance,
+        airframe=airframe,
+        notes=[*notes, *(in_options(note) for note in found.provenance.notes)],
+        command=shlex.join(["jaxos4", *sys.argv[1:]]),
+    )
+    doubts = tuple(Doubt(doubt.result, doubt.cause, in_options(doubt.remedy)) for doubt in found.doubts)
+    return msgspec.structs.replace(found, doubts=doubts, provenance=provenance)
 
 
 def _publish(found: "Identification", out: Path | None, report: Path | None, *, title: str) -> None:
     """Writes and prints; ends with exit code 1 if the estimate cannot be trusted."""
     from rich.console import Console
 
-    from ..identification import VehicleIdentification
     from ..report import print_identification
     from ..results import meaning
 
@@ -160,7 +169,7 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
     if out is not None:
         write_json(found.to_dict(), out)
     print_identification(console, found)
-    if report is not None and isinstance(found, VehicleIdentification):
+    if report is not None:
         with stages("drawing"):
             from ..report import write_flight_page
 

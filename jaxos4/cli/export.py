@@ -6,10 +6,8 @@ from typing import Annotated
 import typer
 
 from ..errors import InputError
-from ._choices import Simulator
-from ._messages import option_names
-from ._output import check_new_folder, check_output, write_folder, write_text
-from ._progress import stages
+from ._options import Simulator
+from ._output import check_new_folder, check_output, option_names, stages, write_folder, write_text
 
 MOST_SAMPLES = 100_000
 

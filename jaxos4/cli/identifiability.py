@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._files import read_toml
-from ._choices import (
+from ._options import (
     AirframeOption,
     BracketOption,
     ChannelsOption,
@@ -15,10 +14,10 @@ from ._choices import (
     ModelOption,
     OutOption,
     WindowOption,
+    chosen,
+    read_bracket,
 )
-from ._messages import option_names
-from ._output import check_output, write_json
-from ._progress import stages
+from ._output import check_output, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -55,8 +54,8 @@ def identifiability(
         found = assess(
             recording,
             subject,
-            bracket=None if bracket is None else read_toml(bracket),
-            channels=None if channels is None else channels.value,
+            bracket=read_bracket(bracket),
+            channels=chosen(channels),
             initial_state=str(initial_state.value),
             window=window,
             progress=progress,
@@ -72,19 +71,17 @@ def identifiability(
 
 
 def _print_information(console: "Console", found: "FlightInformation") -> None:
-    import rich.box
-    from rich.table import Table
+    from ..report.text import Listing
 
     if not found.fitted:
         console.print("note: no fit; all numbers below hold at the bracket's centre", highlight=False)
-    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("parameter", "unit", "bound", "others known", "of bracket", "noise limit"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
+    rows = []
     for name, row in found.parameters.items():
         bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
         limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
-        table.add_row(name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit)
-    console.print(table, markup=False)
+        rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit))
+    numbers = ("bound", "others known", "of bracket", "noise limit")
+    Listing(("parameter", "unit", *numbers), rows, numbers).print_on(console)
     console.print(
         "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
         "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "

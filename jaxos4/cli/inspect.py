@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
-from ._choices import OutOption
-from ._output import check_different, check_output, write_json, write_text
-from ._progress import stages
+from ._options import OutOption
+from ._output import check_different, check_output, stages, write_json, write_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -109,7 +108,7 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
 
 
 def _print_parts(console: "Console", found: "Inspection") -> None:
-    from ..report.whole import Listing
+    from ..report.text import Listing
 
     rows = []
     shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:MOST_PARTS]

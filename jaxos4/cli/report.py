@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from ._progress import stages
+from ._output import stages
 
 
 def report(

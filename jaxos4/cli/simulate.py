@@ -6,26 +6,43 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
-from ._choices import AirframeOption, Excitation, Method, Model, check_seed
-from ._loop import (
+from ._options import (
+    AirframeOption,
     DelayOption,
     DurationOption,
+    Excitation,
     GustOption,
     LagOption,
+    Method,
+    Model,
+    OpenLoopModelOption,
     SampleTimeOption,
     SensorsOption,
     check_kind,
+    check_seed,
     loop_of,
     times_of,
 )
-from ._output import check_output
-from ._progress import stages
+from ._output import check_output, stages
 
 if TYPE_CHECKING:
     from ..airframe import Airframe
+    from ..closed_loop import ClosedLoop
     from ..flight import Flight
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
+ExcitationOption = Annotated[Excitation | None, typer.Option(help="Shape of the inputs. Default: multisine.")]
+SpeedsOption = Annotated[
+    Path | None, typer.Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation.")
+]
+MethodOption = Annotated[Method | None, typer.Option(help="Integrator of the equations of motion. Default: euler.")]
+NoiseOption = Annotated[
+    float | None, typer.Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
+]
+ReferencesOption = Annotated[
+    Path | None,
+    typer.Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
+]
 
 
 def simulate(
@@ -34,18 +51,11 @@ def simulate(
     duration: DurationOption = None,
     dt: SampleTimeOption = None,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
-    model: Annotated[Model | None, typer.Option(help="Equations of motion. Default: published.")] = None,
-    excitation: Annotated[Excitation | None, typer.Option(help="Shape of the inputs. Default: multisine.")] = None,
-    speeds: Annotated[
-        Path | None,
-        typer.Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation."),
-    ] = None,
-    method: Annotated[
-        Method | None, typer.Option(help="Integrator of the equations of motion. Default: euler.")
-    ] = None,
-    noise: Annotated[
-        float | None, typer.Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
-    ] = None,
+    model: OpenLoopModelOption = None,
+    excitation: ExcitationOption = None,
+    speeds: SpeedsOption = None,
+    method: MethodOption = None,
+    noise: NoiseOption = None,
     closed_loop: Annotated[
         bool, typer.Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
     ] = False,
@@ -53,10 +63,7 @@ def simulate(
     lag: LagOption = None,
     delay: DelayOption = None,
     sensors: SensorsOption = None,
-    references: Annotated[
-        Path | None,
-        typer.Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
-    ] = None,
+    references: ReferencesOption = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
     check_output(out, Path(airframe), references, speeds)
@@ -65,17 +72,8 @@ def simulate(
         of_open={"model": model, "excitation": excitation, "speeds": speeds, "method": method, "noise": noise},
         of_closed={"gust": gust, "lag": lag, "delay": delay, "sensors": sensors, "references": references},
     )
-    for name, value in (("duration", duration), ("dt", dt)):
-        if references is not None and value is not None:
-            raise InputError(f"--{name}: {references} has its own; leave it out.")
-    for name, value in (("duration", duration), ("excitation", excitation)):
-        if speeds is not None and value is not None:
-            raise InputError(f"--{name}: {speeds} has its own; leave it out.")
-    model, excitation, method = (
-        model or Model["published"],
-        excitation or Excitation["multisine"],
-        method or Method["euler"],
-    )
+    _check_not_given(references, duration=duration, dt=dt)
+    _check_not_given(speeds, duration=duration, excitation=excitation)
     duration, dt = times_of(closed_loop, duration, dt)
     noise = 0.0 if noise is None else noise
     if not 0 <= noise <= 1e6:
@@ -86,42 +84,58 @@ def simulate(
     with stages("loading the library") as progress:
         from ..airframe import load_airframe
         from ..logs import write_flight
-        from ..noise import SENSOR_SIGMA, WhiteNoise, measure
         from ..results import RESULTS, result_names
 
         progress("compiling and simulating")
         vehicle = load_airframe(airframe)
-        try:
-            if closed_loop:
-                from ..closed_loop import fly_standard
-
-                loop, flown = loop_of(airframe, gust, lag, delay, sensors), None
-                if references is not None:
-                    from ..design import read_references
-
-                    flown, dt = read_references(references)
-                flight = fly_standard(loop, references=flown, duration=duration, dt=dt, seed=seed)
-                how = f"closed loop, {loop.logged}, gusts of {5.0 if gust is None else gust:g} rad/s^2"
-            else:
-                flight = _open_loop(vehicle, model, excitation, method, duration, dt, speeds)
-                how = f"{model.value} model, {method.value}, noise {noise:g}"
-        except ValueError as error:
-            kind = "--closed-loop" if closed_loop else f"--excitation {excitation.value}"
-            raise InputError(str(error) if speeds is not None else f"{kind}: {error}") from None
+        if closed_loop:
+            try:
+                loop = loop_of(airframe, gust, lag, delay, sensors)
+                flight, dt = _closed_loop(loop, references, duration, dt, seed)
+            except ValueError as error:
+                raise InputError(f"--closed-loop: {error}") from None
+            how = f"closed loop, {loop.logged}, gusts of {5.0 if gust is None else gust:g} rad/s^2"
+        else:
+            model, method = model or Model["published"], method or Method["euler"]
+            flight = _open_loop(vehicle, model, excitation, method, duration, dt, speeds)
+            how = f"{model.value} model, {method.value}, noise {noise:g}"
         if flight.result != RESULTS.successful:
             typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
             raise typer.Exit(1)
         if not closed_loop:
+            from ..noise import SENSOR_SIGMA, WhiteNoise, measure
+
             flight = measure(flight, WhiteNoise(noise * SENSOR_SIGMA), seed=seed)
         progress("writing")
         write_flight(flight, out, vehicle)
     typer.echo(f"{out}: {flight.time.shape[0]} samples of {dt:g} s, {how}")
 
 
+def _check_not_given(file: Path | None, **options: object) -> None:
+    """Refuses options whose values are in the file."""
+    for name, value in options.items():
+        if file is not None and value is not None:
+            raise InputError(f"--{name}: {file} has its own; leave it out.")
+
+
+def _closed_loop(
+    loop: "ClosedLoop", references: Path | None, duration: float, dt: float, seed: int
+) -> tuple["Flight", float]:
+    """A flight under the controller, with random references or those of a file, and its sample time."""
+    from ..closed_loop import fly_standard
+
+    flown = None
+    if references is not None:
+        from ..design import read_references
+
+        flown, dt = read_references(references)
+    return fly_standard(loop, references=flown, duration=duration, dt=dt, seed=seed), dt
+
+
 def _open_loop(
     airframe: "Airframe",
     model: Model,
-    excitation: Excitation,
+    excitation: Excitation | None,
     method: Method,
     duration: float,
     dt: float,
@@ -133,11 +147,14 @@ def _open_loop(
     from ..models import MODELS
     from ..simulation import simulate as fly
 
-    vehicle = MODELS[model](airframe)
-    if speeds is None:
-        omega = EXCITATIONS[excitation](airframe, duration=duration, dt=dt)
-    else:
-        from ..design import read_input
+    vehicle, shape = MODELS[model](airframe), excitation or Excitation["multisine"]
+    try:
+        if speeds is None:
+            omega = EXCITATIONS[shape](airframe, duration=duration, dt=dt)
+        else:
+            from ..design import read_input
 
-        omega = as_float(read_input(speeds, dt))
-    return fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)
+            omega = as_float(read_input(speeds, dt))
+        return fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)
+    except ValueError as error:
+        raise InputError(str(error) if speeds is not None else f"--excitation {shape.value}: {error}") from None

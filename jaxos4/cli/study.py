@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ..errors import InputError
-from ._progress import stages
+from ._output import stages
 
 if TYPE_CHECKING:
     from ..study import Study
@@ -34,7 +34,7 @@ def study(
     if dry_run:
         _print_plan(wanted, out)
         return
-    from ..report.progress import count_outcomes, run_with_bar
+    from ..report.study_terminal import count_outcomes, run_with_bar
 
     if scheduler is None:
         dataset = run_with_bar(wanted, out)

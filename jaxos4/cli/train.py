@@ -8,7 +8,7 @@ import typer
 
 from .._files import read_toml
 from ..errors import InputError
-from ._choices import (
+from ._options import (
     AirframeOption,
     Approximator,
     BracketOption,
@@ -20,9 +20,7 @@ from ._choices import (
     ModelOption,
     check_seed,
 )
-from ._messages import option_names
-from ._output import check_output
-from ._progress import stages
+from ._output import check_output, option_names, stages
 
 # Of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
 NOISE, STEPS = (0.1, 10.0), 4000

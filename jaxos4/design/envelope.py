@@ -1,6 +1,6 @@
-"""What a vehicle may do: limits of rotor speeds, angles, rates, velocity and distance."""
+"""The envelope: limits of rotor speeds, angles, rates, velocity and distance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
@@ -10,6 +10,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._custom_types import Numeric, RotorSpeeds, Scalar, as_float
+from ..airframe import Airframe
+from ..errors import InputError
 from ..flight import STATE_NAMES
 
 ANGLES, RATES, POSITION, VELOCITY = (
@@ -36,12 +38,12 @@ def _limit(name: str, *, axes: bool = False) -> Callable:
 
 
 class Envelope(eqx.Module):
-    """The limits of a flight. Each holds at all times, so they bound what an input may do.
+    """The limits of a flight. Each holds at all times, which restricts the amplitude of an input.
 
     - `slowest`, `fastest`: rotor speed [rad/s].
     - `slew`: the change of a rotor's speed from sample to sample, divided by the sample time [rad/s^2].
-    - `angle`: of phi, theta and psi, to either side [rad]; one number or three.
-    - `rate`: of p, q and r, to either side [rad/s]; one number or three.
+    - `angle`: phi, theta and psi, to either side [rad]; one number or three.
+    - `rate`: p, q and r, to either side [rad/s]; one number or three.
     - `velocity`: the speed of flight [m/s].
     - `distance`: from the start [m].
 
@@ -80,6 +82,15 @@ class Envelope(eqx.Module):
             distance=np.linalg.norm((states - states[..., :1, :])[..., POSITION], axis=-1).max(),
         )
 
+    def limited(self, limits: "Envelope | Mapping[str, float]") -> "Envelope":
+        """This envelope with some limits replaced, or all. Raises `InputError` if one of them is impossible."""
+        if isinstance(limits, Envelope):
+            return limits
+        try:
+            return Envelope(**{**{name: getattr(self, name) for name in Envelope.__annotations__}, **limits})
+        except ValueError as error:
+            raise InputError(f"the envelope: {error}") from None
+
     def shares_of(self, needed: "Envelope") -> dict[str, float]:
         """The largest share of each limit that flights need: 1 is the limit."""
         shares = {
@@ -89,7 +100,7 @@ class Envelope(eqx.Module):
         return shares | {"slowest": 1 / shares["slowest"]}
 
     def uses_of_rotors(self, omega: RotorSpeeds, dt: Scalar) -> Uses:
-        """Which share of each limit of the rotors is used at each sample: 1 is the limit."""
+        """The share of each limit of the rotors that is used at each sample: 1 is the limit."""
         held = omega[:-1]
         return {
             "slowest": self.slowest / held,
@@ -98,13 +109,26 @@ class Envelope(eqx.Module):
         }
 
     def uses_of_states(self, states: Float[Array, "times 12"]) -> Uses:
-        """Which share of each limit of the states is used at each time, with one column for each axis."""
+        """The share of each limit of the states that is used at each time, with one column for each axis."""
         return {
             "angle": states[:, ANGLES] / self.angle,
             "rate": states[:, RATES] / self.rate,
             "velocity": _norm(states[:, VELOCITY]) / self.velocity,
             "distance": _norm(states[:, POSITION] - states[0, POSITION]) / self.distance,
         }
+
+
+def hover_squares(airframe: Airframe, envelope: Envelope) -> Float[np.ndarray, "4"]:
+    """The squared rotor speeds that carry the weight. Raises `InputError` if they lie outside of the envelope."""
+    squares = airframe.hover_squares
+    slowest, fastest = float(envelope.slowest), min(float(envelope.fastest), float(airframe.max_rotor_speed))
+    if not np.all((squares > slowest**2) & (squares < fastest**2)):
+        speeds = ", ".join(f"{x:.4g}" for x in np.sqrt(np.maximum(squares, 0)))
+        raise InputError(
+            f"the vehicle cannot hover within the envelope: its rotors need {speeds} rad/s, and the limits are "
+            f"{slowest:.4g} and {fastest:.4g} rad/s; correct the limits, or the airframe."
+        )
+    return squares
 
 
 def largest(uses: Uses) -> dict[str, Float[Array, " columns"]]:

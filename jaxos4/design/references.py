@@ -1,65 +1,299 @@
-"""The standard references for a controller: multisine, doublet, 3-2-1-1 and chirp.
+"""The design of references for a real vehicle, which flies under its controller: sums of tones, which repeat.
 
 References are roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, as `fly_closed_loop`
 takes them.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
+from os import PathLike
+from typing import ClassVar, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from ..excitation import DOUBLET, STANDARD_TONES, TAPER
+from .._custom_types import Key, Numeric, Scalar, as_float
+from ..bracket import Bracket
+from ..closed_loop import ClosedLoop
+from ..errors import InputError
+from ..excitation import standard_references, with_largest
+from .envelope import ANGLES, RATES, Envelope, Uses
+from .files import write_references
+from .filtered import INERTIAS, Filters, model_of
+from .fleet import LANES, Fleet, batch_of, fly_batch
+from .task import (
+    AbstractTask,
+    Coefficients,
+    Design,
+    Designed,
+    Flown,
+    Progress,
+    Ranges,
+    criterion_of,
+    solve,
+)
 
-# Pulses of a reference last about 0.3 periods of the controlled vehicle's attitude [s].
-WIDTH = 0.3
-# Each pulse of a reference is as high as the others, unlike those of torque in `excitation`.
-STEP_3211 = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
-_VERTICAL_TONES = (0.4, 0.8, 1.2)
-_FREQUENCIES = (0.2, 3.0)
-
-Shape = Float[np.ndarray, "samples 4"]
-
-
-def _tones(samples: int, dt: float) -> Shape:
-    """All references at once."""
-    time = dt * np.arange(samples)[:, None]
-    tones = [np.sin(2 * math.pi * time * np.asarray(some)).sum(axis=1) for some in (*STANDARD_TONES, _VERTICAL_TONES)]
-    return np.stack(tones, axis=1)
-
-
-def pulses(heights: Sequence[float], width: float, samples: int, dt: float) -> Shape:
-    """Pulses of a `width` [s] in one reference after another, each time with the other sign, as often as they fit."""
-    once = np.repeat([*heights, 0.0], max(round(width / dt), 1))
-    return _in_turn([once, -once], samples)
-
-
-def _sweeps(samples: int, dt: float) -> Shape:
-    """A linear sweep of frequencies in one reference after another."""
-    share = np.linspace(0, 1, samples // 4)
-    first, last = _FREQUENCIES
-    phase = 2 * math.pi * share.size * dt * (first * share + (last - first) * share**2 / 2)
-    fade = np.sin(math.pi / 2 * np.clip(np.minimum(share, 1 - share) / TAPER, 0, 1)) ** 2
-    return _in_turn([fade * np.sin(phase)], samples)
-
-
-def _in_turn(shapes: Sequence[np.ndarray], samples: int) -> Shape:
-    found, length = np.zeros((samples, 4)), len(shapes[0])
-    for slot in range(samples // length):
-        found[slot * length : (slot + 1) * length, slot % 4] = shapes[slot // 4 % len(shapes)]
-    return found
+_RANGES = Ranges(samples=(250, 20_000), cycles=2, fastest=0.1, remedy="; longer flights repeat the references")
+_LARGEST_ANGLE, _LARGEST_ACCELERATION = 1.0, 5.0
+# References that need too much are reduced: to about this share of a limit, so often, each time not below this factor.
+_TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
+# A parameter counts as excited if its bound is below this share of the bracket's standard deviation.
+_LITTLE = 0.9
+# Amplitudes of the tones, for which the vehicle is linear: angles [rad] and vertical acceleration [m/s^2].
+_SMALL = np.array([0.02, 0.02, 0.02, 0.2])
+# The least number of flights of a batch of tones that hover in gusts instead.
+_GUSTY = 8
+# Times in periods at which the search looks, about eight for each cycle of the fastest tone.
+_POINTS = np.arange(200) / 200
 
 
-_STANDARD: dict[str, Callable[[int, float], Shape]] = {
-    "multisine": _tones,
-    "doublet": lambda samples, dt: pulses(DOUBLET, WIDTH, samples, dt),
-    "3211": lambda samples, dt: pulses(STEP_3211, WIDTH, samples, dt),
-    "chirp": _sweeps,
-}
+class Tones(NamedTuple):
+    """The tones of references, each a whole number of cycles in a period of the references.
+
+    - `period`: in samples. `count`: the number of tones, which are the multiples of 1 / period.
+    """
+
+    period: int
+    count: int  # type: ignore[assignment]
+
+    @classmethod
+    def up_to(cls, bandwidth: float, samples: int, dt: float) -> "Tones":
+        """As many as fit into a batch, up to a bandwidth [Hz]: the references of a long flight repeat."""
+        most = (LANES - 1 - _GUSTY) // 2
+        period = (samples - 1) // max(math.ceil(samples * dt * bandwidth / most), 1)
+        return cls(period, max(min(math.floor(bandwidth * period * dt + 1e-9), most), 1))
+
+    def turns(self, periods: Float[np.ndarray, " points"]) -> np.ndarray:
+        """exp(i angle) of each tone, at times in periods."""
+        return np.exp(2j * math.pi * np.outer(periods, np.arange(1, self.count + 1)))
+
+    def basis(self, periods: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points coefficients"]:
+        """Cosines of all tones, then their sines, at times in periods."""
+        return _parts(self.turns(periods))
 
 
-def standard_references(samples: int, dt: float, largest: Float[np.ndarray, "4"]) -> dict[str, Shape]:
-    """The standard references, each with these `largest` values; 0 if a shape does not fit into the time."""
-    shapes = {name: make(samples, dt) for name, make in _STANDARD.items()}
-    return {name: largest * shape / np.maximum(np.abs(shape).max(axis=0), 1e-9) for name, shape in shapes.items()}
+def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
+    """Real parts, then imaginary parts."""
+    return np.concatenate([np.real(turns), np.imag(turns)], axis=-1)
+
+
+class Response(NamedTuple):
+    """The response of a vehicle under its controller to small tones. Coefficients are cosines, then sines.
+
+    - `base`: information of a flight in gusts without references, with the prior.
+    - `tones`: the information that a unit of each tone of each reference adds. Both are about the inertias first.
+    - `signals`: the change of the angles and rates of an axis by a unit of the coefficients of its reference, as a
+      share of the part of the limit that gusts leave; by the name of the limit.
+    """
+
+    base: Float[Numeric, "unknowns unknowns"]
+    tones: Float[Numeric, "references count unknowns unknowns"]
+    signals: dict[str, Float[Numeric, "axes points coefficients"]]
+
+    @classmethod
+    def of(
+        cls,
+        fleet: Fleet,
+        filters: Filters,
+        envelope: Envelope,
+        largest: Float[np.ndarray, "4"],
+        tones: Tones,
+        samples: int,
+        key: Key,
+    ) -> "Response":
+        """Fly each tone once in still air, by the simulator. A unit of a tone has the `largest` value of its reference.
+
+        For small tones the vehicle is linear. So the information of a sum of tones is the sum of their informations.
+
+        **Raises:** `InputError` if gusts alone use a limit.
+        """
+        count, turns = tones.count, tones.turns(np.arange(samples) / tones.period)
+        references = np.zeros((LANES, samples, 4))
+        references[:count, :, :3] = _SMALL[:3] * np.real(turns).T[:, :, None]
+        references[count : 2 * count, :, 3] = _SMALL[3] * np.real(turns).T
+        in_gusts = np.arange(LANES) > 2 * count  # the one before is in still air, and has no reference
+        flights = fly_batch(batch_of(fleet.loop, in_gusts), jnp.asarray(references), as_float(fleet.dt), key)
+        found, states = filters.informations(flights), np.asarray(flights.states)
+        whole, channels = np.asarray(found.whole), np.asarray(found.channels)
+        excess = channels - channels[2 * count]
+        each = np.stack([*np.moveaxis(excess[:count, :3], 1, 0), excess[count : 2 * count].sum(axis=1)])
+        # In still air nothing is learned about the noise.
+        beyond = whole.shape[-1] - channels.shape[-1]
+        each = filters.about_inertias(np.pad(each, ((0, 0), (0, 0), (0, beyond), (0, beyond))))
+        base = filters.with_prior(whole[in_gusts].mean(axis=0))
+        scale = np.sqrt(np.diagonal(base))
+        scale[: len(INERTIAS)] = 1  # their bounds are relative already
+        unit = np.outer(scale, scale)
+        # The answers in the last period, in which the beginning is forgotten.
+        last = np.conj(turns[-tones.period :]) * 2 / tones.period
+        signals = {}
+        for name, columns in (("angle", ANGLES), ("rate", RATES)):
+            left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
+            if (left <= 0).any():
+                raise _too_gusty(name)
+            answers = np.einsum("kta,tk->ak", states[:count, -tones.period :, columns], last) / _SMALL[:3, None]
+            moving = _parts(answers[:, None] * tones.turns(_POINTS))
+            signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
+        relative = np.square(largest / _SMALL)[:, None, None, None]
+        return cls(jnp.asarray(base / unit), jnp.asarray(relative * each / unit), signals)
+
+
+class References(AbstractTask):
+    """References for a controller. The targets are Ix, Iy and Iz; a coefficient of 1 is a tone of the largest value.
+
+    - `scale`: the moments of inertia [kg m^2]. `unexcited`: almost the standard deviations of the bracket.
+    - `largest`: the largest value of each reference.
+    - `basis`: the tones at the points of a period.
+    """
+
+    kind: ClassVar[str] = "references"
+    vehicles: ClassVar[int] = LANES
+    starts: ClassVar[int] = 8
+    first: ClassVar[float] = 0.85
+    steps: ClassVar[int] = 80
+
+    envelope: Envelope
+    scale: Float[Numeric, "3"]
+    unexcited: Float[Numeric, " parameters"]
+    fleet: Fleet
+    filters: Filters
+    response: Response
+    largest: Float[Numeric, "4"]
+    basis: Float[Array, "points coefficients"]
+    tones: Tones = eqx.field(static=True)
+    samples: int = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    criterion: str = eqx.field(static=True)
+
+    def objective(self, coefficients: Coefficients) -> Scalar:
+        """See `AbstractTask`."""
+        cosines, sines = jnp.moveaxis(coefficients.reshape(4, 2, -1), 1, 0)
+        added = jnp.einsum("rk,rkuv->uv", jnp.square(cosines) + jnp.square(sines), self.response.tones)
+        return criterion_of(
+            jnp.asarray(self.response.base) + added, jnp.ones(len(INERTIAS), dtype=float), self.criterion
+        )
+
+    def uses(self, coefficients: Coefficients) -> Uses:
+        """See `AbstractTask`."""
+        each = coefficients.reshape(4, -1)
+        signals = self.response.signals.items()
+        return {name: jnp.einsum("apk,ak->pa", signal, each[:3]) for name, signal in signals} | {
+            "reference": self.basis @ each.T
+        }
+
+    def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
+        """See `AbstractTask`. The references have their largest values, or are reduced to a share of them."""
+        basis = self.tones.basis(np.arange(self.samples) / self.tones.period)
+        inputs = with_largest(basis @ coefficients.reshape(4, -1).T, np.asarray(self.largest))
+        uses, factor, still = self.fleet.uses(inputs, self.envelope), 1.0, None
+        for _ in range(_MOST_REDUCTIONS):
+            if max(uses.values()) <= 1:
+                break
+            still = still or self.fleet.uses(0 * inputs, self.envelope)
+            steps = [1.0]
+            for name, share in uses.items():
+                if still[name] >= 1:
+                    raise _too_gusty(name)
+                if share > 1:  # the share beyond that of gusts grows about linearly with the references
+                    steps.append((_TARGET - still[name]) / (share - still[name]))
+            factor *= max(min(steps), _LEAST_STEP)
+            uses = self.fleet.uses(factor * inputs, self.envelope)
+        if max(uses.values()) > 1:
+            raise InputError("no references keep the limits; give weaker gusts, or wider limits.")
+        return factor * inputs, uses | {"reference": factor}
+
+    def standard(self) -> dict[str, Flown]:
+        """See `AbstractTask`. They have the largest values of the references, whatever the limits."""
+        shapes = standard_references(self.samples, self.fleet.dt, np.asarray(self.largest))
+        return {name: (shape, {}) for name, shape in shapes.items()}
+
+    def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
+        """See `AbstractTask`. The bounds are those of filter error, after a flight through gusts."""
+        bounds = self.fleet.bounds(self.filters, {name: references for name, (references, _) in flown.items()})
+        dt = self.fleet.dt
+        return {
+            name: Designed(references, dt, bounds[name], uses, dt * self.tones.period)
+            for name, (references, uses) in flown.items()
+        }
+
+    def write(self, designed: Designed, path: str | PathLike[str]) -> None:
+        """See `write_references`."""
+        write_references(designed, path)
+
+
+def design_references(
+    loop: ClosedLoop,
+    *,
+    angle: float = 0.3,
+    acceleration: float = 1.5,
+    limits: Envelope | Mapping[str, float] | None = None,
+    bracket: Bracket | None = None,
+    duration: float = 20.0,
+    dt: float = 0.004,
+    criterion: str = "D",
+    bandwidth: float = 6.0,
+    compare: bool = False,
+    key: Key | int,
+    progress: Progress = lambda _: None,
+) -> Design:
+    """Design the references with which filter error identifies the moments of inertia of a vehicle most accurately.
+
+    Each reference is a sum of tones, which repeats. The simulator flies each tone once; the search for the amplitudes
+    and phases is then algebra. At the end 64 vehicles with moments of inertia from the bracket fly the references
+    through gusts, and the references are reduced until all of them stay within the limits.
+
+    **Arguments:**
+
+    - `loop`: the vehicle, its controller, its gusts and its sensors.
+    - `angle`, `acceleration`: the largest reference of roll, pitch and yaw [rad] and of the vertical acceleration
+      [m/s^2].
+    - `limits`: an `Envelope`, or some of its limits by name, but not `slew`. The others are those that 3-2-1-1
+      references with the same largest values need; those of rotor speeds are the airframe's.
+    - `bracket`: the knowledge of the parameters of a `FlightModel` before the flight; by default the model's.
+    - `duration`, `dt`: length and sample time [s].
+    - `criterion`: as of `design_input`, for the logarithms of Ix, Iy and Iz.
+    - `bandwidth`: the highest frequency [Hz].
+    - `compare`: whether to judge the standard references too.
+    - `key`: for the draws, the gusts and the starts, or a seed. `progress`: called with the name of each stage.
+
+    **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
+    """
+    for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
+        if not 0 < value <= most:
+            raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
+    _RANGES.check(duration, dt, bandwidth, criterion)
+    progress("limits")
+    key = jax.random.key(key) if isinstance(key, int) else key
+    bracket = Bracket.default(model_of(loop)) if bracket is None else bracket
+    samples, largest = round(duration / dt) + 1, np.array([angle, angle, angle, acceleration])
+    fleet, filters = Fleet.of(loop, bracket, dt, key), Filters.of(loop, bracket.half_width)
+    envelope = fleet.envelope(standard_references(samples, dt, largest)["3211"], limits or {})
+    tones = Tones.up_to(bandwidth, samples, dt)
+    progress("flying tones")
+    response = Response.of(fleet, filters, envelope, largest, tones, samples, jax.random.fold_in(key, 3))
+    task = References(
+        envelope=envelope,
+        scale=np.asarray(loop.airframe.inertia),
+        unexcited=_LITTLE * filters.bounds(np.zeros((filters.prior.shape[0],) * 2)),
+        fleet=fleet,
+        filters=filters,
+        response=response,
+        largest=largest,
+        basis=as_float(tones.basis(_POINTS)),
+        tones=tones,
+        samples=samples,
+        size=8 * tones.count,
+        names=filters.names,
+        units=filters.units,
+        criterion=criterion,
+    )
+    return solve(task, compare=compare, key=key, progress=progress)
+
+
+def _too_gusty(name: str) -> InputError:
+    return InputError(f"gusts alone need the whole `{name}`, without references; give weaker gusts, or a wider limit.")

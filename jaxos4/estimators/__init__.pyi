@@ -1,6 +1,6 @@
 from .ant_colony import AntColony as AntColony
 from .equation_error import EquationError as EquationError
-from .filter_error import FilterError as FilterError, FilterFit as FilterFit
+from .filter_error import FilterError as FilterError
 from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS
 from .kalman import JointEKF as JointEKF

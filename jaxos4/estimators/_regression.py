@@ -16,9 +16,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Count, Scalar
-from ..bracket import Bracket
-from ..estimate import Estimate, best_start, check_dynamic_count, conclude
+from .._custom_types import Count, Parameters, Scalar
+from ..estimate import Estimate, as_estimate, best_start, check_dynamic_count
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
@@ -33,13 +32,15 @@ DIFFUSE = 1e6
 class Regression(NamedTuple):
     """A flight as a regression for the parameters, in half-widths from the bracket's center.
 
+    - `center`, `half_width`: of the bracket; a half-width of 0 holds a parameter.
     - `rates`: NaN if not measured, and at the first sample if the initial state is known.
     - `anchor`: the known initial rates; NaN if they are free. `anchored`: whether they are known.
     - `memory`, `forgetting`, `bridge`: see `RecursiveLeastSquares`.
     """
 
     problem: ShootingProblem
-    bracket: Bracket
+    center: Parameters
+    half_width: Parameters
     rates: Float[Array, "samples 3"]
     anchor: Float[Array, "3"]
     anchored: bool
@@ -106,7 +107,7 @@ class Regression(NamedTuple):
         of both ends (the trapezoidal rule), with an error of the order T^2.
         """
         model, sigma, dt = self.problem.model, self.problem.sigma[CASCADE_ORDER[:3]], self.problem.flight.dt
-        center, half_width = self.bracket.center, self.bracket.half_width
+        center, half_width = self.center, self.half_width
 
         def acceleration(steps, rates, forcing):
             return jnp.stack(model.angular_acceleration(Rates(*rates), forcing, center + half_width * steps)) * dt
@@ -124,20 +125,38 @@ class Regression(NamedTuple):
 
 
 def regression(
-    problem: ShootingProblem, bracket: Bracket, *, memory: Scalar, bridge: Count, forgetting: Scalar | float = 1.0
+    problem: ShootingProblem, *, memory: Scalar, bridge: Count, forgetting: Scalar | float = 1.0
 ) -> Regression:
-    """The regression of a flight's body rates."""
-    if not problem.model.is_linear:
-        raise ValueError(
-            "`problem.model` must have rate equations that are linear in its parameters for a regression: identify "
-            "alpha1..8 and then call `fit_inertia`, or use an estimator that shoots."
-        )
-    rates = problem.restrict("rates")
+    """The regression of a flight's body rates. Parameters in which it is not linear stay at their center."""
+    unknowns, rates = problem.unknowns.usable, problem.restrict("rates")
+    linear = np.array([each.linear and not each.in_forcing for each in problem.model.parameters])
     anchored = problem.initial_state is not None
     anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
-    measured = rates.measured()[:, :3]
-    decay = jnp.asarray(forgetting, dtype=float)
-    return Regression(problem, bracket, measured, anchor, anchored, memory, decay, bridge)
+    return Regression(
+        problem=problem,
+        center=unknowns.center,
+        half_width=jnp.where(linear, unknowns.width, 0.0),
+        rates=rates.measured()[:, :3],
+        anchor=anchor,
+        anchored=anchored,
+        memory=memory,
+        forgetting=jnp.asarray(forgetting, dtype=float),
+        bridge=bridge,
+    )
+
+
+def check_linear(problem: ShootingProblem) -> None:
+    """Raises `ValueError` unless the rate equations are linear in all parameters that are not held.
+
+    Inside `jit`, where it is not known which parameters are held, all of them must be linear.
+    """
+    mask, parameters = problem.unknowns.free, problem.model.parameters
+    free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
+    if any(not each.linear or each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):
+        raise ValueError(
+            "`problem.model` must have rate equations that are linear in its parameters for a regression: hold the "
+            "others, or identify alpha1..8 and then call `fit_inertia`, or use an estimator that shoots."
+        )
 
 
 def normal_equations(
@@ -208,7 +227,6 @@ def check_settings(memory: Scalar, bridge: Count, forgetting: Scalar | None = No
 
 def answer(
     data: Regression,
-    bracket: Bracket,
     steps: Float[Array, " parameters"],
     covariance: Float[Array, "parameters parameters"],
     *,
@@ -219,12 +237,12 @@ def answer(
     A parameter that is not identifiable can have any value. If the flight cannot be simulated with it, the estimate is
     the bracket's center. If there is a `history`, its last row is the estimate.
     """
-    problem, usable = data.problem, data.bracket
-    parameters = usable.center + usable.half_width * steps if history is None else history[-1]
-    covariance = usable.half_width[:, None] * covariance * usable.half_width[None, :]
-    identifiable = usable.identifies(jnp.sqrt(jnp.diagonal(covariance))).all()
+    problem, center, half_width = data.problem, data.center, data.half_width
+    parameters = center + half_width * steps if history is None else history[-1]
+    covariance = half_width[:, None] * covariance * half_width[None, :]
+    identifiable = problem.unknowns.usable.identifiable(jnp.sqrt(jnp.diagonal(covariance))).all()
     initial_state, rollouts = best_start(problem, parameters)
-    choices = (parameters, initial_state), (usable.center, problem.first_state()[0])
+    choices = (parameters, initial_state), (center, problem.first_state()[0])
     choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
     # One after the other, so that the simulation is compiled once.
     shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
@@ -232,8 +250,8 @@ def answer(
     (parameters, initial_state), shot = jax.tree.map(
         lambda both: jnp.where(identifiable | flies, *both), (choices, shots)
     )
-    return conclude(
-        bracket,
+    return as_estimate(
+        problem,
         parameters=parameters,
         covariance=covariance,
         initial_state=initial_state,

@@ -18,19 +18,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Key, Scalar, as_float, as_int
+from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import (
     REACH,
     AbstractEstimator,
     Estimate,
-    check_bracket,
+    as_estimate,
     check_count,
     check_dynamic_count,
     check_positive,
-    conclude,
 )
 from ..linalg import covariance_of_shared
-from ..shooting import ROUNDING, ShootingProblem
+from ..shooting import ROUNDING, AbstractProblem
 
 Points = Float[Array, "archive unknowns"]
 Costs = Float[Array, " archive"]
@@ -71,6 +71,7 @@ class AntColony(AbstractEstimator):
     shoots: ClassVar[bool] = True
     prior: ClassVar[float] = NO_PRIOR
     needs_network: ClassVar[bool] = False
+    in_closed_loop: ClassVar[bool] = True
 
     archive: int = eqx.field(static=True, default=50)
     ants: int = eqx.field(static=True, default=10)
@@ -88,8 +89,8 @@ class AntColony(AbstractEstimator):
         for name in ("q", "xi", "tolerance"):
             check_positive(name, getattr(self, name), finite=True)
 
-    @eqx.filter_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    @quick_jit
+    def __call__(self, problem: AbstractProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
         The estimate's `rollouts` count each point that was simulated, and the Fisher information at the answer. The
@@ -97,15 +98,14 @@ class AntColony(AbstractEstimator):
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters.
         """
-        check_bracket(problem, bracket)
-        usable, count = bracket.usable, len(problem.model.parameter_names)
-        first, off = problem.first_state()
+        problem = problem.within(bracket)
+        usable, count, (first, off) = problem.unknowns.usable, problem.unknowns.count, problem.first_state()
         unknowns = count + problem.windows * problem.free_size
 
         def split(point: Float[Array, " unknowns"]) -> tuple[Array, Array]:
-            """The parameters and the initial state of a point."""
+            """The shared unknowns and the initial state of a point."""
             start = first + off * point[count:] if problem.free_size else first
-            return usable.center + usable.half_width * point[:count], start
+            return usable.center + usable.width * point[:count], start
 
         @jax.vmap
         def shoot(point: Float[Array, " unknowns"]) -> Scalar:
@@ -124,8 +124,8 @@ class AntColony(AbstractEstimator):
         colony = jax.lax.while_loop(lambda c: ~self._settled(c.costs) & (c.sweeps < self.max_sweeps), sweep, colony)
         parameters, initial_state = split(colony.points[0])
         curvature = problem.curvatures(parameters, initial_state)
-        return conclude(
-            bracket,
+        return as_estimate(
+            problem,
             parameters=parameters,
             covariance=covariance_of_shared(curvature.information, count),
             initial_state=initial_state,
@@ -134,6 +134,7 @@ class AntColony(AbstractEstimator):
             sweeps=colony.sweeps,
             sound=curvature.shot.sound.all(),
             done=self._settled(colony.costs),
+            parts=curvature.parts,
         )
 
     def _best(self, points: Float[Array, "tried unknowns"], costs: Float[Array, " tried"]) -> tuple[Points, Costs]:

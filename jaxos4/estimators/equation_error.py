@@ -5,10 +5,19 @@ from typing import ClassVar
 import equinox as eqx
 
 from .._custom_types import Count, Parameters, Scalar, as_float, as_int
+from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_bracket
+from ..estimate import AbstractEstimator, Estimate
 from ..shooting import ShootingProblem, in_blocks
-from ._regression import answer, check_settings, normal_equations, propagated_covariance, regression, solve
+from ._regression import (
+    answer,
+    check_linear,
+    check_settings,
+    normal_equations,
+    propagated_covariance,
+    regression,
+    solve,
+)
 
 
 class EquationError(AbstractEstimator):
@@ -48,30 +57,31 @@ class EquationError(AbstractEstimator):
     def __check_init__(self):
         check_settings(self.memory, self.bridge)
 
-    @eqx.filter_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
-        linear in them.
+        linear in those that are not held.
         """
-        check_bracket(problem, bracket)
-        return in_blocks(self._identify, problem, bracket)
+        check_linear(problem)
+        return self._blocks(problem.within(bracket))
 
-    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    @quick_jit
+    def _blocks(self, problem: ShootingProblem) -> Estimate:
+        return in_blocks(self._identify, problem)
+
+    def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
-        data = regression(problem, bracket.usable, memory=self.memory, bridge=self.bridge)
+        data = regression(problem, memory=self.memory, bridge=self.bridge)
         rows, back = data.rows()
         steps, inverse = solve(*normal_equations(rows))
-        return answer(data, bracket, steps, propagated_covariance(data, rows, back, steps, inverse))
+        return answer(data, steps, propagated_covariance(data, rows, back, steps, inverse))
 
-    @eqx.filter_jit
-    def solution(self, problem: ShootingProblem, bracket: Bracket) -> Parameters:
+    @quick_jit
+    def solution(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Parameters:
         """The least-squares solution alone, without its covariance and without a simulation.
 
-        **Raises:** as a call does.
+        Parameters in which the rate equations are not linear stay at the center of their bracket.
         """
-        check_bracket(problem, bracket)
-        usable = bracket.usable
-        rows, _ = regression(problem, usable, memory=self.memory, bridge=self.bridge).rows()
-        return usable.center + usable.half_width * solve(*normal_equations(rows))[0]
+        data = regression(problem.within(bracket), memory=self.memory, bridge=self.bridge)
+        return data.center + data.half_width * solve(*normal_equations(data.rows()[0]))[0]

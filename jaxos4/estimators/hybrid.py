@@ -1,7 +1,7 @@
 """The hybrid: a network says where to look, and IBSS finds the answer there."""
 
 import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,18 +10,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric
+from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
 from ..results import RESULTS
-from ..shooting import ShootingProblem, in_blocks
+from ..shooting import AbstractProblem, InnovationsProblem, in_blocks
 from .ibss import IBSS
 
 _LEVEL = 0.999  # the share of flights in which the seed's intervals hold all parameters at once
-# The seed was wrong if the answer is this many half-widths of these intervals away from the seed,
+# The seed was wrong if the answer is this many half-widths of these intervals away from the seed.
 _MISSED = 2.0
-# or if the cost is this many standard deviations above the cost of pure noise.
-_UNEXPLAINED = 5.0
 
 
 class Hybrid(AbstractEstimator):
@@ -45,13 +44,19 @@ class Hybrid(AbstractEstimator):
     shoots: ClassVar[bool] = True
     prior: ClassVar[float] = NO_PRIOR
     needs_network: ClassVar[bool] = True
+    in_closed_loop: ClassVar[bool] = True
 
     network: TrainedNetwork
     ibss: IBSS = eqx.field(default_factory=IBSS)
 
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        """Identifies one flight. Raises as the network does."""
-        return search_from_seed(self.ibss, problem, bracket, self.network(problem, bracket))
+    def __call__(self, problem: AbstractProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight. Raises as the network does.
+
+        The network looks at the shooting problem of a problem of innovations.
+        """
+        problem = problem.within(bracket)
+        shooting: Any = problem.problem if isinstance(problem, InnovationsProblem) else problem
+        return search_from_seed(self.ibss, problem, self.network(shooting))
 
 
 class Seed(NamedTuple):
@@ -83,31 +88,32 @@ class Seed(NamedTuple):
         return cls(nowhere, unknown, nowhere, np.zeros(starts, kind), np.zeros((), jnp.result_type(int)))
 
 
-@eqx.filter_jit
-def search_from_seed(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, answer: Estimate) -> Estimate:
+@quick_jit
+def search_from_seed(ibss: IBSS, problem: AbstractProblem, answer: Estimate) -> Estimate:
     """`search_near` the seed of an `answer`, as one program."""
-    return search_near(ibss, problem, bracket, Seed.of(answer))
+    return search_near(ibss, problem, Seed.of(answer))
 
 
-def search_near(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
+def search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
     """Searches near the `seed`, and in the whole bracket if the seed was wrong or has no answer."""
-    return in_blocks(_search_near, ibss, problem, bracket, seed)
+    return in_blocks(_search_near, ibss, problem, seed)
 
 
-def _search_near(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: Seed) -> Estimate:
+def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
     """The search of one flight, or of a block of flights."""
-    answered, usable = jnp.isfinite(seed.covariance).all(), bracket.usable
-    wide_spread = jnp.diag(jnp.square(usable.half_width / 2))  # the half-width is two standard deviations
+    answered, unknowns, count = jnp.isfinite(seed.covariance).all(), problem.unknowns.usable, seed.parameters.shape[0]
+    # The half-width is two standard deviations.
+    wide_spread = jnp.diag(jnp.square(unknowns.half_width[:count] / 2))
     first = problem.split(problem.first_state()[0])
-    # The network's channels come first.
-    estimated = seed.initial_state.reshape(problem.windows, -1)[:, : problem.size]
+    # The network's channels come first; a problem whose initial state is no unknown needs none of them.
+    estimated = seed.initial_state.reshape(problem.windows, -1)[:, : first.shape[1]]
     seeded = first.at[:, : estimated.shape[1]].set(estimated)
+    rest = jnp.full(unknowns.count - count, jnp.nan)
 
     def search(hit: Bool[Array, ""], near: Bool[Array, ""]) -> tuple[Bool[Array, ""], Estimate]:
         found = ibss.search(
             problem,
-            bracket,
-            start=jnp.where(near, seed.parameters, usable.center),
+            start=jnp.concatenate([jnp.where(near, seed.parameters, unknowns.center[:count]), rest]),
             spread=jnp.where(near, seed.covariance, wide_spread),
             initial_state=jnp.where(near, seeded, first).ravel(),
             cascade=~near,
@@ -129,11 +135,9 @@ def _search_near(ibss: IBSS, problem: ShootingProblem, bracket: Bracket, seed: S
     )
 
 
-def _confirms(near: Estimate, seed: Seed, problem: ShootingProblem) -> Bool[Array, ""]:
+def _confirms(near: Estimate, seed: Seed, problem: AbstractProblem) -> Bool[Array, ""]:
     """Whether the search near a seed ended well, close to the seed, and with residuals no larger than noise."""
-    far = jnp.abs(near.parameters - seed.parameters) > _MISSED * seed.half_width
-    measurements = jnp.sum(~jnp.isnan(problem.measured()))
-    explained = 2 * near.cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
+    far = jnp.abs(near.parameters[: seed.parameters.shape[0]] - seed.parameters) > _MISSED * seed.half_width
     # A parameter that is not identifiable near the seed is not identifiable elsewhere either.
     ended = (near.result == RESULTS.successful) | (near.result == RESULTS.unidentifiable)
-    return ended & ~far.any() & explained
+    return ended & ~far.any() & problem.explains(near.cost)

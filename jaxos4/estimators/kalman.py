@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Parameters, Scalar, as_int
+from .._xla import quick_jit
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_dynamic_count, check_recursive, conclude
+from ..estimate import AbstractEstimator, Estimate, as_estimate, check_dynamic_count, check_recursive
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
-from ..shooting import Rows, ShootingProblem, in_blocks
+from ..shooting import Rows, ShootingProblem, Unknowns, in_blocks
 
 _SETTLED = 0.1  # standard deviations: the passes end once one of them moves no parameter by more
 
@@ -75,19 +76,19 @@ class JointEKF(AbstractEstimator):
     def __check_init__(self):
         check_dynamic_count("passes", self.passes, 1)
 
-    @eqx.filter_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    @quick_jit
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
         windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
-        check_recursive(problem, bracket)
-        return in_blocks(self._identify, problem, bracket)
+        check_recursive(problem)
+        return in_blocks(self._identify, problem.within(bracket))
 
-    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
-        rows, prior = jax.tree.map(lambda leaf: leaf[0], problem.rows()), bracket.usable
+        rows, prior = jax.tree.map(lambda leaf: leaf[0], problem.rows()), problem.unknowns.usable
         count, size = prior.center.shape[0], problem.size
         start = problem.first_state()[0]
 
@@ -98,7 +99,7 @@ class JointEKF(AbstractEstimator):
             before, first = split(last.joint), last.passes == 0
             joint, root, history = _run(problem, rows, prior, before, first=first)
             std = jnp.sqrt(jnp.square(root[size : size + count]).sum(axis=1))
-            moved = (jnp.abs(split(joint)[0] - before[0]) / std).max()
+            moved = (jnp.abs(split(joint)[0] - before[0]) / jnp.where(prior.free, std, 1.0)).max()
             # A NaN ends the passes: it stays NaN.
             done = jnp.where(first, self.passes == 1, ~(moved > _SETTLED))
             return _Pass(joint, root, history, last.passes + 1, done)
@@ -116,8 +117,8 @@ class JointEKF(AbstractEstimator):
         parameters, initial_state = split(last.joint)
         cost, sound = problem.shots(parameters, initial_state)
         factor = last.root[size : size + count]
-        return conclude(
-            bracket,
+        return as_estimate(
+            problem,
             parameters=parameters,
             covariance=gram(factor),
             initial_state=initial_state,
@@ -138,7 +139,7 @@ def _joint(state: Float[Array, " size"], parameters: Parameters, free_size: int)
 def _run(
     problem: ShootingProblem,
     rows: Rows,
-    prior: Bracket,
+    prior: Unknowns,
     about: tuple[Parameters, Float[Array, " size"]],
     *,
     first: Bool[Array, ""],
@@ -149,7 +150,7 @@ def _run(
     """
     count, size = prior.center.shape[0], problem.size
     start, off = problem.first_state()
-    spread = jnp.concatenate([prior.half_width, off[: problem.free_size]])
+    spread = jnp.concatenate([prior.width, off[: problem.free_size]])
     constants = jnp.diag(spread)
     # A known initial state has no tangent of its own.
     moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])

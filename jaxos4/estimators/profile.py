@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Scalar, as_float
+from .._custom_types import as_float
+from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
-from ..models.held import HeldParameters
 from ..shooting import ShootingProblem
 
 
@@ -21,7 +21,7 @@ class Profile(NamedTuple):
     - `deviance`: twice the difference of the costs with and without the parameter held. Values with a deviance below
       3.84 form the 95 % likelihood interval. A negative deviance shows that the search of `whole` had not converged;
       an infinite one, that one of the two fits has no answer.
-    - `estimates`: of the other parameters, a batch with one estimate for each value.
+    - `estimates`: a batch with one estimate for each value, in which the parameter is held.
     """
 
     values: Float[Array, " values"]
@@ -37,7 +37,7 @@ def profile_likelihood(
 
     **Arguments:**
 
-    - `estimator`: one that shoots, such as `IBSS` or `OutputError`; its problem has one parameter fewer.
+    - `estimator`: one that shoots, such as `IBSS` or `OutputError`.
     - `name`: of the parameter, as in `problem.model.parameter_names`.
 
     **Raises:** `ValueError` for an unknown name, or values that are not one-dimensional.
@@ -48,23 +48,15 @@ def profile_likelihood(
     values = as_float(values)
     if values.ndim != 1:
         raise ValueError(f"`values` must be one-dimensional, got shape {values.shape}.")
-    whole = estimator(problem, bracket)
-    held = _held(estimator, problem, bracket, names.index(name), values)
+    problem = problem.within(bracket)
+    whole = estimator(problem)
+    held = _held(estimator, problem, name, values)
     deviance = jnp.where(jnp.isfinite(whole.cost), 2 * (held.cost - whole.cost), jnp.inf)
     return Profile(values, whole, deviance, held)
 
 
-@eqx.filter_jit
+@quick_jit
 def _held(
-    estimator: AbstractEstimator,
-    problem: ShootingProblem,
-    bracket: Bracket,
-    index: int,
-    values: Float[Array, " values"],
+    estimator: AbstractEstimator, problem: ShootingProblem, name: str, values: Float[Array, " values"]
 ) -> Estimate:
-    def at(value: Scalar) -> Estimate:
-        model = HeldParameters(problem.model, held=(index,), values=value[None])
-        others = Bracket(model.without(bracket.lower), model.without(bracket.upper))
-        return estimator(eqx.tree_at(lambda p: p.model, problem, model), others)
-
-    return eqx.filter_vmap(at)(values)
+    return eqx.filter_vmap(lambda value: estimator(problem.hold({name: value})))(values)

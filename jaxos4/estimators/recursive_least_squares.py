@@ -7,10 +7,19 @@ import jax
 import jax.numpy as jnp
 
 from .._custom_types import Count, Scalar, as_float, as_int
+from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_recursive
 from ..shooting import ShootingProblem, in_blocks
-from ._regression import answer, check_settings, normal_equations, propagated_covariance, regression, solve
+from ._regression import (
+    answer,
+    check_linear,
+    check_settings,
+    normal_equations,
+    propagated_covariance,
+    regression,
+    solve,
+)
 
 
 class RecursiveLeastSquares(AbstractEstimator):
@@ -47,20 +56,24 @@ class RecursiveLeastSquares(AbstractEstimator):
     def __check_init__(self):
         check_settings(self.memory, self.bridge, self.forgetting)
 
-    @eqx.filter_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model that is not linear
-        in them, or a flight that is cut into windows.
+        in those that are not held, or a flight that is cut into windows.
         """
-        check_recursive(problem, bracket)
-        return in_blocks(self._identify, problem, bracket)
+        check_recursive(problem)
+        check_linear(problem)
+        return self._blocks(problem.within(bracket))
 
-    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    @quick_jit
+    def _blocks(self, problem: ShootingProblem) -> Estimate:
+        return in_blocks(self._identify, problem)
+
+    def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
-        usable, count = bracket.usable, bracket.lower.shape[0]
-        data = regression(problem, usable, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
+        count = problem.unknowns.count
+        data = regression(problem, memory=self.memory, forgetting=self.forgetting, bridge=self.bridge)
         rows, back = data.rows()
 
         def update(carry, row):
@@ -73,4 +86,4 @@ class RecursiveLeastSquares(AbstractEstimator):
         zero = jnp.zeros((count, count), dtype=float)
         (*_, inverse), steps = jax.lax.scan(update, (zero, jnp.zeros(count, dtype=float), zero), rows)
         covariance = propagated_covariance(data, rows, back, steps[-1], inverse)
-        return answer(data, bracket, steps[-1], covariance, history=usable.center + usable.half_width * steps)
+        return answer(data, steps[-1], covariance, history=data.center + data.half_width * steps)

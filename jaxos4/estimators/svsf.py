@@ -20,20 +20,21 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, as_float
+from .._xla import quick_jit
 from ..bracket import GAUSSIAN_PRIOR, Bracket
 from ..estimate import (
     REACH,
     AbstractEstimator,
     Estimate,
+    as_estimate,
     check_count,
     check_positive,
     check_recursive,
-    conclude,
     fit_start,
 )
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, stack, unstack
-from ..shooting import Rows, ShootingProblem, in_blocks
+from ..shooting import Rows, ShootingProblem, Unknowns, in_blocks
 
 _AVERAGED = 0.5  # the share of the last pass over which the parameters are averaged
 
@@ -110,19 +111,19 @@ class SVSF(AbstractEstimator):
         if not isinstance(self.equilibration, Tracer) and not 1 <= self.equilibration < float("inf"):
             raise ValueError(f"`equilibration` must be finite and at least 1, got {self.equilibration}.")
 
-    @eqx.filter_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    @quick_jit
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight. The filter begins at the bracket's center.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
         windows, or a model with rotor lag, delay, thrust curve or sensor terms.
         """
-        check_recursive(problem, bracket)
-        return in_blocks(self._identify, problem, bracket)
+        check_recursive(problem)
+        return in_blocks(self._identify, problem.within(bracket))
 
-    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
+    def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
-        box, rates = bracket.usable, problem.restrict("rates")
+        box, rates = problem.unknowns.usable, problem.restrict("rates")
         rows, start = jax.tree.map(lambda leaf: leaf[0], rates.rows()), rates.first_state()
         count, samples = box.center.shape[0], rows.measured[0].shape[0]
         averaged = jnp.arange(samples) >= (1 - _AVERAGED) * samples
@@ -154,12 +155,12 @@ class SVSF(AbstractEstimator):
         )
         none = jnp.zeros((samples, count), dtype=float)
         (last, history), _ = jax.lax.scan(fly, (at_center, none), length=self.passes)
-        parameters = box.center + box.half_width * (shares[:, None] * history).sum(axis=0)
+        parameters = box.center + box.width * (shares[:, None] * history).sum(axis=0)
         initial_state, cost, sound, rollouts = fit_start(problem, parameters)
-        return conclude(
-            bracket,
+        return as_estimate(
+            problem,
             parameters=parameters,
-            covariance=last.covariance[3 + count :, 3 + count :] * box.half_width[:, None] * box.half_width,
+            covariance=last.covariance[3 + count :, 3 + count :] * box.width[:, None] * box.width,
             initial_state=initial_state,
             cost=cost,
             rollouts=self.passes * (1 + 3 + count) + rollouts,
@@ -167,11 +168,11 @@ class SVSF(AbstractEstimator):
             sound=sound,
             prior=self.prior,
             done=jnp.ones((), dtype=bool),
-            history=box.center + box.half_width * history,
+            history=box.center + box.width * history,
         )
 
     def _step(
-        self, problem: ShootingProblem, box: Bracket, before: _Filter, row: Rows, share: Float[Array, ""]
+        self, problem: ShootingProblem, box: Unknowns, before: _Filter, row: Rows, share: Float[Array, ""]
     ) -> tuple[_Filter, Parameters]:
         """Corrects with one measurement and predicts the next; returns the parameters after the correction too."""
         rates, parameters, residual, influence, energy, _, covariance = before
@@ -200,7 +201,7 @@ class SVSF(AbstractEstimator):
         residual = jnp.where(valid, jnp.abs(measured - rates), residual)
 
         def advance(x: Float[Array, "3"], u: Parameters) -> Float[Array, "3"]:
-            return stack(problem.step(unstack(x), row.forcing, tuple(box.center + box.half_width * u)))
+            return stack(problem.step(unstack(x), row.forcing, tuple(box.center + box.width * u)))
 
         following = advance(rates, parameters)
         by_rates, by_parameters = jax.jacfwd(advance, argnums=(0, 1))(rates, parameters)

@@ -73,12 +73,12 @@ class _File(msgspec.Struct):
 
 
 class Identified(NamedTuple):
-    """What a result file says of a vehicle.
+    """A vehicle from a result file.
 
     - `source`: names the file, the estimator, the model and the result.
     - `result`: the name of the result code. If it is not `"successful"`, the estimate cannot be trusted.
     - `airframe`: the constants that were not estimated.
-    - `values`: of all parameters by name, estimated or held.
+    - `values`: all parameters by name, estimated or held.
     - `drawn`, `covariance`: the names of the parameters that are uncertain, and their covariance.
     - `doubts`: why the estimate cannot be trusted, and what to do; one line each. Empty if the result code says it all.
     - `notes`: differences between the result and the vehicle that simulators get; one line each.
@@ -95,12 +95,12 @@ class Identified(NamedTuple):
 
     @property
     def successful(self) -> bool:
-        """Whether the estimate can be trusted."""
+        """True if the estimate can be trusted."""
         return self.result == _SUCCESSFUL
 
     @property
     def reason(self) -> str:
-        """What the result code says."""
+        """The meaning of the result code."""
         return meaning(self.result)
 
     @property
@@ -252,7 +252,7 @@ def _of_vehicle(file: _File, covariance: np.ndarray) -> _Parts:
     apart = tuple(itertools.chain(_GYROSCOPIC, *_APART))
     fixed = [name for name in values.keys() - found.keys() if not name.startswith(apart)]
     if fixed:
-        notes.append(f"do not vary in samples, because the flights do not tell them: {', '.join(sorted(fixed))}")
+        notes.append(f"do not vary in samples, because the flights do not identify them: {', '.join(sorted(fixed))}")
     zero = [name for name in (*_INVERSES, "thrust_gain") if values.get(name) == 0]
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")

@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from . import notes
-from .vehicle import RigidVehicle
+from .vehicle import DRAG_OF_ROTORS, NO_ROTOR_INERTIA, RigidVehicle, differences
 
 # The gravity that RotorPy has [m/s^2].
 _GRAVITY = 9.81
@@ -11,29 +10,24 @@ _GRAVITY = 9.81
 _NO_LAG = 1e-3
 
 
-def limits(vehicle: RigidVehicle) -> tuple[str, ...]:
-    """What RotorPy cannot have, or has differently."""
-    lines = []
-    if vehicle.rotor_inertia:
-        lines.append(notes.NO_ROTOR_INERTIA)
-    if vehicle.thrust_share:
-        lines.append(notes.curve_of_speed(vehicle, "rotor_speed_max"))
-    if vehicle.torque.any():
-        lines.append("offsets: not carried: RotorPy has no constant torque")
-    if vehicle.damping.any():
-        lines.append("damping: not carried: RotorPy has no torque against the body rates")
-    if vehicle.drag.any():
-        lines.append(notes.DRAG_OF_ROTORS)
-    if vehicle.delay:
-        lines.append(f"rotor_delay: not carried: give commands {vehicle.delay:.4g} s late")
-    if not vehicle.lag:
-        lines.append(f"rotor_lag: none was identified; tau_m is {_NO_LAG:g} s, because RotorPy needs one")
-    if vehicle.gravity != _GRAVITY:
-        lines.append(f"gravity: RotorPy has {_GRAVITY:g} m/s^2, the airframe {vehicle.gravity:g}")
-    return tuple(lines)
+def rotorpy_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
+    """The effects that RotorPy does not have, or has differently."""
+    return differences(
+        (vehicle.rotor_inertia, NO_ROTOR_INERTIA),
+        (vehicle.thrust_share, vehicle.curve("rotor speed = rotor_speed_max x sqrt({})")),
+        (vehicle.torque.any(), "offsets: not carried: RotorPy has no constant torque"),
+        (vehicle.damping.any(), "damping: not carried: RotorPy has no torque against the body rates"),
+        (vehicle.drag.any(), DRAG_OF_ROTORS),
+        (vehicle.delay, f"rotor_delay: not carried: give commands {vehicle.delay:.4g} s late"),
+        (not vehicle.lag, f"rotor_lag: none was identified; tau_m is {_NO_LAG:g} s, because RotorPy needs one"),
+        (
+            vehicle.gravity != _GRAVITY,
+            f"gravity: RotorPy has {_GRAVITY:g} m/s^2, the airframe {vehicle.gravity:g}",
+        ),
+    )
 
 
-def text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
+def rotorpy_text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
     """The Python file. It defines `quad_params`."""
     arm = vehicle.arm
     moments = dict(zip(("Ixx", "Iyy", "Izz"), vehicle.inertia.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""The vehicle that simulators get: a rigid body with four rotors, with what was identified of it."""
+"""The vehicle that simulators get: a rigid body with four rotors and the identified parameters."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -16,6 +16,12 @@ _HOVER = 9.81
 # The full-scale rotor speed if nobody knows it, in hover speeds.
 _FULL_SCALE = 2.0
 
+# Differences that several simulators have.
+NO_ROTOR_INERTIA = (
+    "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
+)
+DRAG_OF_ROTORS = "drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw"
+
 
 class RigidVehicle(NamedTuple):
     """A rigid body with four rotors, in a frame with x forward, y left, z up and the centre of mass at its origin.
@@ -27,7 +33,7 @@ class RigidVehicle(NamedTuple):
     - `thrust_coefficient`: b [N s^2/rad^2]. `drag_coefficient`: d, yaw torque = -spin d omega^2 [N m s^2/rad^2].
     - `rotor_inertia`: J_R [kg m^2].
     - `max_rotor_speed`: full scale [rad/s].
-    - `lag`, `delay`: of the rotors behind their commands [s].
+    - `lag`, `delay`: lag and delay of the rotors behind their commands [s].
     - `torque`: constant, about each axis [N m].
     - `damping`: torque against the body rate about each axis [N m s].
     - `drag`: force against the body velocity along x and y [N s/m].
@@ -80,6 +86,10 @@ class RigidVehicle(NamedTuple):
             return f"max(0, {curve:.4g} u^2 - {curve - 1:.4g} u)"
         return "" if curve == 1 else f"{curve:.4g} u^2 + {1 - curve:.4g} u"
 
+    def curve(self, formula: str) -> str:
+        """The note on the thrust curve, with the simulator's `formula` for a function {} of the command."""
+        return f"thrust_curve: for the u-th part of a full command, {formula.format(self.thrust_share)}"
+
     @property
     def rotor_drag(self) -> float:
         """The in-plane drag of one rotor over its speed and velocity [N s^2/(rad m)].
@@ -100,16 +110,17 @@ class RigidVehicle(NamedTuple):
             return "the thrust is not positive"
         if not 0 <= 4 * self.rotor_inertia < self.inertia[2]:
             return "the rotors have no inertia that a part of the vehicle can have"
-        return self._cannot_hover
-
-    @property
-    def _cannot_hover(self) -> str:
         if not self.thrust_curve >= -1:
             return f"thrust_curve = {self.thrust_curve:.3g} makes thrust fall before full scale"
         for number, thrust in enumerate(self.hover_thrust, start=1):
             if not 0 <= thrust <= self.full_thrust:
                 return f"rotor {number} can make 0 to {self.full_thrust:.3g} N, and hover needs {thrust:.3g} N of it"
         return ""
+
+
+def differences(*lines: tuple[object, str]) -> tuple[str, ...]:
+    """The lines whose condition holds."""
+    return tuple(line for applies, line in lines if applies)
 
 
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
@@ -126,19 +137,26 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
         elif inverse in values:
             # Torques exceed the airframe's by the same factor as thrust.
             inertia[axis] = gain / values[inverse]
-    slopes = {"roll_thrust": values.get("roll_thrust", 0.0), "pitch_thrust": values.get("pitch_thrust", 0.0)}
-    offset = np.array([_mean_offset(values, axis) for axis in AXES])
+    offset = np.array([_mean([x for name, x in values.items() if name.startswith(f"{axis}_offset")]) for axis in AXES])
+    slopes = {name: values.get(name, 0.0) for name in ("roll_thrust", "pitch_thrust")}
     offset[:2] -= _HOVER * np.array(list(slopes.values()))
+    # The centre of mass, x and y, in the frame of the airframe's rotor positions [m].
+    named = slopes | {"alpha3": gain / inertia[0], "alpha6": gain / inertia[1]}
+    found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)
+    center = np.array([coordinate.value for coordinate in found])
+    rotor_inertia = values.get("J_R", float(airframe.rotor_inertia))
+    if "rotor_reaction" in values:
+        rotor_inertia = values["rotor_reaction"] * inertia[2]
     speed = float(airframe.max_rotor_speed)
     vehicle = RigidVehicle(
         mass=mass,
         gravity=float(airframe.gravity),
         inertia=inertia,
-        rotor_positions=np.asarray(airframe.rotor_positions, dtype=float) - _center(slopes, gain / inertia, airframe),
+        rotor_positions=np.asarray(airframe.rotor_positions, dtype=float) - center,
         rotor_spins=np.asarray(airframe.rotor_spins, dtype=float),
         thrust_coefficient=gain * float(airframe.thrust_coefficient),
         drag_coefficient=gain * float(airframe.drag_coefficient),
-        rotor_inertia=_rotor_inertia(values, inertia[2], airframe),
+        rotor_inertia=rotor_inertia,
         max_rotor_speed=speed,
         lag=values.get("rotor_lag", 0.0),
         delay=values.get("rotor_delay", 0.0),
@@ -151,19 +169,5 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed) if unknown else vehicle
 
 
-def _mean_offset(values: Mapping[str, float], axis: str) -> float:
-    each = [value for name, value in values.items() if name.startswith(f"{axis}_offset")]
-    return float(np.mean(each)) if each else 0.0
-
-
-def _center(slopes: dict[str, float], alphas: np.ndarray, airframe: Airframe) -> np.ndarray:
-    """The centre of mass, x and y, in the frame of the airframe's rotor positions [m]."""
-    named = slopes | {"alpha3": alphas[0], "alpha6": alphas[1]}
-    found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)
-    return np.array([coordinate.value for coordinate in found])
-
-
-def _rotor_inertia(values: Mapping[str, float], yaw_inertia: float, airframe: Airframe) -> float:
-    if "rotor_reaction" in values:
-        return values["rotor_reaction"] * yaw_inertia
-    return values.get("J_R", float(airframe.rotor_inertia))
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else 0.0

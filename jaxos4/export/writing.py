@@ -1,14 +1,37 @@
-"""From a result to the texts of files for a simulator."""
+"""From a result to the texts of files for a simulator. A new simulator has two functions, and a line in `TARGETS`."""
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from .._version import __version__
 from ..errors import InputError
 from .result import Identified
-from .targets import TARGETS
+from .rotorpy import rotorpy_limits, rotorpy_text
 from .vehicle import RigidVehicle
+from .xml_formats import mujoco_limits, mujoco_text, sdf_limits, sdf_text
 
 _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. Rotor 1 is the airframe's first."
+
+
+class Target(NamedTuple):
+    """A simulator's format.
+
+    - `label`: the name of the format. `suffix`: that of its files.
+    - `text`: the file for a vehicle, with lines of comment at its top.
+    - `limits`: the effects that the simulator does not have, or has differently; one line each.
+    """
+
+    label: str
+    suffix: str
+    text: Callable[[RigidVehicle, Sequence[str]], str]
+    limits: Callable[[RigidVehicle], tuple[str, ...]]
+
+
+TARGETS: dict[str, Target] = {
+    "mujoco": Target("MJCF for MuJoCo", ".xml", mujoco_text, mujoco_limits),
+    "rotorpy": Target("parameters for RotorPy", ".py", rotorpy_text, rotorpy_limits),
+    "sdf": Target("SDF model for Gazebo", ".sdf", sdf_text, sdf_limits),
+}
 
 
 class Exported(NamedTuple):
@@ -16,9 +39,9 @@ class Exported(NamedTuple):
 
     - `text`: the estimated vehicle.
     - `samples`: vehicles drawn from the uncertainty of the estimate.
-    - `impossible`: how many draws were impossible, and were repeated.
-    - `notes`: what the simulator cannot have, or has differently; one line each. They stand in the file too, and each
-      sample has its own.
+    - `impossible`: the number of impossible draws, which were repeated.
+    - `notes`: the effects that the simulator does not have, or has differently; one line each. They stand in the file
+      too, and each sample has its own.
     """
 
     text: str
@@ -35,10 +58,10 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 
     **Arguments:**
 
-    - `found`: what `read_result` returns.
+    - `found`: a result, from `read_result`.
     - `to`: the simulator, a name in `TARGETS`.
-    - `samples`: how many vehicles to draw from the covariance of the estimate. What was not estimated, such as the
-      mass, does not change. `seed`: of the draws. Sample i does not depend on the number of samples.
+    - `samples`: the number of vehicles to draw from the covariance of the estimate. Constants that were not estimated,
+      such as the mass, do not change. `seed`: for the draws. Sample i does not depend on the number of samples.
 
     **Raises:** `InputError` for an unknown simulator, if `samples` or `seed` is not an integer of at least 0, or if
     hardly any draw is a possible vehicle.

@@ -1,11 +1,10 @@
-"""From recorded flights to an identification: parameters with intervals, constants, quality of fit, predictions."""
+"""From recorded flights to an identification: prepare, fit, judge, describe."""
 
-from .entry import identify as identify
+from .identify import identify as identify
 from .information import assess as assess
-from .results import (
-    FlightIdentification as FlightIdentification,
-    FlightInformation as FlightInformation,
-    Identification as Identification,
-    VehicleIdentification as VehicleIdentification,
+from .results import FlightInformation as FlightInformation, Identification as Identification
+from .settings import (
+    FlightSettings as FlightSettings,
+    VehicleSettings as VehicleSettings,
+    settings_for as settings_for,
 )
-from .vehicle import VehicleFit as VehicleFit, fit_vehicle as fit_vehicle, refit as refit

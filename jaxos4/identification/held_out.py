@@ -1,77 +1,49 @@
 """Predictions of measurements that were not fitted."""
 
-from typing import NamedTuple
+import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._custom_types import as_float
+from .._xla import quick_jit
 from ..analysis.disturbance import disturbances
-from ..analysis.prediction import HORIZONS, Predictions, Skill, predictions, skill, starts
-from ..bracket import Bracket
-from ..errors import InputError
+from ..analysis.evaluation import evaluate
+from ..analysis.prediction import Predictions, Skill, predictions, skill
+from ..estimate import fit_start
 from ..estimators import EquationError
-from ..flight import Flight
-from ..models.held import hold
-from ..models.vehicle import FlightModel
-from ..shooting import ShootingProblem
-from ..shooting.filtering import Noise
-from .results import PredictionSkill, RateSkill, finite_or_none
-from .vehicle import VehicleFit
+from ..shooting import ShootingProblem, padded
+from ..shooting.filters import LogNoise
+from .fit import Fit
+from .prepare import HeldOut
+from .quality import channel_fits, diagnose
+from .results import PredictionSkill, RateSkill, Validation, finite_or_none
 
 # Memory of the regression for comparison: the best on real flights.
 _MEMORY = 0.9
 
 
-class HeldOut(NamedTuple):
-    """Measurements that are not fitted.
-
-    - `flight`: with these measurements.
-    - `seconds`: how long they last [s].
-    - `name`: of the recording.
-    - `fitted_vehicle`: whether they are a part of the fitted recordings, which have their own offsets.
-    """
-
-    flight: Flight
-    seconds: float
-    name: str
-    fitted_vehicle: bool
-
-
-def check_starts(held_out: HeldOut) -> None:
-    """Raise `InputError` if no part is long enough to be predicted."""
-    try:
-        starts(held_out.flight)
-    except ValueError:
-        remedy = "give `holdout` 0 or `validate`" if held_out.fitted_vehicle else "give another flight"
-        raise InputError(
-            f"{held_out.name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
-        ) from None
-
-
-def predict_held_out(
-    fit: VehicleFit, model: FlightModel, held_out: HeldOut, noise: Noise | None = None
-) -> tuple[Predictions, PredictionSkill]:
+def predict_held_out(fit: Fit, held_out: HeldOut) -> tuple[Predictions, PredictionSkill]:
     """Predict the rates of measurements that were not fitted, by the fit and by a regression with the same terms.
 
-    - `model`: with all parameters, held or not.
-    - `noise`: of filter error, which predicts the disturbance too, from the measurements before each start.
+    The fit predicts the disturbance too, from the measurements before each start.
     """
+    values = np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count]
 
-    def scored(parameters: Array, noise: Noise | None) -> tuple[Predictions, Skill]:
+    def scored(values: np.ndarray, noise: LogNoise | None) -> tuple[Predictions, Skill]:
+        problem, whole, parameters = held_out.problem, held_out.problem, values
         if held_out.fitted_vehicle:
-            problem = eqx.tree_at(lambda p: p.flight, fit.problem, held_out.flight)
-            whole = eqx.tree_at(lambda p: p.flight, fit.problem, _joined(fit.problem.flight, held_out.flight))
+            whole = _joined(fit.problem, problem)
         else:
-            problem, parameters = _on_another_flight(fit, model, parameters, held_out.flight)
-            whole = problem
-        known = None if noise is None else disturbances(whole, parameters, noise)
-        predicted = predictions(problem, parameters, disturbance=known)
+            parameters = _of_one_recording(fit.problem, problem, values)
+        known = None if noise is None else disturbances(whole, as_float(parameters), noise)
+        predicted = predictions(problem, as_float(parameters), disturbance=known)
         return predicted, skill(predicted)
 
-    predicted, own = scored(fit.estimate.parameters, noise)
-    _, regressed = scored(_regression(fit.problem, fit.estimate.parameters), None)
+    predicted, own = scored(values, fit.noise)
+    _, regressed = scored(np.asarray(_regression(fit.problem, as_float(values), jnp.asarray(_is_held(fit)))), None)
     tables = (own.skill, own.std, own.rmse, own.persistence, regressed.skill)
     rates = {
         rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
@@ -79,37 +51,37 @@ def predict_held_out(
     return predicted, PredictionSkill(predicted.horizons.tolist(), own.starts, **rates)
 
 
-def _joined(fitted: Flight, tested: Flight) -> Flight:
-    """All measurements: those that were fitted and those that were not."""
-    states = np.where(np.isnan(np.asarray(tested.states)), fitted.states, tested.states)
-    return eqx.tree_at(lambda f: f.states, tested, jnp.asarray(states))
+def _joined(fitted: ShootingProblem, tested: ShootingProblem) -> ShootingProblem:
+    """The problem with all measurements: those that were fitted and those that were not."""
+    own, others = np.asarray(tested.flight.states), np.asarray(fitted.flight.states)
+    return eqx.tree_at(lambda p: p.flight.states, tested, as_float(np.where(np.isnan(own), others, own)))
 
 
-def _on_another_flight(
-    fit: VehicleFit, model: FlightModel, parameters: Array, flight: Flight
-) -> tuple[ShootingProblem, Array]:
-    """The problem of another flight, and its parameters: the mean where each recording has its own."""
-    values = fit._replace(estimate=eqx.tree_at(lambda e: e.parameters, fit.estimate, parameters)).values
-    stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
-    other = FlightModel(
-        model.airframe, terms=model.terms, recordings=(0,) * stretches, battery_voltage=model.battery_voltage
-    )
-    recordings = range(1, max(model.recordings) + 2)
-    means = [
-        values[name] if name in values else float(np.mean([values[f"{name}_{i}"] for i in recordings]))
-        for name in other.parameter_names
-    ]
-    problem = ShootingProblem(other, flight, sigma=fit.problem.sigma, channels="rates", method="rk4")
-    return problem, jnp.asarray(means)
+def _of_one_recording(fitted: ShootingProblem, other: ShootingProblem, values: np.ndarray) -> np.ndarray:
+    """The parameters of another recording: the mean of those of which each fitted recording has its own."""
+    known = dict(zip(fitted.unknowns.names, values.tolist(), strict=True))
+    each = {name: [known[own] for own in known if own.rpartition("_")[0] == name] for name in other.unknowns.names}
+    return np.array([known[name] if name in known else np.mean(each[name]) for name in other.unknowns.names])
 
 
-@eqx.filter_jit
-def _regression(problem: ShootingProblem, parameters: Array) -> Array:
-    """The parameters by regression, except lag, delay and thrust curve, which regression cannot estimate."""
-    names, regression = problem.model.parameter_names, EquationError(memory=_MEMORY)
-    known = {names[i]: parameters[i] for i in problem.model.forcing_parameters}
-    if not known:
-        return regression.solution(problem, Bracket.default(problem.model))
-    linear = hold(problem.model, known)
-    problem = eqx.tree_at(lambda p: p.model, problem, linear)
-    return linear.complete(regression.solution(problem, Bracket.default(linear)))
+def _is_held(fit: Fit) -> np.ndarray:
+    return np.array([name in fit.held for name in fit.problem.unknowns.names])
+
+
+@quick_jit
+def _regression(problem: ShootingProblem, values: Array, held: Array) -> Array:
+    """The parameters by regression; held ones, and those that it cannot estimate, have the values of the fit."""
+    linear = np.array([each.linear and not each.in_forcing for each in problem.model.parameters])
+    own = jnp.where(linear & ~held, problem.unknowns.center, values)
+    unknowns = dataclasses.replace(problem.unknowns, center=own, free=linear & ~held)
+    return EquationError(memory=_MEMORY).solution(dataclasses.replace(problem, unknowns=unknowns))
+
+
+def validate_on(fit: Fit, held_out: HeldOut) -> Validation:
+    """How well the parameters explain another flight; only its initial state is fitted."""
+    other, parameters = eqx.tree_at(lambda p: p.sigma, held_out.problem, fit.problem.sigma), fit.estimate.parameters
+    start, cost, sound, _ = quick_jit(fit_start)(padded(other), parameters)
+    if not bool(sound):
+        return Validation(held_out.name, None, None)
+    diagnostics = diagnose(evaluate(other, parameters, start), fitted=False)
+    return Validation(held_out.name, finite_or_none(cost), channel_fits(other, diagnostics))

@@ -9,7 +9,7 @@ from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..recording.reading import Recording, as_recordings
-from .flight_fit import fit_flight
+from .fit import fit_flight
 from .problem import Intervals, bracket_of, flight_problem
 from .results import FlightInformation, ParameterInformation, finite_or_none, has_answer
 
@@ -30,8 +30,9 @@ def assess(
     """
     (recording,) = as_recordings(flight)
     where = bracket_of(bracket, model)
-    problem = flight_problem(recording, model, channels=channels, initial_state=initial_state, window=window)
-    fit = fit_flight(IBSS(), problem, where, progress=progress)
+    settings = {"channels": channels, "initial_state": initial_state, "window": window}
+    problem = flight_problem(recording, model, where, **settings)
+    fit = fit_flight(IBSS(), problem, progress=progress)
     problem, estimate, fitted = fit.problem, fit.estimate, has_answer(fit.estimate)
     if fit.evaluation is None:
         known = identifiability(problem, where, estimate.parameters)

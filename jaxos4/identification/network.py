@@ -40,9 +40,10 @@ def train_network(
     - `settings`: of the training, except the channels.
     - `channels`: what the network looks at; by default the rates, and the attitude if a rate was not measured.
     """
-    problem = flight_problem(recording, model, channels=channels, initial_state=initial_state)
+    where = bracket_of(bracket, model)
+    problem = flight_problem(recording, model, where, channels=channels, initial_state=initial_state)
     settings = dataclasses.replace(settings, channels=channels or _seen_channels(problem))
-    return _train(settings, problem, bracket_of(bracket, model), recording.name, seed, progress=True)
+    return _train(settings, problem, where, recording.name, seed, progress=True)
 
 
 def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
@@ -51,9 +52,9 @@ def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots
     return _train(NetworkEstimator(channels=_seen_channels(problem), steps=steps), problem, bracket, name, seed)
 
 
-def vehicle_network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, seed: int) -> TrainedNetwork:
+def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> TrainedNetwork:
     """Train a network for a vehicle's flights in windows, at the noise levels of the problem."""
-    return _train(_VEHICLE_TRAINING, problem, bracket, name, seed)
+    return _train(_VEHICLE_TRAINING, problem, problem.unknowns.bracket, name, seed)
 
 
 def loaded(network: GivenNetwork) -> TrainedNetwork | None:

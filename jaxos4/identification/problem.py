@@ -14,7 +14,7 @@ from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..noise import SENSOR_SIGMA
 from ..recording.reading import Recording
-from ..shooting import ShootingProblem
+from ..shooting import ShootingProblem, Unknowns
 
 # A bracket, or `[lower, upper]` by parameter name; the model's default for all others.
 Intervals = Bracket | Mapping[str, Any] | None
@@ -51,6 +51,7 @@ def _interval(name: str, value: Any) -> list[float]:
 def flight_problem(
     recording: Recording,
     model: AbstractModel,
+    bracket: Bracket,
     *,
     channels: str | None = None,
     initial_state: str = "free",
@@ -88,7 +89,15 @@ def flight_problem(
     if measured[:, columns].sum() <= unknowns:
         remedy = "give a longer flight" if window is None else "give a longer flight, or fewer windows"
         raise InputError(f"{name}: {measured[:, columns].sum()} measurements for {unknowns} unknowns; {remedy}.")
-    return ShootingProblem(model, flight, sigma=SENSOR_SIGMA, initial_state=start, channels=chosen, windows=windows)
+    return ShootingProblem(
+        model,
+        flight,
+        sigma=SENSOR_SIGMA,
+        initial_state=start,
+        channels=chosen,
+        windows=windows,
+        unknowns=Unknowns.of(model, bracket),
+    )
 
 
 def _chosen_channels(name: str, measured: np.ndarray, channels: str | None) -> str:

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 
@@ -12,7 +13,7 @@ from ..estimators import ESTIMATORS
 from ..shooting import ShootingProblem
 
 
-def versions(problem: ShootingProblem) -> dict[str, str]:
+def versions(problem: ShootingProblem) -> dict[str, Any]:
     """Versions, device and precision."""
     return {
         "version": importlib.metadata.version("jaxos4"),
@@ -39,8 +40,3 @@ def name_and_class(estimator: str | AbstractEstimator) -> tuple[str, type[Abstra
     if estimator not in ESTIMATORS:
         raise InputError(f"`estimator`: must be one of {', '.join(ESTIMATORS)}, got {estimator!r}.")
     return estimator, ESTIMATORS[estimator]
-
-
-def shooting_names() -> str:
-    """The names of the estimators that shoot."""
-    return ", ".join(name for name, kind in ESTIMATORS.items() if kind.shoots)

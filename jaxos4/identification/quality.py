@@ -1,17 +1,12 @@
-"""How well a model explains flights that were fitted, and flights that were not."""
-
-import equinox as eqx
+"""How well a model explains each channel of a flight."""
 
 from ..analysis.diagnostics import Diagnostics, diagnostics_of
-from ..analysis.evaluation import Evaluation, evaluate
-from ..estimate import Estimate, fit_start
+from ..analysis.evaluation import Evaluation
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.state import CASCADE_ORDER
-from ..shooting import ShootingProblem, padded
-from .results import ChannelFit, Validation, finite_or_none
+from ..shooting import ShootingProblem
+from .results import ChannelFit, finite_or_none
 
-# Residuals are coloured if neighbours correlate by more than this: intervals then allow for it.
-COLOURED = 0.3
 # Correlations of residuals are computed up to this many samples apart.
 _LAGS = 25
 _FEWEST_SAMPLES = 2
@@ -41,13 +36,3 @@ def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str
         for i, column in enumerate(CASCADE_ORDER[: problem.size])
         if diagnostics.count[i] > _FEWEST_SAMPLES
     }
-
-
-def validate_on(problem: ShootingProblem, estimate: Estimate, other: ShootingProblem, name: str) -> Validation:
-    """How well the parameters explain another flight, named `name`; only its initial state is fitted."""
-    other = eqx.tree_at(lambda p: p.sigma, other, problem.sigma)
-    start, cost, sound, _ = eqx.filter_jit(fit_start)(padded(other), estimate.parameters)
-    if not bool(sound):
-        return Validation(name, None, None)
-    diagnostics = diagnose(evaluate(other, estimate.parameters, start), fitted=False)
-    return Validation(name, finite_or_none(cost), channel_fits(other, diagnostics))

@@ -4,7 +4,6 @@ import math
 from typing import Any, SupportsFloat
 
 import msgspec
-import numpy as np
 
 from ..airframe import airframe_table
 from ..analysis.frequency_response import FrequencyResponse
@@ -80,6 +79,10 @@ class RigidBody(msgspec.Struct, frozen=True):
         """Constants by name, then the tests that were made."""
         tests = {"consistency_p": self.consistency_p, "rigid_body": self.is_rigid_body}
         return msgspec.to_builtins(self.constants) | {k: v for k, v in tests.items() if v is not None}
+
+
+COLOURED = 0.3
+"""Residuals are coloured if neighbours correlate by more than this: intervals then allow for it."""
 
 
 class ChannelFit(msgspec.Struct, frozen=True):
@@ -159,18 +162,75 @@ class PredictionSkill(msgspec.Struct, frozen=True):
     r: RateSkill
 
 
+class Provenance(msgspec.Struct, frozen=True, kw_only=True):
+    """Inputs, settings and versions of an identification. Fields that do not apply are not written.
+
+    - `flight`: the name of the flight of an OS4; `flights`, `validate`: of a vehicle's recordings.
+    - `airframe`: its name or file; `terms`: of the vehicle's model; `battery_voltage`: its usual one [V].
+    - `channels`, `initial_state`, `windows`, `samples`: of the problem of a flight.
+    - `sample_time`: of the fitted data [s]. `fitted_seconds`, `tested_seconds`: how long these last [s].
+    - `network`: where a network is from, and how it was trained.
+    - `notes`: about the data. `command`: the command line, if there was one.
+    - `version`, `jax`, `device`, `precision`: of the computation.
+    """
+
+    flight: str | msgspec.UnsetType = msgspec.UNSET
+    flights: list[str] | msgspec.UnsetType = msgspec.UNSET
+    validate: str | None | msgspec.UnsetType = msgspec.UNSET
+    airframe: str
+    channels: str | msgspec.UnsetType = msgspec.UNSET
+    initial_state: str | msgspec.UnsetType = msgspec.UNSET
+    windows: int | msgspec.UnsetType = msgspec.UNSET
+    samples: int | msgspec.UnsetType = msgspec.UNSET
+    terms: list[str] | msgspec.UnsetType = msgspec.UNSET
+    sample_time: float
+    fitted_seconds: float | msgspec.UnsetType = msgspec.UNSET
+    tested_seconds: float | msgspec.UnsetType = msgspec.UNSET
+    battery_voltage: float | msgspec.UnsetType = msgspec.UNSET
+    network: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
+    notes: list[str] = []
+    command: str | msgspec.UnsetType = msgspec.UNSET
+    version: str
+    jax: str
+    device: str
+    precision: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields that apply, by name."""
+        return msgspec.to_builtins(self)
+
+
 class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The parameters of a quadrotor, with what a user needs to judge them. Made by `jaxos4.identify`.
 
     - `estimator`, `model`: their names.
     - `result`: the name of the result code, see `jaxos4.RESULTS`.
     - `rollouts`: simulated flights of all searches together.
-    - `cost`: 1/2 |W (y - x)|^2 at the estimate, by filter error the negative log-likelihood; `None` without one.
+    - `cost`: 1/2 |W (y - x)|^2 at the estimate; of a vehicle the negative log-likelihood. `None` without one.
     - `seconds`: computing time [s].
     - `parameters`: by name. Without an answer, a vehicle has none.
     - `rigid_body`: moments of inertia.
-    - `provenance`: inputs, settings, notes about the data, versions.
-    - `estimate`, `problem`: the estimate as arrays, and the problem that was solved; not in `to_dict`.
+    - `provenance`: inputs, settings, versions, and notes about the data.
+    - `covariance`: of `parameters`; `None` without an answer.
+    - `estimate`, `problem`: the estimate of all unknowns as arrays, and the flight with its model and the noise levels
+      that were found; not in `to_dict`.
+
+    Only of a flight of an OS4:
+
+    - `fit`: how well the model explains each measured channel, by the channel's name.
+    - `validation`: the same for another flight, if one was given.
+
+    Only of a vehicle:
+
+    - `held`: parameters that were not estimated.
+    - `noise`: standard deviation of the sensors' noise by channel.
+    - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
+    - `disturbances`: the accelerations that the model lacks, by channel.
+    - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
+    - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
+    - `predictions`: the predictions themselves; not in `to_dict`.
+    - `response`: the frequency response from modelled to measured angular acceleration, with the fitted data; not in
+      `to_dict`. `None` without an answer.
     """
 
     estimator: str
@@ -181,9 +241,21 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     seconds: float
     parameters: dict[str, ParameterEstimate]
     rigid_body: RigidBody
-    provenance: dict[str, Any]
+    provenance: Provenance
+    covariance: list[list[float]] | None
     estimate: Estimate
     problem: ShootingProblem
+    is_vehicle: bool
+    fit: dict[str, ChannelFit] = {}
+    validation: Validation | None = None
+    held: dict[str, HeldParameter] = {}
+    noise: dict[str, float] = {}
+    doubts: tuple[Doubt, ...] = ()
+    disturbances: dict[str, Disturbance] = {}
+    widened: dict[str, float] = {}
+    skill: PredictionSkill | None = None
+    predictions: Predictions | None = None
+    response: FrequencyResponse | None = None
 
     @property
     def successful(self) -> bool:
@@ -201,51 +273,18 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`; `None`
         without an answer.
         """
-        fields = _fields(self, "rigid_body", "estimate", "problem", "predictions", "response")
-        covariance = np.asarray(self.estimate.covariance)
+        others = _OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES
+        fields = _fields(self, "rigid_body", "estimate", "problem", "is_vehicle", "predictions", "response", *others)
         computed = {
             "constants": self.rigid_body.to_dict(),
             "airframe": airframe_table(self.problem.model.airframe),
-            "covariance": covariance.tolist() if np.isfinite(covariance).all() else None,
         }
         return msgspec.to_builtins(fields | computed)
 
 
-class FlightIdentification(Identification, frozen=True, kw_only=True, eq=False):
-    """An OS4 model identified from one flight.
-
-    - `fit`: how well the model explains each measured channel, by the channel's name.
-    - `validation`: the same for another flight, if one was given.
-    """
-
-    fit: dict[str, ChannelFit]
-    validation: Validation | None
-
-
-class VehicleIdentification(Identification, frozen=True, kw_only=True, eq=False):
-    """A real vehicle identified from its recordings.
-
-    - `held`: parameters that were not estimated.
-    - `cut`: the share of the measurements that Huber's loss cut; filter error cuts none.
-    - `noise`: standard deviation of the residuals by channel.
-    - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
-    - `disturbances`: by channel, from filter error; empty for other estimators.
-    - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
-    - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
-    - `predictions`: the predictions themselves; not in `to_dict`.
-    - `response`: the frequency response from modelled to measured angular acceleration, with the fitted data; not in
-      `to_dict`. `None` without an answer.
-    """
-
-    held: dict[str, HeldParameter]
-    cut: float
-    noise: dict[str, float]
-    doubts: tuple[Doubt, ...]
-    disturbances: dict[str, Disturbance]
-    widened: dict[str, float]
-    skill: PredictionSkill | None
-    predictions: Predictions | None
-    response: FrequencyResponse | None
+# Fields that are written of one kind of identification only.
+_OF_FLIGHTS = ("fit", "validation")
+_OF_VEHICLES = ("held", "noise", "doubts", "disturbances", "widened", "skill")
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):

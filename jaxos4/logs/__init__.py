@@ -1,15 +1,91 @@
-"""Files of recorded flights to `Flight`, and back to CSV. Each log format is one file and one line in `FORMATS`."""
+"""Files of recorded flights to `Recording` and `Flight`, and back to CSV.
 
-from .csv import (
-    read_flight as read_flight,
-    read_flight_and_notes as read_flight_and_notes,
-    write_flight as write_flight,
+Each log format is one file and one line in `FORMATS`.
+"""
+
+import os
+import warnings
+
+from ..airframe import Airframe
+from ..flight import Flight
+from .assemble import Recording as Recording, recording_of
+from .blackbox import BLACKBOX
+from .crazyflie import CRAZYFLIE
+from .csv import CSV, write_flight as write_flight
+from .table import (
+    LogFacts as LogFacts,
+    LogFormat as LogFormat,
+    Path,
+    Sampling as Sampling,
+    Table as Table,
+    opened,
+    printable,
 )
-from .facts import LogFacts as LogFacts, Sampling as Sampling
-from .formats import (
-    FORMATS as FORMATS,
-    log_format as log_format,
-    read_log as read_log,
-    read_log_and_facts as read_log_and_facts,
-)
-from .table import LogFormat as LogFormat, Table as Table
+from .ulog import ULOG
+
+FORMATS: tuple[LogFormat, ...] = (ULOG, CRAZYFLIE, BLACKBOX, CSV)
+"""The formats in the order in which they are tried. A new format is one line here, before the last."""
+
+_FIRST_BYTES = 1 << 18
+
+
+def read_log(
+    path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
+) -> tuple[Flight, tuple[str, ...]]:
+    """Read a log of any known format.
+
+    The format is recognised from the first bytes of the file; its name does not matter. The columns of each format
+    are listed in `jaxos4.logs.csv`, `jaxos4.logs.ulog` (PX4), `jaxos4.logs.blackbox` (Betaflight and INAV) and
+    `jaxos4.logs.crazyflie` (micro-SD card).
+
+    **Arguments:**
+
+    - `airframe`: its `max_rotor_speed` turns commands into rotor speeds. A log with rotor speeds needs no airframe.
+    - `full_scale`: rotor speed of command 1 [rad/s] if the airframe gives none. With 1, commands stay as they are.
+
+    **Returns:** the flight, and notes on what the reader changed or assumed: one line each, without the file's name.
+
+    **Raises:** `InputError`, one line: the file, the place in it, what is wrong and what to do.
+    """
+    found = read_recording(path, airframe, full_scale=full_scale)
+    return found.flight, (*found.notes, *([found.facts.too_slow] if found.facts.too_slow else []))
+
+
+def read_recording(path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None) -> Recording:
+    """Read a log in any format that `jaxos4.read_log` knows, named by its path. Arguments and errors are the same.
+
+    If the log was written too rarely, its facts say so, and not its notes.
+    """
+    return recording_of(*log_format(path).read(path), airframe, full_scale=full_scale)
+
+
+def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
+    """Read a flight from a CSV file. The columns are listed in `jaxos4.logs.csv`.
+
+    **Arguments:**
+
+    - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds. A file with `omega1..4` needs none.
+
+    **Returns:** a `Flight`. Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such
+    a grid (see `jaxos4.logs.sampling`). Jumps of 2 pi in roll and yaw are removed.
+
+    **Raises:** `InputError`, one line: file, row, column, what is wrong and what to do.
+
+    **Warns:** `UserWarning` for each change to the data: resampling, empty cells of a rotor, ignored columns.
+    """
+    found = recording_of(*CSV.read(path), airframe)
+    for note in found.notes:
+        warnings.warn(f"{printable(os.fspath(path))}: {note}.", UserWarning, stacklevel=2)
+    return found.flight
+
+
+def log_format(path: Path) -> LogFormat:
+    """The format of a log: the first of `FORMATS` that recognises it, or the last (the flight CSV).
+
+    A pipe can be read only once, so it always counts as the last.
+
+    **Raises:** `InputError` if the file cannot be opened.
+    """
+    with opened(path, "rb") as file:
+        begin = file.read(_FIRST_BYTES) if file.seekable() else b""
+    return next((each for each in FORMATS[:-1] if each.recognises(begin)), FORMATS[-1])

@@ -43,26 +43,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .blackbox_raw import MAGIC, gyro_unit, read_sessions, settings_beside
-from .csv_text import read_table
-from .table import LogFormat, Path, Table, opened, opened_bytes, refuse
+from .blackbox_raw import MAGIC, gyro_unit, is_raw, read_sessions, settings_beside
+from .csv import read_table
+from .table import LogFormat, Path, Table, opened, order_note, refuse
 
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
 _MOST_SETTINGS = 5000  # lines above the header
 _LONGEST_LINE = 1 << 16
-_DEGREE = math.pi / 180
-_GRAVITY = 9.80665
+_DEGREE, _GRAVITY = math.pi / 180, 9.80665
 _POLES = 14
 _COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
 _TIMES = {"time (us)": 1e-6, "time (ms)": 1e-3, "time (s)": 1.0, "time": 1e-6}
 _RATE_UNITS = {"": _DEGREE, " (deg/s)": _DEGREE, " (rad/s)": 1.0}
 _FORCE_UNITS = {"": None, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
-_INAV = {  # column: column of the log, sign
-    **{"phi": ("attitude[0]", 1), "theta": ("attitude[1]", 1), "psi": ("attitude[2]", -1)},
-    **{"x": ("navPos[0]", 1), "y": ("navPos[1]", -1), "z": ("navPos[2]", 1)},
-    **{"vx": ("navVel[0]", 1), "vy": ("navVel[1]", -1), "vz": ("navVel[2]", 1)},
+_ANGLES = {"phi": _DEGREE / 10, "theta": _DEGREE / 10, "psi": -_DEGREE / 10}
+_INAV = {  # column: column of the log, unit in our frame
+    **{axis: (f"attitude[{i}]", unit) for i, (axis, unit) in enumerate(_ANGLES.items())},
+    **{"x": ("navPos[0]", 0.01), "y": ("navPos[1]", -0.01), "z": ("navPos[2]", 0.01)},
+    **{"vx": ("navVel[0]", 0.01), "vy": ("navVel[1]", -0.01), "vz": ("navVel[2]", 0.01)},
 }
+_VOLTAGES = {"vbatLatest": r"Betaflight ([4-9]|\d{2,})\.", "vbat": "INAV"}  # the firmware whose unit is known
 _EXPORT = "export it as CSV by Blackbox Explorer"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _KNOWN = (
@@ -70,7 +71,7 @@ _KNOWN = (
     *(f"{name}[{i}]{unit}" for name in ("gyroUnfilt", "gyroADC") for i in range(3) for unit in _RATE_UNITS),
     *(f"accSmooth[{i}]{unit}" for i in range(3) for unit in _FORCE_UNITS),
     *(name for name, _ in _INAV.values()),
-    *("vbatLatest", "vbat"),
+    *_VOLTAGES,
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
 
@@ -92,14 +93,21 @@ class _Log(NamedTuple):
     def add(self, column: str, name: str, values: np.ndarray) -> None:
         self.columns[column], self.names[column] = values, name
 
+    def has(self, names: list[str]) -> bool:
+        return all(name in self.raw for name in names)
+
     def setting(self, name: str, least: float, most: float) -> float | None:
-        """A setting, if it is a number within these limits."""
-        return _number(self.settings.get(name, ""), least, most)
+        """A setting, or the last of several, if it is a number within these limits."""
+        try:
+            value = float(self.settings.get(name, "").split(",")[-1])
+        except ValueError:
+            return None
+        return value if least <= value <= most else None
 
 
 def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
-    log, table = _decoded(path) if _is_raw(path) else _csv(path)
+    log, first_row = _decoded(path) if is_raw(path) else _csv(path)
     raw = log.raw
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
@@ -108,23 +116,23 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
-    _add_voltage(log)
-    for column, (name, sign) in _INAV.items():
+    for column, (name, unit) in _INAV.items():
         if name in raw:
-            values = sign * raw[name]
-            log.add(column, name, values * 0.1 * _DEGREE if name.startswith("attitude") else values / 100)
-    what = f"rotors keep the log's order ({log.names.get('omega1', log.names.get('command1'))} is rotor 1)"
-    log.notes.append(f"{what}: rotor_positions and rotor_spins must be in the same order")
-    return table._replace(columns=log.columns, unknown=(), names=log.names, remedy=_REMEDY), tuple(log.notes)
+            log.add(column, name, raw[name] * unit)
+    for name, firmware in _VOLTAGES.items():
+        if name in raw and re.match(firmware, log.settings.get("Firmware revision", "")):
+            log.add("voltage", name, raw[name] / 100)
+    log.notes.append(order_note(log.names.get("omega1", log.names.get("command1", ""))))
+    return Table(path, log.columns, first_row=first_row, names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
-def _decoded(path: Path) -> tuple[_Log, Table]:
+def _decoded(path: Path) -> tuple[_Log, None]:
     """A `.bbl` or `.BFL` file."""
     raw, settings, notes = read_sessions(path, _KNOWN)
-    return _Log(path, None, settings, raw, {}, {}, notes), Table(path, {}, first_row=None)
+    return _Log(path, None, settings, raw, {}, {}, notes), None
 
 
-def _csv(path: Path) -> tuple[_Log, Table]:
+def _csv(path: Path) -> tuple[_Log, int | None]:
     """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
     settings, skip = _settings(path)
     notes = []
@@ -133,19 +141,12 @@ def _csv(path: Path) -> tuple[_Log, Table]:
         notes += [f"settings are taken from {beside} beside it"] * bool(settings)
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    return _Log(path, skip + 1, settings, raw, {}, {}, notes), table
-
-
-def _is_raw(path: Path) -> bool:
-    with opened_bytes(path) as file:
-        return file.seekable() and file.read(len(MAGIC)) == MAGIC
+    return _Log(path, skip + 1, settings, raw, {}, {}, notes), table.first_row
 
 
 def _recognises(begin: bytes) -> bool:
-    if begin.startswith(MAGIC):
-        return True
     lines = begin.decode("utf-8-sig", errors="replace").splitlines()
-    return any(_is_header(line) for line in lines[:_MOST_SETTINGS])
+    return begin.startswith(MAGIC) or any(_is_header(line) for line in lines[:_MOST_SETTINGS])
 
 
 BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
@@ -174,19 +175,11 @@ def _settings(path: Path) -> tuple[dict[str, str], int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _number(text: str, least: float, most: float) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if least <= value <= most else None
-
-
 def _add_rates(log: _Log) -> None:
     for field in ("gyroUnfilt", "gyroADC"):
         for unit, factor in _RATE_UNITS.items():
             names = [f"{field}[{i}]{unit}" for i in range(3)]
-            if not all(name in log.raw for name in names):
+            if not log.has(names):
                 continue
             if unit == "":
                 factor *= gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
@@ -202,18 +195,16 @@ def _add_rates(log: _Log) -> None:
 
 
 def _add_rotors(log: _Log) -> None:
-    raw = log.raw
-    for field in ("eRPM", "motor"):
-        if any(f"{field}[{i}]" in raw and np.ptp(_finite(raw[f"{field}[{i}]"])) > 0 for i in range(4, 8)):
-            refuse(log.path, "has more than four motors; give the log of a quadrotor", row=log.header)
+    raw, others = log.raw, [f"{field}[{i}]" for field in ("eRPM", "motor") for i in range(4, 8)]
+    if any(name in raw and np.ptp(_finite(raw[name])) > 0 for name in others):
+        refuse(log.path, "has more than four motors; give the log of a quadrotor", row=log.header)
     speeds, commands = ([f"{field}[{i}]" for i in range(4)] for field in ("eRPM", "motor"))
-    if all(name in raw and (_finite(raw[name]) > 0).any() for name in speeds):
+    if log.has(speeds) and all((_finite(raw[name]) > 0).any() for name in speeds):
         poles = log.setting("motor_poles", 2, 100)
         if poles is None:
             log.notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle")
-        factor = 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60
         for i, name in enumerate(speeds):
-            log.add(f"omega{i + 1}", name, raw[name] * factor)
+            log.add(f"omega{i + 1}", name, raw[name] * (100 / ((poles or _POLES) / 2) * 2 * math.pi / 60))
         return
     for name in commands:
         if name not in raw:
@@ -229,22 +220,19 @@ def _add_rotors(log: _Log) -> None:
 def _ends(values: np.ndarray, log: _Log) -> tuple[float, float]:
     """The commands at rest and at full speed: the ends of the protocol, and not the idle command."""
     finite = _finite(values)
-    output = log.settings.get("motorOutput", "").split(",")[-1]
-    full = _number(output, 1, 65535) or log.setting("maxthrottle", 1, 65535)
-    if (finite[finite > 0] < _PWM[0]).any() or finite.max(initial=0) > _PWM[1] or (full or 0) > _PWM[1]:
-        return _DSHOT
-    return _PWM
+    full = log.setting("motorOutput", 1, 65535) or log.setting("maxthrottle", 1, 65535) or 0.0
+    dshot = (finite[finite > 0] < _PWM[0]).any() or max(finite.max(initial=0), full) > _PWM[1]
+    return _DSHOT if dshot else _PWM
 
 
 def _add_force(log: _Log) -> None:
     for unit, factor in _FORCE_UNITS.items():
         names = [f"accSmooth[{i}]{unit}" for i in range(3)]
-        if not all(name in log.raw for name in names):
+        if not log.has(names):
             continue
         if log.setting("acc_1G", 0, 0) is not None or not any(np.ptp(_finite(log.raw[name])) for name in names):
-            log.notes.append(
-                "the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked"
-            )
+            what = "the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked"
+            log.notes.append(what)
             return
         if factor is None:
             one = log.setting("acc_1G", 1, 65535)
@@ -256,14 +244,6 @@ def _add_force(log: _Log) -> None:
         for column, name in zip(("ax", "ay", "az"), names, strict=True):
             log.add(column, name, log.raw[name] * factor)
         return
-
-
-def _add_voltage(log: _Log) -> None:
-    """The battery's voltage, from firmware whose unit is known."""
-    firmware = log.settings.get("Firmware revision", "")
-    for name, pattern in (("vbatLatest", r"Betaflight ([4-9]|\d{2,})\."), ("vbat", "INAV")):
-        if name in log.raw and re.match(pattern, firmware):
-            log.add("voltage", name, log.raw[name] / 100)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

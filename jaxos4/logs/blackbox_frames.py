@@ -8,14 +8,13 @@ Reference: the description of the format by Nicholas Sherlock ("Blackbox interna
 Betaflight and INAV for the encodings that came later.
 """
 
+import itertools
 import re
 from collections.abc import Collection, Iterator
 from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-
-from .blackbox_numbers import TAG8_4, TOGETHER, Numbers
 
 _TIME, _ITERATION = "time", "loopIteration"
 _MARKER = re.compile(rb"[IPSGHE]")
@@ -24,13 +23,27 @@ _MOST_FIELDS = 512
 _FARTHEST, _MOST_ITERATIONS = 10_000_000, 5000  # [us], from one frame to the next: more is damage
 _AT_ONCE = 4096  # rows
 _END = b"End of log"
+_I, _P, _E = b"IPE"
+_EVENTS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}  # event: how many numbers it has
 
-(_PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT) = range(1, 7)
-(_1500, _VBATREF, _MINMOTOR) = (8, 9, 11)
+_SIGNED, _UNSIGNED, _NEGATIVE_14, _TAG8, _TAG2_3, _TAG8_4, _NULL, _TAG2_3_V = 0, 1, 3, 6, 7, 8, 9, 10
+# How many fields of an encoding are read together.
+_TOGETHER = {_TAG8: 8, _TAG2_3: 3, _TAG8_4: 4, _TAG2_3_V: 3}
+_TOGETHER |= dict.fromkeys((_SIGNED, _UNSIGNED, _NEGATIVE_14, _NULL), 512)
+# Three numbers in 14 or 22 bits: (place, width) of each.
+_IN_14_OR_22 = {
+    _TAG2_3: (((8, 4), (4, 4), (0, 4)), ((16, 6), (8, 6), (0, 6))),
+    _TAG2_3_V: (((9, 5), (4, 5), (0, 4)), ((14, 8), (7, 7), (0, 7))),
+}
+
+_PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT, _1500, _VBATREF, _MINMOTOR = *range(1, 7), 8, 9, 11
 
 
 class BadHeader(Exception):
     """A header that does not describe frames which can be decoded; the text says why."""
+
+    def __init__(self, why: str = "its header is damaged"):
+        super().__init__(why)
 
 
 class Decoded(NamedTuple):
@@ -61,85 +74,62 @@ def decode_frames(settings: dict[str, str], data: bytes, wanted: Collection[str]
         raise BadHeader("its header does not describe the frames")
     names = kinds["I"].names
     if "P" in kinds and len(kinds["P"].predictors) != len(names):
-        raise BadHeader("its header is damaged")
+        raise BadHeader
     places = [i for i, name in enumerate(names) if name in wanted]
     stream = _Stream(data, kinds, _Predictor(settings, names))
-    pick = itemgetter(names.index(_TIME), *places)
-    times, blocks, block = [], [], []
-
-    def store() -> None:
-        rows = np.array(block, dtype=float).reshape(len(block), 1 + len(places))
-        times.append(rows[:, 0])
-        blocks.append(rows[:, 1:].astype(np.float32))
-        block.clear()
-
-    for values in stream.frames():
-        block.append(pick(values) if places else (pick(values),))
-        if len(block) == _AT_ONCE:
-            store()
-    store()
-    table = np.concatenate(blocks)
+    rows = map(itemgetter(names.index(_TIME), names.index(_ITERATION), *places), stream.frames())
+    times, blocks = [np.empty(0)], [np.empty((0, len(places)), dtype=np.float32)]
+    while block := list(itertools.islice(rows, _AT_ONCE)):
+        table = np.array(block, dtype=float)
+        times.append(table[:, 0])
+        blocks.append(table[:, 2:].astype(np.float32))
+    table, time = np.concatenate(blocks), np.concatenate(times)
     columns = {names[place]: table[:, i].astype(float) for i, place in enumerate(places)}
-    columns[_TIME] = _unwrapped(np.concatenate(times))
+    # The vehicle counts the time in 32 bits, so it wraps after 72 minutes.
+    columns[_TIME] = np.concatenate([np.zeros(min(time.size, 1)), np.cumsum(np.diff(time) % 2.0**32)])
     return Decoded(columns, stream.damaged, stream.ended)
 
 
-def _unwrapped(time: np.ndarray) -> np.ndarray:
-    """Time [us] from 0; the vehicle counts it in 32 bits, so it wraps after 72 minutes."""
-    return np.concatenate([np.zeros(min(time.size, 1)), np.cumsum(np.diff(time) % 2.0**32)])
-
-
 def _kind(settings: dict[str, str], letter: str) -> _Kind | None:
-    encodings, predictors = (_numbers(settings, f"Field {letter} {what}") for what in ("encoding", "predictor"))
+    encodings, predictors = (_numbers(settings.get(f"Field {letter} {what}", "")) for what in ("encoding", "predictor"))
     if not encodings:
         return None
     names = [name.strip() for name in settings.get(f"Field {letter} name", "").split(",")]
-    if len(encodings) > _MOST_FIELDS or len(predictors) != len(encodings):
-        raise BadHeader("its header is damaged")
-    if letter != "P" and len(names) != len(encodings):
-        raise BadHeader("its header is damaged")
+    if not len(predictors) == len(encodings) <= _MOST_FIELDS or (letter != "P" and len(names) != len(encodings)):
+        raise BadHeader
     groups: list[tuple[int, int]] = []
-    for encoding in encodings:
-        if encoding not in TOGETHER:
+    for encoding, run in itertools.groupby(encodings):
+        if encoding not in _TOGETHER:
             raise BadHeader(f"its frames have an encoding that is not known, {encoding}")
-        if groups and groups[-1][0] == encoding and groups[-1][1] < TOGETHER[encoding]:
-            groups[-1] = (encoding, groups[-1][1] + 1)
-        else:
-            groups.append((encoding, 1))
-    if TAG8_4 in encodings and settings.get("Data version", "2") != "2":
+        count, most = len(list(run)), _TOGETHER[encoding]
+        groups += [(encoding, min(most, count - done)) for done in range(0, count, most)]
+    if _TAG8_4 in encodings and settings.get("Data version", "2") != "2":
         raise BadHeader("its frames are of version 1")
     return _Kind(names, groups, predictors)
 
 
-def _numbers(settings: dict[str, str], name: str) -> list[int]:
-    text = settings.get(name, "")
+def _numbers(text: str) -> list[int]:
     return [int(cell) for cell in text.split(",")] if re.fullmatch(r"\d{1,3}(,\d{1,3})*", text) else []
 
 
-def _whole(settings: dict[str, str], name: str) -> int:
-    """The first number of a setting, or 0."""
-    match = re.match(r"\d{1,9}", settings.get(name, ""))
-    return int(match[0]) if match else 0
+def _whole(text: str, default: int) -> int:
+    """The number at the beginning of a setting. If there is none, or it is 0, the default."""
+    match = re.match(r"\d{1,9}", text)
+    return int(match[0]) or default if match else default
 
 
 class _Predictor:
     """Adds predictions to the values of main frames."""
 
     def __init__(self, settings: dict[str, str], names: list[str]):
+        names_of = {_MINTHROTTLE: "minthrottle", _VBATREF: "vbatref", _MINMOTOR: "motorOutput"}
+        self.constants = {key: _whole(settings.get(name, ""), 0) for key, name in names_of.items()} | {_1500: 1500}
         self.motor0 = names.index("motor[0]") if "motor[0]" in names else 0
-        self.constants = {
-            _MINTHROTTLE: _whole(settings, "minthrottle"),
-            _1500: 1500,
-            _VBATREF: _whole(settings, "vbatref"),
-            _MINMOTOR: _whole(settings, "motorOutput"),
-        }
         first, _, last = settings.get("P interval", "").partition("/")
-        apart = _whole({"": last or first}, "") or 1
-        self.interval, self.share, self.apart = _whole(settings, "I interval") or 1, _whole({"": first}, "") or 1, apart
-        if not last:
-            self.share = 1
+        self.interval = _whole(settings.get("I interval", ""), 1)
+        self.share, self.apart = (_whole(first, 1), _whole(last, 1)) if last else (1, _whole(first, 1))
         if self.interval > 1 << 16 or not 0 < self.share <= self.apart:
-            raise BadHeader("its header is damaged")
+            raise BadHeader
         self.steps: dict[int, int] = {}
 
     def step(self, iteration: int) -> int:
@@ -169,6 +159,105 @@ class _Predictor:
                 values[i] += before[i] + self.step(before[i])
             elif predictor in constants:
                 values[i] += constants[predictor]
+
+
+class Numbers:
+    """Reads numbers from `data`: few bits for small ones. `at`: the number of bytes read.
+
+    Raises `IndexError` at the end of the data.
+    """
+
+    def __init__(self, data: bytes):
+        self.data, self.at = data, 0
+
+    def read(self, encoding: int, count: int, values: list[int]) -> None:
+        """Append `count` numbers of one encoding."""
+        if encoding == _SIGNED or (encoding == _TAG8 and count == 1):
+            self.signed(count, values)
+        elif encoding == _UNSIGNED:
+            self.unsigned(count, values)
+        elif encoding == _NULL:
+            values += [0] * count
+        elif encoding == _NEGATIVE_14:
+            begin = len(values)
+            self.unsigned(count, values)
+            values[begin:] = [-_extended(value, 14) for value in values[begin:]]
+        elif encoding == _TAG8:
+            header = self.byte()  # which of up to eight numbers are not 0
+            for i in range(count):
+                if header >> i & 1:
+                    self.signed(1, values)
+                else:
+                    values.append(0)
+        else:
+            values += (self._tag8_4() if encoding == _TAG8_4 else self._three(encoding))[:count]
+
+    def byte(self) -> int:
+        """The next byte."""
+        self.at += 1
+        return self.data[self.at - 1]
+
+    def unsigned(self, count: int, values: list[int]) -> None:
+        """Seven bits a byte, the lowest first; the eighth says that another byte follows."""
+        data, at = self.data, self.at
+        for _ in range(count):
+            byte = data[at]
+            at += 1
+            value, shift = byte & 0x7F, 7
+            while byte & 0x80 and shift < 35:
+                byte = data[at]
+                at += 1
+                value |= (byte & 0x7F) << shift
+                shift += 7
+            values.append(value)
+        self.at = at
+
+    def signed(self, count: int, values: list[int]) -> None:
+        """The same, with the sign in the lowest bit."""
+        begin = len(values)
+        self.unsigned(count, values)
+        for i in range(begin, len(values)):
+            values[i] = (values[i] >> 1) ^ -(values[i] & 1)
+
+    def _three(self, encoding: int) -> list[int]:
+        """Three numbers of 2 bits, of `_IN_14_OR_22`, or of one to four bytes each, the lowest byte first."""
+        lead = self.byte()
+        size = lead >> 6
+        if size == 0:
+            return [_extended(lead >> shift, 2) for shift in (4, 2, 0)]
+        if size < 3:
+            bits = lead
+            for _ in range(size):
+                bits = bits << 8 | self.byte()
+            return [_extended(bits >> place, width) for place, width in _IN_14_OR_22[encoding][size - 1]]
+        values = []
+        for shift in (0, 2, 4):
+            length = (lead >> shift & 3) + 1
+            number = self.data[self.at : self.at + length]
+            if len(number) < length:
+                raise IndexError
+            values.append(_extended(int.from_bytes(number, "little"), 8 * length))
+            self.at += length
+        return values
+
+    def _tag8_4(self) -> list[int]:
+        """Four numbers of 0, 4, 8 or 16 bits, in a row of half bytes."""
+        header, values = self.byte(), []
+        bits = held = 0
+        for i in range(4):
+            width = (0, 4, 8, 16)[header >> 2 * i & 3]
+            while held < width:
+                bits, held = bits << 8 | self.byte(), held + 8
+            held -= width
+            values.append(_extended(bits >> held, width) if width else 0)
+            bits &= (1 << held) - 1
+        return values
+
+
+def _extended(value: int, bits: int) -> int:
+    """The lowest `bits` as a signed number."""
+    value &= (1 << bits) - 1
+    return value - (1 << bits) if value >> (bits - 1) else value
 
 
 class _Stream:
@@ -205,36 +294,29 @@ class _Stream:
             elif letter == _I:
                 self.predictor.complete(values, self.kinds[_I], values, values)
                 follows = self._follows(values)
-                if intact and self.last is not None and not self._is_next(values):
-                    self.damaged += 1
+                last = self.last
+                if intact and last is not None and values[self.iteration] != last[0] + self.predictor.step(last[0]):
+                    self.damaged += 1  # a frame is missing between the last one and this one
                     del block[1:]
                 yield from block
                 block = [values] if follows else []
                 intact = follows
-                self.last = self._moment(values) if follows else self.last
+                self.last = (values[self.iteration], values[self.time]) if follows else self.last
             elif letter == _P and intact:
                 self.predictor.complete(values, self.kinds[_P], block[-1], block[max(len(block) - 2, 0)])
                 intact = self._follows(values)
                 self.damaged += not intact
                 if intact:
                     block.append(values)
-                    self.last = self._moment(values)
+                    self.last = values[self.iteration], values[self.time]
         yield from block
-
-    def _moment(self, values: list[int]) -> tuple[int, int]:
-        return values[self.iteration], values[self.time]
-
-    def _is_next(self, values: list[int]) -> bool:
-        """Whether no frame is missing between the last one and this one."""
-        return self.last is not None and values[self.iteration] == self.last[0] + self.predictor.step(self.last[0])
 
     def _follows(self, values: list[int]) -> bool:
         """Whether a frame comes a moment after the last one."""
         if self.last is None:
             return True
-        iteration, time = self._moment(values)
-        later = 0 < (time - self.last[1]) % (1 << 32) < _FARTHEST
-        return later and 0 < iteration - self.last[0] < _MOST_ITERATIONS
+        iteration, time = values[self.iteration], values[self.time]
+        return 0 < (time - self.last[1]) % (1 << 32) < _FARTHEST and 0 < iteration - self.last[0] < _MOST_ITERATIONS
 
     def _values(self, letter: int) -> list[int] | None:
         """The encoded numbers of a frame; `None` if it is none. Raises `IndexError` at the end of the data."""
@@ -266,7 +348,3 @@ class _Stream:
         if event == 14:  # logging goes on after a pause
             self.last = None
         return values
-
-
-_I, _P, _E = b"IPE"
-_EVENTS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}  # event: how many numbers it has

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .blackbox_frames import BadHeader, decode_frames
-from .series import in_order
-from .table import Path, opened_bytes, refuse
+from .sampling import in_order
+from .table import Path, opened, read_bytes, refuse
 
 MAGIC = b"H Product:Blackbox"
 DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
@@ -34,27 +34,23 @@ class Session(NamedTuple):
     settings: dict[str, str]
     frames: bytes
 
+    @property
+    def used(self) -> list[str | None]:
+        """The settings that say what the numbers mean."""
+        return [self.settings.get(name) for name in _USED]
 
-class Sessions(NamedTuple):
-    """The sessions of a file one after the other: columns by their names in the log, settings and notes.
 
-    The columns include `time (us)`, from 0.
-    """
-
-    columns: dict[str, np.ndarray]
-    settings: dict[str, str]
-    notes: list[str]
+def is_raw(path: Path) -> bool:
+    """Whether a file is a blackbox log that was not decoded."""
+    with opened(path, "rb") as file:
+        return file.seekable() and file.read(len(MAGIC)) == MAGIC
 
 
 def sessions(path: Path) -> list[Session]:
     """The sessions of a file, in order; none if it is no blackbox log. Raises `InputError`."""
-    with opened_bytes(path) as file:
-        content = file.read(len(MAGIC))
-        if content != MAGIC:
-            return []
-        content += file.read(_LARGEST)
-    if len(content) > _LARGEST:
-        refuse(path, f"has more than {_LARGEST:,} bytes, far more than one flight; cut it into flights")
+    if not is_raw(path):
+        return []
+    content = read_bytes(path, _LARGEST)
     places = [match.start() for match in re.finditer(re.escape(MAGIC), content)]
     return [_session(content[begin:end]) for begin, end in zip(places, [*places[1:], len(content)], strict=True)]
 
@@ -74,8 +70,11 @@ def _session(content: bytes) -> Session:
     return Session(settings, content[at:])
 
 
-def read_sessions(path: Path, wanted: Collection[str]) -> Sessions:
-    """Decode the columns `wanted` of all sessions. Raises `InputError`."""
+def read_sessions(path: Path, wanted: Collection[str]) -> tuple[dict[str, np.ndarray], dict[str, str], list[str]]:
+    """Decode the columns `wanted` of all sessions, one after the other. Raises `InputError`.
+
+    **Returns:** the columns by their names in the log, with `time (us)` from 0; the settings; notes.
+    """
     notes: list[str] = []
     found: list[tuple[Session, dict[str, np.ndarray]]] = []
     every = sessions(path)
@@ -89,7 +88,7 @@ def read_sessions(path: Path, wanted: Collection[str]) -> Sessions:
         why = f" ({notes[0]})" if notes else ""
         refuse(path, f"no frame of it can be decoded{why}: it is corrupt, or of another kind; {DECODE}")
     longest = max(found, key=lambda each: each[1]["time"][-1])[0]
-    same = [columns for session, columns in found if _used(session) == _used(longest)]
+    same = [columns for session, columns in found if session.used == longest.used]
     if len(same) < len(found):
         what = f"{len(found) - len(same)} of {len(found)} sessions are ignored"
         notes.append(f"{what}: their settings are not those of the longest one")
@@ -102,11 +101,7 @@ def read_sessions(path: Path, wanted: Collection[str]) -> Sessions:
         begin = columns["time"][-1] + 1e6 * BETWEEN
     joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
     joined["time (us)"] = joined.pop("time")
-    return Sessions(joined, longest.settings, notes)
-
-
-def _used(session: Session) -> list[str | None]:
-    return [session.settings.get(name) for name in _USED]
+    return joined, longest.settings, notes
 
 
 def _columns(session: Session, wanted: Collection[str]) -> tuple[dict[str, np.ndarray] | None, str]:

@@ -13,7 +13,7 @@
 
 Any event may hold a variable; if several do, the one with the most samples is used. A command is held until the next
 one, and counts as a fraction of the airframe's `max_rotor_speed`. `t` is 0 at the first sample used. The samples of
-the body rates are the rows; samples at other rates are brought to them (`jaxos4.logs.series`).
+the body rates are the rows; samples at other rates are brought to them (`jaxos4.logs.sampling`).
 
 **Frames.** The body has x forward, y left, z up, as ours, and rates follow the right hand. `stateEstimate.pitch` is
 positive nose up, so theta is its negative. The quaternion needs no correction.
@@ -32,20 +32,30 @@ Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 import array
 import math
 import re
-import struct
 import zlib
 from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from .facts import LogFacts, Sampling, logged_rate
-from .series import Series, at_rows, euler_angles, gyro_rows, in_order, unwrapped
-from .table import LogFormat, Path, Table, opened_bytes, quoted, refuse
+from .sampling import Series, in_order, logged_rate
+from .table import (
+    LogFacts,
+    LogFormat,
+    Path,
+    Sampling,
+    Table,
+    attitude_of,
+    gyro_rows,
+    needed,
+    quoted,
+    read_bytes,
+    refuse,
+    unwrapped,
+)
 
 _MAGIC = b"\xbc"
 _MOST_TYPES, _MOST_VARIABLES = 64, 256
 _LARGEST = 1 << 28  # bytes of a file: an hour at 1 kHz
-_AT_ONCE = 1 << 20
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
 _DEGREE, _GRAVITY, _RPM, _FULL = math.pi / 180, 9.80665, 2 * math.pi / 60, 65535.0
 _RATES = {"p": ("gyro.x", _DEGREE), "q": ("gyro.y", _DEGREE), "r": ("gyro.z", _DEGREE)}
@@ -60,43 +70,35 @@ _ANGLES = {
     "psi": ("stateEstimate.yaw", _DEGREE),
 }
 _QUATERNION = {axis: (f"stateEstimate.q{axis}", 1.0) for axis in "wxyz"}
-_REMEDY = "the log is corrupt there: copy it again from the card, or choose another"
+_ROTORS = (("omega", "rpm.m{}", _RPM), ("command", "motor.m{}", 1 / _FULL), ("command", "pwm.m{}_pwm", 1 / _FULL))
 _AGAIN = "copy it again from the card"
+_REMEDY = f"the log is corrupt there: {_AGAIN}, or choose another"
 _OFTEN = "raise the frequency of these variables in the deck's config.txt, and fly again"
+_DAMAGED = f"it is corrupt; {_AGAIN}"
 
 Variables = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 class _Type(NamedTuple):
-    number: int
-    variables: tuple[str, ...]
+    """A type of events: its variables, and the layout of an event."""
+
+    variables: list[str]
     layout: np.dtype
 
 
 def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a Crazyflie's log, and notes on what was assumed. Raises `InputError`."""
-    content = bytearray()
-    with opened_bytes(path) as file:
-        while part := file.read(_AT_ONCE):
-            content += part
-            if len(content) > _LARGEST:
-                refuse(path, f"has more than {_LARGEST:,} bytes, far more than one flight; cut the log into flights")
+    content = read_bytes(path, _LARGEST)
     notes: list[str] = []
-    events = sorted(_events(path, bytes(content), notes), key=lambda event: event[0].size)
-    variables = {name: (t, column) for t, columns in events for name, column in columns.items()}
     names: dict[str, str] = {}
-    rates = _series(variables, _RATES, names)
-    if rates is None:
-        refuse(path, "holds no body rates; add gyro.x, gyro.y and gyro.z to the deck's config.txt")
-    rotors, measured = _rotors(path, variables, names)
-    rows, columns = gyro_rows(path, rates, rotors, measured=measured)
-    for name, source in _OTHERS.items():
-        series = _series(variables, {name: source}, names)
-        if series is not None:
-            columns[name] = at_rows(rows, series)[:, 0]
-    attitude = _attitude(variables, names)
-    if attitude is not None:
-        columns.update(zip(_ANGLES, at_rows(rows, attitude).T, strict=True))
+    variables = _variables(path, content, notes)
+    remedy = "add gyro.x, gyro.y and gyro.z to the deck's config.txt"
+    rates = needed(path, _series(variables, _RATES, names), "body rates", remedy)
+    remedy = "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt"
+    rotors, measured = needed(path, _rotors(variables, names), "rotor speeds or commands", remedy)
+    others: dict[tuple[str, ...], Series | None] = {tuple(_ANGLES): _attitude(variables, names)}
+    others |= {(name,): _series(variables, {name: source}, names) for name, source in _OTHERS.items()}
+    _, columns = gyro_rows(path, rates, rotors, measured=measured, others=others)
     if not measured:
         notes.append(f"commands are {names['command1']}.., taken as fractions of full-scale rotor speed")
     motors = Sampling(names["omega1" if measured else "command1"], logged_rate(rotors.t))
@@ -107,65 +109,60 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
 CRAZYFLIE = LogFormat("Crazyflie", "Crazyflie micro-SD log", lambda begin: begin.startswith(_MAGIC), read_crazyflie)
 
 
-def _events(path: Path, content: bytes, notes: list[str]) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Times [s] and variables of each event type. An incomplete event at the end is ignored."""
+def _variables(path: Path, content: bytes, notes: list[str]) -> Variables:
+    """Times [s] and values of each variable, from the event that holds the most of its samples."""
     header = _Header(path, content)
     types, version = header.types()
     valid = len(content) >= header.at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
-    end = len(content) - 4 if valid else len(content)
-    places, ignored = _places(path, content, types, header.at, end, valid=valid)
+    places, ignored = _places(path, content[: -4 if valid else None], types, header.at, valid=valid)
     if not valid:
         cut = f"and its last {ignored} bytes are not a complete event" if ignored else "but ends with a complete event"
         notes.append(f"the log has no valid checksum, {cut}: it was cut while it was written, or is corrupt")
-    data = np.frombuffer(content, dtype=np.uint8)
-    scale = 1e-3 if version == 1 else 1e-6
-    out = []
-    for each in types:
-        at = np.asarray(places[each.number], dtype=np.int64)
+    data, found = np.frombuffer(content, dtype=np.uint8), []
+    for number, (names, layout) in types.items():
+        at = np.asarray(places[number], dtype=np.int64)
         if at.size < 2:
             continue
-        records = data[at[:, None] + np.arange(each.layout.itemsize)].reshape(-1).view(each.layout)
-        t = records["t"].astype(float) * scale
+        records = data[at[:, None] + np.arange(layout.itemsize)].reshape(-1).view(layout)
+        t = records["t"].astype(float) * (1e-3 if version == 1 else 1e-6)
         kept = in_order(t)
         if kept is None:
-            refuse(path, f"time runs backward from one event to the next: it is corrupt; {_AGAIN}")
+            refuse(path, f"time runs backward from one event to the next: {_DAMAGED}")
         if not kept.all():
             notes.append(f"{np.count_nonzero(~kept)} late events are ignored")
         with np.errstate(all="ignore"):
-            values = [records[f"v{i}"][kept].astype(float) for i in range(len(each.variables))]
-        values = [np.where(np.isfinite(v), v, np.nan) for v in values]
-        out.append((t[kept], dict(zip(each.variables, values, strict=True))))
-    if not out:
+            values = [records[f"v{i}"][kept].astype(float) for i in range(len(names))]
+        found.append((t[kept], zip(names, [np.where(np.isfinite(v), v, np.nan) for v in values], strict=True)))
+    if not found:
         refuse(path, "holds no events; a flight needs at least two")
-    return out
+    return {
+        name: (t, values) for t, columns in sorted(found, key=lambda event: event[0].size) for name, values in columns
+    }
 
 
 class _Header:
     """Reads the header of a file. `at` is the number of bytes read."""
 
     def __init__(self, path: Path, content: bytes):
-        self.path, self.content, self.at = path, content, 0
+        self.path, self.content, self.at = path, content, 1
 
-    def types(self) -> tuple[list[_Type], int]:
-        """The event types, and the version."""
-        if len(self.content) < 5:
-            self._cut()
-        self.at = 1
+    def types(self) -> tuple[dict[int, _Type], int]:
+        """The event types by their numbers, and the version."""
         version, count = self._short(), self._short()
         if version not in (1, 2):
             refuse(self.path, f"is of version {version}, not 1 or 2; update jaxos4, or give another log")
         if not 0 < count <= _MOST_TYPES:
             self._corrupt(f"announces {count} event types")
-        types: list[_Type] = []
+        types: dict[int, _Type] = {}
         for _ in range(count):
             number = self._short()
             self._text()
             names, kinds = self._variables()
-            if number in [each.number for each in types] or len(set(names)) < len(names):
+            if number in types or len(set(names)) < len(names):
                 self._corrupt("names an event type or a variable twice")
             stamp = "<u4" if version == 1 else "<u8"
             fields = [("number", "<u2"), ("t", stamp), *((f"v{i}", f"<{kind}") for i, kind in enumerate(kinds))]
-            types.append(_Type(number, tuple(names), np.dtype(fields)))
+            types[number] = _Type(names, np.dtype(fields))
         return types, version
 
     def _variables(self) -> tuple[list[str], list[str]]:
@@ -184,32 +181,32 @@ class _Header:
         return names, kinds
 
     def _short(self) -> int:
-        if self.at + 2 > len(self.content):
-            self._cut()
         self.at += 2
-        return struct.unpack_from("<H", self.content, self.at - 2)[0]
+        if self.at > len(self.content):
+            self._cut()
+        return int.from_bytes(self.content[self.at - 2 : self.at], "little")
 
     def _text(self) -> bytes:
-        begin, end = self.at, self.content.find(b"\0", self.at, self.at + 256)
-        if end < 0:
+        text, zero, _ = self.content[self.at : self.at + 256].partition(b"\0")
+        if not zero:
             self._cut()
-        self.at = end + 1
-        return self.content[begin:end]
+        self.at += len(text) + 1
+        return text
 
     def _cut(self) -> NoReturn:
         refuse(self.path, f"ends within its header, or is corrupt; {_AGAIN}")
 
     def _corrupt(self, what: str) -> NoReturn:
-        refuse(self.path, f"{what}: it is corrupt; {_AGAIN}")
+        refuse(self.path, f"{what}: {_DAMAGED}")
 
 
 def _places(
-    path: Path, content: bytes, types: list[_Type], begin: int, end: int, *, valid: bool
+    path: Path, content: bytes, types: dict[int, _Type], at: int, *, valid: bool
 ) -> tuple[dict[int, array.array], int]:
     """The position of each event by its type, and the number of bytes after the last complete event."""
-    sizes = {each.number: each.layout.itemsize for each in types}
+    sizes = {number: each.layout.itemsize for number, each in types.items()}
     places = {number: array.array("q") for number in sizes}
-    at = begin
+    end = len(content)
     while at + 2 <= end:
         number = content[at] | content[at + 1] << 8
         size = sizes.get(number)
@@ -230,27 +227,24 @@ def _series(variables: Variables, wanted: dict[str, tuple[str, float]], names: d
     times = [each[0] for each in found if each is not None]
     if len(times) < len(found) or any(t is not times[0] for t in times):
         return None
-    values = [variables[variable][1] * factor for variable, factor in wanted.values()]
-    names.update((column, variable) for column, (variable, _) in wanted.items())
-    return Series(times[0], np.column_stack(values))
+    names |= {column: variable for column, (variable, _) in wanted.items()}
+    return Series(times[0], np.column_stack([variables[name][1] * factor for name, factor in wanted.values()]))
 
 
-def _rotors(path: Path, variables: Variables, names: dict[str, str]) -> tuple[Series, bool]:
+def _rotors(variables: Variables, names: dict[str, str]) -> tuple[Series, bool] | None:
     """Rotor speeds [rad/s] or commands [0..1], and whether they are measured speeds."""
-    for variable, factor in (("rpm.m{}", _RPM), ("motor.m{}", 1 / _FULL), ("pwm.m{}_pwm", 1 / _FULL)):
-        measured = factor == _RPM
-        prefix = "omega" if measured else "command"
+    for prefix, variable, factor in _ROTORS:
         found: dict[str, str] = {}
         series = _series(variables, {f"{prefix}{i}": (variable.format(i), factor) for i in range(1, 5)}, found)
+        measured = prefix == "omega"
         if series is None or (measured and not (series.values > 0).any(axis=0).all()):
             continue
         finite = np.isfinite(series.values).all(axis=1)
-        if np.count_nonzero(finite) < 2:
-            continue
-        names.update(found)
-        values = series.values[finite]
-        return Series(series.t[finite], values if measured else np.clip(values, 0.0, 1.0)), measured
-    refuse(path, "holds no rotor speeds or commands; add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt")
+        if np.count_nonzero(finite) > 1:
+            names |= found
+            values = series.values[finite]
+            return Series(series.t[finite], values if measured else np.clip(values, 0.0, 1.0)), measured
+    return None
 
 
 def _attitude(variables: Variables, names: dict[str, str]) -> Series | None:
@@ -258,7 +252,7 @@ def _attitude(variables: Variables, names: dict[str, str]) -> Series | None:
     if series is not None:
         return unwrapped(series.t, series.values)
     series = _series(variables, _QUATERNION, {})
-    if series is not None:
-        names.update(dict.fromkeys(_ANGLES, "stateEstimate.q"))
-        return unwrapped(series.t, euler_angles(series.values))
-    return None
+    if series is None:
+        return None
+    names |= dict.fromkeys(_ANGLES, "stateEstimate.q")
+    return attitude_of(series.t, series.values)

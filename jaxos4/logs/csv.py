@@ -16,11 +16,18 @@ The first row holds the names of the columns, in any order. Cells are separated 
 
 A missing column or an empty cell means that the value was not measured. Voltage is interpolated over empty cells. A
 flight needs `t`, all four rotors (speeds or commands), and at least one of the twelve states of Eq. (14).
+
+The parser is our own: `numpy.loadtxt` takes no empty cells and accepts `nan` and `inf`, `numpy.genfromtxt` reads text
+as NaN, and neither gives the row of the file and the name of the column.
 """
 
 import csv
+import math
 import os
-import warnings
+import re
+from collections.abc import Collection, Iterator
+from operator import itemgetter
+from typing import IO
 
 import numpy as np
 
@@ -28,41 +35,37 @@ from .._files import write_atomically
 from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
-from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES, flight_of
-from .csv_text import read_table
-from .table import LogFormat, Path, printable
+from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES
+from .table import MAX_ROWS, LogFormat, Path, Table, opened, printable, quoted, refuse
 
 _ROWS_AT_ONCE = 8192
+_LONGEST_LINE = 1 << 20
+_BLOCK = 1 << 20  # characters parsed at once: the whole text never has to fit in memory
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
+_EMPTY = "leave the cell empty if it was not measured"
+_NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
+
+CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()))
 
 
-def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
-    """Read a flight from a CSV file. The columns are listed in `jaxos4.logs.csv`.
+def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Collection[str] = ()) -> Table:
+    """Read the columns of a CSV file whose names are `known`; the names of the others are listed in the table.
+
+    The text is UTF-8 with any line ends, with or without a byte-order mark. Blanks around cells are ignored.
 
     **Arguments:**
 
-    - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds. A file with `omega1..4` needs none.
+    - `skip`: number of lines before the header.
+    - `missing`: cells that mean "not measured", in addition to the empty cell.
 
-    **Returns:** a `Flight`. Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such
-    a grid (see `jaxos4.logs.resample`). Jumps of 2 pi in roll and yaw are removed.
-
-    **Raises:** `InputError`, one line: file, row, column, what is wrong and what to do.
-
-    **Warns:** `UserWarning` for each change to the data: resampling, empty cells of a rotor, ignored columns.
+    **Raises:** `InputError`, one line with file, row and column, whatever the file contains.
     """
-    flight, notes = read_flight_and_notes(path, airframe)
-    for note in notes:
-        warnings.warn(f"{printable(os.fspath(path))}: {note}.", UserWarning, stacklevel=2)
-    return flight
-
-
-def read_flight_and_notes(
-    path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
-) -> tuple[Flight, tuple[str, ...]]:
-    """Read a flight, and return the warnings of `read_flight` as notes; `full_scale` is as in `read_log`."""
-    return flight_of(read_table(path, COLUMN_NAMES), airframe, full_scale=full_scale)
-
-
-CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()))
+    with opened(path) as file:
+        for _ in range(skip):
+            file.readline(_LONGEST_LINE)
+        header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
+        return _parse(path, file, header, known, skip + 2, missing)
 
 
 def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
@@ -86,18 +89,19 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
     names, omega = SPEED_NAMES, np.asarray(flight.omega)
     if flight.commanded and airframe is not None and np.isfinite(airframe.max_rotor_speed):
         names, omega = COMMAND_NAMES, omega / np.asarray(airframe.max_rotor_speed)
-    columns = {"t": np.asarray(flight.time), **dict(zip(names, omega.T, strict=True))}
-    for name, column in columns.items():
-        _check_cells(path, name, column, np.isfinite(column))
-    measured: dict[str, np.ndarray] = dict(zip(STATE_NAMES, np.asarray(flight.states).T, strict=True))
-    if flight.specific_force is not None:
-        measured.update(zip(FORCE_NAMES, np.asarray(flight.specific_force).T, strict=True))
+    needed = {"t": np.asarray(flight.time), **dict(zip(names, omega.T, strict=True))}
+    measured: dict[str, np.ndarray] = dict(zip((*STATE_NAMES, *FORCE_NAMES), flight.recorded.T, strict=True))
     if flight.voltage is not None:
         measured["voltage"] = np.asarray(flight.voltage)
-    for name, column in measured.items():
-        _check_cells(path, name, column, ~np.isinf(column))
-        if not np.isnan(column).all():
-            columns[name] = column
+    for name, column in {**needed, **measured}.items():
+        usable = np.isfinite(column) if name in needed else ~np.isinf(column)
+        if not usable.all():
+            index = int(np.argmin(usable))
+            raise InputError(
+                f"{printable(os.fspath(path))}: sample {index}, column {name}: is {column[index]}, "
+                "which a flight file cannot contain; cut the flight before it."
+            )
+    columns = needed | {name: column for name, column in measured.items() if not np.isnan(column).all()}
     with write_atomically(path) as beside, open(beside, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
@@ -107,10 +111,110 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
             writer.writerows(zip(*cells, strict=True))
 
 
-def _check_cells(path: Path, name: str, column: np.ndarray, usable: np.ndarray) -> None:
-    if not usable.all():
-        index = int(np.argmin(usable))
-        raise InputError(
-            f"{printable(os.fspath(path))}: sample {index}, column {name}: is {column[index]}, "
-            "which a flight file cannot contain; cut the flight before it."
-        )
+def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str]:
+    """The names of the columns."""
+    if not line:
+        refuse(path, "is empty; a flight needs a header row and at least two rows of data")
+    if not _readable(line):
+        refuse(path, _NOT_UTF8, row=row)
+    if len(line) >= _LONGEST_LINE:
+        refuse(path, "is longer than a million characters; export the log as CSV with a header row", row=row)
+    names = [name.strip() for name in _cells(path, line.rstrip("\n"), row)]
+    if not any(names):
+        refuse(path, "is empty; the first row must be the header", row=row)
+    if len(names) == 1:
+        for separator, shown in ((";", "';'"), ("\t", "tabs"), ("|", "'|'"), (" ", "blanks")):
+            if separator in line.strip():
+                refuse(path, f"is separated by {shown}; separate by commas, with points in the numbers", row=row)
+    if all(_NUMBER.fullmatch(name) for name in names if name):
+        refuse(path, "contains numbers instead of the header; write the names of the columns in a first row", row=row)
+    for name in known:
+        if names.count(name) > 1:
+            refuse(path, f"occurs {names.count(name)} times in the header; keep one of them", row=row, column=name)
+    return names
+
+
+def _parse(
+    path: Path, file: IO[str], header: list[str], known: Collection[str], first_row: int, missing: Collection[str]
+) -> Table:
+    wanted = [(name, itemgetter(i)) for i, name in enumerate(header) if name in known]
+    parts: dict[str, list[np.ndarray]] = {name: [np.empty(0)] for name, _ in wanted}
+    row = first_row
+    for lines in _blocks(path, file, first_row):
+        rows = [_cells(path, line, row + i) for i, line in enumerate(lines)]
+        widths = list(map(len, rows))
+        if widths.count(len(header)) != len(rows):
+            i = next(i for i, width in enumerate(widths) if width != len(header))
+            if not lines[i].strip():
+                refuse(path, "is blank; delete it", row=row + i)
+            count = "1 cell" if widths[i] == 1 else f"{widths[i]} cells"
+            refuse(path, f"has {count}, but the header has {len(header)}; repair or delete the row", row=row + i)
+        for name, cell in wanted:
+            cells = list(map(cell, rows))
+            cells = ["" if text.strip() in missing else text for text in cells] if missing else cells
+            parts[name].append(_numbers(path, name, cells, row))
+        row += len(rows)
+        if row - first_row > MAX_ROWS:
+            refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
+    if row - first_row < 2:
+        refuse(path, f"has a header and {['no data', 'one row of data'][row - first_row]}; a flight needs two rows")
+    columns = {name: np.concatenate(parts.pop(name)) for name, _ in wanted}
+    return Table(path, columns, tuple(name for name in header if name not in known), first_row)
+
+
+def _blocks(path: Path, file: IO[str], row: int) -> Iterator[list[str]]:
+    """Some lines at a time, without the blank lines at the end of the file."""
+    blank: list[str] = []  # at the end of the last block: allowed only if no other line follows
+    while text := file.read(_BLOCK):
+        rest = file.readline(_LONGEST_LINE)
+        lines = blank + (text + rest).removesuffix("\n").split("\n")
+        if len(rest) >= _LONGEST_LINE:
+            refuse(path, "is longer than a million characters; give a CSV file", row=row + len(lines) - 1)
+        end = len(lines)
+        while end and not lines[end - 1].strip():
+            end -= 1
+        blank = lines[end:]
+        if len(blank) > _LONGEST_LINE:
+            refuse(path, "and a million rows after it are blank; delete them", row=row + end)
+        if end:
+            yield lines[:end]
+            row += end
+
+
+def _cells(path: Path, line: str, row: int) -> list[str]:
+    try:
+        return next(csv.reader([line]), [])  # line by line, so that an open quote ends with its line
+    except csv.Error:
+        refuse(path, "contains a cell that is too long; repair or delete the row", row=row)
+
+
+def _numbers(path: Path, column: str, cells: list[str], row: int) -> np.ndarray:
+    text = "".join(cells)
+    if text.isascii() and "_" not in text:  # float() also reads "1_0" and the digits of other scripts
+        try:
+            values = np.array([float(cell) if cell else math.nan for cell in cells])
+        except ValueError:
+            pass
+        else:
+            if np.count_nonzero(np.isfinite(values)) + cells.count("") == len(cells):
+                return values
+    values = np.empty(len(cells))
+    for i, cell in enumerate(map(str.strip, cells)):
+        values[i] = float(cell) if _NUMBER.fullmatch(cell) else math.nan
+        if cell and not math.isfinite(values[i]):
+            refuse(path, _complaint(cell), row=row + i, column=column)
+    return values
+
+
+def _complaint(cell: str) -> str:
+    """The fault of a cell that is no finite number, and the remedy."""
+    if cell.lower().lstrip("+-") in _NO_NUMBER:
+        return f"contains {quoted(cell)}; {_EMPTY}"
+    if _NUMBER.fullmatch(cell):
+        return f"contains {quoted(cell)}, which is too large for a number; {_EMPTY}"
+    return f"contains {quoted(cell)}, which is not a number; correct it, or {_EMPTY}" if _readable(cell) else _NOT_UTF8
+
+
+def _readable(text: str) -> bool:
+    """Whether every byte of the text could be decoded, and none is zero."""
+    return "\0" not in text and (text.isascii() or not any("\ud800" <= each <= "\udfff" for each in text))

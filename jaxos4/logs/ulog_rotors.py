@@ -25,9 +25,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .facts import fast_enough, logged_rate
-from .series import Series
-from .ulog_topics import Topics
+from .sampling import Series, logged_rate
+from .table import fast_enough
+from .ulog_file import Topics
 
 TOPICS = ("esc_status", "actuator_motors", "actuator_outputs")
 
@@ -44,16 +44,25 @@ _TIMERS = 8
 
 
 class Rotors(NamedTuple):
-    """Measured speeds [rad/s] or commands [0..1] of the four rotors, the log's names of them, and how they were made.
+    """Measured speeds [rad/s] or commands [0..1] of the four rotors, and their topic and fields in the log.
 
-    `topic`: where they come from. `note`: what was assumed; empty for measured speeds.
+    `note`: what was assumed; empty for measured speeds.
     """
 
     series: Series
-    measured: bool
     topic: str
-    names: tuple[str, ...]
+    fields: tuple[str, ...]
     note: str = ""
+
+    @property
+    def measured(self) -> bool:
+        """Whether these are measured speeds, and not commands."""
+        return self.topic == "esc_status"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The log's names of the four columns."""
+        return tuple(f"{self.topic}.{field}" for field in self.fields)
 
     @property
     def rate(self) -> float:
@@ -89,7 +98,7 @@ def _speeds(log: Topics) -> Rotors | None:
     if np.count_nonzero(measured) < 2:
         return None
     speeds = Series(series.t[measured], np.abs(series.values[measured])[:, order] * _RPM)
-    return Rotors(speeds, True, "esc_status", tuple(f"esc_status.{names[i]}" for i in order))
+    return Rotors(speeds, "esc_status", tuple(names[i] for i in order))
 
 
 def _motors(log: Topics) -> Rotors | None:
@@ -101,9 +110,7 @@ def _motors(log: Topics) -> Rotors | None:
     curve, what = _thrust_curve(log)
     speeds = np.sqrt(shares) if curve else shares
     note = f"commands are actuator_motors.control, {what}"
-    return Rotors(
-        Series(series.t, speeds), False, "actuator_motors", tuple(f"actuator_motors.{name}" for name in names), note
-    )
+    return Rotors(Series(series.t, speeds), "actuator_motors", names, note)
 
 
 def _outputs(log: Topics) -> Rotors | None:
@@ -124,9 +131,7 @@ def _outputs(log: Topics) -> Rotors | None:
     curve, what = _thrust_curve(log)
     speeds = np.sqrt(curve * shares**2 + (1 - curve) * shares) if curve else shares
     note = f"commands are actuator_outputs.output, {kind} {low.min():g}..{high.max():g}, {what}"
-    return Rotors(
-        Series(series.t, speeds), False, "actuator_outputs", tuple(f"actuator_outputs.{name}" for name in names), note
-    )
+    return Rotors(Series(series.t, speeds), "actuator_outputs", names, note)
 
 
 def _thrust_curve(log: Topics) -> tuple[float, str]:
@@ -183,13 +188,11 @@ def _ends(
     default: tuple[float, float],
 ) -> np.ndarray:
     """The smallest and the largest value of each output: by number, else of the bank, else the default."""
-    out = np.tile(default, (4, 1))
-    for row, channel in enumerate(channels):
-        for end in range(2):
-            candidates = [f"{pair[end]}{number}" for pair in names for number in (channel + 1, "")]
-            values = (log.parameters.get(name, math.nan) for name in candidates)
-            known = next((value for value in values if possible[0] <= value <= possible[1]), default[end])
-            out[row, end] = known
-        if out[row, 0] >= out[row, 1]:
-            out[row] = default
-    return out
+
+    def known(channel: int, end: int) -> float:
+        candidates = [f"{pair[end]}{number}" for pair in names for number in (channel + 1, "")]
+        values = (log.parameters.get(name, math.nan) for name in candidates)
+        return next((value for value in values if possible[0] <= value <= possible[1]), default[end])
+
+    ends = np.array([[known(channel, 0), known(channel, 1)] for channel in channels])
+    return np.where(ends[:, :1] < ends[:, 1:], ends, default)

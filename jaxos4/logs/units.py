@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .sampling import Series, integral
 from .table import Table
 
 DEGREES = 180 / math.pi
@@ -40,6 +41,8 @@ LIMITS = {
     **dict.fromkeys(("ax", "ay", "az"), Limit(1e3, "m/s^2", _FORCE)),
     "voltage": Limit(200.0, "V", "the battery's voltage is in volts: if these are mV, divide by 1000"),
 }
+_NEGATIVE = "is {:g} rad/s; drop the sign, because rotor_spins gives the direction"
+_NO_FRACTION = "is {:g}; commands are fractions 0..1 of full scale: divide by full scale (100, 65535)"
 SHORTEST_STEP, LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
 _ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
 _WINDOW = 0.2  # [s]: increments of an angle over this time are compared with the integral of its rate
@@ -69,33 +72,30 @@ def check_units(table: Table) -> None:
     for name, values in columns.items():
         limit = LIMITS.get(name)
         if limit is None:
-            _check_command(table, name)
+            _refuse_any(table, name, (values < 0) | (values > 1), _NO_FRACTION)
             continue
         largest = _YAW.largest if name == "phi" and flips else limit.largest
-        index = _first(np.abs(values) > largest)
-        if index is not None:
-            advice = table.remedy or limit.advice
-            what = f"is {values[index]:g} {limit.unit}, beyond {largest:.4g} {limit.unit}; {advice}"
-            table.refuse(what, index=index, column=name)
-        if limit is _SPEED and (index := _first(values < 0)) is not None:
-            what = f"is {values[index]:g} rad/s; drop the sign, because rotor_spins gives the direction"
-            table.refuse(what, index=index, column=name)
+        beyond = f"is {{:g}} {limit.unit}, beyond {largest:.4g} {limit.unit}; {table.remedy or limit.advice}"
+        _refuse_any(table, name, np.abs(values) > largest, beyond)
+        if limit is _SPEED:
+            _refuse_any(
+                table, name, values < 0, "is {:g} rad/s; drop the sign, because rotor_spins gives the direction"
+            )
     if "psi" in columns:
-        _check_yaw_steps(table)
+        measured = np.flatnonzero(np.isfinite(columns["psi"]))
+        jumps = np.zeros(columns["psi"].size, dtype=bool)
+        jumps[measured[1:]] = np.abs(np.abs(np.diff(columns["psi"][measured])) - 360) < 20
+        _refuse_any(table, "psi", jumps, "jumps by about 360: it looks like degrees, divide by 57.3")
 
 
 def check_time(table: Table) -> float:
     """The median time between rows [s]. Refuses a time that is missing, does not increase, or is not in seconds."""
     t = table.columns["t"]
-    index = _first(np.isnan(t))
-    if index is not None:
-        table.refuse("is empty; each row needs its time", index=index, column="t")
-    index = _first(np.abs(t) > _TIME.largest)
-    if index is not None:
-        table.refuse(f"is {t[index]:g} s; {_TIME.advice}", index=index, column="t")
+    _refuse_any(table, "t", np.isnan(t), "is empty; each row needs its time")
+    _refuse_any(table, "t", np.abs(t) > _TIME.largest, f"is {{:g}} s; {_TIME.advice}")
     step = np.diff(t)
-    index = _first(step <= 0)
-    if index is not None:
+    if (step <= 0).any():
+        index = int(np.argmax(step <= 0))
         if step[index] == 0:
             row = index + (table.first_row or 0)
             what = f"repeats {t[index]:.9g} s of row {row}; time must increase: delete one of the two rows"
@@ -120,9 +120,8 @@ def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | N
     with_angle, with_rate = np.isfinite(angle), np.isfinite(rate)
     if np.count_nonzero(with_rate) < 2:
         return None
-    times, rates = t[with_rate], rate[with_rate]
-    integral = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
-    with_angle &= (t >= times[0]) & (t <= times[-1])
+    rates = Series(t[with_rate], rate[with_rate, None])
+    with_angle &= (t >= rates.t[0]) & (t <= rates.t[-1])
     instants = t[with_angle]
     if instants.size <= _FEWEST:
         return None
@@ -135,7 +134,7 @@ def scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | N
     turn = 360.0 if np.abs(steps).max() > 3 * math.pi else 2 * math.pi
     unwrapped = np.concatenate([[0.0], np.cumsum(steps - turn * np.rint(steps / turn))])
     increments = np.diff(unwrapped[knots])
-    expected = np.diff(np.interp(instants[knots], times, integral))
+    expected = np.diff(integral(rates, instants[knots], linear=True)[:, 0])
     sizes = float(np.linalg.norm(increments)), float(np.linalg.norm(expected))
     if min(sizes) == 0 or increments @ expected < _SIMILARITY * sizes[0] * sizes[1]:
         return None
@@ -162,21 +161,8 @@ def thrust_note(ratio: float) -> list[str]:
     return [f"{what}: check the airframe, and whether rotor speeds are in {unit}"]
 
 
-def _check_command(table: Table, name: str) -> None:
-    values = table.columns[name]
-    index = _first((values < 0) | (values > 1))
-    if index is not None:
-        what = f"is {values[index]:g}; commands are fractions 0..1 of full scale: divide by full scale (100, 65535)"
-        table.refuse(what, index=index, column=name)
-
-
-def _check_yaw_steps(table: Table) -> None:
-    measured = np.flatnonzero(np.isfinite(table.columns["psi"]))
-    index = _first(np.abs(np.abs(np.diff(table.columns["psi"][measured])) - 360) < 20)
-    if index is not None:
-        what = "jumps by about 360: it looks like degrees, divide by 57.3"
-        table.refuse(what, index=int(measured[index + 1]), column="psi")
-
-
-def _first(condition: np.ndarray) -> int | None:
-    return int(np.argmax(condition)) if condition.any() else None
+def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
+    """Refuse the first value of a column that is `wrong`; `what` may hold a place for the value."""
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        table.refuse(what.format(table.columns[name][index]), index=index, column=name)

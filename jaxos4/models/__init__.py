@@ -6,7 +6,6 @@ from .abstract import (
     AbstractModel as AbstractModel,
 )
 from .corrected import CorrectedOS4 as CorrectedOS4
-from .held import HeldParameters as HeldParameters, hold as hold
 from .inertial import InertialOS4 as InertialOS4
 from .published import PublishedOS4 as PublishedOS4
 from .rotation import with_body_velocity as with_body_velocity

@@ -1,6 +1,7 @@
 """The interface of a quadrotor model, and the base class of the two OS4 models."""
 
 import abc
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,17 +22,27 @@ PARAMETER_NAMES = tuple(f"alpha{i}" for i in range(1, 9))
 DEFAULT_HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
 
 
+Contradiction = Callable[[float, float], tuple[str, str] | None]
+
+
 class Parameter(NamedTuple):
     """One unknown of a model.
 
     - `in_forcing`: whether the forcing depends on the parameter.
     - `linear`: whether the rate equations are linear in the parameter if the forcing does not depend on it.
+    - `nonnegative`: whether physics forbids a negative value.
+    - `scales_torque`: whether torque exceeds that of the airframe by this factor.
+    - `contradiction`: from a value and its error, why physics or the airframe forbids it, and what to do; `None` if
+      they do not.
     """
 
     name: str
     unit: str
     in_forcing: bool = False
     linear: bool = True
+    nonnegative: bool = False
+    scales_torque: bool = False
+    contradiction: Contradiction | None = None
 
 
 class AbstractModel(eqx.Module):

@@ -4,12 +4,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Scalar
-from ..airframe import alpha_scalars
+from ..airframe import Airframe, alpha_scalars
+from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
-from .reparametrised import AbstractReparametrised
+from .state import Forcing, Rates, State
 
 
-class InertialOS4(AbstractReparametrised):
+class InertialOS4(AbstractModel):
     """`PublishedOS4` or `CorrectedOS4` with the parameters Ix, Iy, Iz and J_R instead of the eight alphas.
 
     The eight alphas of a rigid body follow from these four constants (the definitions below Eq. (13)), so an estimate
@@ -46,3 +47,39 @@ class InertialOS4(AbstractReparametrised):
         """alpha_1..8 of these constants."""
         ix, iy, iz, rotor = parameters
         return alpha_scalars(ix, iy, iz, rotor * self.gyroscopic_factor)
+
+    @property
+    def airframe(self) -> Airframe:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """See `AbstractModel`."""
+        return self.model.airframe
+
+    @property
+    def gyroscopic_factor(self) -> Scalar:
+        """See `AbstractModel`."""
+        return self.model.gyroscopic_factor
+
+    @property
+    def force_axes(self) -> tuple[int, ...]:
+        """See `AbstractModel`."""
+        return self.model.force_axes
+
+    @property
+    def observes_states(self) -> bool:
+        """See `AbstractModel`."""
+        return self.model.observes_states
+
+    def forcing(self, inputs: Inputs, parameters) -> Forcing:
+        """See `AbstractModel`."""
+        return self.model.forcing(inputs, jnp.stack(self.inner(tuple(parameters))))
+
+    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
+        """See `AbstractModel`."""
+        return self.model.angular_acceleration(rates, forcing, self.inner(parameters))
+
+    def cascade(self, state: State, forcing: Forcing, parameters) -> State:
+        """See `AbstractModel`."""
+        return self.model.cascade(state, forcing, self.inner(parameters))
+
+    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
+        """See `AbstractModel`."""
+        return self.model.observe(state, forcing, self.inner(parameters))

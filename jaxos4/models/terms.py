@@ -13,6 +13,7 @@ from jax.core import Tracer
 
 from .._custom_types import RotorSpeeds, Scalar
 from ..airframe import Airframe
+from .abstract import Contradiction
 from .rotors import Grid, Speeds, SquaredSpeeds, delayed, lagged
 from .state import Forcing, Rates, Samples, Vector
 
@@ -28,6 +29,12 @@ VOLTAGE = "battery voltage"
 _AUTHORITY, _FAST = 0.2, 5.0
 # The specific thrust in hover [m/s^2]. Torque proportional to it belongs to the term `offset`.
 _HOVER = 9.81
+# A time constant or delay this far below 0 is neither chance nor rounding [s].
+_EARLY = 0.002
+# A thrust gain beyond this factor, or its reciprocal, is no error of a scale or of a propeller's table. An
+# accelerometer that follows less than the second number does not measure the thrust.
+_FAR_GAIN, _DEAD = 2.0, 0.2
+_SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 # The yaw torque of the rotors as a share of their roll torque.
 _YAW = 0.2
 _AXES = ("roll", "pitch", "yaw")
@@ -44,6 +51,7 @@ class TermParameter(NamedTuple):
     - `half_width`, `center`: of the default bracket: a number, or a function of the airframe.
     - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
+    - `nonnegative`, `scales_torque`, `contradiction`: see `jaxos4.models.abstract.Parameter`.
     """
 
     name: str
@@ -52,6 +60,9 @@ class TermParameter(NamedTuple):
     center: Constant = 0.0
     each_recording: bool = False
     force_axis: int | None = None
+    nonnegative: bool = False
+    scales_torque: bool = False
+    contradiction: Contradiction | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +113,11 @@ class Term:
         """Whether the forcing depends on the term's parameters."""
         return any((self.command, self.speed, self.thrust))
 
+    @property
+    def changes_rates(self) -> bool:
+        """Whether predictions of the body rates need the term."""
+        return self.in_forcing or self.angular_acceleration is not None or self.gyro is not None
+
 
 def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
     """The share `_AUTHORITY` of the rotors' torque over the inertia [rad/s^2], divided by `per`."""
@@ -117,6 +133,25 @@ def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
 
 def _reaction(airframe: Airframe) -> Scalar:
     return jnp.asarray(airframe.rotor_inertia) / jnp.asarray(airframe.inertia)[2]
+
+
+def _late(cause: str, remedy: str) -> Contradiction:
+    """A time that must not be negative."""
+
+    def contradiction(value: float, error: float) -> tuple[str, str] | None:
+        return (f"s is negative: {cause}", remedy) if value + error < -_EARLY else None
+
+    return contradiction
+
+
+def _contradicts_thrust(gain: float, error: float) -> tuple[str, str] | None:
+    verdicts = (
+        (gain + error < 0, "answers thrust with the opposite sign", "its z axis points down: change its sign"),
+        (gain + error < _DEAD, "does not follow the thrust", "check that it is switched on and in m/s^2"),
+        (gain - error > _FAR_GAIN, "shows more thrust than the airframe has", _SCALES),
+        (gain + error < 1 / _FAR_GAIN, "shows less thrust than the airframe has", _SCALES),
+    )
+    return next(((f"(the accelerometer {cause})", remedy) for is_so, cause, remedy in verdicts if is_so), None)
 
 
 def _add_offset(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
@@ -200,7 +235,7 @@ TERMS: dict[str, Term] = {
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
-        tuple(TermParameter(f"{x}_damping", "1/s", 5.0) for x in _AXES),
+        tuple(TermParameter(f"{x}_damping", "1/s", 5.0, nonnegative=True) for x in _AXES),
         by_default=lambda available: True,
         angular_acceleration=_add_damping,
     ),
@@ -228,13 +263,34 @@ TERMS: dict[str, Term] = {
     ),
     "lag": Term(
         "rotors follow their commands as first-order systems: rotor_lag [s]",
-        (TermParameter("rotor_lag", "s", 0.03, center=0.05),),  # small vehicles have 0.02 to 0.1 s
+        (
+            TermParameter(  # small vehicles have 0.02 to 0.1 s
+                "rotor_lag",
+                "s",
+                0.03,
+                center=0.05,
+                contradiction=_late(
+                    "rotors cannot answer before their command",
+                    "if the log holds measured rotor speeds, name the columns omega1..4; else check the time stamps",
+                ),
+            ),
+        ),
         by_default=lambda available: COMMANDS in available,
         speed=lambda speeds, values, grid: lagged(speeds.begin, values["rotor_lag"], grid),
     ),
     "delay": Term(
         "commands act later than they are recorded: rotor_delay [s]",
-        (TermParameter("rotor_delay", "s", 0.02),),
+        (
+            TermParameter(
+                "rotor_delay",
+                "s",
+                0.02,
+                contradiction=_late(
+                    "commands cannot act before they are given",
+                    "commands or gyro are logged with wrong time stamps: correct them, or leave out the term `delay`",
+                ),
+            ),
+        ),
         by_default=lambda available: COMMANDS in available,
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
     ),
@@ -255,7 +311,7 @@ TERMS: dict[str, Term] = {
     "accelerometer": Term(
         "specific force is measured: thrust_gain, and ax_bias, ay_bias, az_bias [m/s^2] along the predicted axes",
         (
-            TermParameter("thrust_gain", "1", 0.5, center=1.0),
+            TermParameter("thrust_gain", "1", 0.5, center=1.0, scales_torque=True, contradiction=_contradicts_thrust),
             # A sensor that was levelled before take-off has a smaller bias.
             *(TermParameter(name, "m/s^2", 0.3, force_axis=axis) for axis, name in enumerate(_FORCE_BIASES)),
         ),

@@ -258,7 +258,15 @@ class _Row(NamedTuple):
     def parameter(self) -> Parameter:
         """The name counts recordings from 1."""
         name = self.source.name if self.recording is None else f"{self.source.name}_{self.recording + 1}"
-        return Parameter(name, self.source.unit, in_forcing=self.term.in_forcing)
+        source = self.source
+        return Parameter(
+            name,
+            source.unit,
+            in_forcing=self.term.in_forcing,
+            nonnegative=source.nonnegative,
+            scales_torque=source.scales_torque,
+            contradiction=source.contradiction,
+        )
 
 
 @functools.cache

@@ -6,5 +6,5 @@ from .estimator import (
     TrainedNetwork as TrainedNetwork,
 )
 from .features import FEATURES as FEATURES
-from .file import load_network as load_network, save_network as save_network
+from .file import encode_network as encode_network, load_network as load_network, save_network as save_network
 from .training import CHECK as CHECK

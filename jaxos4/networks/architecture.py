@@ -1,6 +1,9 @@
-"""From features to unknowns: a linear map, a learnt correction, and the learnt size of the error that remains."""
+"""From features to unknowns: a linear map, a learnt correction, the learnt size of the error, calibrated intervals."""
 
+import functools
 import itertools
+import math
+import statistics
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,12 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Key, Scalar
+from .._custom_types import Key, Scalar, as_float
 
 # Features grow linearly up to this size and logarithmically beyond: flights that nearly diverge have huge features.
 _LINEAR = 4.0
+_DRAWN = 1024  # random numbers at once, for the first weights
 # The perceptron that predicts the size of the error: its width and depth, and the limit of its logarithm.
 _SPREAD_WIDTH, _SPREAD_DEPTH, _LARGEST_LOGARITHM = 32, 2, 7.0
+
+
+# Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
+_NORMAL = statistics.NormalDist()
+LEVELS = np.array([2 * _NORMAL.cdf(z) - 1 for z in np.linspace(_NORMAL.inv_cdf(0.75), _NORMAL.inv_cdf(0.9995), 28)])
+_SCALES = 9  # noise scales at which intervals are calibrated, evenly spaced in the logarithm
 
 
 class Scaling(eqx.Module):
@@ -122,6 +132,39 @@ class Regressor(eqx.Module):
         return NetworkOutput(u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM))
 
 
+def first_regressor(
+    linear_map: Float[Array, "unknowns features"], approximator: str, *, width: int, depth: int, key: Key
+) -> Regressor:
+    """A `Regressor` with the distribution of Equinox's first weights: uniform within 1 / sqrt(inputs).
+
+    All random numbers come from one draw: a draw for each array would take XLA five seconds to compile.
+    """
+
+    def layers(regressor: Regressor) -> list[eqx.nn.Linear]:
+        nodes = jax.tree.leaves(regressor, is_leaf=lambda x: isinstance(x, eqx.nn.Linear))
+        return [layer for layer in nodes if isinstance(layer, eqx.nn.Linear)]
+
+    def arrays(regressor: Regressor) -> list:
+        return [array for layer in layers(regressor) for array in (layer.weight, layer.bias)]
+
+    def zero(leaf):
+        return jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+
+    # All arrays outside the layers begin at 0, except the linear map.
+    make = functools.partial(Regressor, linear_map, approximator, width=width, depth=depth)
+    blank = jax.tree.map(zero, eqx.filter_eval_shape(make, key=key))
+    limits = [1 / math.sqrt(layer.weight.shape[1]) for layer in layers(blank) for _ in ("weight", "bias")]
+    shapes = [array.shape for array in arrays(blank)]
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+    keys = jax.random.split(key, -(-int(ends[-1]) // _DRAWN))
+    drawn = jax.lax.map(lambda k: jax.random.uniform(k, (_DRAWN,), minval=-1, maxval=1, dtype=float), keys).ravel()
+    values = [
+        limit * part.reshape(shape)
+        for limit, part, shape in zip(limits, jnp.split(drawn[: ends[-1]], ends[:-1]), shapes, strict=True)
+    ]
+    return eqx.tree_at(lambda r: [r.skip, *arrays(r)], blank, [linear_map, *values])
+
+
 def compress(x: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:
     """Features as the network takes them: linear up to a size, logarithmic beyond."""
     size = jnp.abs(x)
@@ -146,3 +189,46 @@ def loss(
     fixed_error, weight = jax.lax.stop_gradient((error, jnp.exp(-output.log_spread)))
     likelihood = jnp.square(fixed_error * jnp.exp(-output.log_spread)) / 2 + output.log_spread
     return (weight * jnp.square(error)).mean() + likelihood.mean()
+
+
+class ErrorTable(NamedTuple):
+    """A network's errors on simulated flights, in units of the standard deviation that the network gives.
+
+    - `scales`: noise scales; all other fields have one row for each.
+    - `rms`, `correlation`: root mean square, and correlation between the parameters.
+    - `factors`: quantiles of each parameter's error, divided by `rms`.
+    - `simultaneous`: quantiles of the largest of these over all parameters.
+    """
+
+    scales: Float[Array, " scales"]
+    rms: Float[Array, "scales parameters"]
+    correlation: Float[Array, "scales parameters parameters"]
+    factors: Float[Array, "scales levels parameters"]
+    simultaneous: Float[Array, "scales levels"]
+
+    def at(self, scale: Scalar) -> tuple[Array, Array, Array, Array]:
+        """`rms`, `correlation`, `factors` and `simultaneous`, interpolated in the logarithm of the noise scale."""
+        rows = np.arange(self.scales.shape[0])
+        place = jnp.interp(jnp.log(scale), jnp.log(self.scales), as_float(rows))
+        weights = jnp.maximum(1 - jnp.abs(place - rows), 0.0)  # of all rows: linear between the two nearest
+        rms, correlation, factors, simultaneous = (
+            (weights.reshape(-1, *(1 for _ in table.shape[1:])) * table).sum(axis=0) for table in self[1:]
+        )
+        return rms, correlation, factors, simultaneous
+
+
+def calibrated_scales(noise: tuple[float, float]) -> Float[Array, " scales"]:
+    """The noise scales at which a network is calibrated, from the lowest to the highest of its training."""
+    return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else _SCALES))
+
+
+def uncalibrated(scales: Float[Array, " scales"], parameters: int) -> ErrorTable:
+    """The table of a network before training: ones for the errors."""
+    levels = scales.shape[0]
+    return ErrorTable(
+        scales,
+        jnp.ones((levels, parameters)),
+        jnp.tile(jnp.eye(parameters), (levels, 1, 1)),
+        jnp.ones((levels, len(LEVELS), parameters)),
+        jnp.ones((levels, len(LEVELS))),
+    )

@@ -13,19 +13,18 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
-from .._custom_types import Key, Numeric, Scalar, as_float
+from .._custom_types import Key, Parameters, Scalar, as_float
+from .._xla import quick_jit
 from ..bracket import UNIFORM_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Calibration, Estimate, check_bracket, check_count, check_positive
+from ..estimate import AbstractEstimator, Calibration, Estimate, check_count, check_positive
 from ..flight import STATE_NAMES
+from ..linalg import invert
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
-from ..shooting import ShootingProblem, in_blocks
-from .architecture import Regressor, Scaling
-from .calibration import LEVELS, ErrorTable, calibrate, calibrated_scales, uncalibrated
+from ..shooting import ShootingProblem, Unknowns, in_blocks
+from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales, uncalibrated
 from .features import FEATURES, AbstractFeatures, Coordinates
-from .first_weights import first_regressor, linear_samples, scaling_and_linear_map
-from .progress_bar import training_bar
-from .training import Pair, Progress, Purpose, train
+from .training import Progress, calibrate, train, training_bar, untrained
 
 APPROXIMATORS = ("mlp", "cmac")
 
@@ -103,9 +102,7 @@ class NetworkEstimator(eqx.Module):
         self._check(problem, bracket)
         scales = np.asarray(self.noise, float)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
-        scaling, regressor = _first(
-            features, linear_samples(features, scales, key), scales, key, self.approximator, self.width, self.depth
-        )
+        scaling, regressor = untrained(features, scales, key, self.approximator, self.width, self.depth)
         bar = training_bar(self.steps) if progress is True else contextlib.nullcontext(progress or None)
         with bar as report:
             regressor, history = train(
@@ -138,7 +135,7 @@ class NetworkEstimator(eqx.Module):
     def _check(self, problem: ShootingProblem, bracket: Bracket) -> None:
         if CHANNELS[self.channels] > problem.size:
             raise ValueError(f"`channels` {self.channels!r} are more than the problem's {problem.channels!r}.")
-        check_bracket(problem, bracket)
+        problem.within(bracket)  # raises for another length
         names = problem.model.parameter_names
         for name, lower, upper in zip(names, bracket.lower.tolist(), bracket.upper.tolist(), strict=True):
             if not 0 < upper - lower < np.inf:
@@ -149,27 +146,9 @@ class NetworkEstimator(eqx.Module):
             raise ValueError(f'`features` "raw" {what}: use "score".')
 
 
-@eqx.filter_jit
+@quick_jit
 def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> AbstractFeatures:
     return FEATURES[features].of(problem, Coordinates.of(problem, bracket, as_float(noise)))
-
-
-@eqx.filter_jit
-def _first(
-    features: AbstractFeatures,
-    samples: list[Pair],
-    scales: Float[Numeric, "2"],
-    key: Key,
-    approximator: str,
-    width: int,
-    depth: int,
-) -> tuple[Scaling, Regressor]:
-    """Scaling and regressor before training, with the linear map fitted to `samples`."""
-    scaling, linear_map = scaling_and_linear_map(features, scales, samples)
-    place = Purpose.WEIGHTS.place(0)
-    return scaling, first_regressor(
-        linear_map, approximator, width=width, depth=depth, key=jax.random.fold_in(key, place)
-    )
 
 
 class TrainedNetwork(AbstractEstimator):
@@ -210,8 +189,10 @@ class TrainedNetwork(AbstractEstimator):
         count = len(self.problem.model.parameter_names)
         return Bracket.around(self.features.coordinates.center[:count], self.features.coordinates.width[:count])
 
-    def __call__(self, problem: ShootingProblem, bracket: Bracket) -> Estimate:
-        """Identifies one flight. The network looks in its own bracket; `bracket` must only be valid.
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight. The network looks in its own bracket; that of the problem must only be valid.
+
+        A network is trained with all parameters free. If the problem holds some, the answer is that for their values.
 
         **Returns:** an estimate, whose result is `at_bound` if the answer lies outside the bracket of training by more
         than its interval, `unidentifiable` if the interval of a parameter is hardly narrower than the bracket, and
@@ -220,32 +201,32 @@ class TrainedNetwork(AbstractEstimator):
         **Raises:** `ValueError` if the network was trained for another problem, with what differs. Inside `jit` or
         `vmap`, numbers that differ give the result `network_mismatch` instead.
         """
-        answer = self._compare(problem, bracket)
+        answer = self._compare(problem.within(bracket))
         if isinstance(answer, str):
             raise ValueError(f"The network cannot be used on this problem: {answer}; train a network for it.")
         return answer
 
     def mismatch(self, problem: ShootingProblem) -> str | None:
-        """How a problem differs from the problem of training, in words; `None` if it does not.
+        """Compares a problem with the problem of training: the difference in words, or `None`.
 
         Inside `jit` or `vmap` numbers cannot be compared here; `__call__` compares them there.
         """
-        answer = self._compare(problem, self.bracket)
+        answer = self._compare(problem)
         return answer if isinstance(answer, str) else None
 
-    def _compare(self, problem: ShootingProblem, bracket: Bracket) -> Estimate | str:
+    def _compare(self, problem: ShootingProblem) -> Estimate | str:
         """The estimate, or how the problem differs from that of training. One program computes both."""
         kind = self._other_kind(problem)
         if kind is not None:
             return kind
-        estimate, differences = self._identify(problem.restrict(self.channels), bracket)
+        estimate, differences = self._identify(problem.restrict(self.channels))
         for what, differs in differences.items():
             if not isinstance(differs, Tracer) and differs:
                 return f"it was trained for another {what}"
         return estimate
 
     def _other_kind(self, problem: ShootingProblem) -> str | None:
-        """How a problem differs in anything but its numbers, in words; `None` if it does not."""
+        """The difference from the problem of training, apart from its numbers, in words; `None` if there is none."""
         own = self.problem
         if CHANNELS[self.channels] > problem.size:
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"
@@ -298,11 +279,11 @@ class TrainedNetwork(AbstractEstimator):
             "start": ~(jnp.abs(first_state - own_start) <= allowed).all(),
         }
 
-    @eqx.filter_jit
-    def _identify(self, problem: ShootingProblem, bracket: Bracket) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
-        return in_blocks(self._answer, problem, bracket)
+    @quick_jit
+    def _identify(self, problem: ShootingProblem) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
+        return in_blocks(self._answer, problem)
 
-    def _answer(self, problem: ShootingProblem, bracket: Bracket) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
+    def _answer(self, problem: ShootingProblem) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
         """The estimate of one flight, or of a block of flights, and `_differences`."""
         count, coordinates = len(problem.model.parameter_names), self.features.coordinates
         scale = self._scale(problem)
@@ -315,9 +296,11 @@ class TrainedNetwork(AbstractEstimator):
         rms, correlation, factors, simultaneous = self.errors.at(within)
         std = jnp.exp(output.log_spread[:count]) * self.scaling.bound(within)[:count] * rms * features.inflation
         deviations = std * coordinates.width[:count]
+        parameters, correlation = _given_held(problem.unknowns, parameters, deviations, correlation)
         shot = problem.shots(parameters, initial_state)
-        outside = jnp.abs(output.u[:count]) > 1 + factors[-1] * std
-        unidentifiable = std > self.prior
+        free = problem.unknowns.free
+        outside = (jnp.abs(output.u[:count]) > 1 + factors[-1] * std) & free
+        unidentifiable = (std > self.prior) & free
 
         differences = self._differences(problem)
         other = jnp.stack(list(differences.values())).any()
@@ -327,8 +310,8 @@ class TrainedNetwork(AbstractEstimator):
         sound = finite & shot.sound & jnp.isfinite(parameters).all()
         result = RESULTS.where(sound, result, RESULTS.nonfinite_trajectory)
         result = RESULTS.where(other, RESULTS.network_mismatch, result)
-        result = RESULTS.where(bracket.valid, result, RESULTS.bracket_invalid)
-        usable = sound & ~other & bracket.valid
+        result = RESULTS.where(problem.unknowns.valid, result, RESULTS.bracket_invalid)
+        usable = sound & ~other & problem.unknowns.valid
         estimate = Estimate(
             parameters=jnp.where(usable, parameters, self.bracket.center),
             covariance=jnp.where(usable, correlation * deviations[:, None] * deviations[None, :], jnp.inf),
@@ -345,3 +328,20 @@ class TrainedNetwork(AbstractEstimator):
         """The problem's noise in multiples of that of training; the largest over the channels."""
         order = CASCADE_ORDER[: CHANNELS[self.channels]]
         return (problem.sigma[order] / self.problem.sigma[order]).max()
+
+
+def _given_held(
+    unknowns: Unknowns,
+    parameters: Parameters,
+    deviations: Parameters,
+    correlation: Float[Array, "parameters parameters"],
+) -> tuple[Parameters, Float[Array, "parameters parameters"]]:
+    """The mean and the correlations of a Gaussian answer if the held parameters are known."""
+    free, held = unknowns.free, ~unknowns.free
+    among_held = jnp.where(held[:, None] & held, correlation, jnp.eye(free.size))
+    across = jnp.where(free[:, None] & held, correlation, 0.0)
+    gain = across @ invert(among_held)
+    off = jnp.where(held, (unknowns.center - parameters) / deviations, 0.0)
+    shifted = parameters + jnp.where(held.any(), deviations * (gain @ off), 0.0)
+    known = jnp.where(free[:, None] & free, correlation - gain @ across.T, 0.0)
+    return jnp.where(held, unknowns.center, shifted), known

@@ -1,22 +1,44 @@
-"""The features of a flight: a few numbers in place of a trajectory, from a measured flight or from a simulated one.
+"""The features of a flight: a few numbers in place of a trajectory, from a measured flight or from simulated ones.
 
 Unknowns are the parameters and, if it is free, the initial state. They are in *bracket coordinates*: 0 at the center
 of the bracket, +-1 at its ends.
 """
 
 import abc
+import enum
+import math
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, Scalar
+from .._custom_types import Key, Numeric, Parameters, Scalar
+from .._xla import quick_jit
 from ..bracket import Bracket
 from ..linalg import unit_directions
 from ..models.state import CASCADE_ORDER
 from ..shooting import FASTEST, ShootingProblem
+
+CHUNK = 1000
+"""Flights that are simulated at once. All chunks share one compiled program."""
+
+
+class Purpose(enum.IntEnum):
+    """Purposes of random numbers. Numbers are drawn from a key and a place; each purpose has its own places."""
+
+    WEIGHTS = 0
+    LINEAR_MAP = 1
+    VALIDATION = 2
+    STEPS = 3
+    CALIBRATION = 4
+    FLIGHTS = 5
+
+    def place(self, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
+        """The place of a number, or of each number."""
+        return np.asarray(len(Purpose) * np.asarray(number) + int(self))
 
 
 class FlightFeatures(NamedTuple):
@@ -82,7 +104,7 @@ class AbstractFeatures(eqx.Module):
 
     @abc.abstractmethod
     def noise(self, normal: Float[Array, " features"]) -> Float[Array, " features"]:
-        """What white noise adds to the features. `normal`: standard normal numbers, times the noise scale."""
+        """The effect of white noise on the features. `normal`: standard normal numbers, times the noise scale."""
 
     def _deviation(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
         """W (x(u) - x(0)); 0 in samples that are not measured, NaN everywhere if the flight at `u` diverges."""
@@ -206,3 +228,66 @@ def _measured(problem: ShootingProblem) -> Bool[Array, "samples size"]:
 def _noise_factor(jacobian: Float[Array, "samples size unknowns"]) -> Float[Array, "unknowns unknowns"]:
     """A factor of F^-1, the covariance of the score."""
     return unit_directions(jnp.einsum("tcu,tcv->uv", jacobian, jacobian))
+
+
+# Simulated flights.
+
+
+class Flights(NamedTuple):
+    """Simulated flights without noise: features, and the true unknowns in bracket coordinates."""
+
+    features: Float[Array, "*batch features"]
+    u: Float[Array, "*batch unknowns"]
+
+
+class Pair(NamedTuple):
+    """A simulated flight with noise: features, noise scale (multiples of sigma), and the true unknowns."""
+
+    features: Float[Array, "*batch features"]
+    scale: Float[Array, "*batch"]
+    u: Float[Array, "*batch unknowns"]
+
+
+def draw_chunks(
+    features: AbstractFeatures, count: int, *, key: Key, purpose: Purpose, first: int = 0, uniform: bool = False
+) -> list[Flights]:
+    """Simulates at least `count` flights in chunks of `CHUNK`. Parameters are uniform in the bracket.
+
+    `uniform`: whether free initial states are uniform in the bracket too. Otherwise they are denser near its center.
+    Chunk i is drawn from `key` at the place `first` + i of the `purpose`.
+    """
+    numbers = range(first, first + math.ceil(count / CHUNK))
+    return [_chunk(features, key, purpose.place(number), np.asarray(uniform)) for number in numbers]
+
+
+@quick_jit
+def _chunk(features: AbstractFeatures, key: Key, place: Int[Numeric, ""], uniform: Bool[Numeric, ""]) -> Flights:
+    unknowns, parameters = features.coordinates.center.shape[0], len(features.problem.model.parameter_names)
+    drawn = jax.random.uniform(jax.random.fold_in(key, place), (CHUNK, unknowns + 1), minval=-1, maxval=1, dtype=float)
+    shrunk = jnp.where(uniform, 1.0, jnp.abs(drawn[:, -1:]))
+    u = drawn[:, :-1] * jnp.where(np.arange(unknowns) < parameters, 1.0, shrunk)
+    return Flights(jax.vmap(features.simulated)(u), u)
+
+
+def with_noise(
+    features: AbstractFeatures, flights: Flights, scales: Float[Numeric, "2"], uniform: Float[Array, "flights random"]
+) -> Pair:
+    """Adds noise to flights, with scales that are log-uniform between `scales`.
+
+    `uniform`: random numbers between -1 and 1, one for the scale and one for each feature.
+    """
+    low, high = jnp.log(jnp.asarray(scales, uniform.dtype))
+    scale = jnp.exp((low + high + (high - low) * uniform[:, 0]) / 2)
+    most = 1 - jnp.finfo(uniform.dtype).eps  # a finite number of standard deviations
+    normal = jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(uniform[:, 1:], -most, most))
+    return Pair(flights.features + jax.vmap(features.noise)(scale[:, None] * normal), scale, flights.u)
+
+
+@quick_jit
+def noisy_chunk(
+    features: AbstractFeatures, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
+) -> Pair:
+    """Adds noise to a chunk of flights, drawn from `key` at a place, by one compiled program for all chunks."""
+    shape = CHUNK, 1 + features.size
+    drawn = jax.random.uniform(jax.random.fold_in(key, place), shape, minval=-1, maxval=1, dtype=float)
+    return with_noise(features, chunk, scales, drawn)

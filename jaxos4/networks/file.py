@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import io
 import json
 import os
 import zipfile
@@ -27,9 +28,16 @@ _LARGEST = 2**30
 
 
 def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
-    """Writes a network with its problem of training: model, airframe, inputs, sampling, bracket, noise, version.
+    """Writes the file of a network. Raises as `encode_network` does; `OSError` if the file cannot be written."""
+    data = encode_network(network)
+    with write_atomically(path) as beside:
+        beside.write_bytes(data)
 
-    **Raises:** `ValueError` for a model that is not in `MODELS`; `OSError` if the file cannot be written.
+
+def encode_network(network: TrainedNetwork) -> bytes:
+    """The bytes of a network's file, with its problem of training: model, airframe, inputs, sampling, bracket, noise.
+
+    **Raises:** `ValueError` for a model that is not in `MODELS`.
     """
     problem = network.problem
     kinds = {kind: name for name, kind in MODELS.items()}
@@ -54,12 +62,13 @@ def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
     without_problem = eqx.tree_at(lambda n: n.features.problem, network, None)
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(without_problem, eqx.is_array))
     arrays |= {_name(leaf_path): leaf for leaf_path, leaf in leaves}
-    with write_atomically(path) as beside, open(beside, "wb") as file:
-        np.savez(file, header=np.asarray(json.dumps(header)), **jax.tree.map(np.asarray, arrays))  # pyright: ignore[reportArgumentType]
+    file = io.BytesIO()
+    np.savez(file, header=np.asarray(json.dumps(header)), **jax.tree.map(np.asarray, arrays))  # pyright: ignore[reportArgumentType]
+    return file.getvalue()
 
 
-def load_network(path: str | os.PathLike[str]) -> TrainedNetwork:
-    """Reads a network that `save_network` wrote, in the current precision.
+def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
+    """Reads a network that `save_network` wrote, in the current precision. `path` can also be the open file.
 
     **Raises:** `InputError` if it is no complete network file of this version; `OSError` if it cannot be read.
     """
@@ -78,7 +87,7 @@ def load_network(path: str | os.PathLike[str]) -> TrainedNetwork:
         raise InputError(f"{path}: not a whole network file ({what}); train it again with `jaxos4 train`.") from None
 
 
-def _restore(path: str | os.PathLike[str], arrays: dict[str, np.ndarray]) -> TrainedNetwork:
+def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     header = json.loads(str(arrays["header"]))
     if header["format"] != _FORMAT:
         raise InputError(f"{path}: trained by another version of jaxos4; train it again with `jaxos4 train`.")

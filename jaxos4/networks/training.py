@@ -1,45 +1,27 @@
-"""Simulated flights for training, and the loop that trains a network on them.
+"""The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals.
 
 Between two checks, training simulates new flights. Each step takes some of them, with new noise.
 """
 
-import enum
+import contextlib
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
-from .._custom_types import Key, Numeric, Scalar
+from .._custom_types import Key, Numeric, Scalar, as_float
+from .._xla import quick_jit
 from ..errors import TrainingError
-from .architecture import Regressor, Scaling, loss
-from .features import AbstractFeatures
+from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
+from .features import CHUNK, AbstractFeatures, Flights, Pair, Purpose, Score, draw_chunks, noisy_chunk, with_noise
 
 if TYPE_CHECKING:
     import optax  # `_optimiser` imports it, because it is slow to import
-
-CHUNK = 1000
-"""Flights that are simulated at once. All chunks share one compiled program."""
-
-
-class Purpose(enum.IntEnum):
-    """What random numbers are for. They are drawn from a key and a place, and each purpose has places of its own."""
-
-    WEIGHTS = 0
-    LINEAR_MAP = 1
-    VALIDATION = 2
-    STEPS = 3
-    CALIBRATION = 4
-    FLIGHTS = 5
-
-    def place(self, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
-        """The place of a number, or of each number."""
-        return np.asarray(len(Purpose) * np.asarray(number) + int(self))
-
 
 CHECK = 250
 """Steps between two evaluations of the validation loss."""
@@ -57,65 +39,57 @@ _WARM_UP = 200  # steps
 _LAST_RATE = 1e-3  # the learning rate at the end of training, relative to the largest
 _NEWTON_SCHULZ = ((3.4445, -4.7750, 2.0315),) * 5  # Optax's coefficients; as rows they compile to a loop
 
-
-class Flights(NamedTuple):
-    """Simulated flights without noise: features, and the true unknowns in bracket coordinates."""
-
-    features: Float[Array, "*batch features"]
-    u: Float[Array, "*batch unknowns"]
+# Flights for each feature, and the ridge, of the fit of the linear map.
+_PER_FEATURE, _RIDGE = 4, 1e-6
 
 
-class Pair(NamedTuple):
-    """A simulated flight with noise: features, noise scale (multiples of sigma), and the true unknowns."""
-
-    features: Float[Array, "*batch features"]
-    scale: Float[Array, "*batch"]
-    u: Float[Array, "*batch unknowns"]
-
-
-def draw_chunks(
-    features: AbstractFeatures, count: int, *, key: Key, purpose: Purpose, first: int = 0, uniform: bool = False
-) -> list[Flights]:
-    """Simulates at least `count` flights in chunks of `CHUNK`. Parameters are uniform in the bracket.
-
-    `uniform`: whether free initial states are uniform in the bracket too. Otherwise they are denser near its center.
-    Chunk i is drawn from `key` at the place `first` + i of the `purpose`.
-    """
-    numbers = range(first, first + math.ceil(count / CHUNK))
-    return [_chunk(features, key, purpose.place(number), np.asarray(uniform)) for number in numbers]
+def untrained(
+    features: AbstractFeatures, scales: Float[np.ndarray, "2"], key: Key, approximator: str, width: int, depth: int
+) -> tuple[Scaling, Regressor]:
+    """Scaling and regressor before training, with a linear map that is fitted to simulated flights."""
+    count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
+    chunks = draw_chunks(features, count, key=key, purpose=purpose)
+    samples = [
+        noisy_chunk(features, chunk, scales, key, purpose.place(len(chunks) + i)) for i, chunk in enumerate(chunks)
+    ]
+    return _untrained(features, samples, scales, key, approximator, width, depth)
 
 
-@eqx.filter_jit
-def _chunk(features: AbstractFeatures, key: Key, place: Int[Numeric, ""], uniform: Bool[Numeric, ""]) -> Flights:
-    unknowns, parameters = features.coordinates.center.shape[0], len(features.problem.model.parameter_names)
-    drawn = jax.random.uniform(jax.random.fold_in(key, place), (CHUNK, unknowns + 1), minval=-1, maxval=1, dtype=float)
-    shrunk = jnp.where(uniform, 1.0, jnp.abs(drawn[:, -1:]))
-    u = drawn[:, :-1] * jnp.where(np.arange(unknowns) < parameters, 1.0, shrunk)
-    return Flights(jax.vmap(features.simulated)(u), u)
+@quick_jit
+def _untrained(
+    features: AbstractFeatures,
+    chunks: list[Pair],
+    scales: Float[Numeric, "2"],
+    key: Key,
+    approximator: str,
+    width: int,
+    depth: int,
+) -> tuple[Scaling, Regressor]:
+    scaling, linear_map = _scaling_and_linear_map(features, scales, chunks)
+    key = jax.random.fold_in(key, Purpose.WEIGHTS.place(0))
+    return scaling, first_regressor(linear_map, approximator, width=width, depth=depth, key=key)
 
 
-def with_noise(
-    features: AbstractFeatures, flights: Flights, scales: Float[Numeric, "2"], uniform: Float[Array, "flights random"]
-) -> Pair:
-    """Adds noise to flights, with scales that are log-uniform between `scales`.
+def _scaling_and_linear_map(
+    features: AbstractFeatures, scales: Float[Numeric, "2"], chunks: list[Pair]
+) -> tuple[Scaling, Float[Array, "unknowns features"]]:
+    """Measures the features' sizes on simulated flights, and fits the best linear map from features to unknowns."""
+    samples = jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
+    # The score's own derivatives give the bound.
+    score = features if isinstance(features, Score) else Score.of(features.problem, features.coordinates)
+    unit = jnp.linalg.norm(score.noise_factor, axis=1)
 
-    `uniform`: random numbers between -1 and 1, one for the scale and one for each feature.
-    """
-    low, high = jnp.log(jnp.asarray(scales, uniform.dtype))
-    scale = jnp.exp((low + high + (high - low) * uniform[:, 0]) / 2)
-    most = 1 - jnp.finfo(uniform.dtype).eps  # a finite number of standard deviations
-    normal = jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(uniform[:, 1:], -most, most))
-    return Pair(flights.features + jax.vmap(features.noise)(scale[:, None] * normal), scale, flights.u)
-
-
-@eqx.filter_jit
-def noisy_chunk(
-    features: AbstractFeatures, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
-) -> Pair:
-    """Adds noise to a chunk of flights, drawn from `key` at a place, by one compiled program for all chunks."""
-    shape = CHUNK, 1 + features.size
-    drawn = jax.random.uniform(jax.random.fold_in(key, place), shape, minval=-1, maxval=1, dtype=float)
-    return with_noise(features, chunk, scales, drawn)
+    flown = jnp.isfinite(samples.features).all(axis=1)
+    width = 1.5 * jnp.nanmedian(jnp.where(flown[:, None], jnp.abs(samples.features), jnp.nan), axis=0)
+    # Scaled so that one learning rate suits both kinds of features, however many they are.
+    width = jnp.where(width > 0, width, 1.0) * jnp.sqrt(features.size / unit.shape[0])
+    inputs = jnp.where(flown[:, None], compress(samples.features / width), 0.0)
+    targets = jnp.where(flown[:, None], samples.u, 0.0)
+    ridge = _RIDGE * jnp.trace(inputs.T @ inputs) / features.size
+    linear_map = jnp.linalg.solve(inputs.T @ inputs + ridge * jnp.eye(features.size), inputs.T @ targets).T
+    gain = jnp.minimum(10 * unit, 1.0)
+    span = jnp.maximum(jnp.abs(jnp.log(scales)).max(), 1.0)
+    return Scaling(width, unit, gain, span), linear_map
 
 
 def train(
@@ -178,7 +152,7 @@ def train(
     return best, np.asarray(history)
 
 
-@eqx.filter_jit
+@quick_jit
 def _advance(
     regressor: Regressor,
     state: PyTree,
@@ -221,7 +195,7 @@ def _advance(
     return regressor, state, total / count, mean_loss(regressor, validation)
 
 
-@eqx.filter_jit
+@quick_jit
 def _first_state(regressor: Regressor) -> PyTree:
     return _optimiser(0.0).init(eqx.filter(regressor, eqx.is_inexact_array))
 
@@ -256,3 +230,70 @@ def _check_trainable(held_out: list[Pair], regressor: Regressor) -> None:
             "the network's first weights are not finite, because the flight at the bracket's center diverges or too "
             "few samples were measured: move the bracket, or use a longer flight."
         )
+
+
+def calibrate(
+    regressor: Regressor,
+    scaling: Scaling,
+    features: AbstractFeatures,
+    scales: Float[Array, " scales"],
+    count: int,
+    key: Key,
+) -> ErrorTable:
+    """Measures a network's errors on `count` new simulated flights, with new noise at each noise scale.
+
+    Each quantile is the smallest that holds its level for one more flight. Flights that diverge do not count.
+
+    **Raises:** `TrainingError` if too few flights can be flown.
+    """
+    parameters, tables = len(features.problem.model.parameter_names), []
+    flights = draw_chunks(features, count, key=key, purpose=Purpose.CALIBRATION, uniform=True)
+    for number, scale in enumerate(np.asarray(scales)):
+        first = (1 + number) * len(flights)  # behind the places of the flights
+        errors = [
+            _standardised(regressor, scaling, noisy_chunk(features, chunk, np.stack([scale, scale]), key, place), scale)
+            for place, chunk in zip(Purpose.CALIBRATION.place(first + np.arange(len(flights))), flights, strict=True)
+        ]
+        tables.append(_table(np.concatenate(errors)[:, :parameters]))
+    return ErrorTable(scales, *(as_float(np.stack(column)) for column in zip(*tables, strict=True)))
+
+
+@quick_jit
+def _standardised(
+    regressor: Regressor, scaling: Scaling, pairs: Pair, scale: Scalar
+) -> Float[Array, "flights unknowns"]:
+    """Errors in units of the standard deviation that the network gives, at one noise scale."""
+    output = jax.vmap(regressor, in_axes=(0, None, None))(pairs.features, scale, scaling)
+    return (output.u - pairs.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
+
+
+def _table(error: Float[np.ndarray, "flights parameters"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`rms`, `correlation`, `factors` and `simultaneous` of an `ErrorTable` at one noise scale."""
+    error = error[np.isfinite(error).all(axis=1)]
+    flown = len(error)
+    rank = np.ceil((flown + 1) * LEVELS).astype(int) - 1
+    if rank[-1] >= flown:
+        raise TrainingError("too few of the held-out flights can be flown to calibrate: narrow the bracket.")
+    moments = error.T @ error / flown
+    rms = np.sqrt(np.diagonal(moments))
+    relative = np.abs(error) / rms
+    quantiles = np.sort(np.column_stack([relative, relative.max(axis=1)]), axis=0)[rank]
+    return rms, moments / np.outer(rms, rms), quantiles[:, :-1], quantiles[:, -1]
+
+
+@contextlib.contextmanager
+def training_bar(steps: int) -> Iterator[Progress]:
+    """Shows a bar on the error output while the block runs; shows nothing unless that is a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    name, loss = TextColumn("training the network"), TextColumn("loss {task.fields[loss]}")
+    console = Console(stderr=True)
+    columns = (name, BarColumn(), loss, TimeElapsedColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=steps, loss="-")
+
+        def update(done: int, steps: int, loss: float) -> None:
+            bar.update(task, completed=done, total=steps, loss=f"{loss:.4g}")
+
+        yield update

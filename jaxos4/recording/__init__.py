@@ -1,11 +1,10 @@
-"""What happens to a recorded flight before it is fitted."""
+"""Steps from a recorded flight to one that can be fitted: usable parts, averages, joined pieces, drafts, inspection."""
 
-from .averaging import averaged as averaged
-from .excited import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
-from .joining import join as join
+from .motion import Excitation as Excitation, excitation as excitation, gyro_noise as gyro_noise
+from .pieces import averaged as averaged, cut as cut, join as join
 from .reading import (
     Recording as Recording,
     read_recording as read_recording,
     vehicle_evidence as vehicle_evidence,
 )
-from .usable import Stretch as Stretch, cut as cut, stretches as stretches, usable_stretches as usable_stretches
+from .usable import Stretch as Stretch, stretches as stretches, usable_stretches as usable_stretches

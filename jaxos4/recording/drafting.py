@@ -9,11 +9,11 @@ import tomlkit
 from tomlkit import TOMLDocument
 
 from ..airframe import GUESS, PRESETS, Airframe, load_airframe
-from ..flight import Flight
 from ..models.terms import has_full_scale
-from .layout import RotorSigns, rotor_signs
+from .motion import RotorSigns, rotor_signs
+from .pieces import cut
 from .reading import Recording
-from .usable import cut, stretches
+from .usable import stretches
 
 FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
@@ -51,8 +51,8 @@ def airframe_draft(recording: Recording, source: str | None = None) -> AirframeD
       else, a comment at the end says so.
     """
     facts, airframe = recording.facts, None if source is None else load_airframe(source)
-    found = stretches(recording.flight, airframe, landed=facts.landed)
-    parts = [cut(recording.flight, part) for part in found if not part.reason]
+    found = stretches(recording, airframe, landed=facts.landed)
+    parts = [cut(recording, part) for part in found if not part.reason]
     signs = None if facts.too_slow else rotor_signs(parts)
     hover = _hover(parts)
     spins = facts.rotor_spins or (None if signs is None else signs.spins)
@@ -61,16 +61,16 @@ def airframe_draft(recording: Recording, source: str | None = None) -> AirframeD
     return _begun(recording, signs, spins, hover)
 
 
-def _hover(parts: Sequence[Flight]) -> _Hover | None:
+def _hover(parts: Sequence[Recording]) -> _Hover | None:
     """The speed at which thrust is as large as the weight, by the accelerometer if it is plausible.
 
     Without accelerometer, the median thrust in flight counts as the weight.
     """
     if not parts:
         return None
-    squares = np.concatenate([(np.asarray(part.omega, dtype=float) ** 2).mean(axis=1) for part in parts])
-    seconds = sum(float(np.ptp(np.asarray(part.time))) for part in parts)
-    force = [np.asarray(part.specific_force)[:, 2] for part in parts if part.specific_force is not None]
+    squares = np.concatenate([(part.omega**2).mean(axis=1) for part in parts])
+    seconds = sum(float(np.ptp(part.time)) for part in parts)
+    force = [part.specific_force[:, 2] for part in parts if part.specific_force is not None]
     vertical = np.concatenate(force) if len(force) == len(parts) else np.full(1, np.nan)
     share = float(np.median(vertical[np.isfinite(vertical)])) / _GRAVITY if np.isfinite(vertical).any() else np.nan
     felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
@@ -81,7 +81,7 @@ def _begun(
     recording: Recording, signs: RotorSigns | None, spins: tuple[float, ...] | None, hover: _Hover | None
 ) -> AirframeDraft:
     """A file from nothing but the log."""
-    flight, facts, document, missing = recording.flight, recording.facts, tomlkit.document(), ["mass"]
+    facts, document, missing = recording.facts, tomlkit.document(), ["mass"]
     _say(document, f"The airframe of {Path(recording.name).name}. SI units.", *_battery(recording))
     _head(document, "Weigh and measure: write the numbers, and remove the # in front.")
     _say(document, "mass =   # kg, with battery: all inertias are proportional to it")
@@ -97,7 +97,7 @@ def _begun(
         _add(document, "rotor_spins", [], "fill in, such as [1, -1, 1, -1]; 1: counter-clockwise seen from above")
     else:
         _add_spins(document, recording, spins)
-    full = FULL_SCALE if flight.commanded else 1.0
+    full = FULL_SCALE if recording.commanded else 1.0
     if hover is None:
         missing.append("hover_speed")
         _say(document, "hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
@@ -105,7 +105,7 @@ def _begun(
         _add(document, "hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
         if not hover.felt:
             _say(document, "Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
-    if flight.commanded:
+    if recording.commanded:
         _add(document, "max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
     _head(document, "Guesses from mass and positions, where the search begins. Numbers are better.")
     _add(document, "inertia", GUESS, "kg m^2, as [Ix, Iy, Iz]")
@@ -118,13 +118,13 @@ def _continued(
     recording: Recording, source: str, airframe: Airframe, spins: tuple[float, ...] | None, hover: _Hover | None
 ) -> str:
     """A file that starts from another: added is what it lacks, and as comments what the log says otherwise."""
-    flight, facts = recording.flight, recording.facts
+    facts = recording.facts
     document = _preset(airframe) if source in PRESETS else tomlkit.parse(Path(source).read_text(encoding="utf-8"))
     begin = tomlkit.dumps(document)
     given = set(document)
     _head(document, f"What {Path(recording.name).name} adds.")
     before = tomlkit.dumps(document)
-    if flight.commanded and not has_full_scale(airframe):
+    if recording.commanded and not has_full_scale(airframe):
         full = FULL_SCALE if hover is None else float(airframe.hover_speed) / hover.speed
         how = "a convention" if hover is None else f"the rotors then carry the weight, {_how(hover)}"
         _add(document, "max_rotor_speed", _short(full), f"rad/s at command 1; {how}")
@@ -162,9 +162,9 @@ def _preset(airframe: Airframe) -> TOMLDocument:
 
 def _battery(recording: Recording) -> list[str]:
     """The cells and the voltage, if the log has them: the model takes the voltage from each log."""
-    cells, voltage = recording.facts.cells, recording.flight.voltage
+    cells, voltage = recording.facts.cells, recording.voltage
     words = [] if cells is None else [f"{cells} cells"]
-    words += [] if voltage is None else [f"{float(np.median(np.asarray(voltage))):.3g} V (median)"]
+    words += [] if voltage is None else [f"{float(np.median(voltage)):.3g} V (median)"]
     return [f"Battery: {', '.join(words)}."] if words else []
 
 

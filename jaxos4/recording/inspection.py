@@ -9,15 +9,15 @@ import numpy as np
 from ..airframe import Airframe
 from ..analysis.identifiability import identifiability
 from ..bracket import Bracket
-from ..flight import CHANNEL_NAMES, Flight
-from ..logs import LogFacts, log_format
+from ..flight import CHANNEL_NAMES
+from ..logs import log_format
 from ..models.corrected import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem
-from .excited import RATE_COLUMNS, WEAK, excitation
+from .motion import RATE_COLUMNS, WEAK, excitation, opposite_axes, opposite_note
+from .pieces import cut
 from .reading import Recording
-from .signs import opposite_axes, opposite_note
-from .usable import Stretch, cut, nothing_usable, stretches
+from .usable import Stretch, nothing_usable, stretches
 
 # The identifiability is computed from this much of a stretch [s], in windows of this length [s].
 _LONGEST, _WINDOW = 20.0, 0.5
@@ -105,26 +105,26 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
 
     - `recording`: of a file, read with the same `airframe`, and with `full_scale=1.0`.
     """
-    flight, facts = recording.flight, recording.facts
-    found = stretches(flight, airframe, landed=facts.landed)
+    facts = recording.facts
+    found = stretches(recording, airframe, landed=facts.landed)
     longest = max((part for part in found if not part.reason), key=lambda part: part.length, default=None)
-    rates_measured = not np.isnan(np.asarray(flight.states)[:, RATE_COLUMNS]).all(axis=0).any()
-    parts = tuple(_part(flight, stretch, airframe) for stretch in found)
+    rates_measured = not np.isnan(recording.states[:, RATE_COLUMNS]).all(axis=0).any()
+    parts = tuple(_part(recording, stretch, airframe) for stretch in found)
     nothing = "" if longest is not None else f"{nothing_usable(found)}; give the log of a flight"
-    usable = [cut(flight, part) for part in found if not part.reason]
+    usable = [cut(recording, part) for part in found if not part.reason]
     opposite = "" if airframe is None else opposite_note(opposite_axes(usable, airframe))
     findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts), opposite)))
     identifiable = None
     if longest is not None and not facts.too_slow and airframe is not None and rates_measured:
-        identifiable = _identifiable(flight, longest, airframe)
+        identifiable = _identifiable(recording, longest, airframe)
     return Inspection(
         log=recording.name,
         format=log_format(recording.name).name,
-        samples=int(flight.time.shape[0]),
-        begin=float(flight.time[0]),
-        end=float(flight.time[-1]),
-        sample_time=float(flight.dt),
-        measured=_measured(flight, facts),
+        samples=recording.time.size,
+        begin=float(recording.time[0]),
+        end=float(recording.time[-1]),
+        sample_time=recording.dt,
+        measured=_measured(recording),
         findings=findings,
         notes=recording.notes,
         parts=parts,
@@ -132,16 +132,17 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     )
 
 
-def _measured(flight: Flight, facts: LogFacts) -> dict[str, Channel]:
-    columns = dict(zip(CHANNEL_NAMES, np.asarray(flight.channels).T, strict=True))
-    columns |= {f"rotor{i + 1}": speed for i, speed in enumerate(np.asarray(flight.omega).T)}
-    time, channels = np.asarray(flight.time), {}
+def _measured(recording: Recording) -> dict[str, Channel]:
+    time, motors = recording.time, recording.facts.motors
+    columns = dict(zip(CHANNEL_NAMES, recording.channels.T, strict=True))
+    columns |= {f"rotor{i + 1}": speed for i, speed in enumerate(recording.omega.T)}
+    channels = {}
     for name, values in columns.items():
         at = np.flatnonzero(np.isfinite(values))
         if at.size:
-            rate = at.size / float(flight.time[-1] - flight.time[0])
-            if name.startswith("rotor") and facts.motors is not None:
-                rate = facts.motors.rate  # each sample of the flight has a speed, measured or held
+            rate = at.size / float(time[-1] - time[0])
+            if name.startswith("rotor") and motors is not None:
+                rate = motors.rate  # each sample of the flight has a speed, measured or held
             gaps = np.diff(np.concatenate([time[:1], time[at], time[-1:]]))
             channels[name] = Channel(rate, float(gaps.max()), float(values[at].min()), float(values[at].max()))
     return channels
@@ -160,20 +161,20 @@ def _too_little(parts: tuple[Part, ...]) -> str:
     )
 
 
-def _part(flight: Flight, stretch: Stretch, airframe: Airframe | None) -> Part:
-    axes = () if stretch.reason else excitation(cut(flight, stretch), airframe)
+def _part(recording: Recording, stretch: Stretch, airframe: Airframe | None) -> Part:
+    axes = () if stretch.reason else excitation(cut(recording, stretch), airframe)
     excited = {a.axis: AxisExcitation(_finite(a.torque), _finite(a.rate), _finite(a.noise), a.verdict) for a in axes}
     return Part(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited)
 
 
-def _identifiable(flight: Flight, stretch: Stretch, airframe: Airframe) -> IdentifiableParameters:
+def _identifiable(recording: Recording, stretch: Stretch, airframe: Airframe) -> IdentifiableParameters:
     stretch = Stretch(stretch.begin, min(stretch.end, stretch.begin + _LONGEST))
-    part, model = cut(flight, stretch), CorrectedOS4(airframe)
+    part, model = cut(recording, stretch), CorrectedOS4(airframe)
     sigma = np.asarray(SENSOR_SIGMA, dtype=float).copy()
     for axis, column in zip(excitation(part), RATE_COLUMNS, strict=True):
         sigma[column] = max(float(np.nan_to_num(axis.noise)), sigma[column])
-    windows = min(max(round(stretch.length / _WINDOW), 1), part.time.shape[0] // 2)
-    problem = ShootingProblem(model, part, sigma=sigma, channels="rates", windows=windows)
+    windows = min(max(round(stretch.length / _WINDOW), 1), part.time.size // 2)
+    problem = ShootingProblem(model, part.flight, sigma=sigma, channels="rates", windows=windows)
     known = identifiability(problem, Bracket.default(model), model.alpha)
     notes = known.notes(model.parameter_names)
     parameters = {

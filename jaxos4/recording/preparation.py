@@ -8,16 +8,13 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..errors import InputError
-from ..flight import FORCE_NAMES, STATE_NAMES, Flight
-from ..models.rotation import with_body_velocity
+from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
 from ..models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE, has_full_scale
-from .averaging import averaged
-from .holdout import hold_out
-from .joining import join
+from .motion import opposite_axes, opposite_note
+from .pieces import averaged, cut, hold_out, joined, whole_windows, with_body_velocity
 from .reading import Recording
-from .signs import opposite_axes, opposite_note
-from .usable import Stretch, cut, nothing_usable, stretches
+from .usable import Stretch, nothing_usable, stretches
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -81,7 +78,7 @@ def prepare(
     _check_options(begin, end, window, sample_time, holdout)
     _check_recordings(recordings)
     notes: list[str] = []
-    parts: list[tuple[int, Flight]] = []
+    parts: list[tuple[int, Recording]] = []
     for number, recording in enumerate(recordings):
         slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
         pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
@@ -95,48 +92,50 @@ def prepare(
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
-    slowest = max(float(piece.dt) for _, piece in parts)
+    slowest = max(piece.dt for _, piece in parts)
     if predicted and sample_time is not None and slowest > sample_time * _NEARLY_EQUAL:
         raise InputError(
             f"{recordings[0].name}: has one sample every {slowest:.4g} s, the fitted logs one every {sample_time:.4g} "
             f"s; give `sample_time` {slowest:.4g}, or another `validate`."
         )
     step, length = _sampling(slowest, window, sample_time)
-    shortest = (length - 1) * step / _NEARLY_EQUAL
-    long = [(number, piece) for number, piece in parts if np.ptp(np.asarray(piece.time)) >= shortest]
-    coarse = [(number, with_body_velocity(averaged(piece, step))) for number, piece in long]
-    kept = [(number, piece) for number, piece in coarse if piece.time.shape[0] >= length]
-    numbers, pieces = tuple(number for number, _ in kept), [piece for _, piece in kept]
+    coarse = [(number, whole_windows(averaged(piece, step), length)) for number, piece in parts]
+    numbers = tuple(number for number, piece in coarse if piece.time.size)
+    pieces = [with_body_velocity(piece) for _, piece in coarse if piece.time.size]
     unused = [recording for i, recording in enumerate(recordings) if i not in numbers]
     if unused:
-        remedy = "leave this log out, or give a shorter `window`" if kept else "give a shorter `window`"
+        remedy = "leave this log out, or give a shorter `window`" if pieces else "give a shorter `window`"
         raise InputError(f"{unused[0].name}: no part is as long as a window, {window:g} s; {remedy}.")
-    flight = join(pieces, length=length)
-    fitted, tested = hold_out(flight, length, holdout)
-    available = _available_inputs(flight, pieces, airframe)
+    whole = joined(pieces)
+    fitted, tested = hold_out(whole, length, holdout)
     seconds = _seconds(fitted), 0.0 if tested is None else _seconds(tested)
-    return Prepared(fitted, tested, numbers, length, available, seconds, tuple(notes))
+    return Prepared(
+        fitted.flight,
+        None if tested is None else tested.flight,
+        numbers,
+        length,
+        _available_inputs(whole, pieces, airframe),
+        seconds,
+        tuple(notes),
+    )
 
 
-def _available_inputs(flight: Flight, stretches: Sequence[Flight], airframe: Airframe) -> frozenset[str]:
-    """What the flight joined from these stretches offers to `Term.needs`; a force, if every stretch measured it."""
-    force = [
-        all(not np.isnan(stretch.recorded[:, len(STATE_NAMES) + axis]).all() for stretch in stretches)
-        for axis in range(len(FORCE_NAMES))
-    ]
+def _available_inputs(whole: Recording, pieces: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
+    """The inputs for `Term.needs` that the joined recording offers. A force counts if every piece measured it."""
+    force = np.all([~np.isnan(piece.channels[:, len(STATE_NAMES) :]).all(axis=0) for piece in pieces], axis=0)
     offers = {
-        COMMANDS: flight.commanded,
-        BODY_VELOCITY: flight.body_velocity is not None,
+        COMMANDS: whole.commanded,
+        BODY_VELOCITY: whole.body_velocity is not None,
         LATERAL_FORCE: force[0] and force[1],
         VERTICAL_FORCE: force[2],
         FULL_SCALE: has_full_scale(airframe),
-        VOLTAGE: flight.voltage is not None,
+        VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
 
 
-def _seconds(flight: Flight) -> float:
-    return float((~np.isnan(np.asarray(flight.states)[:, CASCADE_ORDER[0]])).sum() * flight.dt)
+def _seconds(recording: Recording) -> float:
+    return float(np.count_nonzero(~np.isnan(recording.states[:, CASCADE_ORDER[0]])) * recording.dt)
 
 
 def _sampling(slowest: float, window: float, sample_time: float | None) -> tuple[float, int]:
@@ -153,19 +152,18 @@ def _sampling(slowest: float, window: float, sample_time: float | None) -> tuple
 
 def _usable_parts(
     recording: Recording, airframe: Airframe, begin: float | None, end: float | None, slow: str, predicted: bool
-) -> tuple[list[Flight], str | None]:
+) -> tuple[list[Recording], str | None]:
     """The usable stretches, or what `begin` and `end` ask for; and a note about the stretches that are not used.
 
     `slow`: what is wrong with the rate of logging, for the message if nothing is usable.
     """
-    flight, name = recording.flight, recording.name
-    first, last = np.asarray(flight.time)[[0, -1]].tolist()
+    name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
     if begin is not None or end is not None:
         try:
-            return [cut(flight, Stretch(first if begin is None else begin, last if end is None else end))], None
+            return [cut(recording, Stretch(first if begin is None else begin, last if end is None else end))], None
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
-    every = stretches(flight, airframe, landed=recording.facts.landed)
+    every = stretches(recording, airframe, landed=recording.facts.landed)
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
@@ -173,10 +171,10 @@ def _usable_parts(
         besides = f" Besides, {slow}." if slow else ""
         raise InputError(f"{name}: {nothing_usable(every)}; {remedy}.{besides}")
     if not refused:
-        return [flight], None
+        return [recording], None
     reasons = "; ".join(f"{part.begin:.1f} to {part.end:.1f} s: {part.reason}" for part in refused[:_MOST_REASONS])
     seconds = sum(stretch.length for stretch in usable)
-    return [cut(flight, stretch) for stretch in usable], (
+    return [cut(recording, stretch) for stretch in usable], (
         f"{seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {reasons}"
         f"{'; ...' if len(refused) > _MOST_REASONS else ''}{'' if predicted else ' (`begin` and `end` override)'}"
     )
@@ -186,7 +184,7 @@ def _check_recordings(recordings: Sequence[Recording]) -> None:
     for number, recording in enumerate(recordings):
         if any(recording.same_data(earlier) for earlier in recordings[:number]):
             raise InputError(f"{recording.name}: given twice; give each log once.")
-        if np.isnan(np.asarray(recording.flight.states)[:, CASCADE_ORDER[:3]]).all(axis=0).any():
+        if np.isnan(recording.states[:, CASCADE_ORDER[:3]]).all(axis=0).any():
             raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
 
 

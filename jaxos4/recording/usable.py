@@ -2,7 +2,7 @@
 
 A part is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, the gyro
 is not clipped, no samples are lost, and the vehicle does not crash. The rotors do not carry it if they are idle, or if
-the accelerometer does not feel them (`jaxos4.recording.resting`).
+the accelerometer does not feel them.
 """
 
 import itertools
@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ..airframe import Airframe
-from ..errors import InputError
 from ..flight import Flight
-from .excited import RATE_COLUMNS
-from .resting import resting
+from .motion import RATE_COLUMNS
+from .reading import Recording, as_recording
 
 ON_GROUND = "on the ground"
 SHORTEST = 1.0  # [s], of a usable stretch
@@ -34,6 +33,13 @@ _SLOWEST_CLIP = 3.0  # [rad/s]: no gyro's range ends below 4.3 (250 deg/s)
 _IMPACT_FORCE, _IMPACT_RATE = 50.0, 15.0  # [m/s^2], and [rad/s] within `_IMPACT_TIME`
 _IMPACT_TIME = 0.02  # [s]
 _AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s], until the rotors stop; not trusted before the impact
+_GRAVITY = 9.80665  # [m/s^2], the unit "g" below
+_BIN, _SMOOTH = 0.05, 4  # [s], means over this time; bins, longer than the lag of any rotor
+_REST, _FILLED = 2.0, 5.0  # [s], a window; a gap between two resting windows is filled up to this length
+_VARIES = 0.2  # standard deviation of thrust in a window, as a share of its mean
+_UNFELT = 0.1  # relative change of the vertical force for a relative change of thrust: 1 in flight
+_STEADY, _ONE_G = 0.1, 0.15  # [g], standard deviation of the force of a resting vehicle; error of an accelerometer
+_TILTED, _STILL, _SHORTEST_REST = 0.5, 0.2, 1.0  # [g] along z, [rad/s], [s]
 
 _USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last one that applies counts
 _NAMES = {
@@ -62,15 +68,8 @@ class Stretch(NamedTuple):
         return self.end - self.begin
 
 
-class _Saturation(NamedTuple):
-    rotor: int
-    what: str
-    begin: int
-    end: int
-
-
 def stretches(
-    flight: Flight, airframe: Airframe | None = None, *, landed: Sequence[tuple[float, float]] = ()
+    flight: Flight | Recording, airframe: Airframe | None = None, *, landed: Sequence[tuple[float, float]] = ()
 ) -> tuple[Stretch, ...]:
     """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
@@ -81,26 +80,25 @@ def stretches(
       (thrust below a third or above three times the weight), the median thrust is taken as the weight.
     - `landed`: from when to when the vehicle itself says that it is on the ground [s], see `jaxos4.logs.LogFacts`.
     """
-    time, omega = np.asarray(flight.time, dtype=float), np.asarray(flight.omega, dtype=float)
-    states, dt = np.asarray(flight.states, dtype=float), float(flight.dt)
-    share = _thrust_share(omega, airframe, commanded=flight.commanded)
+    recording = as_recording(flight)
+    time, omega, dt, force = recording.time, recording.omega, recording.dt, recording.specific_force
+    rates = recording.states[:, RATE_COLUMNS]
+    share = _thrust_share(omega, airframe, commanded=recording.commanded)
     ground = _ground(share, dt)
     for begin, end in landed:
         ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
     saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
     for label, where in (
-        (_CLIPPING, _clipped(states[:, RATE_COLUMNS])),
-        (_SATURATED, _anywhere(saturations, time.size)),
-        (_LOST, _lost(states, dt)),
-        (_CRASHED, _crashed(flight, share, ground, dt)),
+        (_CLIPPING, _clipped(rates)),
+        (_SATURATED, np.any([where.any(axis=1) for where in saturations.values()], axis=0)),
+        (_LOST, _lost(recording.states, dt)),
+        (_CRASHED, _crashed(rates, force, share, ground, dt)),
         (_GROUND, ground),
     ):
         labels[where] = label
-    if flight.specific_force is not None:
-        force = np.asarray(flight.specific_force, dtype=float)
-        at_rest = resting(omega, force, states[:, RATE_COLUMNS], labels == _USABLE, dt)
-        labels[at_rest & (labels != _LOST)] = _GROUND
+    if force is not None:
+        labels[_resting(omega, force, rates, labels == _USABLE, dt) & (labels != _LOST)] = _GROUND
     for begin, end in _runs(labels == _USABLE):
         if time[end - 1] - time[begin] < SHORTEST - dt / 2:
             labels[begin:end] = _SHORT
@@ -111,7 +109,7 @@ def stretches(
     )
 
 
-def usable_stretches(flight: Flight, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
+def usable_stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
     """The usable stretches, in order; each lasts at least one second."""
     return tuple(stretch for stretch in stretches(flight, airframe) if not stretch.reason)
 
@@ -123,25 +121,6 @@ def nothing_usable(every: Sequence[Stretch]) -> str:
     grounded = longest.reason == ON_GROUND and all(stretch.reason in no_flight for stretch in every)
     never = "the vehicle never flew" if grounded else "no part can be used"
     return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
-
-
-def cut(flight: Flight, stretch: Stretch) -> Flight:
-    """The part of a flight from `stretch.begin` to `stretch.end`; its time stays as recorded.
-
-    **Raises:** `InputError` if the part has fewer than two samples.
-    """
-    time, half = np.asarray(flight.time), float(flight.dt) / 2
-    inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
-    if inside.size < 2:
-        raise InputError(
-            f"from {stretch.begin:g} s to {stretch.end:g} s: fewer than two samples; the flight lasts from "
-            f"{time[0]:.6g} s to {time[-1]:.6g} s."
-        )
-    part = slice(int(inside[0]), int(inside[-1]) + 1)
-    force = None if flight.specific_force is None else np.asarray(flight.specific_force)[part]
-    voltage = None if flight.voltage is None else np.asarray(flight.voltage)[part]
-    omega, states = np.asarray(flight.omega)[part], np.asarray(flight.states)[part]
-    return Flight(time[part], omega, states, force, flight.result, commanded=flight.commanded, voltage=voltage)
 
 
 def _thrust_share(omega: np.ndarray, airframe: Airframe | None, *, commanded: bool) -> np.ndarray:
@@ -187,24 +166,22 @@ def _clipped(rates: np.ndarray) -> np.ndarray:
     return out
 
 
-def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> list[_Saturation]:
-    """The runs in which a rotor rests, or is at its limit, for longer than a moment."""
-    found, full_scale = [], math.inf if airframe is None else float(airframe.max_rotor_speed)
+def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dict[str, np.ndarray]:
+    """The samples of each rotor in which it is at its limit, or rests, for longer than a moment."""
+    full_scale = math.inf if airframe is None else float(airframe.max_rotor_speed)
+    found = {what: np.zeros(omega.shape, dtype=bool) for what in ("at full speed", "at rest or idle")}
     for i, speed in enumerate(omega.T):
         largest, least, usual = float(speed.max()), float(speed.min()), float(np.median(speed))
         same = _LIMIT * largest
         if largest <= 0:
             continue
-        full = np.asarray(speed >= _FULL * full_scale)
+        full, rest = np.asarray(speed >= _FULL * full_scale), np.asarray(speed <= same)
         if largest > 1.3 * usual > 0:
             full |= _steady(speed, same) & (speed >= largest - same)
-        rest = np.asarray(speed <= same)
         if least < 0.5 * usual:
             rest |= _steady(speed, same) & (speed <= least + same)
-        for where, what in ((full, "at full speed"), (rest, "at rest or idle")):
-            found += [
-                _Saturation(i + 1, what, begin, end) for begin, end in _runs(where) if (end - begin) * dt > MOMENT
-            ]
+        for where, lasting in zip((full, rest), found.values(), strict=True):
+            lasting[:, i] = _lasting(where, MOMENT / dt)
     return found
 
 
@@ -220,18 +197,17 @@ def _lost(states: np.ndarray, dt: float) -> np.ndarray:
     for measured in [seen[:, c] for c in RATE_COLUMNS if seen[:, c].any()] or [seen.any(axis=1)]:
         at = np.flatnonzero(measured)
         usual = float(np.median(np.diff(at))) * dt if at.size > 1 else 0.0
-        for begin, end in _runs(np.asarray(~measured)):
-            if (end - begin + 1) * dt > max(_GAP, 5 * usual):
-                out[begin:end] = True
+        out |= _lasting(np.asarray(~measured), max(_GAP, 5 * usual) / dt - 1)
     return out
 
 
-def _crashed(flight: Flight, share: np.ndarray, ground: np.ndarray, dt: float) -> np.ndarray:
+def _crashed(
+    rates: np.ndarray, force: np.ndarray | None, share: np.ndarray, ground: np.ndarray, dt: float
+) -> np.ndarray:
     """The samples of a crash: from before an impact until the rotors stop, or the recording ends, soon after."""
     out, impact = np.zeros(share.size, dtype=bool), np.zeros(share.size, dtype=bool)
-    if flight.specific_force is not None:
-        impact = np.nan_to_num(np.linalg.norm(np.asarray(flight.specific_force), axis=1)) > _IMPACT_FORCE
-    rates = np.asarray(flight.states)[:, RATE_COLUMNS]
+    if force is not None:
+        impact = np.nan_to_num(np.linalg.norm(force, axis=1)) > _IMPACT_FORCE
     measured, rates = np.asarray(np.isfinite(rates).all(axis=1)), np.nan_to_num(rates)
     lag = min(max(_samples(_IMPACT_TIME, dt), 1), share.size - 1)
     jump = np.abs(rates[lag:] - rates[:-lag]).max(axis=1) > _IMPACT_RATE * max(lag * dt / _IMPACT_TIME, 1.0)
@@ -245,14 +221,88 @@ def _crashed(flight: Flight, share: np.ndarray, ground: np.ndarray, dt: float) -
     return out
 
 
-def _reason(label: int, begin: int, end: int, saturations: list[_Saturation]) -> str:
-    if label == _SATURATED:
-        rotors: dict[str, set[int]] = {}
-        for each in saturations:
-            if each.begin < end and each.end > begin:
-                rotors.setdefault(each.what, set()).add(each.rotor)
-        return "; ".join(f"rotor {', '.join(map(str, sorted(which)))} {what}" for what, which in rotors.items())
-    return _NAMES[label]
+def _resting(
+    omega: Float[np.ndarray, "samples 4"],
+    force: Float[np.ndarray, "samples 3"],
+    rates: Float[np.ndarray, "samples 3"],
+    airborne: Bool[np.ndarray, " samples"],
+    dt: float,
+) -> Bool[np.ndarray, " samples"]:
+    """Which samples are of a vehicle at rest, by its accelerometer.
+
+    In flight the specific force along z is the thrust, divided by the mass. On the ground and in a hand it is that of
+    gravity, whatever the rotors do. And a vehicle that lies on its side or back measures gravity across its rotors'
+    axes.
+
+    **Arguments:** rotor speeds or commands, specific force [m/s^2], body rates [rad/s], the samples that may be in
+    flight (only these are judged), and the step [s].
+
+    A window without changes of thrust proves nothing. Gaps of up to 5 s between windows at rest are at rest as well.
+    """
+    size = omega.shape[0]
+    length = max(round(_BIN / dt), 1)
+    bins = size // length
+    if bins < 2 or np.ptp(np.nan_to_num(force), axis=0).max() == 0:  # no accelerometer lies still to the last bit
+        return np.zeros(size, dtype=bool)
+    sensed = np.column_stack([omega.mean(axis=1) ** 2, force / _GRAVITY, np.abs(rates).max(axis=1)])
+    sensed[~airborne] = np.nan
+    means = sensed[: bins * length].reshape(bins, length, -1).mean(axis=1)  # NaN where a sample is
+    step = length * dt
+    found = _unfelt(means, step) | _tilted(means, step)
+    out = np.repeat(found, length)
+    return np.append(out, np.full(size - out.size, found[-1]))
+
+
+def _unfelt(means: np.ndarray, step: float) -> np.ndarray:
+    """The bins of windows in which thrust changes, and the accelerometer does not."""
+    smooth = np.column_stack([np.convolve(column, np.full(_SMOOTH, 1 / _SMOOTH), "same") for column in means.T])
+    smooth[: _SMOOTH // 2] = smooth[-(_SMOOTH // 2) :] = np.nan
+    out, felt = np.zeros(means.shape[0], dtype=bool), np.zeros(means.shape[0], dtype=bool)
+    wide = max(round(_REST / step), 4)
+    for begin in range(0, means.shape[0] - wide // 2, max(wide // 4, 1)):
+        part = smooth[begin : begin + wide]
+        part = part[np.isfinite(part[:, :4]).all(axis=1)]
+        if part.shape[0] < wide // 2:
+            continue
+        thrust, vertical = part[:, 0], part[:, 3]
+        size = np.linalg.norm(part[:, 1:4], axis=1)
+        mean = float(thrust.mean())
+        if mean <= 0 or thrust.std() < _VARIES * mean:
+            continue
+        deviation = thrust - mean
+        follows = (
+            float(deviation @ vertical) / float(deviation @ deviation) * mean / max(abs(float(vertical.mean())), 0.1)
+        )
+        gravity = abs(size.mean() - 1) < _ONE_G and size.std() < _STEADY
+        (out if gravity and abs(follows) < _UNFELT else felt)[begin : begin + wide] = True
+    known = np.flatnonzero(out)
+    for one, following in zip(known[:-1], known[1:], strict=True):
+        if 1 < following - one <= _FILLED / step and not felt[one + 1 : following].any():
+            out[one:following] = True
+    return out
+
+
+def _tilted(means: np.ndarray, step: float) -> np.ndarray:
+    """The bins of a vehicle that lies on its side or back, for at least a second."""
+    size = np.linalg.norm(means[:, 1:4], axis=1)
+    with np.errstate(invalid="ignore"):
+        lies = (np.abs(size - 1) < _ONE_G) & (means[:, 3] < _TILTED) & (means[:, 4] < _STILL)
+    return _lasting(np.asarray(lies), math.ceil(_SHORTEST_REST / step) - 1)
+
+
+def _reason(label: int, begin: int, end: int, saturations: dict[str, np.ndarray]) -> str:
+    if label != _SATURATED:
+        return _NAMES[label]
+    rotors = {what: np.flatnonzero(where[begin:end].any(axis=0)) + 1 for what, where in saturations.items()}
+    return "; ".join(f"rotor {', '.join(map(str, which))} {what}" for what, which in rotors.items() if which.size)
+
+
+def _lasting(where: np.ndarray, most: float) -> np.ndarray:
+    """`where`, without runs of at most so many samples."""
+    out = np.zeros_like(where)
+    for begin, end in _runs(where):
+        out[begin:end] = end - begin > most
+    return out
 
 
 def _samples(seconds: float, dt: float) -> int:
@@ -263,10 +313,3 @@ def _runs(where: Bool[np.ndarray, " samples"]) -> list[tuple[int, int]]:
     """Begin and end (exclusive) of each run of `True`."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
-
-
-def _anywhere(saturations: list[_Saturation], size: int) -> np.ndarray:
-    out = np.zeros(size, dtype=bool)
-    for each in saturations:
-        out[each.begin : each.end] = True
-    return out

@@ -1,51 +1,153 @@
-"""What `jaxos4 design` prints: the bounds of the designed input beside those of the standard inputs."""
+"""The table that `jaxos4 design` prints, and its figure: a design beside the standard inputs."""
 
 import math
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import rich.box
 from rich.console import Console
 from rich.table import Table
 
-from ..design import InputDesign
-from .numbers import plain
+from .._files import write_atomically
+from ..design import Design
+from .text import plain
 
+_COLUMNS = 4
 _LONGEST_REPEATED = 1e4
+# The inputs are drawn for so many periods. Bounds that fall with the root of the duration are drawn up to this
+# multiple of the flight.
+_PERIODS, _LONGER = 2, 10
 
 
-def print_design(console: Console, found: InputDesign, accuracy: float) -> None:
-    """Prints the table, what is gained, what limits the input, and how long to fly.
+class _Words(NamedTuple):
+    """Descriptions of a kind of design.
 
-    `accuracy`: the wanted standard deviation of each parameter, as a share of its bracket's half-width.
+    - `relative`: whether bounds of the targets are shown in percent of their scale.
+    - `panels`: titles of the panels of the inputs.
     """
+
+    unexcited: str
+    targets: str
+    compared: str
+    relative: bool
+    panels: tuple[str, ...]
+
+
+_WORDS = {
+    "rotor speeds": _Words(
+        "no better than the default bracket, not excited",
+        "that both have",
+        "in the same envelope and time",
+        False,
+        tuple(f"rotor {i} [rad/s]" for i in range(1, 5)),
+    ),
+    "references": _Words(
+        "the flight adds little to the bracket",
+        "of Ix, Iy and Iz",
+        "of the same length and largest angle",
+        True,
+        ("roll [rad]", "pitch [rad]", "yaw [rad]", "vertical [m/s^2]"),
+    ),
+}
+
+
+def print_design(console: Console, found: Design, accuracy: float) -> None:
+    """Print the table, the gain, the share of the limits that is used, and how long to fly.
+
+    `accuracy`: the wanted standard deviation of each target, as a share of its scale.
+    """
+    task, words = found.task, _WORDS[found.task.kind]
+    every = {"designed": found.designed, **found.standard}
     table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("parameter", "unit", "designed", *found.standard):
+    for heading in ("parameter", "unit", *every):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
-    columns = [found.designed.bounds[-1], *(one.bounds[-1] for one in found.standard.values())]
-    for i, (name, unit) in enumerate(zip(found.names, found.units, strict=True)):
-        cells = (plain(column[i], 2) if column[i] < found.usual[i] else "-" for column in columns)
-        table.add_row(name, unit, *cells)
+    for i, (name, unit) in enumerate(zip(task.names, task.units, strict=True)):
+        in_percent = words.relative and i < task.scale.size
+        factor = 100 / task.scale[i] if in_percent else 1.0
+        excited = [one.bounds[i] < task.unexcited[i] for one in every.values()]
+        cells = (plain(factor * one.bounds[i], 2) for one in every.values())
+        cells = (cell if known else "-" for cell, known in zip(cells, excited, strict=True))
+        table.add_row(name, "%" if in_percent else unit, *cells)
     console.print(table, markup=False)
-    console.print("the smallest possible standard deviation; -: no better than the default bracket, not excited.")
+    console.print(f"the smallest possible standard deviation; -: {words.unexcited}.")
     gains = "; ".join(_gain(found, name) for name in found.standard)
-    console.print(f"geometric mean of the bounds that both have: {gains}; in the same envelope and time.")
+    console.print(f"geometric mean of the bounds {words.targets}: {gains}; {words.compared}.")
     uses = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.designed.uses.items())
-    console.print(f"largest share of each limit, of {found.vehicles} vehicles from the bracket: {uses}.")
-    console.print(_duration(found, accuracy))
+    console.print(f"largest share of each limit, of {task.vehicles} vehicles from the bracket: {uses}.")
+    console.print(_lengths(found, accuracy))
 
 
-def _gain(found: InputDesign, name: str) -> str:
+def _gain(found: Design, name: str) -> str:
     ratio, excited = found.gain(name)
     if not excited:
         return f"{name} excites nothing"
-    return f"{plain(ratio, 2)} x {name}{'' if excited == len(found.names) else f' ({excited} of {len(found.names)})'}"
+    count = found.task.scale.size
+    return f"{plain(ratio, 2)} x {name}{'' if excited == count else f' ({excited} of {count})'}"
 
 
-def _duration(found: InputDesign, accuracy: float) -> str:
-    wanted = accuracy * found.half_width
+def _lengths(found: Design, accuracy: float) -> str:
+    """The flight time for an accuracy of the targets."""
+    task, designed = found.task, found.designed
+    times = designed.shortest(accuracy * task.scale)
+    longest = float(np.max(times))
+    if _WORDS[task.kind].relative:
+        names = task.names[: times.size]
+        after = ", ".join(f"{name} after {seconds:.3g} s" for name, seconds in zip(names, times, strict=True))
+        return (
+            f"known to {100 * accuracy:g} %: {after}. So fly at least {longest:.3g} s; the references repeat every "
+            f"{designed.period:.3g} s."
+        )
     goal = f"every parameter known to {100 * accuracy:g} % of its bracket's half-width"
-    enough = found.designed.first_time(wanted)
-    if math.isfinite(enough):
-        return f"{goal}: the first {enough:.2f} s are enough."
-    times = float(np.max(np.square(found.designed.bounds[-1] / wanted)))
-    return f"{goal}: fly it {math.ceil(times)} times." if times < _LONGEST_REPEATED else f"{goal}: not by this input."
+    if longest <= designed.duration:
+        return f"{goal}: the first {longest:.2f} s are enough."
+    repeats = longest / designed.duration
+    return (
+        f"{goal}: fly it {math.ceil(repeats)} times." if repeats < _LONGEST_REPEATED else f"{goal}: not by this input."
+    )
+
+
+def write_design(found: Design, accuracy: float, out: Path) -> None:
+    """Write the figure as SVG: above what to fly, below the bound of each target against the time of flight.
+
+    A line shows the wanted accuracy of references, or half of the bracket of rotor speeds.
+    """
+    from .style import INK, drawing, grid, label_edges, log_axis, styles, svg  # a second that the table does not need
+
+    task, words, designed = found.task, _WORDS[found.task.kind], found.designed
+    every, targets = {"designed": designed, **found.standard}, task.scale.size
+    with drawing():
+        figure, panels = grid(_COLUMNS + targets, columns=_COLUMNS, height=1.9)
+        looks, shown = styles(list(every)), round(_PERIODS * designed.period / designed.dt)
+        time = designed.dt * np.arange(designed.inputs.shape[0])
+        for i, panel in enumerate(panels[:_COLUMNS]):
+            for name in ("designed",) if words.relative else ("multisine", "designed"):
+                if name in every:
+                    look = looks[name]
+                    panel.plot(time[:shown], every[name].inputs[:shown, i], color=look.color, linestyle=look.dash)
+            panel.set_title(words.panels[i])
+        for i, panel in enumerate(panels[_COLUMNS:]):
+            panel.axhline(100 * accuracy if words.relative else float(task.scale[i]), color=INK, linewidth=0.8)
+            for name, one in every.items():
+                if one.history is None:
+                    seconds = np.geomspace(designed.period, _LONGER * designed.duration, 50)
+                    bound = one.bounds[i] * np.sqrt(one.duration / seconds)
+                    bound = np.where(bound < task.unexcited[i], 100 * bound / task.scale[i], np.nan)
+                else:
+                    seconds, bound = time, one.history[:, i]
+                    bound = np.where(bound < 3 * task.scale[i], bound, np.nan)
+                panel.plot(seconds, bound, color=looks[name].color, linestyle=looks[name].dash, label=name)
+            if words.relative:
+                log_axis(panel, "x")
+            log_axis(panel, "y")
+            panel.set_title(f"{task.names[i]}: bound [{'%' if words.relative else task.units[i]}]")
+        if words.relative:
+            for i, panel in enumerate(panels):
+                panel.set_xlabel("time [s]" if i < _COLUMNS else "flight [s]")
+        else:
+            label_edges(panels, _COLUMNS, x="time [s]")
+        handles = panels[_COLUMNS].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=len(every))
+        content = svg(figure)
+    with write_atomically(out) as beside:
+        beside.write_bytes(content)

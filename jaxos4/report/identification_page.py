@@ -1,199 +1,188 @@
-"""An identification as text, for a terminal."""
+"""The page of an identified vehicle, which needs no other file, and its figures: `jaxos4 estimate --report`."""
 
-from collections.abc import Iterator
+import json
+import math
+import os
+from typing import Any
 
-from rich.console import Console
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, NullLocator
 
-from ..estimators import ESTIMATORS
-from ..identification.quality import COLOURED
-from ..identification.results import (
-    FlightIdentification,
-    Identification,
-    PredictionSkill,
-    RigidBody,
-    Validation,
-    VehicleIdentification,
-)
+from .._files import check_writable, write_atomically
+from ..analysis.frequency_response import AxisResponse, FrequencyResponse
+from ..analysis.prediction import Predictions
+from ..identification.results import Identification
 from ..results import NINETY_FIVE
-from .whole import Listing
+from .html import Drawing, drawings, render
+from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg
+from .text import MISSING, plain
 
-# The share of fits of true models that a test of all channels' residuals may reject.
-_SIGNIFICANCE = 0.01
+BAND = 0.95
+"""The share of the errors that the band of the predictions holds."""
 
-
-def print_identification(console: Console, found: Identification) -> None:
-    """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; without an answer, why."""
-    for part in _parts(found):
-        if isinstance(part, Listing):
-            part.print_on(console)
-        else:
-            console.print(part, markup=False, highlight=False)
-
-
-def _parts(found: Identification) -> Iterator[str | Listing]:
-    if isinstance(found, VehicleIdentification):
-        yield from (f"not to be trusted because {doubt}." for doubt in found.doubts)
-    yield from (f"note: {note}" for note in found.provenance.get("notes", ()))
-    if found.result == "nonfinite_trajectory" and isinstance(found, FlightIdentification):
-        shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
-        yield (
-            "No estimate: the model's trajectory diverged wherever the search went. The vehicle may do something that "
-            f"the model lacks{' (try --window, or a shorter window)' if shoots else ''}, or the airframe's constants "
-            "or the units of the flight are wrong."
-        )
-    if not found.has_answer:
-        return
-    if isinstance(found, FlightIdentification):
-        yield from _of_flight(found)
-    elif isinstance(found, VehicleIdentification):
-        yield from _of_vehicle(found)
+# The horizon that the page shows first [s], and the digits of its estimates.
+_SHOWN, _DIGITS = 0.25, 4
+# The page shows these entries of the provenance in a place of their own.
+_APART = ("command", "notes")
+# Width of the figure of predictions by the time that it shows [inch/s], and its limits [inch].
+_INCHES_A_SECOND, _NARROWEST, _WIDEST = 0.25, 9.0, 30.0
+# The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
+_HIGHEST, _GAINS = 40.0, (0.2, 5.0)
+_FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 
 
-def _of_flight(found: FlightIdentification) -> Iterator[str | Listing]:
-    yield _parameters(found, digits=5, with_bound=True)
-    limits = [
-        f"{name} {row.noise_limit:.2g}"
-        for name, row in found.parameters.items()
-        if "below noise" in row.note and row.noise_limit
-    ]
-    if limits:
-        yield (
-            "below noise: cannot be distinguished from 0. The airframe's values could be distinguished at this "
-            f"multiple of the noise: {', '.join(limits)}."
-        )
-    yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
-    percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
-    yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
-    yield from _residuals(found)
-    yield from _rigid_body(found.rigid_body)
-    if found.validation is not None:
-        yield _validation(found.validation)
-    yield (
-        f"{found.estimator}, {found.model} model, {found.provenance['channels']} channels: {found.result}, "
-        f"{found.rollouts} rollouts, {found.seconds:.1f} s"
+def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str) -> None:
+    """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
+    check_writable(path)
+    look = styles([found.estimator])[found.estimator]
+    predictions, responses = (), ()
+    if found.predictions is not None:
+        predictions = _predictions(found.predictions, found.provenance.sample_time, look)
+    if found.response is not None:
+        with drawing():
+            file = svg(frequency_responses(found.response, look))
+        description = "Frequency response of roll, pitch and yaw"
+        responses = drawings({"": file}, 0, stem="response", description=description)
+    text = render(
+        "identification.html.j2",
+        filters={"number": _number, "interval": _interval, "share": _share, "plain": plain},
+        title=title,
+        found=found,
+        ninety_five=NINETY_FIVE,
+        predictions=predictions,
+        band=f"{100 * BAND:g}",
+        responses=responses,
+        command=found.provenance.command or "",
+        notes=found.provenance.notes,
+        provenance=[
+            (name.replace("_", " "), _text(x)) for name, x in found.provenance.to_dict().items() if name not in _APART
+        ],
     )
+    with write_atomically(path) as beside:
+        beside.write_text(text, encoding="utf-8")
 
 
-def _residuals(found: FlightIdentification) -> Iterator[str]:
-    coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
-    if coloured and found.estimator == "network":
-        yield (
-            f"The residuals of {coloured} are not white noise: the network's answer is not the best fit, but lies "
-            "within its intervals of it. The hybrid continues the search from there and tests the model."
-        )
-    elif coloured:
-        yield (
-            f"The residuals of {coloured} are not white noise: the model does not explain this flight completely. The "
-            "intervals of estimators that shoot allow for correlated residuals, but are too narrow for slow errors."
-        )
-    tests = {"free of the inputs (cross-correlation)": "input_p"}
-    if found.provenance["windows"] == 1:  # the free initial states of windows mislead the test
-        tests = {"white (Ljung-Box)": "white_p"} | tests
-    for property_, p_value in tests.items() if found.fit else ():
-        failed = [name for name, row in found.fit.items() if getattr(row, p_value) * len(found.fit) < _SIGNIFICANCE]
-        answer = f"not those of {', '.join(failed)}" if failed else "all"
-        yield f"residuals {property_}, tests at {_SIGNIFICANCE:.0%}: {answer}."
+def _number(value: float | None, digits: int = _DIGITS) -> str:
+    return MISSING if value is None else plain(value, digits)
 
 
-def _rigid_body(body: RigidBody) -> Iterator[str]:
-    if not body.constants or body.consistency_p is None:
-        return
-    inertias = [
-        f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}"
-        if abs(row.estimate) > NINETY_FIVE * row.std
-        else f"{name} below noise"
-        for name, row in body.constants.items()
-    ]
-    if body.consistency_p < _SIGNIFICANCE:
-        verdict = f"the alphas are not those of one rigid body, p = {body.consistency_p:.1g}"
-    elif not body.is_rigid_body:
-        verdict = "no rigid body has such inertias: one exceeds the sum of the other two"
-    else:
-        verdict = f"the alphas agree with one rigid body, p = {body.consistency_p:.2g}"
-    yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}; {verdict}."
-
-
-def _validation(validation: Validation) -> str:
-    if validation.fit is None:
-        return f"validation on {validation.flight}: the model's trajectory diverges before the flight ends."
-    channels = [
-        f"{name} {row.percent:.1f} ({row.level**0.5:.2g})"
-        for name, row in validation.fit.items()
-        if row.percent is not None
-    ]
-    return f"validation on {validation.flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
-
-
-def _of_vehicle(found: VehicleIdentification) -> Iterator[str | Listing]:
-    yield _parameters(found, digits=4, with_bound=False)
-    reasons: dict[str, list[str]] = {}
-    for name, row in found.held.items():
-        reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
-    for reason, held in reasons.items():
-        yield f"held, {reason}: {', '.join(held)}."
-    inertias = [
-        f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g} ({row.note})"
-        for name, row in found.rigid_body.constants.items()
-    ]
-    if inertias:
-        yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}."
-    yield from _disturbances(found) if found.disturbances else _residual_levels(found)
-    if found.widened:
-        factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
-        yield f"intervals widened, because parts of the flights disagree, by the factor: {factors}."
-    if found.skill is not None:
-        yield (
-            "Predictions of data that were not fitted: 1 is perfect, 0 as good as constant rates; +- one standard "
-            f"error ({found.skill.starts} starts)."
-        )
-        yield _skill(found.skill)
-    used = found.provenance
-    windows = "" if found.disturbances else f" in windows of {used['window']:g} s"
-    yield (
-        f"{found.estimator}, flight model ({', '.join(used['terms'])}), {used['fitted_seconds']:.0f} s{windows}, "
-        f"a sample every {1e3 * used['sample_time']:g} ms: {found.result}, {found.rollouts} rollouts, "
-        f"{found.seconds:.0f} s"
-    )
-
-
-def _disturbances(found: VehicleIdentification) -> Iterator[str]:
-    rows = (f"{name} {x.strength:.2g} {x.unit} over {x.time_constant:.2g} s" for name, x in found.disturbances.items())
-    yield f"disturbances that the model lacks, and their correlation time: {', '.join(rows)}."
-    sensors = ", ".join(f"{name} {row.sensor:.2g}" for name, row in found.disturbances.items())
-    yield f"white noise of the sensors [rad/s; m/s^2, of means over 0.25 s]: {sensors}."
-
-
-def _residual_levels(found: VehicleIdentification) -> Iterator[str]:
-    noise = ", ".join(f"{name} {sigma:.2g}" for name, sigma in found.noise.items())
-    yield (
-        f"residuals in a window [rad/s, m/s^2]: {noise}; the intervals allow for their correlation. "
-        f"Outliers cut: {100 * found.cut:.0f} % (18 % is normal for Gaussian noise)."
-    )
-
-
-def _skill(skill: PredictionSkill) -> Listing:
-    rows = []
-    rates = (skill.p, skill.q, skill.r)
-    for i, horizon in enumerate(skill.horizons):
-        cells = [f"{_share(rate.skill[i])} +- {_share(rate.std[i])}" for rate in rates]
-        rows.append((f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates)))
-    return Listing(("ahead", "p", "q", "r", "equation error: p, q, r"), rows)
-
-
-def _parameters(found: Identification, *, digits: int, with_bound: bool) -> Listing:
-    rows = []
-    for name, row in found.parameters.items():
-        cells = ["-", "-", "-"]
-        if row.estimate is not None and row.ci95 is not None:
-            low, high = row.ci95
-            bound = "-" if row.bound is None else f"{row.bound:.2g}"
-            cells = [f"{row.estimate:.{digits}g}", f"[{low:.{digits}g}, {high:.{digits}g}]", bound]
-        rows.append((name, row.unit, *cells[: 2 + with_bound]))
-    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * with_bound)
-    return Listing(headings, rows, ("estimate", "bound"), [row.note for row in found.parameters.values()])
+def _interval(ends: tuple[float, float] | None) -> str:
+    return "" if ends is None else f"{_number(ends[0])} to {_number(ends[1])}"
 
 
 def _share(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"
+    return MISSING if value is None else f"{value:.2f}"
+
+
+def _text(x: Any) -> str:
+    if isinstance(x, str):
+        return x
+    return MISSING if x is None else json.dumps(x, ensure_ascii=False)
+
+
+def _predictions(predicted: Predictions, sample_time: float, look: Style) -> tuple[Drawing, ...]:
+    """A drawing for each horizon."""
+    labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
+    with drawing():
+        files = {label: svg(predicted_rates(predicted, sample_time, at, look)) for at, label in enumerate(labels)}
+    chosen = list(files).index(labels[int(np.argmin(np.abs(predicted.horizons - _SHOWN)))])
+    return drawings(files, chosen, stem="predictions", description="Measured and predicted body rates p, q, r")
+
+
+def predicted_rates(predicted: Predictions, sample_time: float, horizon: int, look: Style) -> Figure:
+    """Measured and predicted p, q, r against the time that is predicted, with a band that holds 95 % of the errors.
+
+    **Arguments:**
+
+    - `sample_time`: of the flight [s].
+    - `horizon`: index into `predicted.horizons`.
+    """
+    time = predicted.start * sample_time + predicted.horizons[horizon]
+    # Lines break between stretches.
+    usual = np.median(np.diff(predicted.start)) if predicted.start.size > 1 else 1
+    breaks = np.flatnonzero(np.diff(predicted.start) > 1.5 * usual) + 1
+    width = float(np.clip(_INCHES_A_SECOND * np.ptp(time), _NARROWEST, _WIDEST))
+    figure, panels = grid(3, columns=1, width=width, height=1.9)
+    for rate, (panel, name) in enumerate(zip(panels, "pqr", strict=True)):
+        y, measured = predicted.predicted[:, horizon, rate], predicted.measured[:, horizon, rate]
+        errors = np.abs(y - measured)
+        errors = errors[np.isfinite(errors)]
+        half = float(np.quantile(errors, BAND)) if errors.size else math.nan
+        x, y, measured = (np.insert(values.astype(float), breaks, np.nan) for values in (time, y, measured))
+        band = panel.fill_between(x, y - half, y + half, color=look.color, alpha=0.22, linewidth=0)
+        (line,) = panel.plot(x, y, color=look.color)
+        (dots,) = panel.plot(x, measured, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
+        panel.set_title(f"{name} [rad/s]")
+        panel.margins(x=0.01)
+        panel.tick_params(labelbottom=rate == 2)
+        if rate == 2:
+            panel.set_xlabel("time [s]")
+            labels = ("measured", f"predicted {predicted.horizons[horizon]:.3g} s ahead", f"{100 * BAND:g} % of errors")
+            figure.legend([dots, line, band], labels, loc="outside lower left", ncols=3)
+    return figure
+
+
+def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
+    """Gain, phase and coherence of roll, pitch and yaw, with 95 % bands, and the model as a line.
+
+    The title of an axis says by how much the measured response exceeds the model's from 4 to 20 Hz. A frequency without
+    a clear response is drawn faintly.
+    """
+    figure, panels = grid(9, columns=3, width=9.0, height=1.75)
+    top = min(_HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
+    shown: list[Artist] = []
+    for column, (name, axis) in enumerate(zip(found._fields, found, strict=True)):
+        gain, phase, coherence = panels[column::3]
+        drawn = _response(gain, axis, axis.gain, axis.gain * np.exp([-axis.half_width, axis.half_width]), look)
+        degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
+        _response(phase, axis, degrees, degrees + np.array([-spread, spread]), look)
+        coherence.plot(axis.frequency, axis.coherence, color=look.color)
+        model = gain.axhline(1.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
+        phase.axhline(0.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
+        coherence.axhline(0.6, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[1])
+        shown = [*drawn, model]
+        gain.set_title(f"{name}: {_said(axis)}")
+        gain.set_yscale("log")
+        gain.set_ylim(_GAINS)
+        _ticks(gain, "y", _GAIN_TICKS)
+        phase.set_ylim(-180, 180)
+        phase.yaxis.set_major_locator(MultipleLocator(90))
+        coherence.set_ylim(0, 1.03)
+        coherence.set_xlabel("frequency [Hz]")
+        for panel in (gain, phase, coherence):
+            panel.set_xscale("log")
+            panel.set_xlim(1.0, top)
+            _ticks(panel, "x", _FREQUENCY_TICKS)
+            panel.tick_params(labelbottom=panel is coherence, labelleft=column == 0)
+    for panel, label in zip(panels[::3], ("gain", "phase [degrees]", "coherence"), strict=True):
+        panel.set_ylabel(label)
+    labels = ("measured over modelled", "95 %", "coherence below 0.6", "the model")
+    figure.legend(shown, labels, loc="outside lower left", ncols=4)
+    return figure
+
+
+def _response(panel: Axes, axis: AxisResponse, values: np.ndarray, band: np.ndarray, look: Style) -> list[Artist]:
+    """A line with its band: strong for a clear response, else faint."""
+    (faint,) = panel.plot(axis.frequency, values, color=FAINT, linewidth=0.8)
+    shown = np.where(axis.clear, values, np.nan)
+    low, high = np.where(axis.clear, band, np.nan)
+    filled = panel.fill_between(axis.frequency, low, high, color=look.color, alpha=0.25, linewidth=0)
+    (line,) = panel.plot(axis.frequency, shown, color=look.color)
+    return [line, filled, faint]
+
+
+def _said(axis: AxisResponse) -> str:
+    agreement = axis.agreement()
+    if math.isnan(agreement.ratio):
+        return "no clear response"
+    return "{:.2f} ({:.2f} to {:.2f}) times the model".format(agreement.ratio, *agreement.interval)
+
+
+def _ticks(panel: Axes, which: str, ticks: tuple[float, ...]) -> None:
+    axis = panel.xaxis if which == "x" else panel.yaxis
+    axis.set_major_locator(FixedLocator(list(ticks)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())

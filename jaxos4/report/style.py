@@ -1,4 +1,4 @@
-"""The style of figures: colours for colour-blind readers, markers and dashes, and files that are reproducible."""
+"""The style of figures: colours for colour-blind readers, markers, dashes, axes, legends, and reproducible files."""
 
 import contextlib
 import io
@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 INK = "#1b1e23"
@@ -47,6 +48,7 @@ _STYLES = (
 )
 _KNOWN = ("ibss", "network", "hybrid", "output-error", "equation-error", "rls", "svsf", "kalman")
 BOUND_DASHES = (_SOLID, _DOTTED, _DASHED)
+_LEGEND_WIDTH = 1.4  # of an entry [inch]
 
 _INKED = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color", "xtick.color", "ytick.color")
 _RC: dict[Any, Any] = {
@@ -88,10 +90,10 @@ def drawing() -> Iterator[None]:
 def styles(estimators: Sequence[str]) -> dict[str, Style]:
     """A style for each estimator: always the same for those in `_KNOWN`, an unused one for each other name."""
     free = (place for place in itertools.count() if place >= len(_KNOWN) or _KNOWN[place] not in estimators)
-    return {name: _style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
+    return {name: style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
 
 
-def _style(place: int) -> Style:
+def style(place: int) -> Style:
     """Style number `place`. Beyond the table, a colour comes with the marker and dashes of another row."""
     count = len(_STYLES)
     return _STYLES[(place + place // count) % count]._replace(color=_STYLES[place % count].color)
@@ -137,6 +139,35 @@ def scale_axis(axes: Axes, scales: np.ndarray) -> None:
     axes.set_xticks(list(scales), [f"{scale:g}" for scale in scales])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlim(scales.min() / 1.8, scales.max() * 1.8)
+
+
+def legend(
+    figure: Figure,
+    estimators: Sequence[str],
+    *,
+    bounds: Sequence[str] = (),
+    lines: bool = True,
+    markers: bool = True,
+) -> None:
+    """Adds a legend below the figure: an entry for each bound and each estimator, with lines, markers or both.
+
+    The page hides the entry of an estimator together with the estimator.
+    """
+    handles = [
+        Line2D([], [], color=INK, linestyle=d, linewidth=1.1) for d, _ in zip(BOUND_DASHES, bounds, strict=False)
+    ]
+    labels = [f"bound, {name}" for name in bounds[: len(handles)]]
+    first = len(handles)
+    for name, look in styles(estimators).items():
+        marker, dash = look.marker if markers else None, look.dash if lines else "none"
+        handles.append(Line2D([], [], color=look.color, marker=marker, linestyle=dash))
+        labels.append(name)
+    rows = -(-len(labels) // int(figure.get_figwidth() / _LEGEND_WIDTH))
+    columns = -(-len(labels) // rows)
+    box = figure.legend(handles, labels, loc="outside lower center", ncols=columns, handlelength=3)
+    for place, pair in enumerate(zip(box.legend_handles[first:], box.get_texts()[first:], strict=True)):
+        for part in filter(None, pair):
+            part.set_gid(estimator_gid(place))
 
 
 def svg(figure: Figure) -> bytes:

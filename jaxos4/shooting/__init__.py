@@ -1,7 +1,11 @@
 """The mismatch between a flight and a simulation of it: cost, residuals, gradient and information."""
 
-from .lanes import in_blocks as in_blocks
+from .abstract import AbstractProblem as AbstractProblem, Stages as Stages
+from .batching import in_blocks as in_blocks
+from .innovations import InnovationsProblem as InnovationsProblem
 from .padding import padded as padded
-from .problem import ROUNDING as ROUNDING, ShootingProblem as ShootingProblem
+from .problem import ShootingProblem as ShootingProblem
 from .rows import Rows as Rows, each_window as each_window
-from .scans import FASTEST as FASTEST, Curvature as Curvature, Length as Length, Shot as Shot
+from .scans import FASTEST as FASTEST, Curvature as Curvature, Length as Length, Parts as Parts, Shot as Shot
+from .stages import ROUNDING as ROUNDING
+from .unknowns import Unknowns as Unknowns

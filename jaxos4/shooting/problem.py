@@ -1,6 +1,8 @@
 """A shooting problem: how badly parameters of a model explain a flight."""
 
 import dataclasses
+from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -10,22 +12,26 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
+from .._xla import quick_jit
+from ..bracket import NO_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
+from .abstract import AbstractProblem, Stages
 from .rows import Rows, each_window, windowed
 from .scans import Curvature, Length, Shot, predict_window, shoot, shoot_with_derivatives
+from .stages import ROUNDING, shooting_stages
+from .unknowns import Unknowns
 
-# Rounding errors add up over a flight, to about this many times the rounding of one measurement.
-ROUNDING = 64.0
-
+# A cost this many standard deviations above that of pure noise is not explained.
+_UNEXPLAINED = 5.0
 # How far off an initial state may be that was not measured, in cascade order: rad/s, rad, then m and m/s.
 _UNMEASURED = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
 
 
-class ShootingProblem(eqx.Module):
+class ShootingProblem(AbstractProblem):
     """A model, a flight and weights: how badly do parameters explain the flight?
 
     **Arguments:**
@@ -43,6 +49,7 @@ class ShootingProblem(eqx.Module):
       else identifies the initial states.
     - `length`: the number of samples that count; the others are padding, in which nothing was measured. `padded` makes
       it. `None`: all of them.
+    - `unknowns`: by default all parameters of the model, in the model's bracket.
 
     An *initial state* below is the part of X that the channels need, in cascade order: p, q, r, then phi, theta, psi,
     then x, vx, y, vy, z, vz. The initial states of several windows follow each other in one array.
@@ -50,9 +57,12 @@ class ShootingProblem(eqx.Module):
     **Raises:** `ValueError` that names the argument.
     """
 
+    prior: ClassVar[float] = NO_PRIOR
+
     model: AbstractModel
     flight: Flight
     sigma: Float[Array, "12"] | Float[Array, "15"] = eqx.field(converter=as_float)
+    unknowns: Unknowns
     initial_state: StateVector | None = None
     channels: str = eqx.field(static=True, default="all")
     method: str = eqx.field(static=True, default="euler")
@@ -70,6 +80,7 @@ class ShootingProblem(eqx.Module):
         method: str = "euler",
         windows: int = 1,
         length: Length = None,
+        unknowns: Unknowns | None = None,
     ):
         if channels not in CHANNELS:
             raise ValueError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
@@ -97,6 +108,7 @@ class ShootingProblem(eqx.Module):
         self.model, self.flight, self.sigma = model, flight, as_float(sigma)
         self.initial_state = None if initial_state is None else as_float(initial_state)
         self.channels, self.method, self.windows, self.length = channels, method, windows, length
+        self.unknowns = Unknowns.of(model) if unknowns is None else unknowns
 
     @property
     def size(self) -> int:
@@ -113,6 +125,22 @@ class ShootingProblem(eqx.Module):
         """The positions in `CHANNEL_NAMES` of what is compared: states in cascade order, then specific force."""
         forces = np.asarray(self.model.force_axes, dtype=int)
         return np.concatenate([CASCADE_ORDER[: self.size], len(STATE_NAMES) + forces])
+
+    @property
+    def starts(self) -> Float[Array, "1 unknowns"]:
+        """The center of the bracket: a search in stages needs no other start."""
+        return self.unknowns.usable.center[None]
+
+    def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "ShootingProblem":
+        """The same problem with some parameters held at known values: `problem.hold({"rotor_lag": 0.06})`.
+
+        **Raises:** `ValueError` for a name that the model does not have, or if no parameter remains free.
+        """
+        return dataclasses.replace(self, unknowns=self.unknowns.hold(values))
+
+    def within(self, bracket: Bracket | None) -> "ShootingProblem":
+        """The same problem, with another bracket for its unknowns; unchanged for `None`."""
+        return self if bracket is None else dataclasses.replace(self, unknowns=self.unknowns.within(bracket))
 
     def restrict(self, channels: str) -> "ShootingProblem":
         """The same problem on fewer channels."""
@@ -193,7 +221,7 @@ class ShootingProblem(eqx.Module):
         off = 3 * sigma + jnp.where((first == 0) & ~jnp.isnan(value), 0.0, _UNMEASURED[: self.size])
         return jnp.where(jnp.isnan(value), 0.0, value).ravel(), off.ravel()
 
-    @eqx.filter_jit
+    @quick_jit
     def cost(self, parameters: Parameters, initial_state: InitialStates | None = None) -> Scalar:
         """1/2 |W (y - x)|^2 over the measured samples, without the first sample if the initial state is known.
 
@@ -204,7 +232,7 @@ class ShootingProblem(eqx.Module):
         cost, sound = self.shots(parameters, start)
         return jnp.where(sound, cost, jnp.inf)
 
-    @eqx.filter_jit
+    @quick_jit
     def residuals(
         self, parameters: Parameters, initial_state: InitialStates | None = None
     ) -> Float[Array, " residuals"]:
@@ -213,7 +241,7 @@ class ShootingProblem(eqx.Module):
         predicted, measured = self.predict(parameters, start), self.measured()
         return jnp.where(jnp.isnan(measured), 0.0, (measured - predicted) / self.sigma[self.columns]).ravel()
 
-    @eqx.filter_jit
+    @quick_jit
     def predict(self, parameters: Parameters, initial_state: InitialStates) -> Float[Array, "samples columns"]:
         """The output of noise-free sensors, in the order of `columns`."""
         _, within = self.cut()
@@ -229,11 +257,28 @@ class ShootingProblem(eqx.Module):
         each = each_window(lambda rows, start: self.shot(rows, parameters, start), rows, starts)
         return Shot(each.cost.sum(), each.sound.all())
 
-    def curvatures(self, parameters: Parameters, initial_state: InitialStates) -> Curvature:
-        """The curvature of each window, in the parameters and the window's own initial state."""
-        rows = self.with_forcing(self.rows(), parameters)
-        starts = self.split(initial_state)
-        return each_window(lambda rows, start: self.curvature(rows, parameters, start), rows, starts)
+    def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
+        """`curvatures` for a loop: the rows that do not depend on the parameters are made once."""
+        rows, inputs = self.rows(), self.flight.inputs
+
+        def evaluate(parameters: Parameters, initial_state: InitialStates) -> Curvature:
+            forced, starts = self.with_forcing(rows, parameters, inputs=inputs), self.split(initial_state)
+            return each_window(lambda rows, start: self.curvature(rows, parameters, start), forced, starts)
+
+        return evaluate
+
+    def stages(self, *, cascade: bool) -> Stages:
+        """See `shooting_stages`."""
+        return shooting_stages(self, cascade=cascade)
+
+    def cascade(self) -> "tuple[ShootingProblem, ...]":
+        """The rates, and then all channels with them: the rates depend on nothing else."""
+        return (self,) if self.channels == "rates" else (self.restrict("rates"), self)
+
+    def explains(self, cost: Scalar) -> Bool[Array, ""]:
+        """Whether a cost is at most `_UNEXPLAINED` standard deviations above that of pure noise."""
+        measurements = jnp.sum(~jnp.isnan(self.measured()))
+        return 2 * cost < measurements + _UNEXPLAINED * jnp.sqrt(2.0 * measurements)
 
     def shot(self, rows: Rows, parameters: Parameters, initial_state: InitialState) -> Shot:
         """The cost of one window, from `rows` that an inner loop prepares once."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import InitialState, Parameters, Scalar
 from ..models.state import Forcing, State, unstack
-from .lanes import computed_once, with_batch
+from .batching import computed_once, with_batch
 from .rows import Rows
 
 # A body rate [rad/s] that no quadrotor reaches and no gyro measures: a faster trajectory has diverged.
@@ -47,12 +47,28 @@ class Shot(NamedTuple):
     sound: Bool[Array, ""]
 
 
+class Parts(NamedTuple):
+    """The likelihood of each part of a flight, without the prior.
+
+    - `gradient`, `information`: about all unknowns.
+    - `products`: for each channel, sums of the products of standardised innovations 0, 1, 2, ... samples apart.
+    """
+
+    gradient: Float[Array, "parts unknowns"]
+    information: Float[Array, "parts unknowns unknowns"]
+    products: Float[Array, "parts channels lags"]
+
+
 class Curvature(NamedTuple):
-    """A shot with its gradient and its Fisher information J^T W^2 J in (parameters, initial state)."""
+    """A shot with its gradient and its Fisher information J^T W^2 J in (parameters, initial state).
+
+    `parts`: from a likelihood whose parts are compared.
+    """
 
     shot: Shot
     gradient: Float[Array, " unknowns"]
     information: Float[Array, "unknowns unknowns"]
+    parts: Parts | None = None
 
 
 def predict_window(

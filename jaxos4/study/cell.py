@@ -4,7 +4,11 @@ A cell is one call of each of its programs, on one device. Last digits depend on
 of devices that share a program; with whole cells they are the same in any order and in any process.
 """
 
+import contextlib
 import dataclasses
+import io
+import math
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -14,70 +18,65 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import States, as_float
+from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, Hybrid, make_estimator
 from ..estimators.hybrid import Seed, search_near
 from ..models.state import CHANNELS
 from ..networks import TrainedNetwork
-from ..results import result_names
+from ..results import NAMES, result_names
 from ..shooting import ShootingProblem
-from .cell_file import LEVELS, OUTCOMES
-from .devices import one_core
-from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly, problem_of
-from .network_jobs import hybrid_channels, job_of
-from .specification import Cell, Study
+from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly, key_of, problem_of
+from .specification import Cell, Job, Scenario, Study
 
-# Sweeps of a search that are kept, for a scenario's first flight.
+OUTCOMES = (*NAMES, "failed", "not_run")
+"""Outcomes of an estimate. `failed`: its cell could not be computed; `not_run`: not yet. Files hold the index."""
+
+LEVELS = (0.5, 0.9, 0.95, 0.99)
+"""The levels of the intervals that are kept."""
+
+# Sweeps of IBSS that are kept, for a scenario's first flight.
 _RECORDED_SWEEPS = 64
 # Attributes of an estimate that are kept.
 _KEPT = ("parameters", "std", "cost", "rollouts", "initial_state", "result", "seed", "brackets")
+# An estimator with more flights computes for longer than its fully optimised program compiles.
+_FEW_FLIGHTS = 2000
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
-    """Identifies the flights of a cell on the default device. `network`: that of `job_of`, if the estimator needs one.
+    """Identifies the flights of a cell on the default device. `network`: that of `Study.job`.
 
     Raises as the estimator does.
     """
     with jax.enable_x64(study.double):
-        scenario, (fleet, flights, blank) = cell.scenario, _flown(study, cell)
+        scenario = cell.scenario
         with one_core():
+            fleet = fleet_of(study, scenario)
+            flights = fly(study, fleet, cell)
+            blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
             standard = blank_problem(study, fleet, 1.0, scenario.seen)
             bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
         found = _answers(study, cell, fleet, blank, flights.measured, network)
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
 
 
-def compile_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> None:
-    """Compiles the programs of `run_cell`, on flights without measurements: each search ends after its first look.
-
-    The values of the network do not matter. Raises as the estimator does.
-    """
-    with jax.enable_x64(study.double):
-        fleet, flights, blank = _flown(study, cell)
-        with one_core():
-            nothing = jax.device_put(np.full_like(flights.measured, np.nan))
-        jax.block_until_ready(_answers(study, cell, fleet, blank, nothing, network))
+@contextlib.contextmanager
+def one_core() -> Iterator[None]:
+    """Computes on the first core of a CPU: a program that all estimators share is compiled once, not for each core."""
+    first = jax.local_devices()[0]
+    with jax.default_device(first) if first.platform == "cpu" else contextlib.nullcontext():
+        yield
 
 
-def _flown(study: Study, cell: Cell) -> tuple[Fleet, Flights, ShootingProblem]:
-    """The flights of a cell, and the problem that an estimator solves for each."""
-    scenario = cell.scenario
-    with one_core():
-        fleet = fleet_of(study, scenario)
-        blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
-        return fleet, fly(study, fleet, cell), blank
-
-
-def programs_of(study: Study, cell: Cell) -> list[tuple]:
-    """The keys of the programs that a cell runs, in the order of use. Cells with an equal key share the program.
+def programs_of(study: Study, scenario: Scenario) -> list[tuple]:
+    """The keys of the programs that identify the flights of a scenario, in the order of use.
 
     IBSS and the hybrid share their search. The hybrid also runs its network's program.
     """
-    scenario = cell.scenario
     kind, shapes = ESTIMATORS[scenario.estimator], (scenario.model, scenario.duration)
     if issubclass(kind, Hybrid):
-        return [(TrainedNetwork, *shapes, job_of(study, scenario).channels), (IBSS, *shapes, scenario.seen)]
+        return [(TrainedNetwork, *shapes, study.seed_channels(scenario)), (IBSS, *shapes, scenario.seen)]
     return [(kind, *shapes, scenario.seen)]
 
 
@@ -90,26 +89,28 @@ def _answers(
     network: TrainedNetwork | None,
 ) -> dict[str, Any]:
     """The attributes in `_KEPT` of each flight's estimate, and its `half_width` at `LEVELS`, by name."""
-    estimator, bracket = _estimator(cell.scenario.estimator, network), fleet.bracket
-    if not isinstance(estimator, Hybrid | IBSS):
-        return _identify(estimator, blank, bracket, states)[0]
-    channels = hybrid_channels(study, cell.scenario)
+    few = math.prod(study.shape[:-1]) * study.flights <= _FEW_FLIGHTS
+    identify, search = _COMPILED_QUICKLY if few else _OPTIMISED
+    if network is not None:  # a history of another length would be another program
+        network = eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
+    estimator, channels = make_estimator(cell.scenario.estimator, network), study.seed_channels(cell.scenario)
+    if isinstance(estimator, Hybrid):
+        with one_core():
+            looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
+        _, seeds = identify(estimator.network, looked_at, fleet.bracket, states)
+        return search(estimator.ibss, blank, fleet.bracket, states, seeds) | {"brackets": None}
     if isinstance(estimator, IBSS):
         # Without an answer near which to search, it searches the whole bracket.
         none = Seed.none(len(fleet.model.parameter_names), CHANNELS[channels])
         seeds = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (study.batch, *leaf.shape)), none)
-        return _search(estimator, blank, bracket, states, seeds) | {"seed": None}
-    with one_core():
-        looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
-    _, seeds = _identify(estimator.network, looked_at, bracket, states)
-    return _search(estimator.ibss, blank, bracket, states, seeds) | {"brackets": None}
+        return search(estimator, blank, fleet.bracket, states, seeds) | {"seed": None}
+    return identify(estimator, blank, fleet.bracket, states)[0]
 
 
-@eqx.filter_jit
 def _identify(
     estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"]
 ) -> tuple[dict[str, Any], Seed]:
-    """What `_answers` returns, and the seed that each answer is for a search."""
+    """The results as in `_answers`, and for each answer the seed of a search."""
 
     def one(states: States) -> tuple[dict[str, Any], Seed]:
         found = estimator(problem_of(blank, states), bracket)
@@ -118,15 +119,14 @@ def _identify(
     return jax.vmap(one)(states)
 
 
-@eqx.filter_jit
 def _search(
     ibss: IBSS, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"], seeds: Seed
 ) -> dict[str, Any]:
-    """What `_answers` returns, from a search near the seeds. Its sweeps are recorded."""
+    """The results as in `_answers`, of a search near the seeds. Its sweeps are recorded."""
     ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
 
     def one(states: States, seed: Seed) -> dict[str, Any]:
-        return _kept(search_near(ibss, problem_of(blank, states), bracket, seed))
+        return _kept(search_near(ibss, problem_of(blank, states).within(bracket), seed))
 
     return jax.vmap(one)(states, seeds)
 
@@ -136,10 +136,8 @@ def _kept(found: Estimate) -> dict[str, Any]:
     return {name: getattr(found, name) for name in _KEPT} | {"half_width": half_width}
 
 
-def _estimator(name: str, network: TrainedNetwork | None) -> AbstractEstimator:
-    # A history of another length would be another program.
-    without_history = None if network is None else eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
-    return make_estimator(name, without_history)
+_COMPILED_QUICKLY = quick_jit(_identify), quick_jit(_search)
+_OPTIMISED = eqx.filter_jit(_identify), eqx.filter_jit(_search)
 
 
 def _results(
@@ -173,3 +171,28 @@ def _results(
         if found["brackets"] is not None:
             results["brackets"] = found["brackets"][0]
     return results
+
+
+def encode(results: dict[str, np.ndarray]) -> bytes:
+    """The bytes of a cell's file; equal results give equal bytes."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **results)  # pyright: ignore[reportArgumentType]
+    return buffer.getvalue()
+
+
+def decode(data: bytes) -> dict[str, np.ndarray]:
+    """The results in the bytes of a cell's file. Raises an exception of `_files.BROKEN` for other bytes."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def train_network(study: Study, job: Job) -> TrainedNetwork:
+    """Trains a network for all noises and scales of a study. Raises as `NetworkEstimator.fit` does.
+
+    The numbers are the same bit for bit only on the same number of cores, which share the products of matrices.
+    """
+    with jax.enable_x64(study.double):
+        scales, fleet = [scale or 1.0 for scale in study.scales], fleet_of(study, job)
+        settings = study.network.estimator(job.channels, (min(scales), max(scales)))
+        problem = blank_problem(study, fleet, 1.0, job.channels)
+        return settings.fit(problem, fleet.bracket, key=key_of(study.network.seed, study.jobs()[job]))

@@ -5,18 +5,16 @@ Workers need only this package. If a worker is lost, another worker repeats its 
 
 import collections
 import functools
-import tempfile
+import io
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import msgspec
 
 from ..errors import InputError
-from ..networks import TrainedNetwork, load_network, save_network
-from .network_jobs import job_number, jobs, train_network
-from .run import FAILURES, Step, compute, label_of
+from ..networks import TrainedNetwork, load_network
+from .run import Step, compute, label_of, train
 from .specification import Study
 from .store import Store
 
@@ -38,7 +36,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
     from distributed import as_completed
 
     study = store.study
-    specification, needed = msgspec.json.encode(study).decode(), jobs(study)
+    specification = msgspec.json.encode(study).decode()
+    numbers = study.jobs()
     waiting = collections.deque(store.missing())
     done = study.count - len(waiting)
     networks: dict[int, Any] = {}
@@ -61,7 +60,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         room = _AHEAD * max(_threads(client), 1) - len(running)
         for _ in range(min(room, len(waiting))):
             index = waiting.popleft()
-            number = job_number(study, study.cell(index), needed)
+            job = study.job(study.cell(index).scenario)
+            number = None if job is None else numbers[job]
             network = None if number is None else network_of(number)
             future = client.submit(remote_cell, specification, index, network, retries=_RETRIES, pure=False)
             running[future] = index, number
@@ -78,8 +78,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
             what = " ".join(str(error).split())[:300] or type(error).__name__
             raise InputError(f"cell {index}: lost by the cluster ({what}); run the study again to resume.") from None
         if number is not None and isinstance(trained, bytes):
-            store.write(store.network_file(number), trained, network=number)
-        store.write(store.cell_file(index), data, cell=index, seconds=seconds)
+            store.write_network(number, trained)
+        store.write_cell(index, data, seconds)
         done += 1
         yield Step(done, label_of(study, study.cell(index)))
         submit()
@@ -93,14 +93,7 @@ def _threads(client: Any) -> int:
 def remote_training(specification: str, number: int) -> bytes | str:
     """The bytes of a network's file, or a message that says why there is none."""
     study = msgspec.json.decode(specification, type=Study)
-    try:
-        network = train_network(study, jobs(study)[number])
-    except FAILURES as error:
-        return str(error)
-    with tempfile.TemporaryDirectory() as folder, jax.enable_x64(study.double):
-        path = Path(folder) / "network.net"
-        save_network(network, path)
-        return path.read_bytes()
+    return train(study, list(study.jobs())[number])
 
 
 def remote_cell(specification: str, index: int, network: bytes | str | None) -> tuple[bytes, float]:
@@ -112,7 +105,5 @@ def remote_cell(specification: str, index: int, network: bytes | str | None) -> 
 
 @functools.lru_cache(maxsize=2)
 def _loaded(network: bytes, double: bool) -> TrainedNetwork:
-    with tempfile.TemporaryDirectory() as folder, jax.enable_x64(double):
-        path = Path(folder) / "network.net"
-        path.write_bytes(network)
-        return load_network(path)
+    with jax.enable_x64(double):
+        return load_network(io.BytesIO(network))

@@ -18,10 +18,9 @@ from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..networks import CHECK
-from .cell_file import LEVELS, OUTCOMES
-from .flights import bracket_of, fly_again, truth_of
+from .cell import LEVELS, OUTCOMES
+from .flights import fleet_of, fly, fly_again
 from .metrics import SCENARIO
-from .network_jobs import jobs
 from .specification import AXES, Cell, Study
 from .store import RESULTS_FILE, Store
 
@@ -85,7 +84,8 @@ def assemble(store: Store) -> xr.Dataset:
             arrays["result"][lanes] = OUTCOMES.index("failed")
             # Another estimator that has run has stored the same truths, bit for bit.
             if np.isnan(arrays["truth"][shared]).all():
-                arrays["truth"][shared] = truth_of(study, cell)
+                truth = fly(study, fleet_of(study, cell.scenario), cell).truth
+                arrays["truth"][shared] = np.asarray(truth)[: flights.stop - flights.start]
             where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
             continue
@@ -153,7 +153,12 @@ def provenance(study: Study, device: str) -> dict[str, str | int]:
 def _brackets(study: Study) -> dict:
     """The brackets of all searches and networks, by model, airframe and width."""
     shape = [len(study.models), len(study.airframes), len(study.widths)]
-    brackets = [bracket_of(study, *which) for which in itertools.product(study.models, study.airframes, study.widths)]
+    first = study.cell(0).scenario
+    scenarios = [
+        first._replace(model=model, airframe=airframe, width=width)
+        for model, airframe, width in itertools.product(study.models, study.airframes, study.widths)
+    ]
+    brackets = [fleet_of(study, scenario).bracket for scenario in scenarios]
     lower, upper = (np.stack([getattr(b, end) for b in brackets]).reshape(*shape, -1) for end in ("lower", "upper"))
     dims = ("model", "airframe", "width", "parameter")
     return {
@@ -210,7 +215,7 @@ def _example(store: Store) -> dict:
 
 def _training(store: Store) -> dict:
     """The losses of the networks during training."""
-    needed = jobs(store.study)
+    needed = store.study.jobs()
     networks = [store.read_network(number) for number in range(len(needed))]
     histories = [np.zeros((0, 2)) if network is None else np.asarray(network.history) for network in networks]
     if not any(len(history) for history in histories):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
+from .._xla import quick_jit
 from ..analysis.fisher import cramer_rao_bound
 from ..bracket import Bracket
 from ..flight import Flight
@@ -26,7 +27,7 @@ _LARGEST_OFFSET = 0.8
 
 
 class Fleet(NamedTuple):
-    """What the flights of a scenario have in common at all noises."""
+    """Model, bracket and inputs of a scenario. They are the same for all noises."""
 
     model: AbstractModel
     bracket: Bracket
@@ -44,27 +45,20 @@ class Flights(NamedTuple):
 
 def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
     """Model, bracket and rotor speeds of a scenario or of a network's job."""
-    airframe = study.vehicle(scenario.airframe)
-    model = MODELS[scenario.model](airframe)
-    omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)
-    return Fleet(model, _bracket(study, model, scenario.width), omega, as_float(study.dt))
-
-
-def bracket_of(study: Study, model: str, airframe: str, width: float) -> Bracket:
-    """The bracket of all searches and networks of a model, an airframe and a width."""
     with jax.enable_x64(study.double):
-        return _bracket(study, MODELS[model](study.vehicle(airframe)), width)
+        model = MODELS[scenario.model](study.vehicle(scenario.airframe))
+        offset = study.truth == "airframe"
+        bracket = _bracket(model, np.asarray(scenario.width), key_of(study.seed, 0), offset=offset)
+        omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)
+        return Fleet(model, bracket, omega, as_float(study.dt))
 
 
-def _bracket(study: Study, model: AbstractModel, width: float) -> Bracket:
-    return _offset_bracket(model, np.asarray(width), study.seed, offset=study.truth == "airframe")
-
-
-@eqx.filter_jit
-def _offset_bracket(model: AbstractModel, width: Float[Numeric, ""], seed: int, *, offset: bool) -> Bracket:
+@quick_jit
+def _bracket(model: AbstractModel, width: Float[Numeric, ""], key: Key, *, offset: bool) -> Bracket:
+    """The bracket of all searches and networks: around the airframe's parameters, or off them."""
     center, half_width = model.alpha, width * model.half_width
     if offset:
-        key, most = key_of(seed, 0), _LARGEST_OFFSET
+        most = _LARGEST_OFFSET
         u = jax.random.uniform(key, center.shape, minval=-most, maxval=most, dtype=float)
         center = center + half_width * u
     return Bracket.around(center, half_width)
@@ -101,52 +95,28 @@ def problem_of(blank: ShootingProblem, states: States) -> ShootingProblem:
 
 def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
     """Simulates the flights of a cell. Flights of one number have the same random numbers in all scenarios."""
-    return _fly(
-        fleet,
-        *_draws(study, cell),
-        as_float(cell.scenario.scale),
-        method=cell.scenario.method,
-        kind=cell.scenario.noise,
-        drawn=study.truth == "drawn",
-    )
-
-
-def truth_of(study: Study, cell: Cell) -> np.ndarray:
-    """The true parameters of a cell's flights."""
     with jax.enable_x64(study.double):
-        fleet = fleet_of(study, cell.scenario)
-        truths = _truths(fleet, *_draws(study, cell), drawn=study.truth == "drawn")
-        return np.asarray(truths)[: study.flights - cell.first]
+        return _fly(
+            fleet,
+            cell.first + np.arange(study.batch),
+            key_of(study.seed, 1),
+            as_float(cell.scenario.scale),
+            method=cell.scenario.method,
+            kind=cell.scenario.noise,
+            drawn=study.truth == "drawn",
+        )
 
 
-def _draws(study: Study, cell: Cell) -> tuple[Int[np.ndarray, " lanes"], Key]:
-    """The numbers of a cell's flights, and the key that each number is folded into."""
-    return cell.first + np.arange(study.batch), key_of(study.seed, 1)
-
-
-def _truth(fleet: Fleet, key: Key, drawn: bool) -> Parameters:
-    truth = fleet.model.alpha
-    if not drawn:
-        return truth
-    u = jax.random.uniform(key, truth.shape, minval=-1, maxval=1, dtype=float)
-    return fleet.bracket.center + u * fleet.bracket.half_width
-
-
-@eqx.filter_jit
-def _truths(
-    fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, *, drawn: bool
-) -> Float[Array, "lanes parameters"]:
-    """The true parameters that `_fly` draws."""
-    return jax.vmap(lambda number: _truth(fleet, jax.random.split(jax.random.fold_in(key, number))[0], drawn))(numbers)
-
-
-@eqx.filter_jit
+@quick_jit
 def _fly(
     fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, scale: Scalar, *, method: str, kind: str, drawn: bool
 ) -> Flights:
     def simulated(number: Int[Array, ""]) -> tuple[Parameters, Flight, Key]:
         truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
-        truth = _truth(fleet, truth_key, drawn)
+        truth = fleet.model.alpha
+        if drawn:
+            u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
+            truth = fleet.bracket.center + u * fleet.bracket.half_width
         return truth, simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method), noise_key
 
     def measured(exact_and_key: tuple[Flight, Key]) -> States:
@@ -159,7 +129,7 @@ def _fly(
     return Flights(truth, exact.states, each(measured, (exact, noise_keys)))
 
 
-@eqx.filter_jit
+@quick_jit
 def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "lanes parameters"]:
     """The Cramer-Rao standard deviations of each flight, at the noise of a problem."""
 
@@ -177,25 +147,21 @@ def fly_again(study: Study, cell: Cell, answers: list[dict[str, np.ndarray]]) ->
     `answers`: for each estimator, the results of its cell of the same flights; NaN without an estimate.
     """
     with jax.enable_x64(study.double):
-        fleet = fleet_of(study, cell.scenario)
         parameters = np.stack([results["estimate"][0] for results in answers])
         starts = np.zeros((len(answers), 12))
         for start, results in zip(starts, answers, strict=True):
             known = results["initial_state"][0]
             start[CASCADE_ORDER[: known.size]] = known
-        return np.asarray(_simulated(fleet, as_float(parameters), as_float(starts), method=study.fit_method))
+        fleet = fleet_of(study, cell.scenario)
+        states = _fly_from(fleet, as_float(starts), as_float(parameters), method=study.fit_method)
+        return np.where(np.isfinite(parameters).all(axis=1).reshape(-1, 1, 1), states, np.nan)
 
 
-@eqx.filter_jit
-def _simulated(
-    fleet: Fleet,
-    parameters: Float[Array, "estimators parameters"],
-    starts: Float[Array, "estimators 12"],
-    *,
-    method: str,
-) -> Float[Array, "estimators samples 12"]:
-    def one(parameters: Parameters, start: Float[Array, "12"]) -> States:
-        flight = simulate(fleet.model, parameters, fleet.omega, dt=fleet.dt, initial_state=start, method=method)
-        return jnp.where(jnp.isfinite(parameters).all(), flight.states, jnp.nan)
+@quick_jit
+def _fly_from(
+    fleet: Fleet, starts: Float[Array, "lanes 12"], parameters: Float[Array, "lanes parameters"], *, method: str
+) -> Float[Array, "lanes samples 12"]:
+    def one(start: Float[Array, "12"], parameters: Parameters) -> States:
+        return simulate(fleet.model, parameters, fleet.omega, dt=fleet.dt, initial_state=start, method=method).states
 
-    return jax.vmap(one)(parameters, starts)
+    return jax.vmap(one)(starts, parameters)

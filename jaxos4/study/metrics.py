@@ -44,7 +44,7 @@ def was_run(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def result_counts(dataset: xr.Dataset) -> xr.DataArray:
-    """How many flights ended with each result, along `code`."""
+    """The number of flights with each result, along `code`."""
     known = codes(dataset)
     counts = [(dataset["result"] == value).sum("flight") for value in known.values()]
     return xr.concat(counts, dim=xr.DataArray(list(known), dims="code", name="code"))
@@ -61,23 +61,22 @@ def no_percentage(dataset: xr.Dataset) -> xr.DataArray:
     1 if the truth of any flight is 0; else 2 if the truth of any flight is below its noise floor, `NINETY_FIVE` bounds:
     it cannot be distinguished from 0, so that its relative error is arbitrary. 0 otherwise.
     """
-    return _no_percentage(dataset["truth"], dataset["bound"])
+    return _no_percentage(dataset, dataset["bound"])
 
 
 def estimator_error(dataset: xr.Dataset) -> xr.Dataset:
     """Root mean square error of converged flights: in `percent` of each flight's truth, and `absolute`."""
-    return _both(error(dataset), dataset["truth"], no_percentage(dataset))
+    return _both(dataset, error(dataset), dataset["bound"])
 
 
 def bound_error(dataset: xr.Dataset) -> xr.Dataset:
     """The Cramer-Rao bound in the form of `estimator_error`: root mean square over all flights."""
-    return _both(dataset["bound"], dataset["truth"], no_percentage(dataset))
+    return _both(dataset, dataset["bound"], dataset["bound"])
 
 
 def center_error(dataset: xr.Dataset) -> xr.Dataset:
     """The error of the bracket's centre, in the form of `estimator_error`; `reason` is by the smallest bound."""
-    truth = dataset["truth"]
-    return _both(dataset["center"] - truth, truth, _no_percentage(truth, dataset["bound"].min("estimator")))
+    return _both(dataset, dataset["center"] - dataset["truth"], dataset["bound"].min("estimator"))
 
 
 def normalised_error(dataset: xr.Dataset) -> xr.DataArray:
@@ -153,13 +152,14 @@ def _one_of(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
     return dataset["result"].isin([known[name] for name in names if name in known])
 
 
-def _no_percentage(truth: xr.DataArray, bound: xr.DataArray) -> xr.DataArray:
-    zero = (truth == 0).any("flight")
+def _no_percentage(dataset: xr.Dataset, bound: xr.DataArray) -> xr.DataArray:
+    truth = dataset["truth"]
     below = (abs(truth) < NINETY_FIVE * bound).any("flight")
-    return xr.where(zero, 1, xr.where(below, 2, 0))
+    return xr.where((truth == 0).any("flight"), 1, xr.where(below, 2, 0))
 
 
-def _both(values: xr.DataArray, truth: xr.DataArray, reason: xr.DataArray) -> xr.Dataset:
+def _both(dataset: xr.Dataset, values: xr.DataArray, bound: xr.DataArray) -> xr.Dataset:
+    truth, reason = dataset["truth"], _no_percentage(dataset, bound)
     percent = (100 * values / abs(truth.where(truth != 0))).where(reason == 0)
     return xr.Dataset({"percent": _rms(percent), "absolute": _rms(values), "reason": reason})
 

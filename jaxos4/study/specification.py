@@ -46,7 +46,7 @@ _MOST_SAMPLES = 1_000_000
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the networks of a study are trained: the table `network` of the specification. See `NetworkEstimator`.
+    """Training of a study's networks: the table `network` of the specification. See `NetworkEstimator`.
 
     - `hybrid_channels`: the channels that the hybrid's network looks at, at most those of the scenario. A network
       alone looks at the rates.
@@ -59,14 +59,10 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     hybrid_channels: Literal["rates", "attitude", "all"] = "all"
     seed: Seed = 0
 
-    def estimator(self, **settings: Any) -> NetworkEstimator:
+    def estimator(self, channels: str, noise: tuple[float, float]) -> NetworkEstimator:
         """The network to be trained. Raises `ValueError` as `NetworkEstimator` does."""
         return NetworkEstimator(
-            features=self.features,
-            approximator=self.approximator,
-            steps=self.steps,
-            held_out=self.held_out,
-            **settings,
+            self.features, self.approximator, channels, noise, steps=self.steps, held_out=self.held_out
         )
 
 
@@ -85,11 +81,6 @@ class Scenario(NamedTuple):
     estimator: str
 
     @property
-    def needs_network(self) -> bool:
-        """Whether the estimator is made from a trained network."""
-        return ESTIMATORS[self.estimator].needs_network
-
-    @property
     def seen(self) -> str:
         """The channels that the estimator looks at."""
         return min(self.channels, ESTIMATORS[self.estimator].looks_at, key=CHANNELS.__getitem__)
@@ -99,7 +90,7 @@ AXES = tuple(field if field.endswith("s") else f"{field}s" for field in Scenario
 
 
 class Job(NamedTuple):
-    """What a network is trained for."""
+    """A network to be trained: `channels` are those that it looks at."""
 
     model: str
     airframe: str
@@ -186,7 +177,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise InputError("`title` has a line break or another control character; remove it.")
         for name, table in self.airframe.items():
             if not (name.isprintable() and name.strip()):
-                raise InputError(f"[airframe.{_short(name)}]: its name is empty or not printable; rename it.")
+                raise InputError(f"[airframe.{name[:60]!r}]: its name is empty or not printable; rename it.")
             if name not in self.airframes:
                 raise InputError(f"[airframe.{name}] is not flown; name it in `airframes`, or remove it.")
             if not all(math.isfinite(value) for value in table.values() if isinstance(value, float)):
@@ -212,7 +203,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             except ValueError as error:
                 raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
         try:
-            self.network.estimator()
+            self.network.estimator("rates", NetworkEstimator.noise)
         except ValueError as error:
             raise InputError(f"`network`: {error}") from None
 
@@ -239,9 +230,26 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise ValueError(f"a rotor would exceed the `max_rotor_speed` of {fastest:g} rad/s; design another input.")
         return as_float(speeds)
 
+    def job(self, scenario: Scenario) -> Job | None:
+        """The network that a scenario's estimator needs; `None` if it needs none."""
+        kind = ESTIMATORS[scenario.estimator]
+        if not kind.needs_network:
+            return None
+        channels = self.seed_channels(scenario) if kind.shoots else scenario.seen
+        return Job(scenario.model, scenario.airframe, scenario.excitation, scenario.duration, scenario.width, channels)
+
+    def seed_channels(self, scenario: Scenario) -> str:
+        """The channels that a hybrid's network looks at: it only says where to shoot."""
+        return min(scenario.seen, self.network.hybrid_channels, key=CHANNELS.__getitem__)
+
+    def jobs(self) -> dict[Job, int]:
+        """The networks that the study needs, with their numbers."""
+        needed = (self.job(self.cell(index).scenario) for index in range(0, self.count, self.blocks))
+        return {job: number for number, job in enumerate(dict.fromkeys(job for job in needed if job))}
+
     @property
     def double(self) -> bool:
-        """Whether the study is computed in double precision."""
+        """True if the study is computed in double precision."""
         return self.precision == "float64"
 
     @property
@@ -322,14 +330,3 @@ def _in_words(message: str) -> str:
         choices = get_args(get_type_hints(known)[key.removeprefix("network.")])
         return f"`{key}`: unknown {complaint.removeprefix('Invalid enum value ')}; choose from {', '.join(choices)}"
     return f"`{key}`: {complaint[:1].lower()}{complaint[1:]}" if key else complaint
-
-
-def differences(now: Study, before: Study) -> list[str]:
-    """How a specification differs from an earlier one, a phrase for each key."""
-    a, b = msgspec.to_builtins(now), msgspec.to_builtins(before)
-    return [f"`{key}` was {_short(b.get(key))}, now {_short(a.get(key))}" for key in a if a.get(key) != b.get(key)]
-
-
-def _short(value: Any) -> str:
-    text = msgspec.json.encode(value).decode()
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -5,6 +5,7 @@ ends with its process, even if the process is killed.
 """
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -20,8 +21,8 @@ import numpy as np
 from .._files import BROKEN, write_atomically
 from ..errors import InputError
 from ..networks import TrainedNetwork, load_network
-from .cell_file import decode
-from .specification import Study, differences
+from .cell import decode
+from .specification import Study
 
 RESULTS_FILE = "results.nc"
 _SPECIFICATION, _LOCK, _LOG = "study.json", "lock", "log.jsonl"
@@ -29,18 +30,21 @@ _SPECIFICATION, _LOCK, _LOG = "study.json", "lock", "log.jsonl"
 _UNFINISHED = ".*.part*"
 
 
+@dataclasses.dataclass(frozen=True)
 class Store:
     """A study's folder, made by `open_store`, or by `read_store` to read only."""
 
-    def __init__(self, directory: Path, study: Study, device: str, version: str):
-        self.directory, self.study, self.device, self.version = directory, study, device, version
+    directory: Path
+    study: Study
+    device: str
+    version: str
 
     def cell_file(self, index: int) -> Path:
         """The file of a cell."""
         return self.directory / "cells" / f"{index:08d}.npz"
 
     def network_file(self, number: int) -> Path:
-        """The file of a network, by its place in `jobs`."""
+        """The file of a network, by its place in `Study.jobs`."""
         return self.directory / "networks" / f"{number:04d}.net"
 
     def missing(self) -> list[int]:
@@ -59,11 +63,15 @@ class Store:
             what = " ".join(str(error).split())[:120]
             raise InputError(f"{path}: not a whole cell ({what}); delete it, and run the study again.") from None
 
-    def write(self, path: Path, data: bytes, **entry: Any) -> None:
-        """Writes a file of the study, and an entry of the log."""
-        with write_atomically(path) as beside:
-            beside.write_bytes(data)
-        self.log(**entry)
+    def write_cell(self, index: int, data: bytes, seconds: float) -> None:
+        """Writes the file of a cell, and an entry of the log with the seconds that it took."""
+        _write(self.cell_file(index), data)
+        self.log(cell=index, seconds=seconds)
+
+    def write_network(self, number: int, data: bytes, **entry: Any) -> None:
+        """Writes the file of a network, and an entry of the log."""
+        _write(self.network_file(number), data)
+        self.log(network=number, **entry)
 
     def log(self, **entry: Any) -> None:
         """Adds an entry to the log."""
@@ -109,7 +117,6 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
     run is computing; `OSError` if it cannot be written to.
     """
     _check_folder(directory)
-    specification = directory / _SPECIFICATION
     directory.mkdir(parents=True, exist_ok=True)
     lock = filelock.FileLock(directory / _LOCK, timeout=0)
     try:
@@ -118,14 +125,10 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
         what = "another run is at work on this study; wait for its end, or give another folder."
         raise InputError(f"{directory}: {what}") from None
     try:
-        if specification.exists():
-            store = read_store(directory)
-            _check_same(directory, study, store.study)
-        else:
-            store = Store(directory, study, device, importlib.metadata.version("jaxos4"))
+        store = check_store(directory, study, device)
+        if not (directory / _SPECIFICATION).exists():
             header = {"version": store.version, "device": device, "study": study}
-            with write_atomically(specification) as beside:
-                beside.write_bytes(msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
+            _write(directory / _SPECIFICATION, msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
         for folder in (directory, directory / "cells", directory / "networks"):
             folder.mkdir(exist_ok=True)
             for unfinished in folder.glob(_UNFINISHED):
@@ -163,13 +166,16 @@ class _Header(_Version):
     study: Study
 
 
-def check_store(directory: Path, study: Study) -> Store:
+def check_store(directory: Path, study: Study, device: str = "") -> Store:
     """The folder of a study as a run would find it; nothing is written. Raises `InputError` as `open_store` does."""
     _check_folder(directory)
     if not (directory / _SPECIFICATION).exists():
-        return Store(directory, study, "", "")
+        return Store(directory, study, device, importlib.metadata.version("jaxos4"))
     store = read_store(directory)
-    _check_same(directory, study, store.study)
+    now, before = msgspec.to_builtins(study), msgspec.to_builtins(store.study)
+    changed = [f"`{key}` was {_short(before[key])}, now {_short(now[key])}" for key in now if now[key] != before[key]]
+    if changed:
+        raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")
     return store
 
 
@@ -183,6 +189,11 @@ def _check_folder(directory: Path) -> None:
         raise InputError(f"{directory}: holds {min(names)} and no study; give an empty or a new folder.")
 
 
-def _check_same(directory: Path, wanted: Study, stored: Study) -> None:
-    if changed := differences(wanted, stored):
-        raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")
+def _short(value: Any) -> str:
+    text = msgspec.json.encode(value).decode()
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _write(path: Path, data: bytes) -> None:
+    with write_atomically(path) as beside:
+        beside.write_bytes(data)

@@ -10,7 +10,7 @@ from benchmarks.case import Case
 
 import jaxos4
 from jaxos4.estimators import make_estimator
-from jaxos4.study.devices import use_all_cores
+from jaxos4.study import use_all_cores
 
 jax.config.update("jax_enable_x64", True)
 
@@ -41,28 +41,25 @@ def fit(
     if all_cores:
         use_all_cores()
     problem, lanes = problem_of(case, channels), min(lanes, case.flights)
-    places, names = np.arange(parameters), problem.model.parameter_names
-    held = {name: case.truth[place] for place, name in enumerate(names) if place >= parameters}
+    held = dict(zip(problem.unknowns.names[parameters:], case.truth[parameters:], strict=True))
     if held:
-        problem = eqx.tree_at(lambda p: p.model, problem, jaxos4.hold(problem.model, held))
+        problem = problem.hold(held)
     searching = _estimator(estimator, problem, case)
 
     def identify(measured, center):
         data = eqx.tree_at(lambda p: p.flight.states, problem, measured)
-        found = searching(data, jaxos4.Bracket.around(center, case.half_width[places]))
+        found = searching(data, jaxos4.Bracket.around(center, case.half_width))
         return found.parameters, found.initial_state
 
-    measured, starts = jnp.asarray(case.measured), jnp.asarray(case.starts[:, places])
+    measured, starts = jnp.asarray(case.measured), jnp.asarray(case.starts)
     groups = [slice(first, first + lanes) for first in range(0, case.flights, lanes)]
     compiled = jax.jit(for_all_flights(identify, all_cores)).lower(measured[:lanes], starts[:lanes]).compile()
 
     def run() -> dict:
         found = [jax.block_until_ready(compiled(measured[g], starts[g])) for g in groups]
-        answer = np.broadcast_to(case.truth, case.starts.shape).copy()
-        answer[:, places] = np.concatenate([p for p, _ in found])
         first = np.zeros((case.flights, 12))
         first[:, problem.columns] = np.concatenate([x for _, x in found])
-        return {"parameters": answer, "first": first}
+        return {"parameters": np.concatenate([p for p, _ in found]), "first": first}
 
     return run
 

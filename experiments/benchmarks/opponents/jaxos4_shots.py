@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.case import Case
 from benchmarks.opponents.jaxos4_fit import for_all_flights, problem_of
 
-from jaxos4.study.devices import use_all_cores
+from jaxos4.study import use_all_cores
 
 BLOCK = 32  # shots at a time
 

@@ -1,0 +1,118 @@
+"""Functions that the experiments share: batched identification, tables, Datasets and figure files."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float, Key as Keys
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from jaxos4._custom_types import Key, States
+from jaxos4._files import write_atomically
+from jaxos4.bracket import Bracket
+from jaxos4.estimate import AbstractEstimator, Estimate
+from jaxos4.flight import Flight
+from jaxos4.models.abstract import AbstractModel
+from jaxos4.noise import AbstractNoise
+from jaxos4.report.study_terminal import run_with_bar
+from jaxos4.report.style import Style, drawing, pdf, svg
+from jaxos4.shooting import ShootingProblem
+from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset, use_all_cores as use_all_cores
+
+PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
+"""Column headings of the eight alphas."""
+
+
+def run_studies(studies: dict[str, Study], out: Path) -> None:
+    """Runs or resumes each study in the folder of its name in `out`. Raises what `open_store` raises."""
+    for name, study in studies.items():
+        run_with_bar(study, out / name)
+
+
+def save_results(dataset: xr.Dataset, study: Study, out: Path) -> None:
+    """Writes a Dataset that was not computed by the cells of `study`, with the provenance of `study`, into a folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    save_dataset(dataset.assign_attrs(provenance(study, device_name())), out)
+
+
+def load_results(directory: Path) -> xr.Dataset:
+    """Reads the Dataset that `save_results` wrote."""
+    return xr.load_dataset(directory / RESULTS_FILE, engine="h5netcdf")
+
+
+def table_of(title: str, headings: Iterable[str]) -> Table:
+    """An empty table for the terminal. Only the column `results` wraps its lines."""
+    table = Table(title=title)
+    for heading in headings:
+        table.add_column(heading, no_wrap=heading != "results")
+    return table
+
+
+@eqx.filter_jit
+def measure(noise: AbstractNoise, exact: Flight, keys: Keys[Array, " flights"]) -> Float[Array, "flights samples 12"]:
+    """The states of a flight as noisy sensors measure them, once for each key."""
+    return jax.lax.map(lambda key: noise(exact, key=key).states, keys)
+
+
+@eqx.filter_jit
+def identify(
+    estimator: AbstractEstimator,
+    problem: ShootingProblem,
+    brackets: Bracket,
+    states: Float[Array, "flights samples 12"],
+) -> Estimate:
+    """Identifies many flights in one call; flight i has the measurements `states[i]` and the bracket `brackets[i]`."""
+
+    def one(bracket: Bracket, states: States) -> Estimate:
+        return estimator(eqx.tree_at(lambda p: p.flight.states, problem, states), bracket)
+
+    return jax.vmap(one)(brackets, states)
+
+
+def brackets_around(model: AbstractModel, keys: Keys[Array, " flights"], share: float = 0.8) -> Bracket:
+    """For each key, a bracket of the default width. Its centre lies within `share` half-widths of the truth."""
+
+    def one(key: Key) -> Bracket:
+        offset = jax.random.uniform(key, model.alpha.shape, minval=-share, maxval=share, dtype=float)
+        return Bracket.around(model.alpha + offset * model.half_width, model.half_width)
+
+    return jax.vmap(one)(keys)
+
+
+def count_results(names: np.ndarray) -> dict[str, int]:
+    """The number of estimates by result, from their `result_names`."""
+    found, counts = np.unique(names, return_counts=True)
+    return dict(zip(found.tolist(), counts.tolist(), strict=True))
+
+
+def in_words(counts: dict[str, int]) -> str:
+    """The counts of `count_results` as the text of a table cell."""
+    return ", ".join(f"{count} {what}" for what, count in counts.items())
+
+
+def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) -> None:
+    """Draws a figure in the style of this library and writes it as SVG and PDF; nothing if `draw` returns `None`."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with drawing():
+        figure = draw()
+        if figure is None:
+            return
+        for suffix, render in ((".svg", svg), (".pdf", pdf)):
+            with write_atomically(directory / f"{name}{suffix}") as beside:
+                beside.write_bytes(render(figure))
+
+
+def draw_spread(panel: Axes, x: np.ndarray, values: xr.DataArray, look: Style, label: str) -> None:
+    """Draws the geometric mean over the parameters at each x, with a bar from the smallest to the largest."""
+    values = values.transpose(..., "parameter")
+    finite = values.notnull().any("parameter").values
+    logarithm = xr.apply_ufunc(np.log, values.where(values > 0))
+    mean = np.exp(logarithm.mean("parameter").values)
+    panel.plot(x, mean, color=look.color, marker=look.marker, linestyle=look.dash, label=label)
+    low, high = (end.values[finite] for end in (values.min("parameter"), values.max("parameter")))
+    panel.vlines(x[finite], low, high, color=look.color, linewidth=1.0)

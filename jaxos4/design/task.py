@@ -1,0 +1,251 @@
+"""A design: the search for the most informative inputs within an envelope, and a comparison with standard inputs.
+
+The search minimises criterion + penalty by BFGS. The penalty grows from stage to stage, so that the limits hold better
+and better. They hold exactly only after the task has flown the inputs and has reduced their amplitude.
+
+Reference: Nocedal and Wright, Numerical Optimization, ch. 6 (BFGS) and 17 (penalty).
+"""
+
+import abc
+import math
+from collections.abc import Callable, Mapping
+from os import PathLike
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+from jaxtyping import Array, Float
+
+from .._custom_types import Key, Numeric, Scalar, as_float
+from .._xla import quick_jit
+from ..errors import InputError
+from ..linalg import gram, joint_factor
+from .envelope import Envelope, Uses
+
+Coefficients = Float[Array, " coefficients"]
+Inputs = Float[np.ndarray, "samples 4"]
+# Inputs, and the largest share of each limit that a vehicle uses.
+Flown = tuple[Inputs, dict[str, float]]
+Progress = Callable[[str], None]
+
+CRITERIA = ("D", "A", "worst")
+# In the criterion `worst`, the largest bound is replaced by this norm of the bounds, which has derivatives.
+_NORM = 16
+# The penalty of each stage.
+_PENALTIES = (10.0, 50.0, 250.0, 1250.0, 6000.0)
+# BFGS starts with a unit matrix as second derivative, so its unknowns are coefficients over their usual size.
+_UNIT = 0.1
+_TOLERANCE = 1e-6
+
+
+class Designed(NamedTuple):
+    """Inputs of a flight, and the accuracy of an estimate from it.
+
+    - `inputs`: rotor speeds [rad/s], held from sample to sample; or references of roll, pitch and yaw angle [rad] and
+      vertical acceleration [m/s^2], as `fly_closed_loop` takes them.
+    - `dt`: the sample time [s].
+    - `bounds`: the smallest standard deviation that each parameter can have after the flight.
+    - `uses`: the largest share of each limit that any vehicle of the bracket uses, by the name of the limit; at most 1.
+      Empty if no vehicle was flown to find out.
+    - `period`: the time after which the inputs repeat [s]; the whole flight if they do not.
+    - `history`: the bounds after each sample. Infinite as long as a parameter is not excited. `None`: the bounds fall
+      with the square root of the duration.
+    """
+
+    inputs: Inputs
+    dt: float
+    bounds: Float[np.ndarray, " parameters"]
+    uses: dict[str, float]
+    period: float
+    history: Float[np.ndarray, "samples parameters"] | None = None
+
+    @property
+    def duration(self) -> float:
+        """The length of the flight [s]."""
+        return self.dt * (self.inputs.shape[0] - 1)
+
+    def shortest(self, wanted: Float[Numeric, " targets"]) -> Float[np.ndarray, " targets"]:
+        """The shortest flights [s] after which the first parameters can have the standard deviations `wanted`.
+
+        Longer flights repeat the inputs. Each repetition adds the same information, so the bounds fall with the square
+        root of the duration. For references, shorter flights cut a period, which is not exact.
+        """
+        wanted = np.asarray(wanted)
+        repeated = self.duration * np.square(self.bounds[: wanted.size] / wanted)
+        if self.history is None:
+            return repeated
+        enough = self.history[:, : wanted.size] <= wanted
+        return np.where(enough.any(axis=0), self.dt * np.argmax(enough, axis=0), repeated)
+
+
+class AbstractTask(eqx.Module):
+    """A kind of input: how coefficients become a flight, its limits, its information, and its file.
+
+    - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
+    - `size`: the number of coefficients. `starts`: the number of searches. `first`: the length of their first
+      coefficients. `steps`: the number of steps of BFGS in a stage.
+    - `names`, `units`: those of the parameters. The targets of the design come first.
+    - `scale`: for each target, a size of which accuracies are shares.
+    - `unexcited`: a parameter whose bound is not below this counts as not excited.
+    """
+
+    kind: ClassVar[str]
+    vehicles: ClassVar[int]
+    starts: ClassVar[int]
+    first: ClassVar[float]
+    steps: ClassVar[int]
+    size: eqx.AbstractVar[int]
+    envelope: eqx.AbstractVar[Envelope]
+    names: eqx.AbstractVar[tuple[str, ...]]
+    units: eqx.AbstractVar[tuple[str, ...]]
+    scale: eqx.AbstractVar[Float[Numeric, " targets"]]
+    unexcited: eqx.AbstractVar[Float[Numeric, " parameters"]]
+
+    @abc.abstractmethod
+    def objective(self, coefficients: Coefficients) -> Scalar:
+        """The criterion of the information that the flight gives: smaller is better."""
+
+    @abc.abstractmethod
+    def uses(self, coefficients: Coefficients) -> Uses:
+        """The shares of the limits at each sample, which should be at most 1."""
+
+    @abc.abstractmethod
+    def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
+        """The inputs, with an amplitude at which all vehicles keep the limits."""
+
+    @abc.abstractmethod
+    def standard(self) -> dict[str, Flown]:
+        """The standard inputs that fit into the time, by name."""
+
+    @abc.abstractmethod
+    def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
+        """The bounds of several inputs."""
+
+    @abc.abstractmethod
+    def write(self, designed: Designed, path: str | PathLike[str]) -> None:
+        """Write the inputs as CSV."""
+
+
+class Design(NamedTuple):
+    """Designed inputs, and the standard inputs of the same length.
+
+    - `task`: its `envelope` has the limits, its `names` and `units` are those of the parameters.
+    - `standard`: by name; empty if they were not to be compared. One that does not fit into the time is missing.
+    """
+
+    task: AbstractTask
+    designed: Designed
+    standard: dict[str, Designed]
+
+    def gain(self, name: str) -> tuple[float, int]:
+        """The designed bounds over those of a standard input.
+
+        **Returns:** the geometric mean over the targets that the standard input excites, NaN without any; and their
+        number.
+        """
+        count = self.task.scale.size
+        own, other = (one.bounds[:count] for one in (self.designed, self.standard[name]))
+        excited = other < self.task.unexcited[:count]
+        mean = float(np.exp(np.log(own / other)[excited].mean())) if excited.any() else math.nan
+        return mean, int(excited.sum())
+
+
+def solve(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -> Design:
+    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`."""
+    progress("compiling the search")
+    directions = jax.random.normal(jax.random.fold_in(key, 2), (task.starts, task.size), dtype=float)
+    starts = task.first / math.sqrt(task.size) * directions
+    costs = np.zeros(task.starts)
+    for number, penalty in enumerate(_PENALTIES, start=1):
+        starts, costs = jax.block_until_ready(_minimise(task, starts, as_float(penalty)))
+        progress(f"search, stage {number} of {len(_PENALTIES)}")
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    progress(f"flying {task.vehicles} vehicles")
+    flown = {"designed": task.flown(np.asarray(starts)[best])}
+    progress("bounds")
+    judged = task.judged(flown | (task.standard() if compare else {}))
+    return Design(task, judged.pop("designed"), judged)
+
+
+@quick_jit
+def _minimise(
+    task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar
+) -> tuple[Float[Array, "starts coefficients"], Float[Array, " starts"]]:
+    """One stage of all searches: their last coefficients and costs. A trial whose simulation fails is rejected."""
+
+    def cost(scaled: Coefficients, penalty: Scalar) -> Scalar:
+        uses = jax.tree.leaves(task.uses(_UNIT * scaled))
+        excess = sum(jnp.square(jnp.maximum(jnp.square(use) - 1, 0)).sum() / use.shape[0] for use in uses)
+        return task.objective(_UNIT * scaled) + penalty / 2 * excess
+
+    def one(start: Coefficients) -> tuple[Coefficients, Scalar]:
+        solver = optimistix.BFGS(_TOLERANCE, _TOLERANCE)
+        found = optimistix.minimise(cost, solver, start / _UNIT, penalty, max_steps=task.steps, throw=False)
+        return _UNIT * found.value, found.state.f_info.f
+
+    return jax.vmap(one)(starts)
+
+
+def bounds_of(information: Float[Array, "unknowns unknowns"], count: int) -> tuple[Float[Array, "count count"], Scalar]:
+    """The smallest covariance of the first `count` unknowns, and the logarithm of its determinant.
+
+    The other unknowns are nuisances: estimated too, and eliminated by the Schur complement.
+    """
+    factor, basis = joint_factor(information[None], count)
+    determinant = -2 * jnp.log(jnp.diagonal(factor[0, :count, -count:])).sum()
+    return gram(basis[0, :count, -count:]), determinant
+
+
+def criterion_of(
+    information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str
+) -> Scalar:
+    """The logarithm of a mean relative bound of the first unknowns. Smaller is better.
+
+    A bound is a standard deviation as a share of the `half_width` of its parameter's bracket.
+
+    - `"D"`: the volume of the confidence ellipsoid, as the edge of a cube of that volume.
+    - `"A"`: the root of the mean of the squared bounds.
+    - `"worst"`: the largest bound.
+    """
+    count = half_width.shape[0]
+    covariance, determinant = bounds_of(information, count)
+    if criterion == "D":
+        return (determinant / 2 - jnp.log(half_width).sum()) / count
+    squares = jnp.diagonal(covariance) / jnp.square(half_width)
+    if criterion == "A":
+        return jnp.log(squares.mean()) / 2
+    largest = squares.max()
+    return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (_NORM / 2)).sum()) / _NORM
+
+
+class Ranges(NamedTuple):
+    """The settings that can be designed for.
+
+    - `samples`: the fewest and the most. `remedy`: the remedy if a flight is too long.
+    - `cycles`: the least number of cycles of the fastest tone. `fastest`: its largest frequency over the sample rate.
+    """
+
+    samples: tuple[int, int]
+    cycles: int
+    fastest: float
+    remedy: str = ""
+
+    def check(self, duration: float, dt: float, bandwidth: float, criterion: str) -> None:
+        """Raise `InputError` for settings that are out of range."""
+        for name, value in (("duration", duration), ("dt", dt)):
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"`{name}` must be positive and finite [s], got {value:g}.")
+        if not self.samples[0] <= duration / dt <= self.samples[1]:
+            allowed = f"{self.samples[0]} to {self.samples[1]} samples of {dt:g} s (`dt`)"
+            raise InputError(f"`duration` must be {allowed}, got {duration:g} s{self.remedy}.")
+        if criterion not in CRITERIA:
+            raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
+        low, high = self.cycles / duration, self.fastest / dt
+        if not low <= bandwidth <= high:
+            raise InputError(
+                f"`bandwidth` must lie between {self.cycles} / `duration` and {self.fastest:g} / `dt`, {low:.3g} to "
+                f"{high:.3g} Hz, got {bandwidth:g} Hz."
+            )

@@ -1,0 +1,124 @@
+"""Parameters and moments of inertia with their intervals, from the estimate of a fit."""
+
+import msgspec
+import numpy as np
+
+from .._custom_types import Parameters
+from .._xla import quick_jit
+from ..analysis.identifiability import identifiability_of
+from ..analysis.inertia import fit_inertia
+from ..bracket import is_identifiable
+from ..estimate import Estimate
+from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from ..models.corrected import CorrectedOS4
+from .fit import Fit
+from .prepare import Case
+from .results import Constant, ParameterEstimate, RigidBody, finite_or_none
+
+_UNIT = "kg m^2"
+# The place of the alpha that is torque over this moment of inertia.
+_INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
+# The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
+_UNKNOWN = 1e3
+
+
+def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
+    """Estimates by parameter name, without those that are held.
+
+    The rule of `jaxos4.bracket.is_identifiable` decides which have an estimate. The others have a note instead.
+    """
+    estimate, unknowns = fit.estimate, fit.problem.unknowns
+    std, width = map(np.asarray, _intervals(estimate))
+    values, half_width, free = np.asarray(estimate.parameters), np.asarray(unknowns.half_width), fit.free
+    identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, case.prior))
+    reasons = dict.fromkeys(unknowns.names, "not identifiable from this flight")
+    limits: dict[str, float | None | msgspec.UnsetType] = dict.fromkeys(unknowns.names, msgspec.UNSET)
+    if not case.is_vehicle:
+        limits = dict.fromkeys(unknowns.names)
+    if fit.evaluation is not None:
+        information = identifiability_of(fit.evaluation, unknowns.bracket)
+        notes, known = information.notes(unknowns.names), information.identifiable & information.excited
+        reasons |= {name: notes[name] for i, name in enumerate(unknowns.names) if not known[i] and name in notes}
+        limits = {name: finite_or_none(x) for name, x in zip(unknowns.names, information.noise_limit, strict=True)}
+    return {
+        (name := unknowns.names[i]): ParameterEstimate(
+            estimate=float(values[i]) if identifiable[i] else None,
+            std=finite_or_none(std[i]),
+            bound=finite_or_none(fit.bound[i]),
+            ci95=(float(values[i] - width[i]), float(values[i] + width[i])) if identifiable[i] else None,
+            unit=unknowns.units[i],
+            note=_note(fit, i, float(width[i])) if identifiable[i] else reasons[name],
+            noise_limit=limits[name],
+        )
+        for i in free
+    }
+
+
+@quick_jit  # one compiled program instead of one for each operation
+def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
+    return estimate.std, estimate.half_width(0.95)
+
+
+def _note(fit: Fit, i: int, half_width: float) -> str:
+    value, seed, bracket = (
+        float(np.asarray(fit.estimate.parameters)[i]),
+        fit.estimate.seed,
+        fit.problem.unknowns.bracket,
+    )
+    notes = ["below noise"] if abs(value) < half_width else []
+    if not np.asarray(bracket.lower)[i] <= value <= np.asarray(bracket.upper)[i]:
+        notes.append("outside its bracket")
+    if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
+        notes.append("outside the network's interval")
+    return "; ".join(notes)
+
+
+def rigid_body(case: Case, fit: Fit) -> RigidBody:
+    """The moments of inertia that explain the estimate best."""
+    model = fit.problem.model
+    return vehicle_constants(fit) if case.is_vehicle else flight_constants(model, fit.estimate)
+
+
+def flight_constants(model: AbstractModel, estimate: Estimate) -> RigidBody:
+    """Ix, Iy, Iz and J_R of the rigid body that explains the alphas of a flight best; none if not identifiable."""
+    if model.parameter_names != PARAMETER_NAMES:
+        return RigidBody()
+    rigid = fit_inertia(model, estimate.parameters, estimate.covariance)
+    values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
+    if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
+        return RigidBody()
+    table = zip(("Ix", "Iy", "Iz", "J_R"), values.tolist(), std.tolist(), strict=True)
+    constants = {name: Constant(value, error, _UNIT) for name, value, error in table}
+    return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
+
+
+def vehicle_constants(fit: Fit) -> RigidBody:
+    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated.
+
+    If torques exceed the airframe's by an estimated factor, it divides the alphas.
+    """
+    model, free = fit.problem.model, fit.free
+    names, values = [model.parameter_names[i] for i in free], np.asarray(fit.estimate.parameters)
+    scales = [i for i in free if model.parameters[i].scales_torque]
+    gain = scales[0] if scales else None
+    bracket, slopes = fit.problem.unknowns, np.zeros((8, values.size))
+    alpha, variance = np.asarray(bracket.center)[:8].copy(), (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2
+    for row, name in enumerate(PARAMETER_NAMES):
+        if name not in names:
+            continue
+        alpha[row], slopes[row, row], variance[row] = values[row], 1.0, 0.0
+        if gain is not None and row in _INVERSE.values():
+            alpha[row] /= values[gain]
+            slopes[row, row], slopes[row, gain] = 1 / values[gain], -alpha[row] / values[gain]
+    covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(variance)
+    constants, thrust = {}, "thrust_coefficient" if gain is None else "mass"
+    notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and drag are right"}
+    for name, row in _INVERSE.items():
+        if PARAMETER_NAMES[row] in names and alpha[row] > 0:
+            std = float(np.sqrt(covariance[row, row])) / alpha[row] ** 2
+            constants[name] = Constant(1 / float(alpha[row]), float(std), _UNIT, notes[name])
+    # Alphas that are held are no evidence for or against a rigid body.
+    if not set(PARAMETER_NAMES) <= set(names):
+        return RigidBody(constants)
+    rigid = fit_inertia(CorrectedOS4(model.airframe), alpha, covariance)
+    return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))

@@ -1,0 +1,225 @@
+"""The fit: the parameters with their errors, and the noise that belongs to them.
+
+The noise of a simulated likelihood is that of the sensors; it follows from the residuals, and the fit is repeated with
+it. A likelihood of innovations has its noise among its unknowns, and is fitted once.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from .._custom_types import as_float
+from ..analysis.diagnostics import Diagnostics
+from ..analysis.evaluation import Evaluation
+from ..analysis.sandwich import robust_covariance_of
+from ..bracket import GAUSSIAN_PRIOR, is_identifiable
+from ..estimate import AbstractEstimator, Estimate
+from ..results import RESULTS
+from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
+from ..shooting.filters import LogNoise
+from .jackknife import disagreement, parts_of
+from .noise_levels import evaluate_estimate, refine
+from .prepare import Case
+from .quality import diagnose
+from .results import COLOURED, Disturbance, HeldParameter, has_answer
+
+# Noise levels are computed at most this often before the last estimate.
+_PASSES = 3
+# A parameter that must not be negative, and is so by this many standard deviations, is held at 0.
+_NEGATIVE = 2.0
+_PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
+_NEGATIVE_NOTE = "came out negative, which is impossible in air"
+Progress = Callable[[str], None]
+
+
+class Fit(NamedTuple):
+    """An estimate with everything that the search found.
+
+    - `problem`: the flight, with the noise levels of the sensors that were found.
+    - `estimate`: with its cost and covariance at these noise levels.
+    - `bound`: standard deviations of the parameters if the model were right: the Cramer-Rao bound.
+    - `rollouts`: of all searches together.
+    - `diagnostics`: of the residuals; `evaluation`: the flight simulated at the estimate. `None` without an answer, and
+      for innovations.
+    - `held`: parameters of a vehicle that are not estimated.
+    - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
+    - `disturbances`: by channel. `noise`: the same as logarithms. Only for innovations.
+    """
+
+    problem: ShootingProblem
+    estimate: Estimate
+    bound: Float[np.ndarray, " parameters"]
+    rollouts: int
+    diagnostics: Diagnostics | None = None
+    evaluation: Evaluation | None = None
+    held: dict[str, HeldParameter] = {}
+    widened: dict[str, float] = {}
+    disturbances: dict[str, Disturbance] = {}
+    noise: LogNoise | None = None
+
+    @property
+    def answered(self) -> bool:
+        """Whether there is an estimate at all."""
+        return has_answer(self.estimate)
+
+    @property
+    def free(self) -> list[int]:
+        """The places of the parameters that are estimated."""
+        return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.held]
+
+
+def fit_case(case: Case, *, progress: Progress = lambda stage: None) -> Fit:
+    """The fit of a prepared case, by its likelihood."""
+    if isinstance(case.problem, InnovationsProblem):
+        return fit_innovations(case.estimator, case.problem, case.recording, progress=progress)
+    return fit_flight(case.estimator, case.problem, progress=progress)
+
+
+def fit_flight(
+    estimator: AbstractEstimator, problem: ShootingProblem, *, progress: Progress = lambda stage: None
+) -> Fit:
+    """Estimate the parameters and the noise levels of one flight.
+
+    The covariance of an estimator that shoots is the Cramer-Rao bound, or `robust_covariance` if residuals are
+    coloured. The other estimators have their own, and estimate once more with the last noise levels.
+    """
+    passes = 0
+
+    def search(weighted: ShootingProblem) -> Estimate:
+        nonlocal passes
+        progress(f"fitting with the noise levels of pass {passes}" if passes else "compiling and fitting")
+        passes += 1
+        shared = padded(weighted) if estimator.shoots and not estimator.needs_network else weighted
+        return jax.block_until_ready(estimator(shared))
+
+    def failed(estimate: Estimate) -> bool:
+        return estimator.shoots and bool(estimate.result != RESULTS.successful)
+
+    refined = refine(problem, search, passes=_PASSES, stop=failed)
+    problem, estimate, rollouts = refined.problem, refined.estimate, refined.rollouts
+    if has_answer(estimate):
+        if not refined.settled:
+            problem = problem.reweighted(evaluate_estimate(problem, estimate).errors)
+        if not estimator.shoots:
+            estimate = search(problem)
+            rollouts += int(estimate.rollouts)
+    if not has_answer(estimate):
+        return Fit(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
+    evaluation = evaluate_estimate(problem, estimate)
+    bound, covariance = evaluation.covariance, estimate.covariance
+    diagnostics = diagnose(evaluation, fitted=True)
+    if estimator.shoots:
+        coloured = (diagnostics.colour > COLOURED).any()
+        covariance = robust_covariance_of(evaluation) if coloured else bound
+    estimate = eqx.tree_at(
+        lambda e: (e.covariance, e.cost), estimate, (as_float(covariance), as_float(evaluation.cost))
+    )
+    return Fit(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, diagnostics, evaluation)
+
+
+def fit_innovations(
+    estimator: AbstractEstimator,
+    problem: InnovationsProblem,
+    recording: np.ndarray,
+    *,
+    progress: Progress = lambda stage: None,
+) -> Fit:
+    """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
+
+    The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket is not
+    estimated. A parameter that came out negative, though physics forbids it, is held at 0. Intervals widen if parts of
+    the flights disagree.
+
+    **Arguments:** `recording`: the number of the recording of each sample.
+    """
+    own, names = problem.problem.unknowns, problem.model.parameter_names
+    unknowns = own.count + 3 * len(problem.channels)
+    progress("compiling, and fitting parameters and disturbances")
+    found = jax.block_until_ready(estimator(problem))
+    rollouts, std = int(found.rollouts), _std(found)
+    values, nonnegative = np.asarray(found.parameters), [each.nonnegative for each in problem.model.parameters]
+    at_zero = nonnegative & (values[: own.count] < -_NEGATIVE * std[: own.count])
+    if at_zero.any() and has_answer(found):
+        progress("fitting again without what came out negative")
+        zero = {name: np.zeros(()) for name, negative in zip(names, at_zero, strict=True) if negative}
+        problem = problem.hold(zero).starting_from(values)
+        found = jax.block_until_ready(estimator(problem))
+        rollouts += int(found.rollouts)
+    progress("computing errors")
+    values, std = np.asarray(found.parameters)[: own.count], _std(found)[: own.count]
+    half_width, factor = np.asarray(own.half_width), np.ones(own.count)
+    if has_answer(found):
+        factor[~at_zero] = _widening(problem, found, ~at_zero, recording)
+    identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
+    if not has_answer(found) or not identifiable.any():
+        identifiable[:] = True
+    notes = {i: _NEGATIVE_NOTE if at_zero[i] else _PRIOR_NOTE for i in np.flatnonzero(~identifiable | at_zero)}
+    held = {names[i]: HeldParameter(float(values[i]), own.units[i], note) for i, note in notes.items()}
+    scale = np.ones(unknowns)
+    scale[: own.count] = factor
+    spread = np.asarray(found.covariance) * scale[:, None] * scale
+    noise = LogNoise(*np.asarray(found.parameters)[own.count :].reshape(-1, 3).T)
+    return Fit(
+        problem=_with_sensors(problem.problem, noise),
+        estimate=eqx.tree_at(lambda e: e.covariance, found, as_float(spread)),
+        bound=std,
+        rollouts=rollouts,
+        held=held,
+        widened={names[i]: float(factor[i]) for i in range(own.count) if factor[i] > 1 and names[i] not in held},
+        disturbances=_disturbances(problem, found, noise),
+        noise=noise,
+    )
+
+
+def _parts(found: Estimate) -> Parts:
+    if found.parts is None:
+        raise ValueError("`estimator` must return the `parts` of the likelihood.")
+    return found.parts
+
+
+def _std(found: Estimate) -> np.ndarray:
+    return np.sqrt(np.maximum(np.diagonal(np.asarray(found.covariance)), 0.0))
+
+
+def _widening(
+    problem: InnovationsProblem, found: Estimate, fitted: np.ndarray, recording: np.ndarray
+) -> Float[np.ndarray, " fitted"]:
+    """The factor by which the interval of each fitted parameter widens. `recording`: of each sample."""
+    index, samples = problem.index, problem.flight.time.shape[0]
+    # The middle of the samples of each segment that count.
+    middle = index[:, (problem.settling + index.shape[1]) // 2 if index.shape[0] > 1 else 0]
+    some, number = np.flatnonzero(fitted), recording[np.minimum(middle, samples - 1)]
+    parts = _parts(found)
+    gradient = np.asarray(parts.gradient)[:, some]
+    information = np.asarray(parts.information)[:, some[:, None], some]
+    prior = np.diag(1 / np.square(np.asarray(problem.problem.unknowns.half_width)[some]))
+    ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
+    return np.max([np.ones(some.size), *ways], axis=0)
+
+
+def _with_sensors(problem: ShootingProblem, noise: LogNoise) -> ShootingProblem:
+    """The problem with the sensors' noise that was found."""
+    sigma = np.array(problem.sigma)
+    sigma[problem.columns] = np.exp(noise.sensor)
+    return eqx.tree_at(lambda p: p.sigma, problem, as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0)))
+
+
+def _disturbances(problem: InnovationsProblem, found: Estimate, noise: LogNoise) -> dict[str, Disturbance]:
+    strength, time_constant, sensor = (np.exp(leaf) for leaf in noise)
+    products = np.asarray(_parts(found).products).sum(axis=0)
+    correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)
+    largest = np.take_along_axis(correlation, np.abs(correlation).argmax(axis=1)[:, None], axis=1)[:, 0]
+    return {
+        name: Disturbance(
+            strength=float(strength[i]),
+            unit="rad/s^2" if i < 3 else "m/s^2",
+            time_constant=float(time_constant[i]),
+            sensor=float(sensor[i]),
+            correlation=float(largest[i]),
+        )
+        for i, name in enumerate(problem.channels)
+    }

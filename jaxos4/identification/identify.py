@@ -1,0 +1,110 @@
+"""`jaxos4.identify`: from recorded flights to parameters with intervals, in one call."""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ..airframe import Airframe
+from ..errors import InputError
+from ..estimate import AbstractEstimator
+from ..flight import CHANNEL_NAMES, Flight
+from ..models.abstract import AbstractModel
+from ..networks import TrainedNetwork
+from ..recording.reading import Recording, as_recordings
+from ..results import result_names
+from .fit import Fit, fit_case
+from .judge import Judgement, judge
+from .prepare import Case, prepare_flight, prepare_vehicle
+from .problem import Intervals
+from .quality import channel_fits
+from .results import Identification, finite_or_none
+from .settings import FlightSettings, VehicleSettings, flight_settings, vehicle_settings
+
+Flights = Flight | Recording | Sequence[Flight | Recording]
+# Results with an answer: a doubt says more than they do.
+_ANSWERS = ("successful", "at_bound", "max_sweeps")
+
+
+def identify(
+    flights: Flights,
+    subject: AbstractModel | Airframe,
+    *,
+    settings: FlightSettings | VehicleSettings | None = None,
+    estimator: str | AbstractEstimator | None = None,
+    bracket: Intervals = None,
+    network: TrainedNetwork | str | os.PathLike[str] | None = None,
+    validate: Flight | Recording | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> Identification:
+    """Identify an OS4 model from one flight, or a real vehicle from one or several recordings.
+
+        found = jaxos4.identify(flight, jaxos4.PublishedOS4())
+        found.parameters["alpha3"].ci95
+
+    The noise levels of the sensors are estimated too. `jaxos4 estimate` calls this function.
+
+    **Arguments:**
+
+    - `flights`: a `Flight`, a `Recording` (a flight with a name), or several for a vehicle.
+    - `subject`: a model in alpha_1..8, such as `PublishedOS4()`, or the `Airframe` of a real vehicle.
+    - `settings`: how to look at the flights: `FlightSettings` for a model, `VehicleSettings` for an airframe.
+    - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
+      `"filter-error"` for a vehicle, which flies in closed loop. Others for a vehicle: `"ibss"`, `"hybrid"`,
+      `"ant-colony"`, which search the same likelihood.
+    - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
+    - `network`: for a model, a trained network or its file; without it, an estimator that needs a network trains one.
+    - `validate`: another flight, which is not fitted but predicted.
+    - `seed`: for training a network.
+    - `progress`: called with the name of each stage.
+
+    **Returns:** an `Identification`. Check its `result`.
+
+    **Raises:** `InputError` for unusable arguments or flights; `TrainingError` if a network cannot be trained.
+    """
+    recordings = as_recordings(flights)
+    if not recordings:
+        raise InputError("`flights`: holds no flight; give one.")
+    other = None if validate is None else as_recordings(validate, "validation flight")[0]
+    begin = time.perf_counter()
+    common = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
+    if isinstance(subject, Airframe):
+        case = prepare_vehicle(recordings, subject, vehicle_settings(settings), progress=progress, **common)
+    else:
+        case = prepare_flight(recordings, subject, flight_settings(subject, settings), progress=progress, **common)
+    fit = fit_case(case, progress=progress)
+    verdict = judge(case, fit, progress=progress)
+    return describe(case, fit, verdict, time.perf_counter() - begin)
+
+
+def describe(case: Case, fit: Fit, verdict: Judgement, seconds: float) -> Identification:
+    """Everything about an answer, in the fields that pages and files show."""
+    result, free = str(result_names(fit.estimate.result)), fit.free
+    covariance, sigma = np.asarray(fit.estimate.covariance)[np.ix_(free, free)], np.asarray(fit.problem.sigma)
+    return Identification(
+        estimator=case.name,
+        model=case.model,
+        result=verdict.doubts[0].result if verdict.doubts and result in _ANSWERS else result,
+        rollouts=fit.rollouts,
+        cost=finite_or_none(fit.estimate.cost),
+        seconds=seconds,
+        parameters=verdict.parameters,
+        rigid_body=verdict.rigid_body,
+        provenance=case.provenance,
+        covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
+        estimate=fit.estimate,
+        problem=fit.problem,
+        is_vehicle=case.is_vehicle,
+        fit={} if fit.diagnostics is None else channel_fits(fit.problem, fit.diagnostics),
+        validation=verdict.validation,
+        held=fit.held,
+        noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in fit.problem.columns},
+        doubts=verdict.doubts,
+        disturbances=fit.disturbances,
+        widened=fit.widened,
+        skill=verdict.skill,
+        predictions=verdict.predictions,
+        response=verdict.response,
+    )

@@ -1,0 +1,226 @@
+"""Checks before an estimate of a vehicle is believed: each doubt has a cause and a remedy."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from .._custom_types import as_float
+from ..airframe import Airframe
+from ..analysis.frequency_response import FrequencyResponse, frequency_response
+from ..analysis.inertia import fit_inertia
+from ..analysis.prediction import Predictions
+from ..models.abstract import AbstractModel, Parameter
+from ..models.corrected import CorrectedOS4
+from .answers import parameter_table, rigid_body
+from .fit import Fit
+from .held_out import predict_held_out, validate_on
+from .prepare import Case, Progress
+from .results import (
+    Constant,
+    Disturbance,
+    Doubt,
+    ParameterEstimate,
+    PredictionSkill,
+    RigidBody,
+    Validation,
+)
+
+# Doubts need this many standard deviations.
+_SURE = 3.0
+# All mass at the rotors would make the squared radius of gyration that of the rotors; a heavy centre, this share of it.
+_HEAVIEST, _LIGHTEST = 1.5, 0.01
+# Aerodynamic moments may look like a gyroscopic coupling of this size (alpha1, alpha4, alpha7).
+_COUPLING = 0.25
+_CONSISTENT = 1e-3
+# Innovations that correlate more than this bias filter error more than its intervals say. Longer samples [s] than the
+# second figure would hide the motion with the vibration.
+_VIBRATION, _LONGEST_SAMPLE = 0.4, 0.008
+_HORIZON = 0.25  # [s]
+# Value and standard deviation of each parameter that has an estimate.
+Found = dict[str, tuple[float, float]]
+_PLACES = {"p": "roll", "q": "pitch", "r": "yaw"}
+
+
+def doubts_of(
+    model: AbstractModel,
+    parameters: dict[str, ParameterEstimate],
+    constants: dict[str, Constant],
+    skill: PredictionSkill | None,
+) -> tuple[Doubt, ...]:
+    """The reasons not to trust the estimate of a vehicle; empty if there are none.
+
+    The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
+    """
+    found: Found = {}
+    stds: dict[str, float] = {}
+    for name, row in parameters.items():
+        if row.estimate is not None and row.std is not None:
+            found[name], stds[name] = (row.estimate, row.std if row.bound is None else row.bound), row.std
+    contradicted = dict(_contradicted(model, found))
+    is_thrust_wrong = any(parameter.scales_torque for parameter in contradicted)
+    return (
+        *contradicted.values(),
+        *(() if is_thrust_wrong else _impossible_inertias(constants, model.airframe)),
+        *_contradictions(found, stds, model.airframe),
+        *_no_answer(found),
+        *_skill(skill),
+    )
+
+
+def _contradicted(model: AbstractModel, found: Found) -> Iterator[tuple[Parameter, Doubt]]:
+    """The parameters whose values physics or the airframe forbid."""
+    for parameter in model.parameters:
+        if parameter.contradiction is None or parameter.name not in found:
+            continue
+        value, std = found[parameter.name]
+        verdict = parameter.contradiction(value, _SURE * std)
+        if verdict is not None:
+            yield parameter, _implausible(f"{parameter.name} = {value:.2g} {verdict[0]}", verdict[1])
+
+
+def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> Iterator[Doubt]:
+    reach = np.square(np.asarray(airframe.rotor_positions)).sum(axis=1).max()
+    limit = float(airframe.mass) * reach
+    for name, row in constants.items():
+        largest, least = _HEAVIEST * limit * (2 if name == "Iz" else 1), _LIGHTEST * limit
+        beyond = row.estimate - _SURE * row.std > largest
+        if beyond or row.estimate + _SURE * row.std < least:
+            limit_passed = f"more than the {largest:.2g}" if beyond else f"less than the {least:.2g}"
+            scale = "`drag_coefficient`" if name == "Iz" else "`thrust_coefficient`, `max_rotor_speed`"
+            yield _implausible(
+                f"{name} = {row.estimate:.3g} kg m^2 is {limit_passed} of a vehicle with this mass and arms",
+                f"check `mass`, `rotor_positions` and {scale} in the airframe, and which rotor is which",
+            )
+    for axis, others in (("Ix", "IyIz"), ("Iy", "IxIz"), ("Iz", "IxIy")):
+        names = (axis, others[:2], others[2:])
+        if not all(name in constants for name in names):
+            continue
+        one, two, three = (constants[name] for name in names)
+        excess = one.estimate - two.estimate - three.estimate
+        if excess > _SURE * np.sqrt(one.std**2 + two.std**2 + three.std**2) + 0.05 * one.estimate:
+            remedy = (
+                "if `drag_coefficient` is a guess, measure it; else fly more yaw"
+                if axis == "Iz"
+                else "check `rotor_positions`"
+            )
+            yield _implausible(
+                f"{axis} = {one.estimate:.3g} exceeds {names[1]} + {names[2]} = {two.estimate + three.estimate:.3g} "
+                "kg m^2, which no rigid body allows",
+                remedy,
+            )
+
+
+def vibration(disturbances: dict[str, Disturbance], sample_time: float) -> Iterator[Doubt]:
+    """A gyro whose noise is not white, usually by vibration: the controller answers it, and filter error is biased.
+
+    `sample_time`: of the fitted data [s].
+    """
+    longer = f"average to longer samples by `sample_time` {2 * sample_time:g}, or " * (
+        2 * sample_time <= _LONGEST_SAMPLE
+    )
+    for name, row in disturbances.items():
+        if name in _PLACES and abs(row.correlation) > _VIBRATION:
+            yield _implausible(
+                f"the noise of {name} is not white (innovations correlate by {row.correlation:.2g}): the gyro vibrates",
+                f"{longer}damp the vibration, or log faster",
+            )
+
+
+def _no_answer(found: Found) -> Iterator[Doubt]:
+    """Roll and pitch must answer the rotors: otherwise nothing was identified."""
+    for name, axis in (("alpha3", "roll"), ("alpha6", "pitch")):
+        value, std = found.get(name, (0.0, np.inf))
+        if -_SURE * std <= value <= _SURE * std:
+            yield _implausible(
+                f"{axis} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
+                f"fly more {axis}, or check `rotor_positions` in the airframe, and which rotor is which",
+            )
+
+
+def _contradictions(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator[Doubt]:
+    negative = False
+    for name, axis in (("alpha3", "roll"), ("alpha6", "pitch"), ("alpha8", "yaw")):
+        value, std = found.get(name, (0.0, 0.0))
+        if value + _SURE * std < 0:
+            negative = True
+            yield _implausible(
+                f"{name} = {value:.3g} is negative: {axis} answers the rotors with the opposite sign",
+                "check `rotor_positions` and `rotor_spins`, and the axes of the log",
+            )
+    if negative or not all(name in found for name in ("alpha1", "alpha3", "alpha4", "alpha6", "alpha7", "alpha8")):
+        return
+    model = CorrectedOS4(airframe)
+    alpha, variance = np.array(model.alpha, dtype=float), np.full(8, np.inf)
+    for i in range(8):
+        if f"alpha{i + 1}" in found:
+            alpha[i] = found[f"alpha{i + 1}"][0]
+            variance[i] = stds[f"alpha{i + 1}"] ** 2
+    variance[[0, 3, 6]] += _COUPLING**2
+    variance[[1, 4]] = np.inf  # they need the inertia of the rotors too
+    variance = np.where(np.isfinite(variance), variance, (1e3 * np.asarray(model.half_width)) ** 2)
+    p_value = float(fit_inertia(model, alpha, np.diag(variance)).p_value)
+    if p_value < _CONSISTENT:
+        yield _implausible(
+            f"alpha1, alpha4 and alpha7 contradict the inertias of alpha3, alpha6 and alpha8 (p = {p_value:.1g})",
+            "check the axes and signs of the gyro, `rotor_positions` and `drag_coefficient`",
+        )
+
+
+def _skill(skill: PredictionSkill | None) -> Iterator[Doubt]:
+    if skill is None:
+        return
+    place = int(np.argmin(np.abs(np.array(skill.horizons) - _HORIZON)))
+    values = {rate: getattr(skill, rate).skill[place] for rate in _PLACES}
+    poor = [rate for rate, value in values.items() if value is not None and value <= 0]
+    if poor:
+        named = ", ".join(f"{rate} {values[rate]:.2g}" for rate in poor)
+        axes = " and ".join(_PLACES[rate] for rate in poor)
+        yield Doubt(
+            "no_skill",
+            f"the fit predicts {axes} {_HORIZON:g} s ahead no better than constant rates (skill {named})",
+            f"fly more {axes}, or check the airframe and the time stamps",
+        )
+
+
+def _implausible(cause: str, remedy: str) -> Doubt:
+    return Doubt("implausible", cause, remedy)
+
+
+class Judgement(NamedTuple):
+    """Everything that speaks for and against an answer.
+
+    - `parameters`, `rigid_body`: the answer itself; empty for a vehicle without one.
+    - `doubts`: why a vehicle's answer is not to be trusted.
+    - `validation`: how well an OS4 model explains another flight.
+    - `skill`, `predictions`: of measurements of a vehicle that were not fitted.
+    - `response`: the frequency response of a vehicle.
+    """
+
+    parameters: dict[str, ParameterEstimate] = {}
+    rigid_body: RigidBody = RigidBody()
+    doubts: tuple[Doubt, ...] = ()
+    validation: Validation | None = None
+    skill: PredictionSkill | None = None
+    predictions: Predictions | None = None
+    response: FrequencyResponse | None = None
+
+
+def judge(case: Case, fit: Fit, *, progress: Progress) -> Judgement:
+    """Compare an answer with the airframe, and with measurements that were not fitted."""
+    if not fit.answered:
+        return Judgement(parameters={} if case.is_vehicle else parameter_table(case, fit))
+    table, body, held_out = parameter_table(case, fit), rigid_body(case, fit), case.held_out
+    if not case.is_vehicle:
+        other = None if held_out is None else validate_on(fit, held_out)
+        return Judgement(table, body, validation=other)
+    predicted = skill = None
+    if held_out is not None:
+        progress("predicting what was not fitted")
+        predicted, skill = predict_held_out(fit, held_out)
+    doubts = doubts_of(fit.problem.model, table, body.constants, skill)
+    doubts += tuple(vibration(fit.disturbances, float(fit.problem.flight.dt)))
+    values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
+    return Judgement(
+        table, body, doubts, skill=skill, predictions=predicted, response=frequency_response(fit.problem, values)
+    )

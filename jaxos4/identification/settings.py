@@ -1,0 +1,87 @@
+"""Settings of an identification: of one flight of an OS4, and of recordings of a vehicle."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from ..airframe import Airframe
+from ..errors import InputError
+from ..models import MODELS
+from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from ..recording.preparation import HOLDOUT
+from .provenance import class_name
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightSettings:
+    """How to look at a flight of an OS4.
+
+    - `channels`: `"rates"`, `"attitude"` or `"all"`: the compared channels; by default everything that was measured.
+    - `initial_state`: `"free"`: estimated too; `"known"`: the first sample is exact.
+    - `window`: length of the windows for multiple shooting [s]; by default the flight is one window.
+    """
+
+    channels: str | None = None
+    initial_state: str = "free"
+    window: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class VehicleSettings:
+    """How to look at recordings of a vehicle.
+
+    - `terms`: of `jaxos4.TERMS`; by default those that the recordings allow.
+    - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.
+    - `sample_time`: average to samples of this length [s]; by default 0.004 s if the recordings have shorter ones.
+    - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
+    """
+
+    terms: Sequence[str] | None = None
+    begin: float | None = None
+    end: float | None = None
+    sample_time: float | None = None
+    holdout: float | None = None
+
+    def share(self, *, validated: bool) -> float:
+        """The share that is held out. `validated`: whether another recording is predicted."""
+        return self.holdout if self.holdout is not None else 0.0 if validated else HOLDOUT
+
+
+Settings = FlightSettings | VehicleSettings
+
+
+def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> Settings:
+    """The settings for a subject, from options by name; those that were not given are `None`.
+
+    **Raises:** `InputError` for an option that does not fit the subject.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    kind = VehicleSettings if isinstance(subject, Airframe) else FlightSettings
+    own = {field.name for field in dataclasses.fields(kind)}
+    for name in given:
+        if name in own or (name, given[name]) == ("initial_state", "free"):
+            continue
+        if kind is FlightSettings:
+            why = f"is for an `Airframe` as `subject`, not for the {class_name(subject, MODELS)} model"
+        elif name == "initial_state":
+            raise InputError(f"`initial_state` {given[name]}: a vehicle's filters find their own state; leave it out.")
+        else:
+            why = "a vehicle is identified from its rates and specific force, without windows"
+        raise InputError(f"`{name}`: {why}; leave it out.")
+    return kind(**{name: value for name, value in given.items() if name in own})
+
+
+def flight_settings(model: AbstractModel, settings: Settings | None) -> FlightSettings:
+    """The settings for a model, or the default ones. Raises `InputError` for a model or settings of another kind."""
+    if getattr(model, "parameter_names", None) != PARAMETER_NAMES:
+        raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(model).__name__}.")
+    if isinstance(settings, VehicleSettings):
+        raise InputError("`settings`: must be FlightSettings for a model as `subject`, got VehicleSettings.")
+    return FlightSettings() if settings is None else settings
+
+
+def vehicle_settings(settings: Settings | None) -> VehicleSettings:
+    """The settings for a vehicle, or the default ones. Raises `InputError` for settings of another kind."""
+    if isinstance(settings, FlightSettings):
+        raise InputError("`settings`: must be VehicleSettings for an airframe as `subject`, got FlightSettings.")
+    return VehicleSettings() if settings is None else settings

@@ -1,0 +1,255 @@
+"""Samples at any times, brought to other times: integrals, means, interpolation. Gaps stay unmeasured (NaN)."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+UNIFORM = 0.01  # of a step: rows this close to a grid keep their values
+REACH = 1.5  # times the step: measured samples further apart have a gap between them
+_ROUNDING = 1e-6  # of a step: a smaller difference from a grid is a rounding error
+_FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
+_MEASURED = 0.45  # of a longer sample must be measured: below one half, because the ends have half of their rows
+_DISORDER = 0.01  # share of samples that may be late or repeated in an intact log
+_PAUSE = 1.0  # [s]; a longer time between samples is a pause of the log, and not its rate
+_FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up to this share, are a rate
+
+Times = Float[np.ndarray, " samples"]
+Columns = Float[np.ndarray, "samples columns"]
+Rotors = Float[np.ndarray, "samples 4"]
+Rows = Float[np.ndarray, " rows"]
+# Time, rotor speeds and channels on another grid.
+Resampled = tuple[Rows, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
+
+
+class Series(NamedTuple):
+    """Samples of one sensor: times [s], increasing, and one column for each quantity. NaN means not measured."""
+
+    t: Times
+    values: Columns
+
+
+def integral(series: Series, at: Float[np.ndarray, " n"], *, linear: bool = False) -> Float[np.ndarray, "n columns"]:
+    """The integral of each column from the first sample to the times `at`. Before the first sample it is 0.
+
+    A value is held until the next one, and the last one for ever. If `linear`, values are interpolated instead.
+    """
+    t, values = series
+    mean = (values[:-1] + values[1:]) / 2 if linear else values[:-1]
+    total = np.vstack([np.zeros(values.shape[1]), np.cumsum(mean * np.diff(t)[:, None], axis=0)])
+    left = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
+    after = np.maximum(at - t[left], 0)[:, None]
+    value = values[left]
+    if linear:
+        right = np.minimum(left + 1, t.size - 1)
+        width = np.where(right > left, t[right] - t[left], 1.0)[:, None]
+        value = value + (values[right] - value) / width * after / 2
+    return total[left] + value * after
+
+
+def root_mean_square(series: Series, rows: Rows, *, linear: bool = False) -> Float[np.ndarray, "rows columns"]:
+    """Root mean square of each rotor's speed or command from each row to the next, so that its impulse is conserved.
+
+    Thrust and torque are proportional to the square. Speeds are held until the next sample; if `linear`, their squares
+    are interpolated. The last row has the speed at that time. No row lies before the first sample.
+    """
+    squares = Series(series.t, np.square(series.values))
+    last = np.searchsorted(series.t, rows[-1], side="right") - 1
+    out = np.empty((rows.size, squares.values.shape[1]))
+    out[:-1] = np.diff(integral(squares, rows, linear=linear), axis=0) / np.diff(rows)[:, None]
+    out[-1] = [np.interp(rows[-1], series.t, column) for column in squares.values.T] if linear else squares.values[last]
+    return np.sqrt(np.maximum(out, 0.0))
+
+
+def average(t: Times, omega: Rotors, channels: Columns, dt: float) -> Resampled:
+    """Average uniformly sampled rows to longer samples of `dt` [s], from the first time on.
+
+    Each measurement becomes the mean over `dt` around its time, which removes vibration above the new rate without a
+    delay. It is missing (NaN) if less than about half of that time was measured. Each rotor speed becomes the root mean
+    square over the sample that follows. `t`: times [s]; `omega`: rotor speeds [rad/s].
+    """
+    own = (t[-1] - t[0]) / (t.size - 1)
+    grid = _grid(t, dt)
+    measured = np.isfinite(channels)
+    edges = np.minimum(np.append(grid - dt / 2, grid[-1] + dt / 2), t[-1] + own / 2)
+    total, share = (
+        np.diff(integral(Series(t - own / 2, values), edges), axis=0)
+        for values in (np.where(measured, channels, 0.0), measured.astype(float))
+    )
+    enough = share > _MEASURED * dt
+    means = np.where(enough, total / np.where(enough, share, 1.0), np.nan)
+    return grid, root_mean_square(Series(t, omega), grid), means
+
+
+def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
+    """Bring each sample of a sensor to the row nearest to it. The other rows are NaN.
+
+    Values are interpolated linearly to the time of the row, but not across a gap: between neighbours more than 1.5
+    steps of the sensor apart. A sensor that is faster than the rows is averaged over the time from half a step before
+    the row to half a step after it. Angles must be unwrapped.
+
+    `step`: the rows are a uniform grid of this step [s]. Every row between neighbours within 1.5 steps then gets a
+    value, and nothing is averaged.
+    """
+    own = step or (float(np.median(np.diff(rows))) if rows.size > 1 else 0.0)
+    out = np.full((rows.size, series.values.shape[1]), np.nan)
+    for column, values in enumerate(series.values.T):
+        measured = np.isfinite(values)
+        t, values = series.t[measured], values[measured]
+        if step is None and t.size > 1 and np.median(np.diff(t)) < _FASTER * own:
+            out[:, column] = _means(rows, own, Series(t, values[:, None]))[:, 0]
+        elif t.size:
+            out[:, column] = _interpolated(rows, own, t, values, every=step is not None)
+    return out
+
+
+def averaged_to(step: float, series: Series) -> Series:
+    """The series, averaged to one sample each `step` [s] if it is faster. Gaps stay gaps."""
+    if series.t.size < 2 or np.median(np.diff(series.t)) >= _FASTER * step:
+        return series
+    grid = series.t[0] + step * (np.unique(np.floor((series.t - series.t[0]) / step)) + 0.5)
+    kept = np.isfinite(series.values).all(axis=1)
+    if np.count_nonzero(kept) < 2:
+        return series
+    means = _means(grid, step, Series(series.t[kept], series.values[kept]))
+    measured = np.isfinite(means).all(axis=1)
+    return Series(grid[measured], means[measured]) if np.count_nonzero(measured) > 1 else series
+
+
+def uniform_grid(t: Times) -> Times | None:
+    """The uniform grid from the first to the last time [s], or None if a row is more than 1 % of a step away from it.
+
+    If the times differ from the grid by rounding errors only, the times themselves are returned.
+    """
+    grid = np.linspace(t[0], t[-1], t.size)
+    dt = (t[-1] - t[0]) / (t.size - 1)
+    off = np.abs(t - grid).max()
+    if off > UNIFORM * dt:
+        return None
+    return t if off <= max(_ROUNDING * dt, 4 * np.spacing(np.abs(t).max())) else grid
+
+
+def grid_size(t: Times, dt: float) -> float:
+    """The number of samples of a grid of step `dt` over the times `t` [s]. It may be too large for memory."""
+    return math.floor((t[-1] - t[0]) / dt + UNIFORM) + 1.0
+
+
+def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Resampled, str]:
+    """Resample rows at uneven times to the grid t_0, t_0 + dt, ...
+
+    **Arguments:** times [s], rotor speeds [rad/s], each held until the next row, measurements with unwrapped angles
+    (NaN means not measured), and the step of the grid [s].
+
+    **Returns:** time, rotor speeds (`root_mean_square`) and channels (`at_rows`); a note with the figures of the
+    resampling. Linear interpolation has an error of second order in dt. A gap is NaN, except for samples within 1 % of
+    dt of a time of the grid.
+    """
+    grid = _grid(t, dt)
+    even = at_rows(grid, Series(t, channels), step=dt)
+    return (grid, root_mean_square(Series(t, omega), grid), even), _note(t, grid, dt)
+
+
+def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:
+    """Remove the jumps of 2 pi from an angle [rad], and count them. Values before the first jump do not change."""
+    measured = np.flatnonzero(np.isfinite(angle))
+    step = np.diff(angle[measured])
+    turns = np.where(np.abs(step) > math.pi, np.rint(step / (2 * math.pi)), 0.0)
+    if not turns.any():
+        return angle, 0
+    angle = angle.copy()
+    angle[measured[1:]] -= 2 * math.pi * np.cumsum(turns)
+    return angle, int(np.count_nonzero(turns))
+
+
+def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:
+    """Which samples are later than all samples before them. None if more than 1 % are not: the log is corrupt."""
+    if not np.isfinite(t).all():
+        return None
+    later = np.ones(t.size, dtype=bool)
+    later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
+    return later if np.count_nonzero(~later) <= max(_DISORDER * t.size, 1) else None
+
+
+def logged_rate(t: Times) -> float:
+    """How often samples at the times `t` [s] were written [Hz]. For half of the time, samples come at least this often.
+
+    A burst of samples does not count as a high rate. Pauses of more than a second do not count, unless there is nothing
+    else.
+    """
+    steps = np.diff(t)
+    steps = np.sort(steps[(steps > 0) & (steps <= _PAUSE)] if (steps <= _PAUSE).any() else steps)
+    total = np.cumsum(steps)
+    if total.size == 0 or total[-1] <= 0:
+        return 0.0
+    return 1.0 / float(steps[np.searchsorted(total, total[-1] / 2)])
+
+
+def held_regularly(t: Times) -> bool:
+    """Whether values that change at the times `t` [s] were written at a fixed rate and held in between."""
+    steps = np.diff(t)
+    if steps.size < _FEWEST_CHANGES:
+        return False
+    low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
+    return bool(high - low <= _REGULAR * middle)
+
+
+def _grid(t: np.ndarray, dt: float) -> np.ndarray:
+    return t[0] + dt * np.arange(int(grid_size(t, dt)))
+
+
+def _means(rows: np.ndarray, width: float, series: Series) -> np.ndarray:
+    """Means over `width` around each row, of values interpolated linearly. NaN at the ends and across a gap."""
+    t, (begin, end) = series.t, (rows - width / 2, rows + width / 2)
+    steps = np.diff(t)
+    gaps = np.append(0, np.cumsum(steps > REACH * np.median(steps)))
+    first, last = (np.clip(np.searchsorted(t, edge, side="right") - 1, 0, t.size - 2) for edge in (begin, end))
+    whole = (begin >= t[0]) & (end <= t[-1]) & (gaps[last + 1] == gaps[first])
+    mean = (integral(series, end, linear=True) - integral(series, begin, linear=True)) / width
+    return np.where(whole[:, None], mean, np.nan)
+
+
+def _interpolated(rows: np.ndarray, step: float, t: np.ndarray, values: np.ndarray, *, every: bool) -> np.ndarray:
+    """One quantity at the rows nearest to a sample of it, or at `every` row that is not in a gap."""
+    row, sample = _nearest(rows, t), _nearest(t, rows)
+    near = np.zeros(rows.size, dtype=bool)
+    near[row[np.abs(rows[row] - t) <= (step / 2 if every else step)]] = True
+    right = np.clip(np.searchsorted(t, rows), min(1, t.size - 1), t.size - 1)
+    left = np.maximum(right - 1, 0)
+    own_step = max(float(np.median(np.diff(t))) if t.size > 1 else 0.0, step)
+    apart = t[right] - t[left]
+    between = (t[left] <= rows) & (rows <= t[right])
+    joined = between & ((near & (apart <= REACH * own_step)) | (every & (apart <= REACH * step)))
+    exact = near & ~joined & (np.abs(t[sample] - rows) <= UNIFORM * step)
+    out = np.where(joined, np.interp(rows, t, values), np.nan)
+    out[exact] = values[sample[exact]]
+    return out
+
+
+def _nearest(grid: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """The index of the time in `grid` that is nearest to each time `t`."""
+    right = np.clip(np.searchsorted(grid, t), 1, max(grid.size - 1, 1))
+    left = right - 1
+    right = np.minimum(right, grid.size - 1)
+    return np.where(t - grid[left] <= grid[right] - t, left, right)
+
+
+def _note(t: np.ndarray, grid: np.ndarray, dt: float) -> str:
+    """The figures of a resampling."""
+    step = np.diff(t)
+    gap = step > REACH * dt
+    jitter = np.std(step[~gap])
+    jitter = jitter if jitter > _ROUNDING * dt else 0.0
+    text = (
+        f"t is not uniform (jitter {1e3 * jitter:.3g} ms, standard deviation): {t.size} rows were resampled to "
+        f"{grid.size} samples, one every {1e3 * dt:.6g} ms"
+    )
+    if not gap.any():
+        return text
+    starts = np.flatnonzero(gap)
+    inside = np.searchsorted(grid, t[starts + 1] - UNIFORM * dt) - np.searchsorted(grid, t[starts] + UNIFORM * dt)
+    gaps = "1 gap" if starts.size == 1 else f"{starts.size} gaps"
+    return (
+        f"{text}; {gaps} of up to {1e3 * step.max():.4g} ms: the {int(inside.sum())} samples in gaps hold the rotor "
+        "speeds and count as not measured"
+    )

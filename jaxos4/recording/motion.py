@@ -1,0 +1,213 @@
+"""The motion of a vehicle: how much each axis is excited, and whether it follows the rotors as the airframe says.
+
+The signs of that response also show where the rotors of an X are, and how they turn.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ..airframe import Airframe
+from ..flight import STATE_NAMES, Flight
+from ..logs.sampling import average
+from .reading import Recording, as_recording
+
+RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
+AXES = ("roll", "pitch", "yaw")
+WEAK = 0.1  # [rad/s], standard deviation of a body rate; less is not excited
+_GOOD = 0.3  # [rad/s]
+_OVER_NOISE = 5.0  # a rate below this many times the gyro's noise is not excited
+_ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi"))
+_STEP = 0.008  # [s]
+_SMOOTH, _SLOW = 3, 63  # samples: differences of these means are the motion between about 2 and 20 Hz
+_DELAYS = 7  # samples, up to 48 ms: lag and delay of rotors
+_LEAST_SECONDS = 3.0
+_OPPOSITE, _CLEAR = 0.4, 1.5  # correlation, and by how much it exceeds that of another sign or pair of rotors
+# Two rotors against the other two: the three ways are roll, pitch and yaw of an X, in an order that depends on the log.
+_PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
+
+Signs = tuple[float, ...]
+
+
+class Excitation(NamedTuple):
+    """How much a flight excites one axis.
+
+    - `axis`: roll, pitch or yaw.
+    - `torque`: standard deviation of the rotors' torque [N m]; NaN without an airframe.
+    - `rate`: standard deviation of the body rate [rad/s]; NaN if neither it nor its angle was measured.
+    - `noise`: standard deviation of the gyro's white noise [rad/s], see `gyro_noise`.
+    - `verdict`: "good", "weak", "none" or "not measured".
+    """
+
+    axis: str
+    torque: float
+    rate: float
+    noise: float
+    verdict: str
+
+
+class RotorSigns(NamedTuple):
+    """The signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from above).
+
+    `spins`: `None` if the vehicle hardly yawed.
+    """
+
+    forward: Signs
+    left: Signs
+    spins: Signs | None
+
+
+def excitation(
+    flight: Flight | Recording, airframe: Airframe | None = None
+) -> tuple[Excitation, Excitation, Excitation]:
+    """The excitation of roll, pitch and yaw over the whole flight; the torque needs an airframe."""
+    recording = as_recording(flight)
+    torque = np.full(3, math.nan)
+    if airframe is not None:
+        mixer = np.asarray(airframe.mixer, dtype=float)[:3]
+        torque = (recording.omega[:-1] ** 2 @ mixer.T).std(axis=0)
+    roll, pitch, yaw = (_excitation(recording, axis, float(torque[i])) for i, axis in enumerate(AXES))
+    return roll, pitch, yaw
+
+
+def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
+    """The standard deviation of the white noise on a body rate [rad/s]; NaN if too little was measured.
+
+    It follows from the median size of second differences: motion is smooth from sample to sample, noise is not.
+    """
+    second = np.diff(rate, 2)
+    second = np.abs(second[np.isfinite(second)])
+    return float(np.median(second)) / 0.6745 / math.sqrt(6) if second.size else math.nan
+
+
+def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> list[str]:
+    """The axes about which the vehicle turns against the torque that the airframe gives to its rotors.
+
+    Axes without clear motion are not judged.
+
+    **Arguments:** usable stretches of flights, each of one vehicle.
+    """
+    found = _correlations(pieces, np.asarray(airframe.mixer, dtype=float)[:3])
+    return [axis for i, axis in enumerate(AXES) if _clear_sign(found[:, i, i]) < 0]
+
+
+def opposite_note(axes: Sequence[str]) -> str:
+    """The fault and the remedy, if the vehicle turns against the torque about these axes; empty without axes."""
+    if not axes:
+        return ""
+    if list(axes) == ["yaw"]:
+        return (
+            "yaw answers the rotors with the opposite sign: the rotors turn the other way than `rotor_spins` of the "
+            "airframe say (props in or out); change all four signs"
+        )
+    verb = "answers" if len(axes) == 1 else "answer"
+    return (
+        f"{' and '.join(axes)} {verb} the rotors with the opposite sign: the rotors of the log are in another order "
+        "than `rotor_positions` and `rotor_spins` of the airframe, or the gyro has other axes than x forward, y left, "
+        "z up (with z down, q and r have the opposite sign); correct one of them"
+    )
+
+
+def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
+    """The places and spins of four rotors in an X, by how the vehicle turns after each pair of rotors speeds up.
+
+    `None`: the flight does not show it, or the rotors are no X.
+
+    **Arguments:** usable stretches of flights, each of one vehicle, with motors and gyro logged fast.
+    """
+    found = _correlations(pieces, _PAIRS)
+    roll, pitch = (_pair(found[:, :, axis]) for axis in (0, 1))
+    if roll is None or pitch is None or roll == pitch:
+        return None
+    (yaw,) = {0, 1, 2} - {roll, pitch}
+    left = _clear_sign(found[:, roll, 0]) * _PAIRS[roll]
+    forward = -_clear_sign(found[:, pitch, 1]) * _PAIRS[pitch]
+    turn = _clear_sign(found[:, yaw, 2])
+    return RotorSigns(
+        tuple(forward.tolist()), tuple(left.tolist()), tuple((-turn * _PAIRS[yaw]).tolist()) if turn else None
+    )
+
+
+def _excitation(recording: Recording, axis: str, torque: float) -> Excitation:
+    """The excitation of one axis. Without a measured rate, it is the slope of the angle."""
+    i = AXES.index(axis)
+    rate, angle = recording.states[:, RATE_COLUMNS[i]], recording.states[:, _ANGLE_COLUMNS[i]]
+    noise = gyro_noise(rate)
+    if np.count_nonzero(np.isfinite(rate)) < 3:
+        seen = np.isfinite(angle)
+        rate = np.gradient(angle[seen], recording.time[seen]) if np.count_nonzero(seen) > 2 else np.full(1, math.nan)
+    size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
+    if math.isnan(size):
+        verdict = "not measured"
+    elif size < WEAK or size < _OVER_NOISE * noise:
+        verdict = "none"
+    else:
+        verdict = "good" if size >= _GOOD else "weak"
+    return Excitation(axis, torque, size, noise, verdict)
+
+
+def _correlations(
+    pieces: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"]
+) -> Float[np.ndarray, "delays rows 3"]:
+    """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
+
+    A controller that answers gusts does not change the sign. One number for each delay of up to 48 ms, each row of
+    `mixer` (the weight of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion.
+    """
+    pairs = [_response(piece, mixer) for piece in pieces if np.ptp(piece.time) > _SLOW * _STEP * 2]
+    found = np.full((_DELAYS, mixer.shape[0], len(AXES)), np.nan)
+    for delay in range(_DELAYS if pairs else 0):
+        torque = np.concatenate([a[: a.shape[0] - delay] for a, _ in pairs])
+        acceleration = np.concatenate([b[delay:] for _, b in pairs])
+        for i, along in enumerate(acceleration.T):
+            measured = np.isfinite(torque).all(axis=1) & np.isfinite(along)
+            if np.count_nonzero(measured) * _STEP < _LEAST_SECONDS:
+                continue
+            x, y = torque[measured] - torque[measured].mean(axis=0), along[measured] - along[measured].mean()
+            spreads = x.std(axis=0) * y.std()
+            found[delay, :, i] = np.where(spreads > 0, y @ x / y.size, np.nan) / np.where(spreads > 0, spreads, 1.0)
+    return found
+
+
+def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
+    """The sign of correlations at several delays, if it is clear; 0 if not."""
+    if np.isnan(found).any():
+        return 0.0
+    for sign in (1.0, -1.0):
+        if max(sign * found) > _OPPOSITE and max(sign * found) > _CLEAR * max(-sign * found):
+            return sign
+    return 0.0
+
+
+def _pair(found: np.ndarray) -> int | None:
+    """The row of `_PAIRS` that turns the vehicle about an axis, if one of them does clearly."""
+    sizes = np.abs(found).max(axis=0)
+    if np.isnan(sizes).any():
+        return None
+    best = int(np.argmax(sizes))
+    alone = sizes[best] > _CLEAR * np.delete(sizes, best).max()
+    return best if alone and _clear_sign(found[:, best]) else None
+
+
+def _response(piece: Recording, mixer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Torques and angular accelerations [rad/s^2], one sample every 8 ms, between about 2 and 20 Hz."""
+    step = max(_STEP, piece.dt)
+    _, omega, rates = average(piece.time, piece.omega, piece.states[:, RATE_COLUMNS], step)
+    acceleration = np.diff(rates, axis=0) / step
+    for i, axis in enumerate(excitation(piece)):
+        if axis.verdict not in ("good", "weak"):
+            acceleration[:, i] = np.nan
+    return _between((omega**2 @ mixer.T)[:-1]), _between(acceleration)
+
+
+def _between(columns: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, "shorter columns"]:
+    """The part of each signal between about 2 and 20 Hz."""
+    edge = (_SLOW - _SMOOTH) // 2
+    fast, slow = (
+        np.column_stack([np.convolve(x, np.full(samples, 1 / samples), "valid") for x in columns.T])
+        for samples in (_SMOOTH, _SLOW)
+    )
+    return fast[edge : fast.shape[0] - edge] - slow

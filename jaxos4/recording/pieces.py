@@ -1,0 +1,160 @@
+"""Pieces of recordings: cut, averaged to longer samples, joined, divided into measurements to fit and to predict."""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from ..errors import InputError
+from ..flight import STATE_NAMES, Flight
+from ..logs.sampling import average
+from .reading import Recording, as_recording
+from .usable import Stretch
+
+# Sample times that differ by less than this share are equal.
+_EQUAL_STEPS = 1e-6
+# Length of a block that is held out [s]: each part of a flight then has blocks of both kinds.
+_BLOCK = 5.0
+
+AnyFlight = TypeVar("AnyFlight", Flight, Recording)
+
+
+def cut(flight: AnyFlight, stretch: Stretch) -> AnyFlight:
+    """The part of a flight from `stretch.begin` to `stretch.end`; its time stays as recorded.
+
+    **Raises:** `InputError` if the part has fewer than two samples.
+    """
+    if isinstance(flight, Flight):
+        return cut(Recording.of(flight), stretch).flight
+    time, half = flight.time, flight.dt / 2
+    inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
+    if inside.size < 2:
+        raise InputError(
+            f"from {stretch.begin:g} s to {stretch.end:g} s: fewer than two samples; the flight lasts from "
+            f"{time[0]:.6g} s to {time[-1]:.6g} s."
+        )
+    return flight.rows(slice(int(inside[0]), int(inside[-1]) + 1))
+
+
+def averaged(flight: AnyFlight, dt: float) -> AnyFlight:
+    """A flight averaged to samples of `dt` [s], see `average`; unchanged if its samples are not shorter."""
+    if isinstance(flight, Flight):
+        return averaged(Recording.of(flight), dt).flight
+    if dt <= flight.dt * (1 + _EQUAL_STEPS):
+        return flight
+    optional = {
+        name: np.reshape(values, (flight.time.size, -1))
+        for name in ("specific_force", "voltage")
+        if (values := getattr(flight, name)) is not None
+    }
+    time, omega, means = average(flight.time, flight.omega, np.hstack([flight.states, *optional.values()]), dt)
+    states, *others = np.split(means, np.cumsum([12, *(each.shape[1] for each in optional.values())])[:-1], axis=1)
+    found = dict(zip(optional, others, strict=True))
+    if "voltage" in found:
+        found["voltage"] = found["voltage"][:, 0]
+    return flight._replace(time=time, omega=omega, states=states, **found, body_velocity=None, stretch=None)
+
+
+def with_body_velocity(recording: Recording) -> Recording:
+    """Add `body_velocity` to a recording with velocity and attitude. Other recordings are returned unchanged."""
+    columns = [STATE_NAMES.index(name) for name in ("psi", "theta", "phi", "vx", "vy", "vz")]
+    values = recording.states[:, columns]
+    if np.isnan(values).all(axis=0).any():
+        return recording
+    # Gaps get the value before them, or the first one.
+    measured, index = ~np.isnan(values), np.arange(len(values))[:, None]
+    source = np.maximum(np.maximum.accumulate(np.where(measured, index, -1)), measured.argmax(axis=0))
+    psi, theta, phi, x, y, z = np.take_along_axis(values, source, axis=0).T
+    # The inverse of R_z(psi) R_y(theta) R_x(phi).
+    x, y = x * np.cos(psi) + y * np.sin(psi), y * np.cos(psi) - x * np.sin(psi)
+    x, z = x * np.cos(theta) - z * np.sin(theta), z * np.cos(theta) + x * np.sin(theta)
+    y, z = y * np.cos(phi) + z * np.sin(phi), z * np.cos(phi) - y * np.sin(phi)
+    return recording._replace(body_velocity=np.column_stack([x, y, z]))
+
+
+def join(flights: Sequence[Flight], *, length: int) -> Flight:
+    """Put stretches of flight one after the other, as one flight of whole windows.
+
+    Samples at the end of a stretch that do not fill a window are dropped, as are stretches shorter than one window.
+    Time becomes a count of samples from 0. Measurements do not change.
+
+    **Arguments:**
+
+    - `flights`: the stretches.
+    - `length`: of a window, in samples.
+
+    **Raises:** `ValueError` if the sample times differ, or if no stretch is as long as one window.
+    """
+    pieces = [as_recording(flight) for flight in flights]
+    _check_steps(pieces)
+    whole = [piece for piece in (whole_windows(piece, length) for piece in pieces) if piece.time.size]
+    if not whole:
+        raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
+    return joined(whole).flight
+
+
+def whole_windows(recording: Recording, length: int) -> Recording:
+    """The recording without the samples at its end that do not fill a window of `length` samples."""
+    return recording.rows(slice(recording.time.size // length * length))
+
+
+def joined(pieces: Sequence[Recording]) -> Recording:
+    """Pieces of recordings one after the other; each becomes a stretch, and time a count of samples from 0.
+
+    **Raises:** `ValueError` if the sample times differ.
+    """
+    steps = _check_steps(pieces)
+    channels = np.concatenate([piece.channels for piece in pieces])
+    states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
+    sizes = [piece.time.size for piece in pieces]
+    return Recording(
+        time=steps[0] * np.arange(sum(sizes)),
+        omega=np.concatenate([piece.omega for piece in pieces]),
+        states=states,
+        specific_force=None if np.isnan(force).all() else force,
+        voltage=_of_all(pieces, "voltage"),
+        body_velocity=_of_all(pieces, "body_velocity"),
+        stretch=np.repeat(np.arange(len(sizes)), sizes),
+        commanded=any(piece.commanded for piece in pieces),
+    )
+
+
+def _of_all(pieces: Sequence[Recording], name: str) -> np.ndarray | None:
+    """A channel, if all pieces have it."""
+    values = [getattr(piece, name) for piece in pieces]
+    return None if any(each is None for each in values) else np.concatenate(values)
+
+
+def _check_steps(pieces: Sequence[Recording]) -> list[float]:
+    steps = [piece.dt for piece in pieces]
+    if steps and np.ptp(steps) > _EQUAL_STEPS * steps[0]:
+        raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
+    return steps
+
+
+def hold_out(recording: Recording, length: int, share: float) -> tuple[Recording, Recording | None]:
+    """Split a recording into measurements to fit and measurements to predict, in alternating blocks of whole windows.
+
+    **Arguments:**
+
+    - `recording`: whole windows, see `whole_windows`.
+    - `length`: of a window, in samples.
+    - `share`: of the windows to hold out, 0 to 0.5.
+
+    **Returns:** two recordings of the same samples: in each, the measurements of the other are missing (NaN). The
+    second keeps the specific force everywhere, because a model may use it as an input. `None`: nothing is held out.
+    """
+    if not share:
+        return recording, None
+    windows = recording.time.size // length
+    period = round(1 / share)
+    block = max(min(round(_BLOCK / (length * recording.dt)), windows // (2 * period)), 1)
+    held_out = np.repeat((np.arange(windows) // block) % period == period - 1, length)[:, None]
+    if not held_out.any() or held_out.all():
+        return recording, None
+    force = recording.specific_force
+    fitted = recording._replace(
+        states=np.where(held_out, np.nan, recording.states),
+        specific_force=None if force is None else np.where(held_out, np.nan, force),
+    )
+    return fitted, recording._replace(states=np.where(held_out, recording.states, np.nan))

@@ -1,0 +1,81 @@
+"""HTML pages that need no other file: their templates, and SVG drawings that follow a page's theme and width."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jinja2
+from markupsafe import Markup, escape
+
+from .style import FAINT, GRID, INK, PAPER
+
+# CSS pixels in a point, and how much a drawing may grow to reach the width of the page's text.
+_PIXELS, _GROWTH = 4 / 3, 4 / 3
+_THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)", PAPER: "none"}
+
+
+class Drawing(NamedTuple):
+    """One choice of a figure on a page: its label, the element `<svg>`, and whether the page shows it first."""
+
+    label: str
+    svg: Markup
+    chosen: bool
+
+
+def render(template: str, *, filters: Mapping[str, Any] | None = None, **values: Any) -> str:
+    """The page that a template in this folder makes of `values`. `filters`: functions for the template, by name."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxos4.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= filters or {}
+    return environment.get_template(template).render(**values)
+
+
+def drawings(
+    choices: Mapping[str, bytes], chosen: int, *, stem: str, description: str, estimators: Sequence[str] = ()
+) -> tuple[Drawing, ...]:
+    """SVG files by label, one of which the page shows at a time.
+
+    **Arguments:**
+
+    - `chosen`: the index of the first choice.
+    - `stem`: the ids in the elements begin with it.
+    - `description`: what a screen reader says.
+    - `estimators`: their names, for tooltips.
+    """
+    made = []
+    for i, (label, file) in enumerate(choices.items()):
+        described = escape(f"{description}, {label}" if label else description)
+        element = Markup(_inline(file, f"{stem}-{i}", described, estimators))  # noqa: S704  # text in our SVG is outlines
+        made.append(Drawing(label, element, i == chosen))
+    return tuple(made)
+
+
+def _inline(svg: bytes, stem: str, description: str, estimators: Sequence[str]) -> str:
+    text = svg.decode()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    # Coordinates to a hundredth of a point: a third of the bytes.
+    text = re.sub(r'(?<= )(d|x|y)="[^"]*"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), text)
+
+    def estimator(match: re.Match[str]) -> str:
+        place = int(match[1])
+        tip = match[2] or (escape(estimators[place]) if place < len(estimators) else "")
+        return f'<g data-estimator="{place}">' + (f"<title>{tip}</title>" if tip else "")
+
+    text = re.sub(r'<g id="estimator-(\d+)(?:: ([^"]*))?">', estimator, text)
+    text = re.sub(r'\bid="([^"]+)"', rf'id="{stem}--\1"', text)
+    text = re.sub(r'href="#([^"]+)"', rf'href="#{stem}--\1"', text)
+    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{stem}--\1)", text)
+    for color, themed in _THEMED.items():
+        text = text.replace(color, themed)
+    head, rest = text.split(">", 1)
+    width = re.search(r' width="([\d.]+)pt"', head)
+    pixels = _PIXELS * float(width[1]) if width else 0.0
+    head = re.sub(r' (width|height)="[^"]*"', "", head)
+    style = f"min-width: {0.8 * pixels:.0f}px; max-width: {_GROWTH * pixels:.0f}px"
+    return f'{head} role="img" aria-label="{description}" style="{style}">{rest}'

@@ -1,0 +1,181 @@
+"""An identification as text, for a terminal."""
+
+from collections.abc import Callable, Iterator
+
+from rich.console import Console
+
+from ..estimators import ESTIMATORS
+from ..identification.results import COLOURED, Identification
+from ..results import NINETY_FIVE
+from .text import Listing
+
+# The share of fits of true models that a test of all channels' residuals may reject.
+_SIGNIFICANCE = 0.01
+
+Section = Iterator[str | Listing]
+
+
+def print_identification(console: Console, found: Identification) -> None:
+    """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; without an answer, why."""
+    for section in _SECTIONS if found.has_answer else _WITHOUT_ANSWER:
+        for part in section(found):
+            if isinstance(part, Listing):
+                part.print_on(console)
+            else:
+                console.print(part, markup=False, highlight=False)
+
+
+def _notes(found: Identification) -> Section:
+    yield from (f"not to be trusted because {doubt}." for doubt in found.doubts)
+    yield from (f"note: {note}" for note in found.provenance.notes)
+
+
+def _failure(found: Identification) -> Section:
+    if found.result != "nonfinite_trajectory" or found.is_vehicle:
+        return
+    shoots = ESTIMATORS[found.estimator].shoots or ESTIMATORS[found.estimator].needs_network
+    yield (
+        "No estimate: the model's trajectory diverged wherever the search went. The vehicle may do something that "
+        f"the model lacks{' (try --window, or a shorter window)' if shoots else ''}, or the airframe's constants "
+        "or the units of the flight are wrong."
+    )
+
+
+def _parameters(found: Identification) -> Section:
+    of_flight = not found.is_vehicle
+    digits = 5 if of_flight else 4
+    rows = []
+    for name, row in found.parameters.items():
+        cells = ["-", "-", "-"]
+        if row.estimate is not None and row.ci95 is not None:
+            low, high = row.ci95
+            bound = "-" if row.bound is None else f"{row.bound:.2g}"
+            cells = [f"{row.estimate:.{digits}g}", f"[{low:.{digits}g}, {high:.{digits}g}]", bound]
+        rows.append((name, row.unit, *cells[: 2 + of_flight]))
+    headings = ("parameter", "unit", "estimate", "95 % interval", *["bound"] * of_flight)
+    yield Listing(headings, rows, ("estimate", "bound"), [row.note for row in found.parameters.values()])
+    limits = [
+        f"{name} {row.noise_limit:.2g}"
+        for name, row in found.parameters.items()
+        if "below noise" in row.note and row.noise_limit
+    ]
+    if limits:
+        yield (
+            "below noise: cannot be distinguished from 0. The airframe's values could be distinguished at this "
+            f"multiple of the noise: {', '.join(limits)}."
+        )
+    if of_flight:
+        yield "bound: Cramer-Rao bound, the smallest possible standard deviation at the noise that was found."
+
+
+def _held(found: Identification) -> Section:
+    reasons: dict[str, list[str]] = {}
+    for name, row in found.held.items():
+        reasons.setdefault(row.note, []).append(f"{name} {row.value:.4g}")
+    yield from (f"held, {reason}: {', '.join(held)}." for reason, held in reasons.items())
+
+
+def _fit(found: Identification) -> Section:
+    if found.is_vehicle:
+        return
+    percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
+    yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
+    coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
+    if coloured and found.estimator == "network":
+        yield (
+            f"The residuals of {coloured} are not white noise: the network's answer is not the best fit, but lies "
+            "within its intervals of it. The hybrid continues the search from there and tests the model."
+        )
+    elif coloured:
+        yield (
+            f"The residuals of {coloured} are not white noise: the model does not explain this flight completely. The "
+            "intervals of estimators that shoot allow for correlated residuals, but are too narrow for slow errors."
+        )
+    tests = {"free of the inputs (cross-correlation)": {name: row.input_p for name, row in found.fit.items()}}
+    if found.provenance.windows == 1:  # the free initial states of windows mislead the test
+        tests = {"white (Ljung-Box)": {name: row.white_p for name, row in found.fit.items()}} | tests
+    for property_, p_values in tests.items() if found.fit else ():
+        failed = [name for name, p_value in p_values.items() if p_value * len(p_values) < _SIGNIFICANCE]
+        answer = f"not those of {', '.join(failed)}" if failed else "all"
+        yield f"residuals {property_}, tests at {_SIGNIFICANCE:.0%}: {answer}."
+
+
+def _inertias(found: Identification) -> Section:
+    body = found.rigid_body
+    inertias = [
+        f"{name} {row.estimate:.4g} +- {NINETY_FIVE * row.std:.2g}{f' ({row.note})' if row.note else ''}"
+        if abs(row.estimate) > NINETY_FIVE * row.std
+        else f"{name} below noise"
+        for name, row in body.constants.items()
+    ]
+    verdict = ""
+    if body.consistency_p is not None:
+        if body.consistency_p < _SIGNIFICANCE:
+            verdict = f"; the alphas are not those of one rigid body, p = {body.consistency_p:.1g}"
+        elif not body.is_rigid_body:
+            verdict = "; no rigid body has such inertias: one exceeds the sum of the other two"
+        else:
+            verdict = f"; the alphas agree with one rigid body, p = {body.consistency_p:.2g}"
+    if inertias:
+        yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}{verdict}."
+
+
+def _validation(found: Identification) -> Section:
+    if found.is_vehicle or found.validation is None:
+        return
+    flight, fit = found.validation.flight, found.validation.fit
+    if fit is None:
+        yield f"validation on {flight}: the model's trajectory diverges before the flight ends."
+        return
+    channels = [f"{name} {x.percent:.1f} ({x.level**0.5:.2g})" for name, x in fit.items() if x.percent is not None]
+    yield f"validation on {flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
+
+
+def _disturbances(found: Identification) -> Section:
+    if found.disturbances:
+        rows = found.disturbances.items()
+        gusts = ", ".join(f"{name} {x.strength:.2g} {x.unit} over {x.time_constant:.2g} s" for name, x in rows)
+        yield f"disturbances that the model lacks, and their correlation time: {gusts}."
+        sensors = ", ".join(f"{name} {x.sensor:.2g}" for name, x in rows)
+        yield f"white noise of the sensors [rad/s; m/s^2, of means over 0.25 s]: {sensors}."
+    if found.widened:
+        factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
+        yield f"intervals widened, because parts of the flights disagree, by the factor: {factors}."
+
+
+def _skill(found: Identification) -> Section:
+    if found.skill is None:
+        return
+    skill, rows = found.skill, []
+    yield (
+        "Predictions of data that were not fitted: 1 is perfect, 0 as good as constant rates; +- one standard "
+        f"error ({skill.starts} starts)."
+    )
+    rates = (skill.p, skill.q, skill.r)
+    for i, horizon in enumerate(skill.horizons):
+        cells = [f"{_share(rate.skill[i])} +- {_share(rate.std[i])}" for rate in rates]
+        rows.append((f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates)))
+    yield Listing(("ahead", "p", "q", "r", "equation error: p, q, r"), rows)
+
+
+def _summary(found: Identification) -> Section:
+    used = found.provenance
+    if found.is_vehicle:
+        how = f"flight model ({', '.join(used.terms or ())}), {used.fitted_seconds:.0f} s, a sample every "
+        how, digits = f"{how}{1e3 * used.sample_time:g} ms", 0
+    else:
+        how, digits = f"{found.model} model, {used.channels} channels", 1
+    yield f"{found.estimator}, {how}: {found.result}, {found.rollouts} rollouts, {found.seconds:.{digits}f} s"
+
+
+def _share(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"
+
+
+_WITHOUT_ANSWER: tuple[Callable[[Identification], Section], ...] = (_notes, _failure)
+_SECTIONS: tuple[Callable[[Identification], Section], ...] = (
+    *(_notes, _parameters, _held, _fit, _inertias, _validation),
+    *(_disturbances, _skill, _summary),
+)

@@ -1,0 +1,115 @@
+"""Reads the Dataset of a study, and divides it into the scenarios that one table or figure compares."""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from ..errors import InputError
+from ..study import RESULTS_FILE, metrics
+
+_FLIGHT = (*metrics.SCENARIO, "flight")
+_DIMENSIONS = (*_FLIGHT, "parameter")
+_VARIABLES = {
+    "truth": tuple(name for name in _DIMENSIONS if name != "estimator"),
+    "center": ("model", "airframe", "width", "parameter"),
+    "estimate": _DIMENSIONS,
+    "half_width": (*_DIMENSIONS, "level"),
+    "bound": _DIMENSIONS,
+    "result": _FLIGHT,
+    "rollouts": _FLIGHT,
+    "hit": _FLIGHT,
+    "seen": ("channels", "estimator"),
+    "unit": ("parameter",),
+}
+_TEXT = ("result", "seen", "unit")
+_PHRASES = {
+    "model": "{} model",
+    "airframe": "airframe {}",
+    "excitation": "{}",
+    "duration": "{:g} s",
+    "method": "truth by {}",
+    "noise": "{} noise",
+    "width": "bracket x {:g}",
+    "channels": "{} channels",
+}
+
+
+def read_results(directory: Path) -> xr.Dataset:
+    """Reads the Dataset in a study's folder.
+
+    **Raises:** `InputError` if there is no Dataset, or if the file is not the results of a study.
+    """
+    path = directory / RESULTS_FILE
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such folder; give one that `jaxos4 study` wrote.")
+    if not path.is_file():
+        raise InputError(f"{directory}: holds no {RESULTS_FILE}; give a folder that `jaxos4 study` wrote.")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
+            dataset = opened.load()
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        what = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
+    if missing := _missing(dataset):
+        raise InputError(f"{path}: not the results of a study: {missing}; give a folder that `jaxos4 study` wrote.")
+    return dataset
+
+
+def _missing(dataset: xr.Dataset) -> str:
+    """Why a Dataset is not the results of a study, or an empty string."""
+    for name, dimensions in _VARIABLES.items():
+        if name not in dataset.variables:
+            return f"no variable `{name}`"
+        if set(dataset[name].dims) != set(dimensions):
+            return f"`{name}` is not along {', '.join(dimensions)}"
+    for name in (*_DIMENSIONS, "level"):
+        if dataset.sizes[name] == 0:
+            return f"nothing along `{name}`"
+        if name not in dataset.coords:
+            return f"no coordinate `{name}`"
+    for name in (*(name for name in _VARIABLES if name not in _TEXT), "scale", "level"):
+        if dataset[name].dtype.kind not in "fiu":
+            return f"`{name}` does not hold numbers"
+    if not {"flag_values", "flag_meanings"} <= dataset["result"].attrs.keys():
+        return "`result` does not say what its codes mean"
+    return ""
+
+
+class Scenario(NamedTuple):
+    """The data of one value on each axis except noise scale and estimator, which a table or figure compares."""
+
+    number: int
+    label: str
+    data: xr.Dataset
+
+
+def scenarios(dataset: xr.Dataset) -> Iterator[Scenario]:
+    """All scenarios, numbered from 1. The label names the dimensions that differ, or all if there is one scenario."""
+    fixed = [name for name in metrics.SCENARIO if name in _PHRASES]
+    varied = [name for name in fixed if dataset.sizes[name] > 1] or fixed
+    for number, at in enumerate(itertools.product(*(range(dataset.sizes[name]) for name in fixed)), start=1):
+        data = dataset.isel(dict(zip(fixed, at, strict=True)))
+        yield Scenario(number, ", ".join(_PHRASES[name].format(data[name].item()) for name in varied), data)
+
+
+def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
+    """The labels along a dimension."""
+    return [str(name) for name in data[dimension].values]
+
+
+def scale_labels(data: xr.Dataset) -> list[str]:
+    """The noise scales in words."""
+    return [f"noise x {scale:g}" for scale in data["scale"].values]
+
+
+def bounds(data: xr.Dataset) -> dict[str, int]:
+    """The channels that estimators look at, each with the index of an estimator that has their bound."""
+    found: dict[str, int] = {}
+    known = data["bound"].notnull().any([name for name in data["bound"].dims if name != "estimator"])
+    for place in np.argsort(~known.values, kind="stable").tolist():  # first those that were run
+        found.setdefault(str(data["seen"].isel(estimator=place).item()), place)
+    return dict(sorted(found.items(), key=lambda item: item[1]))

@@ -1,0 +1,257 @@
+"""Figures of one scenario of a study: errors, efficiency and limits against noise; scatter, coverage and rollouts."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from ..results import NINETY_FIVE
+from ..study import metrics
+from .study_data import bounds, names
+from .style import BOUND_DASHES, FAINT, INK, estimator_gid, grid, label_edges, legend, log_axis, scale_axis, styles
+from .text import plain
+
+_COLUMNS = 4
+# The markers of all estimators are spread over this share of the gap between two noise scales.
+_DODGE = 0.3
+# The quantiles that a box shows. The whiskers hold 95 % of the flights.
+_QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+# The place on a logarithmic axis for an estimator without rollouts.
+_NO_ROLLOUTS = 0.5
+
+
+def positive_scales(data: xr.Dataset) -> xr.Dataset:
+    """The data without the noise scale 0, which a logarithmic axis cannot show."""
+    return data.isel(scale=np.flatnonzero(data["scale"].values > 0))
+
+
+def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
+    """The scale of a parameter's errors: "percent" or "absolute", the unit, and why not percent.
+
+    Absolute if the percentage of any point is meaningless, so that a panel has one scale.
+    """
+    reason = metrics.no_percentage(data).isel(parameter=parameter)
+    if not (reason > 0).any():
+        return "percent", "%", ""
+    worst = int(reason.where(reason > 0).min())
+    at = [f"{scale:g}" for scale in data["scale"].values[(reason > 0).any("estimator").values]]
+    where = f" at noise {', '.join(at)}" if len(at) < data.sizes["scale"] else ""
+    return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
+
+
+def errors(data: xr.Dataset) -> Figure | None:
+    """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
+    data = positive_scales(data)
+    found, best = metrics.estimator_error(data), metrics.bound_error(data)
+    if not data.sizes["scale"] or not found["absolute"].notnull().any():
+        return None
+    figure, axes = grid(data.sizes["parameter"], columns=_COLUMNS, height=2.2)
+    x = data["scale"].values
+    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
+        kind, unit, why = error_unit(data, place)
+        for dash, estimator in zip(BOUND_DASHES, bounds(data).values(), strict=False):
+            y = best[kind].isel(parameter=place, estimator=estimator).values
+            panel.plot(x, y, color=INK, linestyle=dash, linewidth=1.1, marker="_" if len(x) == 1 else None)
+        _draw_estimators(panel, data, found[kind].isel(parameter=place))
+        scale_axis(panel, x)
+        log_axis(panel, "y")
+        panel.set_title(f"{name} [{unit}]")
+        if why:
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high * (high / low) ** 0.22)
+            panel.text(0.03, 0.98, f"absolute: {why}", transform=panel.transAxes, va="top", fontsize=7)
+    label_edges(axes, _COLUMNS, x="noise scale", y="RMS error")
+    legend(figure, names(data, "estimator"), bounds=list(bounds(data)))
+    return figure
+
+
+def efficiency(data: xr.Dataset) -> Figure | None:
+    """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
+    data = positive_scales(data)
+    found = metrics.efficiency(data)
+    if not data.sizes["scale"] or not found["efficiency"].notnull().any():
+        return None
+    figure, axes = grid(data.sizes["parameter"], columns=_COLUMNS, height=2.2)
+    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
+        panel.axhline(1, color=INK, linewidth=1.1)
+        one = found.isel(parameter=place)
+        _draw_estimators(panel, data, one["efficiency"], one)
+        scale_axis(panel, data["scale"].values)
+        panel.set_yscale("log")
+        panel.set_title(name)
+    label_edges(axes, _COLUMNS, x="noise scale", y="RMSE / bound")
+    lows, highs = zip(*(panel.get_ylim() for panel in axes), strict=True)
+    for panel in axes:
+        panel.set_ylim(min(lows), max(highs))
+        log_axis(panel, "y")
+    legend(figure, names(data, "estimator"))
+    return figure
+
+
+def frontier(data: xr.Dataset) -> Figure | None:
+    """The noise scale below which each parameter can be distinguished from 0, and the scales of the study."""
+    limits = metrics.frontier(data)
+    if not (limits > 0).any():
+        return None
+    parameters = names(data, "parameter")
+    figure, (panel,) = grid(1, columns=1, width=7.0, height=0.5 * len(parameters) + 0.6)
+    scales = data["scale"].values[data["scale"].values > 0]
+    seen = bounds(data)
+    least = min(float(limits.where(limits > 0).min()), float(scales.min()))
+    for scale in scales:
+        panel.axvline(scale, color=FAINT, linewidth=0.8, linestyle="dashed", zorder=0)
+    for row, (channels, estimator) in enumerate(seen.items()):
+        y = np.arange(len(parameters)) + 0.36 * (row - (len(seen) - 1) / 2)
+        x = limits.isel(estimator=estimator).values
+        finite = x > 0
+        label = f"bound of channels: {channels}"
+        panel.plot(x[finite], y[finite], "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=label)
+        for a, b in zip(x[finite], y[finite], strict=True):
+            panel.annotate(plain(a, 2), (a, b), (6, 0), textcoords="offset points", va="center", fontsize=7)
+    for y in np.flatnonzero((limits == 0).any("estimator").values):
+        panel.text(least, float(y), "the truth is 0: no noise is small enough", va="center", fontsize=7.5)
+    panel.set_xscale("log")
+    log_axis(panel, "x")
+    low, high = panel.get_xlim()
+    panel.set_xlim(low, high * (high / low) ** 0.06)
+    panel.set_yticks(range(len(parameters)), parameters)
+    panel.set_ylim(len(parameters) - 0.5, -0.5)
+    panel.set_xlabel("noise scale below which |truth| exceeds 1.96 bounds (dashed: the scales of this study)")
+    if len(seen) > 1:
+        figure.legend(loc="outside lower center", ncols=len(seen))
+    return figure
+
+
+def nearest_scale(data: xr.Dataset) -> int:
+    """The index of the noise scale nearest 1 (by ratio). Figures of one scale show it."""
+    scales = data["scale"].values
+    positive = np.where(scales > 0, scales, np.finfo(float).tiny)
+    return int(np.argmin(np.abs(np.log(positive))))
+
+
+def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None:
+    """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1.
+
+    `drawn`: this figure of another scale, whose boxes are replaced. It keeps its layout, which takes half of the time.
+    """
+    every = metrics.normalised_error(data.isel(scale=nearest_scale(data)))
+    some = every.notnull().any("flight")
+    if not some.any():
+        return None
+    found = every.where(some, 0.0).quantile(list(_QUANTILES), dim="flight").where(some)
+    style = styles(names(data, "estimator"))
+    if drawn is None:
+        drawn, _ = grid(data.sizes["parameter"], columns=_COLUMNS, height=0.28 * len(style) + 0.75)
+    # Wide enough for the boxes, but limited in case one estimator is very bad.
+    reach = float(np.clip(1.08 * np.nanmax(np.abs(found.values), initial=0.0), 3.0, 12.0))
+    for place, (panel, name) in enumerate(zip(drawn.axes, names(data, "parameter"), strict=True)):
+        for old in (*panel.lines, *panel.texts):
+            old.remove()
+        for x in (-NINETY_FIVE, NINETY_FIVE):
+            panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
+        panel.axvline(0, color=INK, linewidth=0.8)
+        for row, look in enumerate(style.values()):
+            low, first, middle, third, high = found.isel(parameter=place, estimator=row).values
+            if not np.isfinite(middle):
+                panel.text(0, row, "no estimates", va="center", ha="center", fontsize=7, gid=estimator_gid(row))
+                continue
+            tip = f"median {middle:.2g}, quartiles {first:.2g} to {third:.2g}, 95 % {low:.2g} to {high:.2g}"
+            marks: dict[str, Any] = {"color": look.color, "gid": estimator_gid(row, tip)}
+            panel.plot([low, high], [row, row], linewidth=1.2, solid_capstyle="butt", **marks)
+            panel.plot([first, third], [row, row], linewidth=7, solid_capstyle="butt", alpha=0.55, **marks)
+            panel.plot([middle], [row], marker=look.marker, markersize=4.5, **marks)
+        panel.set_title(name)
+        panel.set_xlim(-reach, reach)
+        panel.set_ylim(len(style) - 0.4, -0.6)
+        panel.set_yticks(range(len(style)), list(style) if place % _COLUMNS == 0 else [])
+        panel.grid(axis="y", visible=False)
+    label_edges(drawn.axes, _COLUMNS, x="error / bound")
+    return drawn
+
+
+def coverage(data: xr.Dataset) -> Figure | None:
+    """Share of intervals that hold the truth against the level that they claim, at each noise scale."""
+    found = metrics.mean_coverage(data)
+    if not found["coverage"].notnull().any():
+        return None
+    style, levels = styles(names(data, "estimator")), data["level"].values
+    figure, axes = grid(
+        data.sizes["scale"], columns=_COLUMNS, width=2.25 * min(data.sizes["scale"], _COLUMNS) + 1.2, height=2.8
+    )
+    lowest = min(float(found["low"].min()), float(levels.min())) - 0.04
+    for place, panel in enumerate(axes):
+        one = found.isel(scale=place)
+        for x, level in enumerate(levels):
+            panel.hlines(level, x - 0.45, x + 0.45, color=INK, linewidth=1.4)
+        for row, look in enumerate(style.values()):
+            shift = 0.7 * (row / max(len(style) - 1, 1) - 0.5)
+            at, part, gid = np.arange(len(levels)) + shift, one.isel(estimator=row), estimator_gid(row)
+            panel.vlines(at, part["low"].values, part["high"].values, color=look.color, linewidth=1.0, gid=gid)
+            shares = part["coverage"].values
+            panel.plot(at, shares, color=look.color, marker=look.marker, linestyle="none", markersize=4, gid=gid)
+        panel.set_title(f"noise scale {data['scale'].values[place]:g}")
+        panel.set_xticks(range(len(levels)), [f"{100 * level:g} %" for level in levels])
+        panel.set_ylim(lowest, 1.02)
+        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
+        panel.grid(axis="x", visible=False)
+        panel.set_xlabel("level claimed")
+        if place % _COLUMNS == 0:
+            panel.set_ylabel("intervals that hold the truth")
+    legend(figure, list(style), lines=False)
+    return figure
+
+
+def rollouts(data: xr.Dataset) -> Figure | None:
+    """RMSE / least bound (mean of all parameters) against rollouts; a line joins the noise scales of an estimator."""
+    data = positive_scales(data)
+    x, y = (of(data).transpose("scale", "estimator") for of in (metrics.mean_rollouts, metrics.accuracy))
+    known = (x.notnull() & y.notnull()).values
+    if not known.any():
+        return None
+    figure, (panel,) = grid(1, columns=1, width=7.0, height=3.6)
+    panel.axhline(1, color=INK, linewidth=1.1)
+    for row, look in enumerate(styles(names(data, "estimator")).values()):
+        at = known[:, row]
+        across, up = np.maximum(x.isel(estimator=row).values[at], _NO_ROLLOUTS), y.isel(estimator=row).values[at]
+        panel.plot(across, up, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(row))
+        for place, a, b in zip(np.flatnonzero(at), across, up, strict=True):
+            tip = f"noise x {data['scale'].values[place]:g}: {plain(float(x[place, row]))} rollouts, {plain(float(b))}"
+            marks = {"color": look.color, "marker": look.marker, "alpha": 0.8, "linewidths": 0}
+            panel.scatter(a, b, s=26 + 30 * place, gid=estimator_gid(row, tip), **marks)
+    log_axis(panel, "x")
+    log_axis(panel, "y")
+    _rollout_ticks(panel, x.values[x.notnull().values])
+    scales = ", ".join(f"{scale:g}" for scale in data["scale"].values)
+    panel.set_xlabel(f"rollouts for one flight (larger markers: larger noise scale of {scales})")
+    panel.set_ylabel("RMSE / least bound, mean of all parameters")
+    legend(figure, names(data, "estimator"))
+    return figure
+
+
+def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
+    """The noise scales, shifted for the estimator `place` of `count`, so that markers do not cover each other."""
+    gap = np.diff(np.log(np.sort(scales))).min() if len(scales) > 1 else np.log(3.0)
+    return scales * np.exp(_DODGE * gap * (place / max(count - 1, 1) - 0.5))
+
+
+def _draw_estimators(panel, data: xr.Dataset, values: xr.DataArray, interval: xr.Dataset | None = None) -> None:
+    style = styles(names(data, "estimator"))
+    for place, look in enumerate(style.values()):
+        y = values.isel(estimator=place).values
+        x = data["scale"].values if interval is None else dodged(data["scale"].values, place, len(style))
+        panel.plot(x, y, color=look.color, marker=look.marker, linestyle=look.dash, gid=estimator_gid(place))
+        if interval is not None:
+            low, high = (interval[end].isel(estimator=place).values for end in ("low", "high"))
+            panel.vlines(x, low, high, color=look.color, linewidth=1.0, gid=estimator_gid(place))
+    if not np.isfinite(values.values).any():
+        panel.text(0.5, 0.5, "no estimates", transform=panel.transAxes, ha="center")
+
+
+def _rollout_ticks(panel, spent: np.ndarray) -> None:
+    top = int(np.ceil(np.log10(max(float(spent.max()), 10.0))))
+    ticks = {_NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
+    ticks |= {10.0**power: f"{10**power:,}" for power in range(top + 1)}
+    panel.set_xticks(list(ticks), list(ticks.values()))
+    panel.set_xlim(min(ticks) / 1.5 if 0 in np.floor(spent) else None, max(ticks) * 1.2)

@@ -1,0 +1,149 @@
+"""The report of a study: its figures with their captions, and one HTML page that needs no other file."""
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from .._files import check_writable, write_atomically
+from . import example_figures, study_figures, study_tables
+from .html import Drawing, drawings, render
+from .study_data import Scenario, names, scale_labels, scenarios
+from .style import drawing, pdf, styles, svg
+
+MOST_DRAWN = 12
+"""At most so many scenarios have figures. All scenarios have tables."""
+
+# Attributes of the Dataset, and their labels on the page.
+_PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
+
+
+# The figures of each scenario, and those of the example flight and of the networks. Each draws nothing if its data are
+# absent. `study.html.j2` has their titles and captions.
+OF_SCENARIO: dict[str, Callable[..., Figure | None]] = {
+    "error": study_figures.errors,
+    "efficiency": study_figures.efficiency,
+    "distribution": study_figures.distribution,
+    "rollouts": study_figures.rollouts,
+    "coverage": study_figures.coverage,
+    "frontier": study_figures.frontier,
+}
+OF_EXAMPLE: dict[str, Callable[..., Figure | None]] = {
+    "trajectories": example_figures.trajectories,
+    "deviations": example_figures.deviations,
+    "path": example_figures.path,
+    "search": example_figures.search,
+    "training": example_figures.training,
+}
+# These show one noise scale: the files the one nearest 1, the page the one that the reader chooses.
+_OF_ONE_SCALE = ("distribution",)
+
+
+class Drawn(NamedTuple):
+    """A figure of one study.
+
+    - `stem`: of the names of its files.
+    - `svg`, `pdf`: the bytes of its files.
+    - `choices`: the figures among which the reader of the page chooses, by label; `svg` is one of them.
+    """
+
+    stem: str
+    svg: bytes
+    pdf: bytes | None
+    choices: dict[str, bytes]
+
+
+def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
+    """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; returns their paths, the page first.
+
+    **Arguments:**
+
+    - `with_pdf`: if false, figures are SVG only, which takes half the time.
+
+    All figures are drawn before the first file is written. Figures that only an older report has are removed.
+    """
+    target, folder = directory / "report.html", directory / "figures"
+    check_writable(target)
+    every = list(scenarios(dataset))
+    sections: list[tuple[Scenario, dict[str, Drawn]]] = []
+    for scenario in every:
+        shown = OF_SCENARIO if scenario.number <= MOST_DRAWN else {}
+        suffix = f"-{scenario.number}" if len(every) > 1 else ""
+        sections.append((scenario, draw(shown, scenario.data, suffix=suffix, with_pdf=with_pdf)))
+    example = draw(OF_EXAMPLE, dataset, with_pdf=with_pdf)
+    page = _page(dataset, sections, example).encode()
+    folder.mkdir(exist_ok=True)
+    files: dict[Path, bytes] = {}
+    for drawn in [drawn for figures in (*(of for _, of in sections), example) for drawn in figures.values()]:
+        files[folder / f"{drawn.stem}.svg"] = drawn.svg
+        if drawn.pdf is not None:
+            files[folder / f"{drawn.stem}.pdf"] = drawn.pdf
+    for path, content in (*files.items(), (target, page)):
+        with write_atomically(path) as beside:
+            beside.write_bytes(content)
+    ours = "|".join(OF_SCENARIO | OF_EXAMPLE)
+    for path in folder.iterdir():
+        if path not in files and re.fullmatch(rf"({ours})(-\d+)?\.(svg|pdf)", path.name):
+            path.unlink()
+    return [target, *files]
+
+
+def draw(
+    figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, *, suffix: str = "", with_pdf: bool = True
+) -> dict[str, Drawn]:
+    """The figures whose data are present. `suffix`: of the names of the files."""
+    made = {}
+    for name, draw_figure in figures.items():
+        with drawing():
+            figure = draw_figure(data)
+            if figure is None:
+                continue
+            as_svg, as_pdf, choices = svg(figure), pdf(figure) if with_pdf else None, {}
+            for place, label in enumerate(scale_labels(data)) if name in _OF_ONE_SCALE else ():
+                if place == study_figures.nearest_scale(data):
+                    choices[label] = as_svg
+                elif draw_figure(data.isel(scale=[place]), figure) is not None:
+                    choices[label] = svg(figure)
+        made[name] = Drawn(f"{name}{suffix}", as_svg, as_pdf, choices or {"": as_svg})
+    return made
+
+
+def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]], example: Mapping[str, Drawn]) -> str:
+    """The page. `sections`: each scenario with its figures; `example`: figures that belong to no scenario."""
+    attributes = {name: str(value) for name, value in dataset.attrs.items()}
+    estimators = names(dataset, "estimator")
+    missing, cells = study_tables.cells_not_run(dataset)
+
+    def inline(drawn: Drawn, description: str) -> tuple[Drawing, ...]:
+        chosen = list(drawn.choices.values()).index(drawn.svg)
+        return drawings(drawn.choices, chosen, stem=drawn.stem, description=description, estimators=estimators)
+
+    return render(
+        "study.html.j2",
+        filters={"inline": inline},
+        title=attributes.get("title", "") or "A study",
+        command=attributes.get("command", ""),
+        specification=attributes.get("specification", ""),
+        provenance=[(label, attributes[name]) for name, label in _PROVENANCE.items() if name in attributes],
+        estimators=[(place, name, look.color) for place, (name, look) in enumerate(styles(estimators).items())],
+        sections=[
+            {
+                "number": scenario.number,
+                "label": scenario.label,
+                "figures": drawn,
+                "tables": study_tables.scenario_tables(scenario.data),
+                "trouble": study_tables.troubled_flights(scenario.data),
+            }
+            for scenario, drawn in sections
+        ],
+        level=study_tables.shown_level(dataset),
+        example=example,
+        failed=study_tables.failed_cells(dataset),
+        missing=missing,
+        cells=cells,
+        drawn=sum(bool(drawn) for _, drawn in sections),
+        zero_scale=bool((dataset["scale"] == 0).any()),
+    )

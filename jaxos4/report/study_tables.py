@@ -1,0 +1,179 @@
+"""The tables of a study as rows of text, for the page and for the terminal."""
+
+import json
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from ..study import metrics
+from .study_data import bounds, names, scale_labels
+from .text import MISSING, percent, plain
+
+# The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
+_MARKS = ("", "†", "‡")
+# The table of coverage by parameter shows this level, or the nearest one in the study.
+_LEVEL = 0.95
+_MOST_LISTED = 20
+
+
+class Cell(NamedTuple):
+    """A number as text, with its interval and its mark."""
+
+    text: str
+    interval: str = ""
+    mark: str = ""
+
+
+class Row(NamedTuple):
+    """One row. `estimator`: the index of its estimator, if any; the page hides the row with the estimator."""
+
+    label: str
+    cells: tuple[Cell, ...]
+    estimator: int | None = None
+
+
+class Table(NamedTuple):
+    """Rows of text, in groups of one noise scale.
+
+    - `headings`: of the columns after the first, each with its unit or an empty string.
+    - `groups`: the label of each group, and its rows.
+    - `notes`: the meaning of the marks.
+    """
+
+    headings: list[tuple[str, str]]
+    groups: list[tuple[str, list[Row]]]
+    notes: tuple[str, ...] = ()
+
+
+def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
+    """The tables of one scenario, by name."""
+
+    def table(found: xr.Dataset, measure: str, text: Callable[[float], str], headings: list[str]) -> Table:
+        return _by_estimator(data, headings, lambda at: _with_intervals(found.isel(at), measure, text))
+
+    parameters = names(data, "parameter")
+    return {
+        "error": error_table(data),
+        "efficiency": table(metrics.efficiency(data), "efficiency", plain, parameters),
+        "coverage": table(metrics.coverage(data).isel(level=_shown_level(data)), "coverage", percent, parameters),
+        "levels": table(metrics.mean_coverage(data), "coverage", percent, [_percents(x) for x in data["level"].values]),
+        "results": _result_table(data),
+    }
+
+
+def shown_level(data: xr.Dataset) -> str:
+    """The level of the intervals in the table of coverage, in percent."""
+    return _percents(data["level"].values[_shown_level(data)])
+
+
+def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
+    """RMS errors in percent of the truth, with rows for the bounds and for the centre of the bracket."""
+    found, best, middle = metrics.estimator_error(data), metrics.bound_error(data), metrics.center_error(data)
+    used: set[int] = set()
+
+    def cells(of: xr.Dataset) -> tuple[Cell, ...]:
+        made = []
+        for place in range(data.sizes["parameter"]):
+            one = of.isel(parameter=place)
+            reason = int(one["reason"])
+            value = float(one["absolute" if reason else "percent"])
+            mark = "" if np.isnan(value) else _MARKS[reason]
+            used.update({reason} if mark else ())
+            made.append(Cell(plain(value, digits), mark=mark))
+        return tuple(made)
+
+    groups = []
+    for place, label in enumerate(scale_labels(data)):
+        rows = [Row(f"bound, {seen}", cells(best.isel(scale=place, estimator=at))) for seen, at in bounds(data).items()]
+        for at, name in enumerate(names(data, "estimator")):
+            rows.append(Row(name, cells(found.isel(scale=place, estimator=at)), at))
+        groups.append((label, [*rows, Row("bracket centre", cells(middle.isel(scale=place)))]))
+    notes = (
+        f"{_MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, so a percentage is "
+        "meaningless."
+        for code in sorted(used)
+    )
+    return Table(list(zip(names(data, "parameter"), names(data, "unit"), strict=True)), groups, tuple(notes))
+
+
+def _result_table(data: xr.Dataset) -> Table:
+    """The number of flights by result, mean rollouts, and the share of seed brackets that hold the truth."""
+    counts, hits, spent = metrics.result_counts(data), metrics.hit_rate(data), metrics.mean_rollouts(data)
+    occurs = np.flatnonzero((counts > 0).any([name for name in counts.dims if name != "code"]).values)
+
+    def cells(at: dict[str, int]) -> tuple[Cell, ...]:
+        hit = _with_intervals(hits.isel(at).expand_dims("parameter"), "hit_rate", percent)
+        numbers = [Cell(str(int(number))) for number in counts.isel(at).values[occurs]]
+        return (*numbers, Cell(plain(float(spent.isel(at)))), *hit)
+
+    headings = [names(counts, "code")[place].replace("_", " ") for place in occurs]
+    return _by_estimator(data, [*headings, "rollouts", "seed hits"], cells)
+
+
+class Trouble(NamedTuple):
+    """Flights or cells without numbers: a description of the first 20, and the total."""
+
+    listed: list[str]
+    total: int
+
+
+def troubled_flights(data: xr.Dataset) -> Trouble:
+    """The flights that were run and did not converge."""
+    order = ("scale", "estimator", "flight")
+    bad, results = (
+        (metrics.was_run(data) & ~metrics.converged(data)).transpose(*order),
+        data["result"].transpose(*order),
+    )
+    places = np.argwhere(bad.values).tolist()
+    known = {code: name.replace("_", " ") for name, code in metrics.codes(data).items()}
+    labels = (scale_labels(data), names(data, "estimator"), names(data, "flight"))
+    listed = []
+    for place in places[:_MOST_LISTED]:
+        scale, estimator, flight = (label[i] for label, i in zip(labels, place, strict=True))
+        listed.append(f"{scale}, {estimator}, flight {flight}: {known.get(int(results[*place]), 'unknown result')}")
+    return Trouble(listed, len(places))
+
+
+def failed_cells(dataset: xr.Dataset) -> Trouble:
+    """The cells of a study that raised an error, with the error's message."""
+    failures: list[dict[str, Any]] = json.loads(dataset.attrs.get("failures", "[]"))
+    shown = [name for name in metrics.SCENARIO if dataset.sizes[name] > 1] or ["estimator"]
+    listed = [
+        f"cell {failure['cell']}, {', '.join(f'{name} {failure[name]}' for name in shown)}: {failure['message']}"
+        for failure in failures[:_MOST_LISTED]
+    ]
+    return Trouble(listed, len(failures))
+
+
+def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
+    """The number of cells that have not been run, and the number of all cells."""
+    missing = (dataset["result"] == metrics.codes(dataset)["not_run"]).all("flight")
+    return int(missing.sum()), missing.size
+
+
+def _percents(level: float) -> str:
+    return f"{100 * level:g} %"
+
+
+def _shown_level(data: xr.Dataset) -> int:
+    return int(np.argmin(np.abs(data["level"].values - _LEVEL)))
+
+
+def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[str, int]], tuple[Cell, ...]]) -> Table:
+    """A table with a row for each noise scale and estimator; `cells` gives the row's cells from its indices."""
+    estimators = list(enumerate(names(data, "estimator")))
+    groups = [
+        (label, [Row(name, cells({"scale": scale, "estimator": at}), at) for at, name in estimators])
+        for scale, label in enumerate(scale_labels(data))
+    ]
+    return Table([(heading, "") for heading in headings], groups)
+
+
+def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
+    made = []
+    for number, *ends in zip(*(one[part].values for part in (measure, "low", "high")), strict=True):
+        low, high = map(text, ends)
+        made.append(Cell(text(number), "" if MISSING in (low, high) else f"{low} to {high}"))
+    return tuple(made)

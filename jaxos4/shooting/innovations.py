@@ -1,0 +1,280 @@
+"""A problem of innovations: the likelihood of a flight with disturbances that the model does not contain.
+
+A real vehicle flies under a controller, which answers gusts and everything else that a model lacks. So the input and
+the disturbance correlate. A likelihood that treats the disturbance as noise of the sensors is then biased, however long
+the flight. Here the disturbance is a part of the model. A Kalman filter estimates it from the past, and only the
+innovations are compared: the part of a measurement that the past cannot predict.
+
+References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, System Identification, ch. 7 and 13.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from .._custom_types import InitialStates, Parameters, Scalar, as_float
+from ..bracket import PROPER_PRIOR, Bracket
+from ..flight import CHANNEL_NAMES, Flight
+from ..models.abstract import AbstractModel
+from ..models.state import CHANNELS
+from .abstract import AbstractProblem, Stages, WindowUnknowns
+from .filters import Innovations, LogNoise, Observed, innovate
+from .problem import ShootingProblem
+from .rows import Rows, windowed
+from .scans import Curvature, Parts, Shot
+from .segments import observe_in_segments, segments_of
+from .unknowns import Unknowns, Values
+
+# The number of samples in a segment, and of those that settle its filter.
+SEGMENT, SETTLING = 384, 128
+# Time constants of the disturbance at which searches start [s]: the likelihood has several maxima.
+_TIMES = np.array([0.2, 0.03])
+_SHORTEST, _LONGEST = 0.25, 3.0  # time constants: in samples, in seconds
+_NOISE_REACH = 1e8  # factor to either side of the first noise levels: simulated flights have no disturbance
+NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
+_STRIDE = 1.0  # the cost is roughly quadratic in a logarithm over such a step
+
+
+class InnovationsProblem(AbstractProblem):
+    """A shooting problem's rates and specific force, compared as innovations of Kalman filters.
+
+    Each channel has a disturbance with a strength and a time constant, and white noise of its sensor. The logarithms of
+    the three are unknowns like the parameters, and follow them: `log_p_strength`, `log_p_time`, `log_p_sensor`, then
+    those of q, r, and each specific force that the model predicts. The bracket is a Gaussian prior, whose standard
+    deviation is its half-width.
+
+    **Arguments:**
+
+    - `problem`: model, flight, known or free initial state, and the bracket of the parameters. Its windows and its
+      sigma do not matter.
+    - `segment`: about how many samples are filtered in a row; segments are filtered in parallel. A short segment loses
+      information if the disturbance is weak, because its filter begins without memory.
+    - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
+    - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
+      of the disturbances.
+    """
+
+    prior: ClassVar[float] = PROPER_PRIOR
+    problem: ShootingProblem
+    start: Values = eqx.field(converter=as_float)
+    segment: int = eqx.field(static=True, default=SEGMENT)
+    settling: int = eqx.field(static=True, default=SETTLING)
+
+    def __init__(
+        self,
+        problem: ShootingProblem,
+        *,
+        segment: int = SEGMENT,
+        settling: int = SETTLING,
+        start: Float[ArrayLike, " unknowns"] | None = None,
+    ):
+        self.problem, self.segment, self.settling = problem.restrict("rates"), segment, settling
+        # An array in any case, so that all starts share one program.
+        unknowns = problem.unknowns.count + 3 * self.problem.columns.size
+        self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
+
+    @property
+    def model(self) -> AbstractModel:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Of the shooting problem."""
+        return self.problem.model
+
+    @property
+    def flight(self) -> Flight:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Of the shooting problem."""
+        return self.problem.flight
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The names of the compared channels."""
+        return tuple(CHANNEL_NAMES[column] for column in self.problem.columns)
+
+    @property
+    def windows(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """1: segments are parts of one window, which share all unknowns."""
+        return 1
+
+    @property
+    def free_size(self) -> int:
+        """0: a filter finds its own state."""
+        return 0
+
+    @property
+    def index(self) -> Int[np.ndarray, "segments time"]:
+        """The samples of each segment."""
+        return segments_of(self.flight.time.shape[0], self.segment, self.settling)
+
+    @property
+    def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
+        own, dt = self.problem.unknowns, self.flight.dt
+        first = jnp.stack(_first_noise(self.problem.measured(), dt), axis=1)
+        lowest, highest = first - np.log(_NOISE_REACH), first + np.log(_NOISE_REACH)
+        lowest, highest = lowest.at[:, 1].set(jnp.log(_SHORTEST * dt)), highest.at[:, 1].set(np.log(_LONGEST))
+        levels = [(f"log_{name}_{level}", "1") for name in self.channels for level in ("strength", "time", "sensor")]
+        precision = jnp.full(first.size, NOISE_PRECISION)
+        return Unknowns(
+            names=own.names + tuple(name for name, _ in levels),
+            units=own.units + tuple(unit for _, unit in levels),
+            center=jnp.concatenate([own.center, first.ravel()]),
+            half_width=jnp.concatenate([own.half_width, 1 / jnp.sqrt(precision)]),
+            free=jnp.concatenate([own.free, jnp.ones(first.size, dtype=bool)]),
+            precision=jnp.concatenate([1 / jnp.square(own.usable.half_width), precision]),
+            lowest=jnp.concatenate([own.lowest, lowest.ravel()]),
+            highest=jnp.concatenate([own.highest, highest.ravel()]),
+            stride=jnp.concatenate([own.stride, jnp.full(first.size, _STRIDE)]),
+        )
+
+    @property
+    def starts(self) -> Float[Array, "starts unknowns"]:
+        """`start` where it is not NaN; all rows are equal if it is a whole start."""
+        unknowns, count = self.unknowns.usable, self.problem.unknowns.count
+        place = np.arange(unknowns.count) - count
+        times = jnp.where((place >= 0) & (place % 3 == 1), jnp.log(jnp.asarray(_TIMES))[:, None], unknowns.center)
+        return jnp.where(jnp.isnan(self.start) | ~unknowns.free, times, self.start)
+
+    def starting_from(self, start: Float[ArrayLike, " unknowns"]) -> "InnovationsProblem":
+        """The same problem, with another start."""
+        return dataclasses.replace(self, start=start)
+
+    def hold(self, values: Mapping[str, Float[ArrayLike, ""]]) -> "InnovationsProblem":
+        """The same problem with some parameters held, see `ShootingProblem.hold`."""
+        return dataclasses.replace(self, problem=self.problem.hold(values))
+
+    def within(self, bracket: Bracket | None) -> "InnovationsProblem":
+        """The same problem, with another bracket for the parameters; unchanged for `None`."""
+        return self if bracket is None else dataclasses.replace(self, problem=self.problem.within(bracket))
+
+    def noise(self, unknowns: Values) -> LogNoise:
+        """The noise levels among the unknowns."""
+        return LogNoise(*unknowns[self.problem.unknowns.count :].reshape(-1, 3).T)
+
+    def first_state(self) -> tuple[InitialStates, InitialStates]:
+        """Nothing: the initial state is no unknown."""
+        return jnp.zeros(0, dtype=float), jnp.zeros(0, dtype=float)
+
+    def split(self, initial_state: InitialStates) -> Float[Array, "1 0"]:
+        """See `AbstractProblem`."""
+        return initial_state[None]
+
+    def shots(self, parameters: Parameters, initial_state: InitialStates) -> Shot:
+        """See `AbstractProblem`."""
+        return jax.tree.map(lambda leaf: leaf[0], self.curvatures(parameters, initial_state).shot)
+
+    def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
+        """See `AbstractProblem`. `parts` are the segments."""
+        unknowns, innovations = self.unknowns.usable, self._innovations(self.observed())
+        count, free = self.problem.unknowns.count, unknowns.free
+        both = free & free[:, None]
+
+        def evaluate(values: Values, initial_state: InitialStates) -> Curvature:
+            del initial_state
+            found = innovations(values[:count], self.noise(values))
+            gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, count)
+            off = values - unknowns.center
+            cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
+            slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
+            curvature = jnp.where(both, information.sum(axis=0), 0.0) + jnp.diag(unknowns.precision)
+            parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0))
+            return Curvature(Shot(cost[None], found.sound.all()[None]), slope[None], curvature[None], parts)
+
+        return evaluate
+
+    def stages(self, *, cascade: bool) -> Stages:
+        """The whole problem: filters follow the measurements, so that errors do not grow with time."""
+        del cascade
+        at, nothing = self.evaluator(), jnp.zeros(0, dtype=float)
+
+        def evaluate(stage: Int[Array, ""], unknowns: WindowUnknowns) -> Curvature:
+            del stage
+            return at(unknowns[0], nothing)
+
+        def misfit(stage: Int[Array, ""], cost: Scalar) -> Scalar:
+            """The residuals are as large as the noise, which is found with the parameters."""
+            del stage
+            return jnp.ones_like(cost)
+
+        smallest_step = jnp.sqrt(jnp.finfo(float).eps) * jnp.ones(1)
+        return Stages(1, evaluate, self.unknowns.free[None], misfit, smallest_step)
+
+    def cascade(self) -> "tuple[InnovationsProblem, ...]":
+        """The problem alone."""
+        return (self,)
+
+    def explains(self, cost: Scalar) -> Bool[Array, ""]:
+        """True: the noise is as large as the flight says."""
+        return jnp.isfinite(cost)
+
+    def observed(self) -> Observed:
+        """The measurements in segments, see `observe_in_segments`."""
+        return observe_in_segments(self.problem, self.index, self.settling)
+
+    def innovations(self, parameters: Parameters, noise: LogNoise) -> Innovations:
+        """The innovations of all segments."""
+        return self._innovations(self.observed())(parameters, noise)
+
+    def _innovations(self, observed: Observed) -> Callable[[Parameters, LogNoise], Innovations]:
+        """The innovations of all segments, as a function of the parameters and the noise."""
+        problem, model, inputs, dt = self.problem, self.model, self.flight.inputs, self.flight.dt
+        samples = np.minimum(self.index, self.flight.time.shape[0] - 1)
+        rows = Rows(windowed(problem.forcing(model.alpha), samples), ())
+
+        def evaluate(parameters: Parameters, noise: LogNoise) -> Innovations:
+            forced = problem.with_forcing(rows, parameters, inputs=inputs, index=samples)
+            forcing, tangents = jax.tree.map(
+                lambda leaf: jnp.moveaxis(leaf, 0, -1), (forced.forcing, forced.forcing_tangents)
+            )
+            return innovate(
+                problem.step,
+                model.observe,
+                observed,
+                forcing,
+                parameters,
+                noise,
+                dt,
+                forcing_tangents=tangents,
+                forcing_parameters=model.forcing_parameters,
+            )
+
+        return evaluate
+
+
+def joined(
+    gradient: Float[Array, "channels some"], information: Float[Array, "channels some some"], count: int
+) -> tuple[Values, Float[Array, "unknowns unknowns"]]:
+    """Gradient and information about all unknowns, from those of each channel about parameters and own noise."""
+    channels = gradient.shape[0]
+    size = count + 3 * channels
+    total = jnp.concatenate([gradient[:, :count].sum(axis=0), gradient[:, count:].ravel()])
+    whole = jnp.zeros((size, size), dtype=float).at[:count, :count].set(information[:, :count, :count].sum(axis=0))
+    for i in range(channels):
+        own = slice(count + 3 * i, count + 3 * (i + 1))
+        whole = whole.at[:count, own].set(information[i, :count, count:])
+        whole = whole.at[own, :count].set(information[i, count:, :count])
+        whole = whole.at[own, own].set(information[i, count:, count:])
+    return total, whole
+
+
+def _first_noise(measured: Float[Array, "samples channels"], dt: Scalar) -> LogNoise:
+    """The center of the noise's bracket, from differences of the measurements."""
+    is_rate = np.arange(measured.shape[1]) < CHANNELS["rates"]
+
+    def power(values: Float[Array, "rows channels"]) -> Float[Array, " channels"]:
+        known = ~jnp.isnan(values)
+        return jnp.where(known, jnp.square(values), 0.0).sum(axis=0) / jnp.maximum(known.sum(axis=0), 1)
+
+    def logarithm(values: Float[Array, " channels"]) -> Float[Array, " channels"]:
+        return jnp.log(jnp.where((values > 0) & jnp.isfinite(values), values, 1.0))
+
+    # White noise has second differences of 6 times its variance.
+    sensor = jnp.sqrt(power(jnp.diff(measured, n=2, axis=0)) / 6)
+    change = jnp.sqrt(power(jnp.diff(measured, axis=0))) / dt / 2
+    mean = jnp.nansum(measured, axis=0) / jnp.maximum((~jnp.isnan(measured)).sum(axis=0), 1)
+    spread = jnp.sqrt(power(measured - mean)) / 2
+    strength, sensor = jnp.where(is_rate, change, spread), jnp.where(is_rate, sensor, spread)
+    return LogNoise(logarithm(strength), jnp.full(strength.shape, np.log(_TIMES[0])), logarithm(sensor))

@@ -1,0 +1,203 @@
+"""Doubts about an estimate of a vehicle, and the jackknife that widens its intervals."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import chdtri
+
+import jaxos4
+from jaxos4.airframe import OS4
+from jaxos4.identification.jackknife import disagreement, parts_of
+from jaxos4.identification.judge import doubts_of, vibration
+from jaxos4.identification.results import Constant, Disturbance, ParameterEstimate, PredictionSkill, RateSkill
+from jaxos4.models.corrected import CorrectedOS4
+from jaxos4.recording import read_recording
+
+AIRFRAME = Path(__file__).parents[1] / "experiments" / "real_flight" / "crazyflie.toml"
+VEHICLE = jaxos4.FlightModel(OS4, terms=("lag", "delay", "accelerometer"))
+IMPLAUSIBLE = "implausible"
+
+
+def parameter(value, std):
+    return ParameterEstimate(value, std, std, (value - 2 * std, value + 2 * std), "1", "")
+
+
+def believable():
+    """Parameters and inertias of the OS4, each known to 2 %."""
+    alpha = np.asarray(CorrectedOS4(OS4).alpha)
+    parameters = {f"alpha{i + 1}": parameter(x, 0.02 * abs(x) + 1e-3) for i, x in enumerate(alpha.tolist())}
+    parameters |= {"rotor_lag": parameter(0.05, 0.001), "rotor_delay": parameter(0.01, 0.001)}
+    parameters["thrust_gain"] = parameter(1.0, 0.01)
+    table = zip(("Ix", "Iy", "Iz"), np.asarray(OS4.inertia).tolist(), strict=True)
+    return parameters, {name: Constant(x, 0.02 * x, "kg m^2") for name, x in table}
+
+
+def skill(**rates):
+    """Skills at 0.25 s; 0.8 for rates that are not given."""
+    nothing = [None, None, None]
+
+    def rate(value):
+        return RateSkill([0.9, value, 0.1], [0.1] * 3, nothing, nothing, nothing)
+
+    return PredictionSkill([0.1, 0.248, 0.5], 100, **{name: rate(rates.get(name, 0.8)) for name in "pqr"})
+
+
+def doubts(changed=None, inertias=None, skill=None):
+    """The doubts about a believable estimate, some of whose parameters or inertias (value, std) are changed."""
+    parameters, constants = believable()
+    parameters |= {name: parameter(*values) for name, values in (changed or {}).items()}
+    constants |= {name: Constant(*values, "kg m^2") for name, values in (inertias or {}).items()}
+    return doubts_of(VEHICLE, parameters, constants, skill)
+
+
+def test_nothing_speaks_against_a_good_estimate():
+    assert doubts(skill=skill()) == doubts() == ()
+    # An uncertain parameter is no contradiction.
+    for name in ("rotor_lag", "rotor_delay", "thrust_gain", "alpha1"):
+        assert doubts({name: (-0.5, 1.0)}) == ()
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"alpha3": (-100.0, 5.0)}, ("alpha3", "roll", "opposite sign")),
+        ({"alpha8": (-70.0, 5.0)}, ("alpha8", "yaw", "rotor_spins")),
+        ({"alpha1": (4.0, 0.1)}, ("alpha1", "contradict", "gyro")),
+        ({"alpha7": (-3.0, 0.1)}, ("alpha7", "contradict")),
+        ({"rotor_lag": (-0.02, 0.003)}, ("rotor_lag = -0.02 s is negative", "omega1..4")),
+        ({"rotor_delay": (-0.02, 0.003)}, ("rotor_delay", "time stamps")),
+        ({"thrust_gain": (0.02, 0.01)}, ("accelerometer", "does not follow")),
+        ({"thrust_gain": (-1.0, 0.05)}, ("z axis points down",)),
+        ({"thrust_gain": (9.8, 0.2)}, ("thrust_gain = 9.8 (the accelerometer shows more thrust", "mass")),
+        (
+            {"thrust_gain": (0.3, 0.02)},
+            ("thrust_gain = 0.3 (the accelerometer shows less thrust", "thrust_coefficient"),
+        ),
+    ],
+)
+def test_a_parameter_that_contradicts_physics_is_named_with_its_cause(changed, words):
+    (doubt,) = doubts(changed)
+    assert doubt.result == IMPLAUSIBLE
+    assert [word for word in words if word not in str(doubt)] == []
+
+
+def test_an_answer_without_roll_and_pitch_is_none():
+    parameters, constants = believable()
+    del parameters["alpha3"]
+    parameters["alpha6"] = parameter(10.0, 5.0)
+    found = doubts_of(VEHICLE, parameters, {"Iz": constants["Iz"]}, None)
+    assert [str(doubt).split()[0] for doubt in found] == ["roll", "pitch"]
+
+
+@pytest.mark.parametrize(
+    ("inertias", "words"),
+    [
+        ({"Iz": 0.03}, ("Iz", "exceeds Ix + Iy", "drag_coefficient")),
+        ({"Ix": 0.03}, ("Ix", "exceeds Iy + Iz")),
+        ({"Ix": 0.2, "Iy": 0.2}, ("Ix", "more than", "mass")),
+        ({"Ix": 7.5e-5, "Iy": 7.5e-5, "Iz": 1.3e-4}, ("Ix", "less than", "rotor_positions")),
+    ],
+)
+def test_inertias_that_no_body_has_are_named(inertias, words):
+    found = doubts(inertias={name: (x, 0.02 * x) for name, x in inertias.items()})
+    assert {doubt.result for doubt in found} == {IMPLAUSIBLE}
+    assert [word for word in words if word not in str(found[0])] == []
+    # Inertias that are wrong because the thrust is are not named beside it.
+    wrong = doubts({"thrust_gain": (9.8, 0.2)}, {name: (x, 0.02 * x) for name, x in inertias.items()})
+    assert len(wrong) == 1
+
+
+def test_a_gyro_that_vibrates_is_named():
+    quiet, loud = (Disturbance(5.0, "rad/s^2", 0.25, 0.02, correlation) for correlation in (0.1, -0.6))
+    assert not list(vibration({"p": quiet, "q": quiet, "r": quiet, "az": loud}, 0.004))
+    (doubt,) = vibration({"p": quiet, "q": loud, "r": quiet}, 0.004)
+    assert all(word in str(doubt) for word in ("noise of q", "-0.6", "`sample_time` 0.008", "log faster"))
+    # Longer samples would hide the motion too.
+    (doubt,) = vibration({"q": loud}, 0.008)
+    assert "sample_time" not in str(doubt)
+
+
+@pytest.mark.parametrize(("rates", "axes"), [({"p": 0.0}, "roll"), ({"q": -1.0, "r": -0.1}, "pitch and yaw")])
+def test_a_fit_without_skill_is_not_believed(rates, axes):
+    (doubt,) = doubts(skill=skill(**rates))
+    assert doubt.result == "no_skill"
+    assert axes in str(doubt)
+    assert doubts(skill=skill(**dict.fromkeys(rates))) == ()  # not measured
+
+
+# The jackknife of a straight line, for which one Gauss-Newton step is exact.
+
+
+def segments_of_a_line(rng, lanes=40, samples=50, *, spread=0.0):
+    """Gradient and information of y = a x + b + noise in each segment, at the joint least-squares estimate.
+
+    `spread`: standard deviation of the slope between segments. Also the data.
+    """
+    x = rng.standard_normal((lanes, samples))
+    y = (1.0 + spread * rng.standard_normal((lanes, 1))) * x + 0.5 + rng.standard_normal((lanes, samples))
+    regressors = np.stack([x, np.ones_like(x)], axis=-1)
+    information = np.einsum("lsi,lsj->lij", regressors, regressors)
+    estimate = np.linalg.solve(information.sum(axis=0), np.einsum("lsi,ls->i", regressors, y))
+    gradient = -np.einsum("lsi,ls->li", regressors, y - regressors @ estimate)
+    return gradient, information, regressors, y
+
+
+def test_the_jackknife_is_that_of_repeated_fits():
+    gradient, information, regressors, y = segments_of_a_line(np.random.default_rng(3), spread=0.5)
+    (part,) = parts_of(40, np.zeros(40, dtype=int))
+    factor = disagreement(gradient, information, np.zeros((2, 2)), part)
+    fits = []
+    for number in range(20):
+        kept = part != number
+        flat, values = regressors[kept].reshape(-1, 2), y[kept].ravel()
+        fits.append(np.linalg.lstsq(flat, values, rcond=None)[0])
+    variance = 19 / 20 * np.square(np.array(fits) - np.mean(fits, axis=0)).sum(axis=0)
+    ratio = np.sqrt(variance / np.diagonal(np.linalg.inv(information.sum(axis=0))))
+    assert ratio[0] > 2
+    np.testing.assert_allclose(factor[0], ratio[0], rtol=1e-6)
+    assert factor[1] == 1 or ratio[1] ** 2 > chdtri(19, 0.05) / 19
+
+
+def test_parts_that_agree_widen_one_interval_in_twenty():
+    rng, part = np.random.default_rng(4), parts_of(40, np.zeros(40, dtype=int))[0]
+    trials = 400
+    factors = [disagreement(*segments_of_a_line(rng)[:2], np.zeros((2, 2)), part) for _ in range(trials)]
+    widened = np.mean(np.array(factors) > 1)
+    assert abs(widened - 0.05) < 4 * np.sqrt(0.05 * 0.95 / (2 * trials))
+    assert np.max(factors) < 2
+
+
+def test_recordings_are_parts_of_their_own_if_there_are_enough():
+    lanes = np.arange(12)
+    assert len(parts_of(12, lanes // 6)) == 1
+    blocks, recordings = parts_of(12, lanes // 3)
+    assert np.unique(blocks).size == 12
+    assert recordings.tolist() == (lanes // 3).tolist()
+    assert parts_of(3, np.zeros(3, dtype=int)) == []
+
+
+def test_recordings_that_differ_widen_more_than_their_blocks():
+    """A slope that differs from recording to recording, and not within one."""
+    rng = np.random.default_rng(5)
+    gradient, information, regressors, y = segments_of_a_line(rng)
+    recording = np.arange(40) // 8
+    y = y + np.repeat(rng.standard_normal(5), 8)[:, None] * regressors[..., 0]
+    estimate = np.linalg.solve(information.sum(axis=0), np.einsum("lsi,ls->i", regressors, y))
+    gradient = -np.einsum("lsi,ls->li", regressors, y - regressors @ estimate)
+    by_block, by_recording = (
+        disagreement(gradient, information, np.zeros((2, 2)), part)[0] for part in parts_of(40, recording)
+    )
+    assert by_recording > 1.3 * by_block > 1.3
+
+
+def test_no_recorded_flight_ends_successful_without_skill_or_against_physics(shared_flights):
+    vehicle = jaxos4.load_airframe(AIRFRAME)
+    for name in ("yaw_a", "yaw_b"):
+        recording = read_recording(shared_flights / f"arpl_crazyflie_{name}.csv", vehicle)
+        found = jaxos4.identify(recording, vehicle)
+        poor = found.skill is not None and any(
+            (value := getattr(found.skill, rate).skill[1]) is not None and value <= 0 for rate in "pqr"
+        )
+        assert not (found.successful and poor)
+        assert found.successful == (not found.doubts) or found.result in ("at_bound", "max_sweeps")

@@ -1,0 +1,410 @@
+"""The laws of all log formats on one table of readers: what is refused, what damage does, how often logs were written.
+
+A file gives a usable flight or an `InputError` of one line, whatever it contains.
+"""
+
+import json
+import math
+import time
+import tracemalloc
+
+import equinox as eqx
+import numpy as np
+import pytest
+import recorded_logs
+import test_flight_csv as flight_csv
+import test_logs_blackbox as blackbox
+import test_logs_crazyflie as crazyflie
+import test_logs_ulog as ulog
+from helpers import CRAZYFLIE, refused, same
+from hypothesis import given, settings, strategies as st
+from recorded_logs import RPM, VEHICLE, blackbox_csv, check, damaged, outcome, rates, speeds
+
+import jaxos4.logs.csv as csv_module
+from jaxos4.errors import InputError
+from jaxos4.flight import STATE_NAMES, Flight
+from jaxos4.logs import FORMATS, LogFacts, LogFormat, Sampling, Table, log_format, read_log, read_recording
+from jaxos4.logs.sampling import held_regularly, logged_rate
+from jaxos4.logs.table import opened, refuse
+
+NAMES = ("t", "omega1", "omega2", "omega3", "omega4", "p", "q", "r", "phi", "theta", "psi", "x", "az")
+JUNK = st.one_of(
+    st.sampled_from(
+        """- , ; " "" "1 -- --1 + e . 1e 1_0 0x1 nan NaN inf -inf true None 1e999 -1e999 1e-999 1e308 -0 -1 0.05 1e11
+        1e-9 6.3 -7 59 61 1e5 1e6""".split()
+        + ["", " ", "1 2", "\0", "\x1c1", "\r", "\n", "\t1", "\u2028", "\x85", "\ufeff", "x" * 60, "١", "½", "é"]
+    ),
+    st.floats().map(repr),
+    st.integers().map(str),
+    st.text(max_size=6),
+)
+
+# Each reader: a good log, the bytes at its beginning that are its header, and bad logs with words of their messages.
+SUBJECTS = {
+    "ULog": (ulog.SMALL, 16, ulog.BAD),
+    "Crazyflie": (crazyflie.SMALL, 60, crazyflie.BAD),
+    "blackbox": (blackbox.SMALL, 400, blackbox.BAD),
+    "blackbox, not decoded": (blackbox.SMALL_RAW, 400, {}),
+    "CSV": (flight_csv.csv().encode(), 38, flight_csv.BAD),
+}
+BAD = {(name, case): bad[case] for name, (_, _, bad) in SUBJECTS.items() for case in bad}
+ACCIDENTS = st.lists(
+    st.tuples(
+        st.sampled_from(["cut", "flip", "flip", "insert", "drop", "zeros"]), st.floats(0, 1), st.integers(0, 999)
+    ),
+    max_size=4,
+)
+
+
+def read(path):
+    return read_log(path, CRAZYFLIE)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz") / "flight.log"
+
+
+def test_every_format_is_a_subject():
+    assert {name.partition(",")[0] for name in SUBJECTS} == {each.name for each in FORMATS}
+
+
+@pytest.mark.parametrize(("name", "case"), BAD)
+def test_a_bad_log_is_refused_in_one_line(name, case, save):
+    content, words = BAD[name, case]
+    message = outcome(read, save(content))
+    assert isinstance(message, str)
+    for word in [words] if isinstance(words, str) else words:
+        assert word in message
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_a_damaged_log(name, path):
+    content = SUBJECTS[name][0]
+    path.write_bytes(content)
+    assert log_format(path).name == name.partition(",")[0]
+    assert isinstance(outcome(read, path), Flight)
+
+    @given(accidents=ACCIDENTS)
+    @settings(max_examples=150)
+    def law(accidents):
+        path.write_bytes(damaged(content, accidents))
+        outcome(read, path)
+
+    law()
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_any_bytes_after_a_part_of_the_header(name, path):
+    content, header, _ = SUBJECTS[name]
+
+    @given(junk=st.binary(max_size=400), keep=st.integers(0, header))
+    @settings(max_examples=80)
+    def law(junk, keep):
+        path.write_bytes(content[:keep] + junk)
+        assert isinstance(outcome(read, path), str)  # no flight is found by chance
+
+    law()
+
+
+# The flight CSV
+
+
+def good(rows, dt, start, wide):
+    """The cells of a good flight."""
+    names = NAMES if wide else NAMES[:7]
+    lines: list[list[str]] = [list(names)]
+    for k in range(rows):
+        swing = [0.3 * math.sin(0.4 * k + i) for i in range(len(names) - 5)]
+        lines.append([repr(start + dt * k), "200.0", "201.5", "199", "2e2", *map(repr, swing)])
+    return lines
+
+
+@st.composite
+def mutated(draw):
+    """A good flight, changed by a few accidents."""
+    lines = good(draw(st.integers(1, 25)), draw(st.sampled_from([0.01, 0.001, 0.3])), 0.0, draw(st.booleans()))
+    for _ in range(draw(st.integers(0, 4))):
+        row = draw(st.integers(0, len(lines) - 1))
+        cell = draw(st.integers(0, max(len(lines[row]) - 1, 0)))
+        accident = draw(st.sampled_from(["cell", "cell", "time", "drop", "twice", "column", "swap", "short", "empty"]))
+        if accident == "cell" and lines[row]:
+            lines[row][cell] = draw(JUNK)
+        elif accident == "time" and lines[row]:
+            lines[row][0] = repr(draw(st.floats(-1, 1e4)))
+        elif accident == "drop" and len(lines) > 1:
+            del lines[row]
+        elif accident == "twice":
+            lines.insert(row, list(lines[row]))
+        elif accident == "column":
+            lines = [line[:cell] + line[cell + 1 :] for line in lines]
+        elif accident == "swap":
+            other = draw(st.integers(0, len(lines) - 1))
+            lines[row], lines[other] = lines[other], lines[row]
+        elif accident == "short":
+            lines[row] = lines[row][:cell]
+        elif accident == "empty":
+            for line in lines[1:]:
+                line[cell:] = [""] * len(line[cell:])
+    return draw(st.sampled_from(["\n", "\r\n", "\r"])).join(",".join(line) for line in lines)
+
+
+@given(text=mutated(), block=st.sampled_from([1, 50, 1 << 20]))
+@settings(max_examples=400)
+def test_good_flights_after_accidents(text, block, path):
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    whole = outcome(read, path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(csv_module, "_BLOCK", block)
+        parts = outcome(read, path)
+    if isinstance(whole, str):
+        assert isinstance(parts, str)  # of two faults, another may be found first
+    else:
+        assert same(whole, parts)
+
+
+@given(keep=st.lists(st.booleans(), min_size=25, max_size=25).filter(lambda k: sum(k) > 2), seed=st.integers(0, 9))
+@settings(max_examples=100)
+def test_dropped_rows_never_refuse_a_flight(keep, seed, path):
+    jitter = 0.002 * np.random.default_rng(seed).uniform(-1, 1, 25)
+    lines = good(25, 0.01, 0.0, True)
+    for line, offset in zip(lines[1:], jitter.tolist(), strict=True):
+        line[0] = repr(float(line[0]) + offset)
+    kept = [lines[0]] + [line for line, k in zip(lines[1:], keep, strict=True) if k]
+    path.write_text("\n".join(",".join(line) for line in kept))
+    flight = outcome(read, path)
+    assert isinstance(flight, Flight)
+
+
+def naive(path):
+    """A reader without checks."""
+    with open(path, encoding="utf-8") as file:
+        file.readline()
+        cells = [[float(cell or "nan") for cell in line.split(",")] for line in file]
+    array = np.array(cells)
+    states = np.full((len(array), 12), np.nan)
+    states[:, 7] = array[:, 5]
+    return Flight(array[:, 0], array[:, 1:5], states), ()
+
+
+@pytest.mark.parametrize(
+    ("row", "cell", "junk"), [(3, 5, "fast"), (3, 5, "inf"), (3, 0, "7"), (3, 1, ""), (3, 2, "-1")]
+)
+def test_the_law_fails_a_naive_reader(row, cell, junk, path):
+    lines = good(9, 0.01, 0.0, False)
+    path.write_text("\n".join(",".join(line) for line in lines))
+    assert isinstance(outcome(naive, path), Flight)
+    lines[row][cell] = junk
+    path.write_text("\n".join(",".join(line) for line in lines))
+    with pytest.raises((AssertionError, ValueError)):
+        outcome(naive, path)
+    outcome(read, path)
+
+
+# Frame, units and truncation
+
+# Each whole log: its content, its states, the time at which it begins, the tolerances of states and rotor speeds.
+WHOLE = {
+    "ULog": (ulog.everything(), STATE_NAMES, 0.0, 2e-3, 0.5),
+    "Crazyflie, version 1": (crazyflie.one_event(crazyflie.T, version=1), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
+    "Crazyflie": (crazyflie.one_event(crazyflie.T), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
+    "blackbox": (blackbox_csv(blackbox.recorded(blackbox.T)), blackbox.RATES, 0.0, 5e-3, 100 / 7 * RPM),
+    "INAV": (blackbox_csv(blackbox.recorded(blackbox.T) | blackbox.inav(blackbox.T)), STATE_NAMES, 0.0, 5e-3, 9.0),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_flight_comes_back_in_our_frame_and_units(name, save):
+    content, states, start, atol, of_speeds = WHOLE[name]
+    flight, notes = read_log(save(content))
+    options = {"names": states, "start": start, "atol": atol}
+    assert check(flight, **options) >= 0.95 * 3 / 0.02  # each sample of the slowest sensor is one sample
+    assert flight.time[0] == 0
+    middle = np.asarray(flight.time)[:-1] + start + (0.0 if name in ("blackbox", "INAV") else float(flight.dt) / 2)
+    np.testing.assert_allclose(flight.omega[:-1], speeds(middle), atol=of_speeds)
+    assert any("is rotor 1" in note for note in notes) == (not name.startswith("Crazyflie"))
+    for column in {STATE_NAMES.index(each) for each in ("q", "theta", "psi", "y", "vz") if each in states}:
+        wrong = eqx.tree_at(lambda f: f.states, flight, flight.states.at[:, column].multiply(-1))
+        with pytest.raises(AssertionError):
+            check(wrong, **options)
+
+
+@pytest.mark.parametrize("name", ["ULog", "Crazyflie"])
+def test_a_log_cut_by_a_loss_of_power_is_read_to_there(name, save):
+    content, _, start, *_ = WHOLE[name]
+    part, words = content[: len(content) * 2 // 3], "ends abruptly" if name == "ULog" else "no valid checksum"
+    for cut in (part, part + bytes(5000)) if name == "ULog" else (part, content[:-4]):
+        flight, notes = read_log(save(cut))
+        assert any(words in note for note in notes)
+        check(flight, start=start, seconds=1.9)
+    assert not any(words in note for note in read_log(save(content))[1])
+
+
+COSTLY = {name: ulog.announced(formats) for name, formats in ulog.BOMBS.items()}
+COSTLY["empty events"] = crazyflie.EMPTY_EVENTS
+
+
+@pytest.mark.parametrize("name", COSTLY)
+def test_a_few_bytes_cost_little_whatever_they_announce(name, save):
+    path = save(COSTLY[name])
+    tracemalloc.start()
+    begin = time.perf_counter()
+    result = outcome(read_log, path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert isinstance(result, str)
+    assert peak < (100e6 if name == "empty events" else 20e6)
+    assert time.perf_counter() - begin < 10
+
+
+# A new log format is one file and one line in the registry
+
+
+def read_json_log(path):
+    """The first line names the log; the second holds the columns."""
+    with opened(path) as file:
+        lines = file.readlines()
+    try:
+        columns = {name: np.array(values, dtype=float) for name, values in json.loads(lines[1]).items()}
+    except (ValueError, IndexError):
+        refuse(path, "has no columns; write them as one JSON object", row=2)
+    return Table(path, columns, first_row=None), ("times are those of the logger",)
+
+
+JSON_LOG = LogFormat("JSON", "two-line JSON", lambda begin: begin.startswith(b'{"log"'), read_json_log)
+
+
+@pytest.fixture
+def log(save, monkeypatch):
+    monkeypatch.setattr("jaxos4.logs.FORMATS", (JSON_LOG, *FORMATS))  # the new line
+    t = 0.01 * np.arange(300)
+    columns = {"t": t, **{f"omega{i}": np.full(300, 226.0) for i in range(1, 5)}, "p": np.sin(t)}
+    return save('{"log": 1}\n' + json.dumps({name: column.tolist() for name, column in columns.items()}), "log")
+
+
+def test_a_new_format_is_read_and_inspected(log, save, run):
+    flight, notes = read_log(log)
+    assert notes == ("times are those of the logger",)
+    np.testing.assert_array_equal(np.asarray(flight.states)[:, 7], np.sin(0.01 * np.arange(300)))
+    assert log_format(log) is JSON_LOG
+    code, out, err = run("inspect", "log", "--out", "found.json")
+    assert (code, err) == (0, "")
+    assert out.startswith("log: two-line JSON, 0.00 to 2.99 s, 300 samples")
+    assert json.loads(log.with_name("found.json").read_text())["format"] == "JSON"
+    with pytest.raises(InputError, match=r"bad: row 2: has no columns; write them as one JSON object\.$"):
+        read_log(save('{"log": 1}\n', "bad"))
+    assert log_format(save("t,p\n", "other")).name == "CSV"
+
+
+# How often motors and gyro were logged
+
+ROWS = 1000
+
+
+def repeating(tmp_path, held, *, stagger=0, lost=0.0):
+    """250 rows a second, with commands that are held for so many rows: each motor `stagger` rows after the last."""
+    rng = np.random.default_rng(0)
+    commands = np.repeat(rng.uniform(0.4, 0.6, (ROWS // held + 9, 4)), held, axis=0)
+    commands = np.stack([commands[stagger * i :, i][:ROWS] for i in range(4)], axis=1)
+    commands[1:][rng.uniform(size=ROWS - 1) < lost] = np.nan
+    table = np.column_stack([0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3))])
+    path = tmp_path / "log.csv"
+    np.savetxt(path, table, delimiter=",", header="t,command1,command2,command3,command4,p,q,r", comments="")
+    path.write_text(path.read_text().replace("nan", ""))
+    return read_recording(path, full_scale=1.0)
+
+
+@pytest.mark.parametrize(("held", "rate"), [(25, 10.0), (5, 50.0), (1, 250.0)])
+def test_values_that_repeat_were_not_logged(tmp_path, held, rate):
+    facts = repeating(tmp_path, held).facts
+    assert facts.motors.rate == pytest.approx(rate, rel=0.01)
+    assert facts.gyro.rate == pytest.approx(250.0, rel=0.01)
+    assert bool(facts.too_slow) == (rate < 40)
+    if facts.too_slow:
+        assert "the motors were logged at 10 Hz (the values of command1 change so often)" in facts.too_slow
+
+
+@pytest.mark.parametrize("kind", [{"stagger": 6}, {"lost": 0.2}])
+def test_motors_that_are_held_one_after_the_other_or_with_empty_cells(tmp_path, kind):
+    assert repeating(tmp_path, 25, **kind).facts.motors.rate == pytest.approx(10.0, rel=0.05)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_inputs_that_change_now_and_then_are_no_rate(seed):
+    steps = np.random.default_rng(seed).exponential(0.3, 200)
+    assert not held_regularly(np.cumsum(steps))
+    assert not held_regularly(0.3 * np.arange(10.0))  # a 3-2-1-1 of few steps
+    assert held_regularly(0.1 * np.arange(50.0))
+
+
+@given(step=st.floats(0.001, 0.9), seed=st.integers(0, 99), pauses=st.integers(0, 3), bursts=st.booleans())
+@settings(max_examples=60)
+def test_the_rate_is_that_of_the_samples_whatever_pauses_and_bursts_come_between(step, seed, pauses, bursts):
+    rng = np.random.default_rng(seed)
+    steps = step * rng.uniform(0.9, 1.1, 300)
+    if bursts:  # five samples at once, then nothing for five steps: this is no high rate
+        steps = np.tile([1e-6, 1e-6, 1e-6, 1e-6, step], 60)
+    steps[rng.integers(0, 300, pauses)] = 500.0
+    assert logged_rate(np.cumsum(steps)) == pytest.approx(1 / step, rel=0.11)
+
+
+def test_the_rate_of_almost_nothing():
+    assert logged_rate(np.zeros(1)) == 0
+    assert logged_rate(np.array([0.0, 5.0])) == pytest.approx(0.2)
+    assert LogFacts().too_slow == ""
+    assert LogFacts(Sampling("m", 38.5), Sampling("g", 250.0)).too_slow == ""  # a nominal 40 Hz with jitter
+
+
+def slow_ulog(step):
+    t = ulog.grid(step, 3.4, offset=-0.2)
+    topics = (
+        ulog.combined(ulog.grid(0.004)),
+        ulog.vehicle_attitude(ulog.grid(0.02)),
+        ulog.motors(t, ulog.thrusts(t).tolist()),
+    )
+    return ulog.log(*topics, SDLOG_PROFILE=131)
+
+
+def slow_csv(step):
+    t = ulog.grid(0.004)
+    command = ulog.thrusts(t).astype(str)
+    command[np.arange(t.size) % round(step / 0.004) != 0] = ""
+    lines = [",".join(["t", *(f"command{i}" for i in range(1, 5)), "p", "q", "r"])]
+    for row in zip(t.tolist(), *command.T, *rates(t).T.tolist(), strict=True):
+        lines.append(",".join(map(str, row)))
+    return "\n".join(lines).encode()
+
+
+def slow_crazyflie(step):
+    t, slow = ulog.grid(0.004), ulog.grid(step, 3.4)
+    gyro = ["gyro.x(f)", "gyro.y(f)", "gyro.z(f)"]
+    events = [("g", gyro, t, np.degrees(rates(t)))]
+    events.append(("m", [f"motor.m{i}(H)" for i in range(1, 5)], slow, np.rint(65535 * ulog.thrusts(slow))))
+    return recorded_logs.crazyflie(events)
+
+
+REMEDIES = {
+    slow_ulog: ("actuator_motors", "set SDLOG_PROFILE to 147 (which includes 16, 'high rate')"),
+    slow_csv: ("command1", "log motors and gyro at 100 Hz or more"),
+    slow_crazyflie: ("motor.m1", "raise the frequency of these variables in the deck's config.txt"),
+}
+
+
+@pytest.mark.parametrize("kind", REMEDIES)
+def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, tmp_path):
+    (tmp_path / "vehicle.toml").write_text(VEHICLE)
+    name, remedy = save(kind(0.1)).name, REMEDIES[kind][1]
+    words = f"the motors were logged at 10 Hz ({REMEDIES[kind][0]}), too rarely to identify a vehicle: "
+    code, out, err = run("inspect", name, "--airframe", "vehicle.toml", "--out", "found.json")
+    assert (code, err) == (0, "")
+    first = out.splitlines()[1]
+    assert first.startswith(f"cannot identify a vehicle: {words}")
+    assert remedy in first
+    assert "rotor4: 10 Hz" in out
+    assert "identifiable: alpha1" not in out
+    result = run("estimate", name, "--model", "flight", "--airframe", "vehicle.toml")
+    refused(result, f"jaxos4: {name}: {words}", remedy)
+    assert read_log(save(kind(0.1)), CRAZYFLIE)[1][-1].startswith(words)
+    fast = read_recording(save(kind(0.02)), CRAZYFLIE).facts
+    assert fast.motors == Sampling(REMEDIES[kind][0], pytest.approx(50.0, rel=0.01))
+    assert fast.too_slow == ""

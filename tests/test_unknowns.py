@@ -1,0 +1,115 @@
+"""`Unknowns`: held parameters keep their values, and the others are estimated as if the values were known."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import noisy_states, standard_flight, standard_problem
+
+import jaxos4
+from jaxos4.shooting import InnovationsProblem
+
+HELD = {"alpha2": 0.0079, "alpha7": 0.01}
+PLACES = [1, 6]
+ESTIMATORS = {
+    "ibss": jaxos4.IBSS(),
+    "output-error": jaxos4.OutputError(),
+    "filter-error": jaxos4.FilterError(),
+    "equation-error": jaxos4.EquationError(),
+    "rls": jaxos4.RecursiveLeastSquares(),
+    "kalman": jaxos4.JointEKF(),
+    "svsf": jaxos4.SVSF(),
+    "ant-colony": jaxos4.AntColony(),
+}
+# Their covariance is the inverse of an information.
+LIKELIHOODS = ("ibss", "output-error", "filter-error", "kalman", "ant-colony")
+
+
+def noisy_problem():
+    return standard_problem(jaxos4.CorrectedOS4, channels="rates", states=noisy_states(1, jaxos4.CorrectedOS4)[0])
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_held_parameter_keeps_its_value_and_has_no_variance(name):
+    found = ESTIMATORS[name](noisy_problem().hold(HELD))
+    np.testing.assert_array_equal(found.parameters[np.array(PLACES)], list(HELD.values()))
+    covariance = np.asarray(found.covariance)
+    assert (covariance[PLACES] == 0).all()
+    assert (covariance[:, PLACES] == 0).all()
+    others = np.delete(np.arange(8), PLACES)
+    assert (np.diagonal(covariance)[others] > 0).all()
+    if name in LIKELIHOODS:
+        # Fewer unknowns are known better; the bound is computed at another answer.
+        free = ESTIMATORS[name](noisy_problem())
+        assert (np.asarray(found.std)[others] <= 1.1 * np.asarray(free.std)[others]).all()
+
+
+@pytest.mark.parametrize("name", ["ibss", "output-error", "kalman", "equation-error"])
+def test_the_others_are_estimated_without_error_if_the_held_values_are_true(name):
+    model = jaxos4.CorrectedOS4()
+    flight = standard_flight(jaxos4.CorrectedOS4)
+    start = flight.states[0]
+    problem = jaxos4.ShootingProblem(
+        model, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=start, channels="rates"
+    ).hold({"alpha2": model.alpha[1], "alpha7": 0.0})
+    bracket = jaxos4.Bracket.around(model.alpha + 0.5 * model.half_width, model.half_width)
+    found = ESTIMATORS[name](problem, bracket)
+    # A Gaussian prior moves the answer by its share of the information.
+    tolerance = 0.05 * np.asarray(found.std) + 1e-12 if name == "kalman" else 1e-5 * np.asarray(model.half_width)
+    assert (np.abs(found.parameters - model.alpha) <= tolerance).all()
+
+
+@pytest.mark.parametrize("kind", ["shooting", "innovations"])
+def test_information_about_held_unknowns_is_left_out(kind):
+    """Gradient and information of the others do not change."""
+    free = noisy_problem() if kind == "shooting" else InnovationsProblem(noisy_problem())
+    held = free.hold(
+        {name: float(value) for name, value in zip(HELD, free.unknowns.center[np.array(PLACES)], strict=True)}
+    )
+    stages = [problem.stages(cascade=False) for problem in (free, held)]
+    at = free.join(free.starts[0], free.first_state()[0])
+    whole, part = (each.evaluate(jnp.asarray(0), at) for each in stages)
+    others = np.delete(np.arange(free.unknowns.count), PLACES)
+    np.testing.assert_allclose(part.shot.cost, whole.shot.cost, rtol=1e-12)
+    np.testing.assert_allclose(part.gradient[:, others], whole.gradient[:, others], rtol=1e-9)
+    np.testing.assert_array_equal(np.asarray(part.gradient)[:, PLACES], 0)
+    cross = np.ix_([0], others, others)
+    np.testing.assert_allclose(np.asarray(part.information)[cross], np.asarray(whole.information)[cross], rtol=1e-9)
+    np.testing.assert_array_equal(np.asarray(part.information)[np.ix_([0], PLACES, others)], 0)
+
+
+def test_held_values_are_data():
+    """Other values need no other program, and a batch of values is that of each."""
+    problem = noisy_problem()
+
+    @jax.jit
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def fit(value):
+        return jaxos4.OutputError()(problem.hold({"alpha3": value})).parameters
+
+    values = jnp.array([110.0, 130.0, 150.0])
+    each = jnp.stack([fit(value) for value in values])
+    np.testing.assert_array_equal(each[:, 2], values)
+    np.testing.assert_allclose(jax.vmap(fit)(values), each, rtol=1e-9)
+    assert (np.diff(np.asarray(each)[:, 0]) != 0).all()
+
+
+def test_a_bracket_moves_free_unknowns_only():
+    problem = noisy_problem().hold(HELD)
+    moved = problem.within(jaxos4.Bracket.around(np.full(8, 5.0), np.full(8, 2.0))).unknowns
+    np.testing.assert_array_equal(np.asarray(moved.center)[PLACES], list(HELD.values()))
+    np.testing.assert_array_equal(np.delete(np.asarray(moved.center), PLACES), 5.0)
+    np.testing.assert_array_equal(moved.half_width, 2.0)
+    twice = noisy_problem().hold({"alpha2": 0.0079}).hold({"alpha7": 0.01}).unknowns
+    assert eqx.tree_equal(twice, problem.unknowns)
+
+
+def test_misuse_is_named():
+    problem = noisy_problem()
+    with pytest.raises(ValueError, match="`values`: wind is no unknown; the unknowns are alpha1, "):
+        problem.hold({"alpha1": 0.0, "wind": 1.0})
+    with pytest.raises(ValueError, match="`values` holds every unknown"):
+        problem.hold(dict.fromkeys(problem.unknowns.names, 0.0))
+    with pytest.raises(ValueError, match="`bracket` must hold 8 parameters, got 3"):
+        problem.within(jaxos4.Bracket(np.zeros(3), np.ones(3)))
