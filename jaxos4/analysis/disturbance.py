@@ -51,8 +51,7 @@ def _filtered(
     dt: Scalar,
 ) -> Float[Array, "samples 3"]:
     measured = ~jnp.isnan(rates)
-    nothing = jnp.zeros(begins.shape, dtype=int)[:, None]
-    observed = Observed(rates[:, :, None], begins[:, None], begins[:, None], nothing, begins[:, None])
+    observed = Observed(rates[:, :, None], begins[:, None], begins[:, None])
     gains = gains_of(observed, noise, dt)
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
 

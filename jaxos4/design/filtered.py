@@ -18,7 +18,6 @@ from ..models.vehicle import FlightModel
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.filters import LogNoise
 from ..shooting.innovations import NOISE_PRECISION, joined
-from ..shooting.segments import BLOCK
 
 INERTIAS = ("Ix", "Iy", "Iz")
 # The place of the alpha that is torque over each moment of inertia.
@@ -63,7 +62,10 @@ class Filters(eqx.Module):
     def of(cls, loop: ClosedLoop, half_width: Parameters) -> "Filters":
         """The filters of a vehicle."""
         model = model_of(loop)
-        known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": loop.rotor_delay}
+        known: dict[str, Any] = {
+            "rotor_lag": loop.rotor_lag,
+            "rotor_delay": loop.rotor_delay if loop.logged == "commands" else 0.0,
+        }
         for i, axis in enumerate(("roll", "pitch", "yaw")):
             known |= {f"{axis}_offset": loop.offset[i], f"{axis}_damping": loop.damping[i]}
         names, alpha = model.parameter_names, np.asarray(model.alpha)
@@ -126,9 +128,7 @@ def _information(model: FlightModel, loop: ClosedLoop, flight: Flight, parameter
     problem = ShootingProblem(model, flight, sigma=np.ones(12), channels="rates", method="rk4")
     innovations, count = InnovationsProblem(problem, segment=flight.time.shape[0]), parameters.shape[0]
     strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), _LEAST)
-    # Specific force is compared as means over blocks.
-    force_noise = loop.force_noise / jnp.sqrt(jnp.maximum(BLOCK / flight.dt, 1.0))
-    sensor = jnp.append(jnp.repeat(loop.gyro_noise, 3), force_noise)
+    sensor = jnp.append(jnp.repeat(loop.gyro_noise, 3), loop.force_noise)
     noise = LogNoise(jnp.log(strength), jnp.log(jnp.repeat(loop.gust_time, 4)), jnp.log(sensor))
     found = innovations.innovations(parameters, noise)
     information = found.information.sum(axis=-1)

@@ -15,9 +15,9 @@ from .fit import Fit
 from .prepare import Case
 from .results import Constant, ParameterEstimate, RigidBody, finite_or_none
 
-_UNIT = "kg m^2"
+UNIT = "kg m^2"
 # The place of the alpha that is torque over this moment of inertia.
-_INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
+INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
 _UNKNOWN = 1e3
 
@@ -88,37 +88,32 @@ def flight_constants(model: AbstractModel, estimate: Estimate) -> RigidBody:
     if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():
         return RigidBody()
     table = zip(("Ix", "Iy", "Iz", "J_R"), values.tolist(), std.tolist(), strict=True)
-    constants = {name: Constant(value, error, _UNIT) for name, value, error in table}
+    constants = {name: Constant(value, error, UNIT) for name, value, error in table}
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
 
 def vehicle_constants(fit: Fit) -> RigidBody:
-    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated.
-
-    If torques exceed the airframe's by an estimated factor, it divides the alphas.
-    """
-    model, free = fit.problem.model, fit.free
-    names, values = [model.parameter_names[i] for i in free], np.asarray(fit.estimate.parameters)
-    scales = [i for i in free if model.parameters[i].scales_torque]
-    gain = scales[0] if scales else None
-    bracket, slopes = fit.problem.unknowns, np.zeros((8, values.size))
-    alpha, variance = np.asarray(bracket.center)[:8].copy(), (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2
-    for row, name in enumerate(PARAMETER_NAMES):
-        if name not in names:
-            continue
-        alpha[row], slopes[row, row], variance[row] = values[row], 1.0, 0.0
-        if gain is not None and row in _INVERSE.values():
+    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated."""
+    model, free, values = fit.problem.model, fit.free, np.asarray(fit.estimate.parameters)
+    known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), fit.problem.unknowns
+    alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
+    for gain in [i for i in free if model.parameters[i].scales_torque]:
+        # Torques exceed those of the airframe by this factor.
+        for row in INVERSE.values():
             alpha[row] /= values[gain]
             slopes[row, row], slopes[row, gain] = 1 / values[gain], -alpha[row] / values[gain]
-    covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(variance)
-    constants, thrust = {}, "thrust_coefficient" if gain is None else "mass"
+    slopes[~known] = 0.0
+    unknown = np.where(known, 0.0, (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
+    covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(unknown)
+    scaled = any(model.parameters[i].scales_torque for i in free)
+    constants, thrust = {}, "mass" if scaled else "thrust_coefficient"
     notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and drag are right"}
-    for name, row in _INVERSE.items():
-        if PARAMETER_NAMES[row] in names and alpha[row] > 0:
+    for name, row in INVERSE.items():
+        if known[row] and alpha[row] > 0:
             std = float(np.sqrt(covariance[row, row])) / alpha[row] ** 2
-            constants[name] = Constant(1 / float(alpha[row]), float(std), _UNIT, notes[name])
+            constants[name] = Constant(1 / float(alpha[row]), float(std), UNIT, notes[name])
     # Alphas that are held are no evidence for or against a rigid body.
-    if not set(PARAMETER_NAMES) <= set(names):
+    if not known.all():
         return RigidBody(constants)
     rigid = fit_inertia(CorrectedOS4(model.airframe), alpha, covariance)
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))

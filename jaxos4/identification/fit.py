@@ -75,7 +75,7 @@ class Fit(NamedTuple):
 def fit_case(case: Case, *, progress: Progress = lambda stage: None) -> Fit:
     """The fit of a prepared case, by its likelihood."""
     if isinstance(case.problem, InnovationsProblem):
-        return fit_innovations(case.estimator, case.problem, case.recording, progress=progress)
+        return fit_innovations(case, case.problem, progress=progress)
     return fit_flight(case.estimator, case.problem, progress=progress)
 
 
@@ -121,21 +121,16 @@ def fit_flight(
     return Fit(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, diagnostics, evaluation)
 
 
-def fit_innovations(
-    estimator: AbstractEstimator,
-    problem: InnovationsProblem,
-    recording: np.ndarray,
-    *,
-    progress: Progress = lambda stage: None,
-) -> Fit:
+def fit_innovations(case: Case, problem: InnovationsProblem, *, progress: Progress = lambda stage: None) -> Fit:
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
 
     The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket is not
     estimated. A parameter that came out negative, though physics forbids it, is held at 0. Intervals widen if parts of
     the flights disagree.
 
-    **Arguments:** `recording`: the number of the recording of each sample.
+    **Arguments:** `problem`: that of the case, perhaps with another start.
     """
+    estimator = case.estimator
     own, names = problem.problem.unknowns, problem.model.parameter_names
     unknowns = own.count + 3 * len(problem.channels)
     progress("compiling, and fitting parameters and disturbances")
@@ -153,7 +148,7 @@ def fit_innovations(
     values, std = np.asarray(found.parameters)[: own.count], _std(found)[: own.count]
     half_width, factor = np.asarray(own.half_width), np.ones(own.count)
     if has_answer(found):
-        factor[~at_zero] = _widening(problem, found, ~at_zero, recording)
+        factor[~at_zero] = _widening(problem, found, ~at_zero, case.recording)
     identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
     if not has_answer(found) or not identifiable.any():
         identifiable[:] = True
@@ -164,7 +159,7 @@ def fit_innovations(
     spread = np.asarray(found.covariance) * scale[:, None] * scale
     noise = LogNoise(*np.asarray(found.parameters)[own.count :].reshape(-1, 3).T)
     return Fit(
-        problem=_with_sensors(problem.problem, noise),
+        problem=_with_sensors(case.shooting, noise),
         estimate=eqx.tree_at(lambda e: e.covariance, found, as_float(spread)),
         bound=std,
         rollouts=rollouts,
@@ -189,13 +184,15 @@ def _widening(
     problem: InnovationsProblem, found: Estimate, fitted: np.ndarray, recording: np.ndarray
 ) -> Float[np.ndarray, " fitted"]:
     """The factor by which the interval of each fitted parameter widens. `recording`: of each sample."""
-    index, samples = problem.index, problem.flight.time.shape[0]
+    index = problem.index
     # The middle of the samples of each segment that count.
     middle = index[:, (problem.settling + index.shape[1]) // 2 if index.shape[0] > 1 else 0]
-    some, number = np.flatnonzero(fitted), recording[np.minimum(middle, samples - 1)]
-    parts = _parts(found)
-    gradient = np.asarray(parts.gradient)[:, some]
-    information = np.asarray(parts.information)[:, some[:, None], some]
+    some, parts = np.flatnonzero(fitted), _parts(found)
+    # Padding fills whole segments, in which nothing was measured.
+    used = np.asarray(parts.information).any(axis=(1, 2))
+    number = recording[np.minimum(middle, recording.size - 1)][used]
+    gradient = np.asarray(parts.gradient)[used][:, some]
+    information = np.asarray(parts.information)[used][:, some[:, None], some]
     prior = np.diag(1 / np.square(np.asarray(problem.problem.unknowns.half_width)[some]))
     ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
     return np.max([np.ones(some.size), *ways], axis=0)

@@ -16,11 +16,13 @@ from ..recording.reading import Recording, as_recordings
 from ..results import result_names
 from .fit import Fit, fit_case
 from .judge import Judgement, judge
-from .prepare import Case, prepare_flight, prepare_vehicle
+from .prepare import Case, prepare_flight
 from .problem import Intervals
 from .quality import channel_fits
-from .results import Identification, finite_or_none
+from .results import Identification, SampleTime, finite_or_none
+from .sample_time import fit_at_sample_times
 from .settings import FlightSettings, VehicleSettings, flight_settings, vehicle_settings
+from .vehicle import DEFAULT, prepare_vehicle, with_estimator
 
 Flights = Flight | Recording | Sequence[Flight | Recording]
 # Results with an answer: a doubt says more than they do.
@@ -69,17 +71,26 @@ def identify(
         raise InputError("`flights`: holds no flight; give one.")
     other = None if validate is None else as_recordings(validate, "validation flight")[0]
     begin = time.perf_counter()
-    common = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other, "seed": seed}
+    common = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other}
+    sample_times: tuple[SampleTime, ...] = ()
     if isinstance(subject, Airframe):
-        case = prepare_vehicle(recordings, subject, vehicle_settings(settings), progress=progress, **common)
+        cases = prepare_vehicle(recordings, subject, vehicle_settings(settings), **common)
+        place, fit, sample_times = fit_at_sample_times(cases, progress=progress)
+        case = cases[place]
+        if estimator not in (None, DEFAULT):
+            case = with_estimator(case, estimator, seed=seed, progress=progress)
+            fit = fit_case(case, progress=progress)
     else:
-        case = prepare_flight(recordings, subject, flight_settings(subject, settings), progress=progress, **common)
-    fit = fit_case(case, progress=progress)
-    verdict = judge(case, fit, progress=progress)
-    return describe(case, fit, verdict, time.perf_counter() - begin)
+        own = flight_settings(subject, settings)
+        case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
+        fit = fit_case(case, progress=progress)
+    verdict = judge(case, fit, sample_times, progress=progress)
+    return describe(case, fit, verdict, sample_times, time.perf_counter() - begin)
 
 
-def describe(case: Case, fit: Fit, verdict: Judgement, seconds: float) -> Identification:
+def describe(
+    case: Case, fit: Fit, verdict: Judgement, sample_times: tuple[SampleTime, ...], seconds: float
+) -> Identification:
     """Everything about an answer, in the fields that pages and files show."""
     result, free = str(result_names(fit.estimate.result)), fit.free
     covariance, sigma = np.asarray(fit.estimate.covariance)[np.ix_(free, free)], np.asarray(fit.problem.sigma)
@@ -104,6 +115,7 @@ def describe(case: Case, fit: Fit, verdict: Judgement, seconds: float) -> Identi
         doubts=verdict.doubts,
         disturbances=fit.disturbances,
         widened=fit.widened,
+        sample_times=sample_times if len(sample_times) > 1 else (),
         skill=verdict.skill,
         predictions=verdict.predictions,
         response=verdict.response,

@@ -1,6 +1,6 @@
 """Checks before an estimate of a vehicle is believed: each doubt has a cause and a remedy."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +23,10 @@ from .results import (
     ParameterEstimate,
     PredictionSkill,
     RigidBody,
+    SampleTime,
     Validation,
 )
+from .sample_time import moved
 
 # Doubts need this many standard deviations.
 _SURE = 3.0
@@ -127,6 +129,20 @@ def vibration(disturbances: dict[str, Disturbance], sample_time: float) -> Itera
             )
 
 
+def _moved(sample_times: Sequence[SampleTime], step: float) -> Iterator[Doubt]:
+    """A moment of inertia that is another one at the next longer sample time. `step`: the chosen one [s]."""
+    place = next((i for i, each in enumerate(sample_times) if each.sample_time == step), len(sample_times))
+    for own, other in zip(sample_times[place : place + 1], sample_times[place + 1 : place + 2], strict=False):
+        for name in moved(own, other):
+            values = [
+                f"{each.constants[name].estimate:.3g} at {1e3 * each.sample_time:.3g} ms" for each in (own, other)
+            ]
+            yield _implausible(
+                f"{name} depends on the sample time: {' and '.join(values)}",
+                "the sensors vibrate, or the model lacks an effect: see the figure of inertia against sample time",
+            )
+
+
 def _no_answer(found: Found) -> Iterator[Doubt]:
     """Roll and pitch must answer the rotors: otherwise nothing was identified."""
     for name, axis in (("alpha3", "roll"), ("alpha6", "pitch")):
@@ -206,8 +222,8 @@ class Judgement(NamedTuple):
     response: FrequencyResponse | None = None
 
 
-def judge(case: Case, fit: Fit, *, progress: Progress) -> Judgement:
-    """Compare an answer with the airframe, and with measurements that were not fitted."""
+def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, progress: Progress) -> Judgement:
+    """Compare an answer with the airframe, with other sample times, and with measurements that were not fitted."""
     if not fit.answered:
         return Judgement(parameters={} if case.is_vehicle else parameter_table(case, fit))
     table, body, held_out = parameter_table(case, fit), rigid_body(case, fit), case.held_out
@@ -219,7 +235,8 @@ def judge(case: Case, fit: Fit, *, progress: Progress) -> Judgement:
         progress("predicting what was not fitted")
         predicted, skill = predict_held_out(fit, held_out)
     doubts = doubts_of(fit.problem.model, table, body.constants, skill)
-    doubts += tuple(vibration(fit.disturbances, float(fit.problem.flight.dt)))
+    step = float(fit.problem.flight.dt)
+    doubts += (*vibration(fit.disturbances, step), *_moved(sample_times, step))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
     return Judgement(
         table, body, doubts, skill=skill, predictions=predicted, response=frequency_response(fit.problem, values)

@@ -1,45 +1,26 @@
 """From recordings and a subject to the problem that an estimator solves, and the measurements that test the answer."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from ..airframe import Airframe
-from ..analysis.prediction import HORIZONS, starts
-from ..bracket import Bracket
-from ..errors import InputError, TrainingError
+from ..errors import InputError
 from ..estimate import AbstractEstimator
-from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
-from ..flight import Flight
+from ..estimators import ESTIMATORS, Hybrid, make_estimator
 from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER
-from ..models.terms import FULL_SCALE, TERMS, VOLTAGE, default_terms
-from ..models.vehicle import FlightModel
 from ..networks import TrainedNetwork
-from ..recording import preparation
 from ..recording.reading import Recording
-from ..shooting import InnovationsProblem, ShootingProblem, Unknowns
-from ..shooting.innovations import SEGMENT, SETTLING
-from .network import GivenNetwork, loaded, network_for, network_provenance, vehicle_network_for
+from ..shooting import InnovationsProblem, ShootingProblem
+from .network import GivenNetwork, loaded, network_for, network_provenance
 from .problem import Intervals, bracket_of, flight_problem
 from .provenance import airframe_name, class_name, name_and_class, versions
 from .results import Provenance
-from .settings import FlightSettings, VehicleSettings
+from .settings import FlightSettings
 
-# The scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
-_FIRST_SIGMA = 0.5
-# A flight has at least so many segments, whose disagreement shows errors of the model, unless they would be too short.
-_FEWEST_SEGMENTS, _SHORTEST_SEGMENT = 8, 80
-# A filter has settled after this time [s].
-_SETTLED = 0.512
-# The cost has kinks where a delay passes a sample. Slopes jump closer to the minimum than this [standard deviations].
-_KINKS = 0.05
-# The estimator of a vehicle, which flies in closed loop.
-DEFAULT = "filter-error"
 Progress = Callable[[str], None]
 
 
@@ -60,7 +41,8 @@ class HeldOut(NamedTuple):
 class Case(NamedTuple):
     """Everything that a fit needs, and the measurements that test it.
 
-    - `problem`: the likelihood, with its bracket. `estimator`: what searches it; `name`: of the estimator.
+    - `problem`: the likelihood, with its bracket. `shooting`: the flight and its model.
+    - `estimator`: what searches it; `name`: of the estimator.
     - `model`: the name of the equations.
     - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`.
     - `held_out`: the measurements that are not fitted, if there are any.
@@ -69,6 +51,7 @@ class Case(NamedTuple):
     """
 
     problem: ShootingProblem | InnovationsProblem
+    shooting: ShootingProblem
     estimator: AbstractEstimator
     name: str
     model: str
@@ -83,9 +66,14 @@ class Case(NamedTuple):
         return isinstance(self.problem, InnovationsProblem)
 
     @property
-    def shooting(self) -> ShootingProblem:
-        """The flight and its model."""
-        return self.problem.problem if isinstance(self.problem, InnovationsProblem) else self.problem
+    def innovations(self) -> InnovationsProblem:
+        """The likelihood of a vehicle.
+
+        **Raises:** `ValueError` for a flight of an OS4.
+        """
+        if not isinstance(self.problem, InnovationsProblem):
+            raise ValueError("`problem` must be one of innovations.")
+        return self.problem
 
 
 def prepare_flight(
@@ -149,173 +137,7 @@ def prepare_flight(
         notes=list(notes),
         **versions(problem),
     )
-    return Case(problem, method, name, subject, kind.prior, held_out, np.zeros(samples, int), provenance)
-
-
-def prepare_vehicle(
-    recordings: Sequence[Recording],
-    airframe: Airframe,
-    settings: VehicleSettings,
-    *,
-    estimator: str | AbstractEstimator | None,
-    bracket: Intervals,
-    network: GivenNetwork,
-    validate: Recording | None,
-    seed: int,
-    progress: Progress,
-) -> Case:
-    """Recordings of a vehicle. Arguments as of `identify`."""
-    estimator = DEFAULT if estimator is None else estimator
-    name, kind = name_and_class(estimator)
-    if not kind.in_closed_loop:
-        fitting = ", ".join(each for each, other in ESTIMATORS.items() if other.in_closed_loop)
-        raise InputError(
-            f"`estimator` {name}: is biased by a controller that answers gusts, as every vehicle has; use one of "
-            f"{fitting}."
-        )
-    if network is not None:
-        raise InputError("`network`: a vehicle's network is trained for its own flights; leave it out.")
-    prepared = preparation.prepare(
-        recordings,
-        airframe,
-        begin=settings.begin,
-        end=settings.end,
-        sample_time=settings.sample_time,
-        holdout=settings.share(validated=validate is not None),
-    )
-    terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
-    model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
-    problem = _vehicle_problem(model, prepared.fitted, bracket_of(bracket, model), prepared.windows, recordings[0].name)
-    held_out, notes = _held_out(recordings, validate, prepared, problem.problem, model)
-    if kind.needs_network and isinstance(estimator, str):
-        progress("training a network for these flights")
-        try:
-            trained = vehicle_network_for(problem.problem, recordings[0].name, seed=seed)
-            method = _coarser(make_estimator(estimator, trained))
-        except TrainingError as error:
-            method, notes = (
-                _coarser(IBSS()),
-                (*notes, f"no network for these flights ({error}); IBSS searched the whole bracket"),
-            )
-    else:
-        method = _coarser(make_estimator(estimator)) if isinstance(estimator, str) else estimator
-    stretch = prepared.fitted.stretch
-    number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
-    powered = any(VOLTAGE in TERMS[term].needs for term in terms)
-    provenance = Provenance(
-        flights=[recording.name for recording in recordings],
-        validate=None if validate is None else validate.name,
-        airframe=airframe_name(airframe),
-        terms=list(terms),
-        sample_time=float(prepared.fitted.dt),
-        fitted_seconds=prepared.seconds[0],
-        tested_seconds=0.0 if held_out is None else held_out.seconds,
-        battery_voltage=voltage if powered and voltage is not None else msgspec.UNSET,
-        notes=list(notes),
-        **versions(problem.problem),
-    )
-    recording = np.asarray(prepared.recordings)[number]
-    return Case(problem, method, name, "flight", FilterError.prior, held_out, recording, provenance)
-
-
-def _coarser(method: AbstractEstimator) -> AbstractEstimator:
-    """The estimator, which ends a bisection where the kinks of a vehicle's cost begin to matter."""
-    if isinstance(method, Hybrid):
-        return dataclasses.replace(method, ibss=dataclasses.replace(method.ibss, tolerance=_KINKS))
-    return dataclasses.replace(method, tolerance=_KINKS) if isinstance(method, IBSS) else method
-
-
-def _vehicle_problem(
-    model: FlightModel, flight: Flight, bracket: Bracket, windows: int, name: str
-) -> InnovationsProblem:
-    shooting = ShootingProblem(
-        model,
-        flight,
-        sigma=np.full(12, _FIRST_SIGMA),
-        channels="rates",
-        method="rk4",
-        windows=windows,
-        unknowns=Unknowns.of(model, bracket),
-    )
-    measured, unknowns = np.count_nonzero(~np.isnan(shooting.recorded())), len(model.parameter_names)
-    if measured <= unknowns:
-        raise InputError(f"{name}: {measured} measurements for {unknowns} unknowns; give a longer flight.")
-    samples = flight.time.shape[0]
-    segment = min(SEGMENT, max(samples // _FEWEST_SEGMENTS, _SHORTEST_SEGMENT))
-    settling = min(SETTLING, max(round(_SETTLED / float(flight.dt)), 1))
-    return InnovationsProblem(shooting, segment=segment, settling=settling)
-
-
-def _held_out(
-    recordings: Sequence[Recording],
-    validate: Recording | None,
-    prepared: preparation.Prepared,
-    fitted: ShootingProblem,
-    model: FlightModel,
-) -> tuple[HeldOut | None, tuple[str, ...]]:
-    """The data that are predicted and not fitted, if there are any; and the notes about all data."""
-    held_out, notes = None, prepared.notes
-    if validate is not None:
-        other = _prepare_other(recordings, validate, prepared, model)
-        held_out, notes = (
-            HeldOut(_on(fitted, model, other.fitted), validate.name, other.seconds[0]),
-            notes + other.notes,
-        )
-    elif prepared.tested is not None:
-        whole = dataclasses.replace(fitted, flight=prepared.tested)
-        held_out = HeldOut(whole, recordings[0].name, prepared.seconds[1], fitted_vehicle=True)
-    if held_out is None:
-        return None, (*notes, "nothing was held out, so no prediction checks the fit")
-    try:
-        starts(held_out.problem.flight)
-    except ValueError:
-        remedy = "give `holdout` 0 or `validate`" if held_out.fitted_vehicle else "give another flight"
-        raise InputError(
-            f"{held_out.name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
-        ) from None
-    return held_out, notes
-
-
-def _on(fitted: ShootingProblem, model: FlightModel, flight: Flight) -> ShootingProblem:
-    """The problem of another flight, which counts as one recording."""
-    stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
-    other = dataclasses.replace(model, recordings=(0,) * stretches)
-    return ShootingProblem(other, flight, sigma=fitted.sigma, channels="rates", method="rk4")
-
-
-def _prepare_other(
-    recordings: Sequence[Recording], validate: Recording, prepared: preparation.Prepared, model: FlightModel
-) -> preparation.Prepared:
-    """The recording to predict, with the sample time of those that are fitted."""
-    if any(validate.same_data(recording) for recording in recordings):
-        raise InputError(
-            f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
-        )
-    step = float(prepared.fitted.dt)
-    other = preparation.prepare([validate], model.airframe, sample_time=step, holdout=0.0, predicted=True)
-    for term in model.terms:
-        if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
-            raise InputError(
-                f"{validate.name}: `validate` did not measure what the term {term} needs; give `terms` without it."
-            )
-    return other
-
-
-def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tuple[str, ...]:
-    """The terms in the order of `TERMS`. Raises `InputError` for one that is unknown or not available."""
-    if terms is None:
-        return default_terms(available)
-    for term in terms:
-        if term not in TERMS:
-            raise InputError(f"`terms`: knows no `{term[:40]}`; the terms are {', '.join(TERMS)}.")
-    for term in terms:
-        missing = TERMS[term].needs - available
-        if FULL_SCALE in missing:
-            raise InputError(f"`terms`: {term} needs `max_rotor_speed` in the airframe; set it or leave it out.")
-        if missing:
-            what = " and ".join(sorted(missing))
-            raise InputError(f"`terms`: {term} needs {what}, which these logs did not measure; leave it out.")
-    return tuple(term for term in TERMS if term in terms)
+    return Case(problem, problem, method, name, subject, kind.prior, held_out, np.zeros(samples, int), provenance)
 
 
 def _restricted(problem: ShootingProblem, channels: str, name: str, recording: Recording) -> ShootingProblem:

@@ -129,8 +129,7 @@ class Disturbance(msgspec.Struct, frozen=True):
     """What acts on a channel besides the model, by filter error.
 
     - `strength`: standard deviation of the disturbance, in `unit`. `time_constant`: of its correlation [s].
-    - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel; of specific force: of means
-      over 0.25 s.
+    - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
     - `correlation`: the largest correlation of innovations up to 8 samples apart; near 0 if the noise is as modelled.
     """
 
@@ -138,6 +137,17 @@ class Disturbance(msgspec.Struct, frozen=True):
     unit: str
     time_constant: float
     sensor: float
+    correlation: float
+
+
+class SampleTime(msgspec.Struct, frozen=True):
+    """The moments of inertia of a vehicle at one sample time [s].
+
+    - `correlation`: the largest of the innovations of a body rate.
+    """
+
+    sample_time: float
+    constants: dict[str, Constant]
     correlation: float
 
 
@@ -227,6 +237,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `doubts`: why the estimate is not to be trusted; empty if nothing speaks against it.
     - `disturbances`: the accelerations that the model lacks, by channel.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
+    - `sample_times`: the moments of inertia at each sample time that was tried; empty if only one was.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
     - `predictions`: the predictions themselves; not in `to_dict`.
     - `response`: the frequency response from modelled to measured angular acceleration, with the fitted data; not in
@@ -253,6 +264,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     doubts: tuple[Doubt, ...] = ()
     disturbances: dict[str, Disturbance] = {}
     widened: dict[str, float] = {}
+    sample_times: tuple[SampleTime, ...] = ()
     skill: PredictionSkill | None = None
     predictions: Predictions | None = None
     response: FrequencyResponse | None = None

@@ -20,6 +20,7 @@ from .state import Forcing, Rates, Samples, Vector
 # What a term can need from the logs or from the airframe.
 COMMANDS = "commands"
 BODY_VELOCITY = "body velocity"
+AXIAL_VELOCITY = "axial velocity"
 LATERAL_FORCE = "lateral specific force"
 VERTICAL_FORCE = "vertical specific force"
 FULL_SCALE = "full scale"
@@ -135,13 +136,11 @@ def _reaction(airframe: Airframe) -> Scalar:
     return jnp.asarray(airframe.rotor_inertia) / jnp.asarray(airframe.inertia)[2]
 
 
-def _late(cause: str, remedy: str) -> Contradiction:
-    """A time that must not be negative."""
-
-    def contradiction(value: float, error: float) -> tuple[str, str] | None:
-        return (f"s is negative: {cause}", remedy) if value + error < -_EARLY else None
-
-    return contradiction
+def _contradicts_lag(lag: float, error: float) -> tuple[str, str] | None:
+    if lag + error >= -_EARLY:
+        return None
+    remedy = "if the log holds measured rotor speeds, name the columns omega1..4; else check the time stamps"
+    return "s is negative: rotors cannot answer before their command", remedy
 
 
 def _contradicts_thrust(gain: float, error: float) -> tuple[str, str] | None:
@@ -209,6 +208,11 @@ def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
     return x - values["x_drag"] * vx, y - values["y_drag"] * vy, z
 
 
+def _add_inflow(force: Vector, values: Values, forcing: Forcing) -> Vector:
+    x, y, z = force
+    return x, y, z - values["z_drag"] * required(forcing.velocity, _missing(AXIAL_VELOCITY, "body_velocity"))[2]
+
+
 def _add_gyro_bias(rates: Rates, values: Values) -> Rates:
     p, q, r = rates
     return Rates(p + values["p_bias"], q + values["q_bias"], r + values["r_bias"])
@@ -264,34 +268,17 @@ TERMS: dict[str, Term] = {
     "lag": Term(
         "rotors follow their commands as first-order systems: rotor_lag [s]",
         (
-            TermParameter(  # small vehicles have 0.02 to 0.1 s
-                "rotor_lag",
-                "s",
-                0.03,
-                center=0.05,
-                contradiction=_late(
-                    "rotors cannot answer before their command",
-                    "if the log holds measured rotor speeds, name the columns omega1..4; else check the time stamps",
-                ),
-            ),
+            # Small vehicles have 0.02 to 0.1 s.
+            TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_contradicts_lag),
         ),
         by_default=lambda available: COMMANDS in available,
         speed=lambda speeds, values, grid: lagged(speeds.begin, values["rotor_lag"], grid),
     ),
     "delay": Term(
-        "commands act later than they are recorded: rotor_delay [s]",
-        (
-            TermParameter(
-                "rotor_delay",
-                "s",
-                0.02,
-                contradiction=_late(
-                    "commands cannot act before they are given",
-                    "commands or gyro are logged with wrong time stamps: correct them, or leave out the term `delay`",
-                ),
-            ),
-        ),
-        by_default=lambda available: COMMANDS in available,
+        "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
+        # A delay of the motors, and an offset between the clocks of motors and gyro, of either sign.
+        (TermParameter("rotor_delay", "s", 0.03),),
+        by_default=lambda available: True,
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
     ),
     "reaction": Term(
@@ -320,6 +307,14 @@ TERMS: dict[str, Term] = {
         force_axes=(2,),
         specific_force=_scale_thrust,
         accelerometer=_add_force_bias,
+    ),
+    "inflow": Term(
+        "thrust falls with the velocity along z, which changes the inflow of the rotors: z_drag [1/s]",
+        # g over twice the induced velocity, which is 4 to 10 m/s in hover.
+        (TermParameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True),),
+        needs=frozenset({AXIAL_VELOCITY, VERTICAL_FORCE}),
+        by_default=lambda available: True,
+        specific_force=_add_inflow,
     ),
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",

@@ -55,23 +55,6 @@ def averaged(flight: AnyFlight, dt: float) -> AnyFlight:
     return flight._replace(time=time, omega=omega, states=states, **found, body_velocity=None, stretch=None)
 
 
-def with_body_velocity(recording: Recording) -> Recording:
-    """Add `body_velocity` to a recording with velocity and attitude. Other recordings are returned unchanged."""
-    columns = [STATE_NAMES.index(name) for name in ("psi", "theta", "phi", "vx", "vy", "vz")]
-    values = recording.states[:, columns]
-    if np.isnan(values).all(axis=0).any():
-        return recording
-    # Gaps get the value before them, or the first one.
-    measured, index = ~np.isnan(values), np.arange(len(values))[:, None]
-    source = np.maximum(np.maximum.accumulate(np.where(measured, index, -1)), measured.argmax(axis=0))
-    psi, theta, phi, x, y, z = np.take_along_axis(values, source, axis=0).T
-    # The inverse of R_z(psi) R_y(theta) R_x(phi).
-    x, y = x * np.cos(psi) + y * np.sin(psi), y * np.cos(psi) - x * np.sin(psi)
-    x, z = x * np.cos(theta) - z * np.sin(theta), z * np.cos(theta) + x * np.sin(theta)
-    y, z = y * np.cos(phi) + z * np.sin(phi), z * np.cos(phi) - y * np.sin(phi)
-    return recording._replace(body_velocity=np.column_stack([x, y, z]))
-
-
 def join(flights: Sequence[Flight], *, length: int) -> Flight:
     """Put stretches of flight one after the other, as one flight of whole windows.
 

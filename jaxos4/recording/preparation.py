@@ -5,19 +5,32 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
-from ..models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE, has_full_scale
+from ..models.terms import (
+    AXIAL_VELOCITY,
+    BODY_VELOCITY,
+    COMMANDS,
+    FULL_SCALE,
+    LATERAL_FORCE,
+    VERTICAL_FORCE,
+    VOLTAGE,
+    has_full_scale,
+)
 from .motion import opposite_axes, opposite_note
-from .pieces import averaged, cut, hold_out, joined, whole_windows, with_body_velocity
+from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
+from .velocity import Motion, motion_of
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
+# The longest sample at which an answer is compared with that of shorter ones [s].
+LONGEST_SAMPLE_TIME = 0.032
 # The share that is held out by default.
 HOLDOUT = 0.25
 _MOST_REASONS = 3
@@ -34,6 +47,7 @@ class Prepared(NamedTuple):
     - `recordings`: for each stretch, the number of its recording, from 0.
     - `length`: of a window, in samples.
     - `available`: what every recording offers to the terms of a model, see `Term.needs`.
+    - `upright`: the cosine of the tilt at each sample. `None`: unknown.
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
     """
@@ -43,6 +57,7 @@ class Prepared(NamedTuple):
     recordings: tuple[int, ...]
     length: int
     available: frozenset[str]
+    upright: Float[np.ndarray, " samples"] | None
     seconds: tuple[float, float]
     notes: tuple[str, ...]
 
@@ -55,6 +70,31 @@ class Prepared(NamedTuple):
     def battery_voltage(self) -> float | None:
         """The median of the battery's voltage [V]. `None`: not logged."""
         return None if self.fitted.voltage is None else float(np.median(self.fitted.voltage))
+
+
+class Usable(NamedTuple):
+    """The usable parts of one vehicle's recordings.
+
+    - `parts`: each with the number of its recording, from 0.
+    - `recordings`: whole.
+    - `notes`: what the reader changed, and which stretches are not used.
+    """
+
+    parts: tuple[tuple[int, Recording], ...]
+    recordings: tuple[Recording, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def slowest(self) -> float:
+        """The longest sample of the logs [s]."""
+        return max(piece.dt for _, piece in self.parts)
+
+    @property
+    def sample_times(self) -> tuple[float, ...]:
+        """The sample times at which an answer is to be compared [s], from the shortest on: each is twice the last."""
+        shortest = max(SAMPLE_TIME, self.slowest)
+        doublings = max(math.floor(math.log2(LONGEST_SAMPLE_TIME * _NEARLY_EQUAL / shortest)), 0)
+        return tuple(shortest * 2**k for k in range(doublings + 1))
 
 
 def prepare(
@@ -75,6 +115,30 @@ def prepare(
 
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
+    usable = usable_parts(
+        recordings, airframe, begin=begin, end=end, window=window, sample_time=sample_time, holdout=holdout,
+        predicted=predicted,
+    )  # fmt: skip
+    if predicted and sample_time is not None and usable.slowest > sample_time * _NEARLY_EQUAL:
+        raise InputError(
+            f"{recordings[0].name}: has one sample every {usable.slowest:.4g} s, the fitted logs one every "
+            f"{sample_time:.4g} s; give `sample_time` {usable.slowest:.4g}, or another `validate`."
+        )
+    return sampled(usable, airframe, window=window, sample_time=sample_time, holdout=holdout)
+
+
+def usable_parts(
+    recordings: Sequence[Recording],
+    airframe: Airframe,
+    *,
+    begin: float | None,
+    end: float | None,
+    window: float = WINDOW,
+    sample_time: float | None,
+    holdout: float,
+    predicted: bool = False,
+) -> Usable:
+    """The parts of recordings that can be used, see `prepare`."""
     _check_options(begin, end, window, sample_time, holdout)
     _check_recordings(recordings)
     notes: list[str] = []
@@ -92,20 +156,30 @@ def prepare(
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
-    slowest = max(piece.dt for _, piece in parts)
-    if predicted and sample_time is not None and slowest > sample_time * _NEARLY_EQUAL:
-        raise InputError(
-            f"{recordings[0].name}: has one sample every {slowest:.4g} s, the fitted logs one every {sample_time:.4g} "
-            f"s; give `sample_time` {slowest:.4g}, or another `validate`."
-        )
-    step, length = _sampling(slowest, window, sample_time)
-    coarse = [(number, whole_windows(averaged(piece, step), length)) for number, piece in parts]
+    return Usable(tuple(parts), tuple(recordings), tuple(notes))
+
+
+def sampled(
+    usable: Usable,
+    airframe: Airframe,
+    *,
+    window: float = WINDOW,
+    sample_time: float | None,
+    holdout: float,
+) -> Prepared:
+    """One flight of the usable parts, with samples of `sample_time` [s]."""
+    step, length = _sampling(usable.slowest, window, sample_time)
+    coarse = [(number, whole_windows(averaged(piece, step), length)) for number, piece in usable.parts]
     numbers = tuple(number for number, piece in coarse if piece.time.size)
-    pieces = [with_body_velocity(piece) for _, piece in coarse if piece.time.size]
-    unused = [recording for i, recording in enumerate(recordings) if i not in numbers]
+    pieces = [piece for _, piece in coarse if piece.time.size]
+    unused = [recording for i, recording in enumerate(usable.recordings) if i not in numbers]
     if unused:
         remedy = "leave this log out, or give a shorter `window`" if pieces else "give a shorter `window`"
         raise InputError(f"{unused[0].name}: no part is as long as a window, {window:g} s; {remedy}.")
+    motions = [motion for piece in pieces if (motion := motion_of(piece)) is not None]
+    moved = len(motions) == len(pieces)
+    if moved:
+        pieces = [piece._replace(body_velocity=motion.velocity) for piece, motion in zip(pieces, motions, strict=True)]
     whole = joined(pieces)
     fitted, tested = hold_out(whole, length, holdout)
     seconds = _seconds(fitted), 0.0 if tested is None else _seconds(tested)
@@ -114,18 +188,22 @@ def prepare(
         None if tested is None else tested.flight,
         numbers,
         length,
-        _available_inputs(whole, pieces, airframe),
+        _available_inputs(whole, pieces, airframe, motions if moved else []),
+        np.concatenate([motion.up[:, 2] for motion in motions]) if moved else None,
         seconds,
-        tuple(notes),
+        usable.notes,
     )
 
 
-def _available_inputs(whole: Recording, pieces: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
+def _available_inputs(
+    whole: Recording, pieces: Sequence[Recording], airframe: Airframe, motions: Sequence[Motion]
+) -> frozenset[str]:
     """The inputs for `Term.needs` that the joined recording offers. A force counts if every piece measured it."""
     force = np.all([~np.isnan(piece.channels[:, len(STATE_NAMES) :]).all(axis=0) for piece in pieces], axis=0)
     offers = {
         COMMANDS: whole.commanded,
-        BODY_VELOCITY: whole.body_velocity is not None,
+        AXIAL_VELOCITY: bool(motions),
+        BODY_VELOCITY: bool(motions) and all(motion.measured for motion in motions),
         LATERAL_FORCE: force[0] and force[1],
         VERTICAL_FORCE: force[2],
         FULL_SCALE: has_full_scale(airframe),

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Numeric, Parameters, Scalar
 from ..models.state import Forcing, Rates, State
@@ -28,8 +28,8 @@ Series = Float[Array, "time channels segments"]
 Scalars = tuple[Scalar, ...]
 Move = Callable[[State, Forcing, Scalars], State]
 Observe = Callable[[State, Forcing, Scalars], Scalars]
-# A row of `Observed`: measured, restart, in_block, closes.
-_Row = tuple[Channels, Bool[Array, " segments"], Int[Array, " segments"], Bool[Array, " segments"]]
+# A row of `Observed`: measured, restart.
+_Row = tuple[Channels, Bool[Array, " segments"]]
 
 LAGS = 8
 """The largest lag at which innovations are compared, in samples."""
@@ -58,18 +58,15 @@ class LogNoise(NamedTuple):
 class Observed(NamedTuple):
     """What was measured, in segments.
 
-    - `measured`: body rates, then the means of specific force over blocks of samples. NaN: not measured.
+    - `measured`: body rates, then specific force. NaN: not measured.
     - `restart`: whether a segment forgets what it knew before this sample.
     - `counts`: whether the innovations at a sample count.
-    - `in_block`: the number of samples in the block so far. `closes`: whether the block ends with this sample.
     - `known`: the rates at the first sample. `None`: unknown.
     """
 
     measured: Series
     restart: Bool[Array, "time segments"]
     counts: Bool[Array, "time segments"]
-    in_block: Int[Array, "time segments"]
-    closes: Bool[Array, "time segments"]
     known: Float[Array, "3 segments"] | None = None
 
 
@@ -214,11 +211,10 @@ def _start(observed: Observed, zero: Channels) -> Channels:
 
 
 class _Known(NamedTuple):
-    """What the filters know before a measurement, and the sum of each specific force over its block."""
+    """What the filters know before a measurement."""
 
     rates: Rates
     disturbance: tuple[Segments, ...]
-    force: tuple[Segments, ...]
 
 
 class _Feedback(NamedTuple):
@@ -234,12 +230,11 @@ def _advance(
     move: Move, observe: Observe, known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """What is known one sample later, and the innovations of this sample."""
-    y, restart, in_block, closes = row
+    y, restart = row
     known = jax.tree.map(lambda leaf: jnp.where(restart, 0.0, leaf), known)
     outputs = observe(State(known.rates), forcing, scalars)
-    force = tuple(total + h for total, h in zip(known.force, outputs[_RATES:], strict=True))
-    means = (total / in_block + d for total, d in zip(force, known.disturbance[_RATES:], strict=True))
-    expected = (*outputs[:_RATES], *means)
+    force = (h + d for h, d in zip(outputs[_RATES:], known.disturbance[_RATES:], strict=True))
+    expected = (*outputs[:_RATES], *force)
     errors = tuple(jnp.where(jnp.isnan(z), 0.0, jnp.nan_to_num(z) - h) for z, h in zip(y, expected, strict=True))
     disturbance = tuple(
         d + gain * e for d, gain, e in zip(known.disturbance, feedback.disturbance, errors, strict=True)
@@ -248,7 +243,7 @@ def _advance(
     following = move(State(Rates(*rates)), forcing, scalars).rates
     pushed = (x + a * d for x, a, d in zip(following, feedback.reach, disturbance[:_RATES], strict=True))
     faded = tuple(share * d for share, d in zip(feedback.kept, disturbance, strict=True))
-    return _Known(Rates(*pushed), faded, tuple(jnp.where(closes, 0.0, total) for total in force)), errors
+    return _Known(Rates(*pushed), faded), errors
 
 
 def innovate(
@@ -312,10 +307,9 @@ def innovate(
 
     zero = jnp.zeros(segments, dtype=float)
     start = _start(observed, jnp.zeros((channels, segments), dtype=float))
-    first = _Known(Rates(*start[:_RATES]), (zero,) * channels, (zero,) * (channels - _RATES))
+    first = _Known(Rates(*start[:_RATES]), (zero,) * channels)
     slopes = jax.tree.map(lambda leaf: jnp.zeros((unknowns, *leaf.shape), dtype=float), first)
-    row = observed.measured, observed.restart, observed.in_block, observed.closes
-    rows = forcing, forcing_tangents, gains, gain_slopes, row
+    rows = forcing, forcing_tangents, gains, gain_slopes, (observed.measured, observed.restart)
     (_, _, sound), (errors, slopes) = jax.lax.scan(body, (first, slopes, jnp.ones(segments, dtype=bool)), rows)
 
     return _likelihood(observed, gains, gain_slopes.variance, sound, errors, slopes)

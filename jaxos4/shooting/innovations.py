@@ -10,7 +10,7 @@ References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, Sys
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialStates, Parameters, Scalar, as_float
+from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
 from ..bracket import PROPER_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
-from ..models.state import CHANNELS
+from ..models.state import CHANNELS, Forcing
+from ..models.vehicle import FlightModel
 from .abstract import AbstractProblem, Stages, WindowUnknowns
 from .filters import Innovations, LogNoise, Observed, innovate
 from .problem import ShootingProblem
@@ -36,9 +37,23 @@ SEGMENT, SETTLING = 384, 128
 # Time constants of the disturbance at which searches start [s]: the likelihood has several maxima.
 _TIMES = np.array([0.2, 0.03])
 _SHORTEST, _LONGEST = 0.25, 3.0  # time constants: in samples, in seconds
+# Time constant of a disturbance of specific force at least [s]: what is faster is vibration, a noise of the sensor.
+_FORCE_SHORTEST = 0.25
 _NOISE_REACH = 1e8  # factor to either side of the first noise levels: simulated flights have no disturbance
 NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
 _STRIDE = 1.0  # the cost is roughly quadratic in a logarithm over such a step
+
+
+class Balance(NamedTuple):
+    """What a vehicle's weight says: over a flight its thrust carries it.
+
+    - `weight`: of the specific force along z at each sample: the cosine of the tilt over the number of samples.
+    - `gravity`, `sigma`: the weighted sum, and its standard deviation [m/s^2].
+    """
+
+    weight: Float[Numeric, " samples"]
+    gravity: Float[ArrayLike, ""]
+    sigma: Float[ArrayLike, ""]
 
 
 class InnovationsProblem(AbstractProblem):
@@ -58,6 +73,7 @@ class InnovationsProblem(AbstractProblem):
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
+    - `balance`: of thrust and weight, another measurement of a model that predicts the specific force along z.
     """
 
     prior: ClassVar[float] = PROPER_PRIOR
@@ -65,6 +81,7 @@ class InnovationsProblem(AbstractProblem):
     start: Values = eqx.field(converter=as_float)
     segment: int = eqx.field(static=True, default=SEGMENT)
     settling: int = eqx.field(static=True, default=SETTLING)
+    balance: Balance | None = None
 
     def __init__(
         self,
@@ -73,7 +90,9 @@ class InnovationsProblem(AbstractProblem):
         segment: int = SEGMENT,
         settling: int = SETTLING,
         start: Float[ArrayLike, " unknowns"] | None = None,
+        balance: Balance | None = None,
     ):
+        self.balance = None if balance is None else jax.tree.map(as_float, balance)
         self.problem, self.segment, self.settling = problem.restrict("rates"), segment, settling
         # An array in any case, so that all starts share one program.
         unknowns = problem.unknowns.count + 3 * self.problem.columns.size
@@ -115,7 +134,9 @@ class InnovationsProblem(AbstractProblem):
         own, dt = self.problem.unknowns, self.flight.dt
         first = jnp.stack(_first_noise(self.problem.measured(), dt), axis=1)
         lowest, highest = first - np.log(_NOISE_REACH), first + np.log(_NOISE_REACH)
-        lowest, highest = lowest.at[:, 1].set(jnp.log(_SHORTEST * dt)), highest.at[:, 1].set(np.log(_LONGEST))
+        is_rate = np.arange(first.shape[0]) < CHANNELS["rates"]
+        shortest = jnp.where(is_rate, jnp.log(_SHORTEST * dt), np.log(_FORCE_SHORTEST))
+        lowest, highest = lowest.at[:, 1].set(shortest), highest.at[:, 1].set(np.log(_LONGEST))
         levels = [(f"log_{name}_{level}", "1") for name in self.channels for level in ("strength", "time", "sensor")]
         precision = jnp.full(first.size, NOISE_PRECISION)
         return Unknowns(
@@ -136,6 +157,7 @@ class InnovationsProblem(AbstractProblem):
         unknowns, count = self.unknowns.usable, self.problem.unknowns.count
         place = np.arange(unknowns.count) - count
         times = jnp.where((place >= 0) & (place % 3 == 1), jnp.log(jnp.asarray(_TIMES))[:, None], unknowns.center)
+        times = jnp.clip(times, unknowns.lowest, unknowns.highest)
         return jnp.where(jnp.isnan(self.start) | ~unknowns.free, times, self.start)
 
     def starting_from(self, start: Float[ArrayLike, " unknowns"]) -> "InnovationsProblem":
@@ -168,18 +190,25 @@ class InnovationsProblem(AbstractProblem):
 
     def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
         """See `AbstractProblem`. `parts` are the segments."""
-        unknowns, innovations = self.unknowns.usable, self._innovations(self.observed())
+        unknowns, innovations, forced = self.unknowns.usable, self._innovations(self.observed()), self._forced()
+        lift = self._lift()
         count, free = self.problem.unknowns.count, unknowns.free
         both = free & free[:, None]
 
         def evaluate(values: Values, initial_state: InitialStates) -> Curvature:
             del initial_state
-            found = innovations(values[:count], self.noise(values))
+            forcing, tangents = forced(values[:count])
+            found = innovations(values[:count], self.noise(values), forcing, tangents)
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, count)
             off = values - unknowns.center
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
             slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
             curvature = jnp.where(both, information.sum(axis=0), 0.0) + jnp.diag(unknowns.precision)
+            if lift is not None:
+                excess, slopes = lift(values[:count], forcing, tangents)
+                slopes = jnp.where(free, jnp.pad(slopes, (0, free.size - count)), 0.0)
+                cost, slope = cost + excess**2 / 2, slope + excess * slopes
+                curvature = curvature + slopes[:, None] * slopes
             parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0))
             return Curvature(Shot(cost[None], found.sound.all()[None]), slope[None], curvature[None], parts)
 
@@ -216,19 +245,15 @@ class InnovationsProblem(AbstractProblem):
 
     def innovations(self, parameters: Parameters, noise: LogNoise) -> Innovations:
         """The innovations of all segments."""
-        return self._innovations(self.observed())(parameters, noise)
+        return self._innovations(self.observed())(parameters, noise, *self._forced()(parameters))
 
-    def _innovations(self, observed: Observed) -> Callable[[Parameters, LogNoise], Innovations]:
-        """The innovations of all segments, as a function of the parameters and the noise."""
-        problem, model, inputs, dt = self.problem, self.model, self.flight.inputs, self.flight.dt
-        samples = np.minimum(self.index, self.flight.time.shape[0] - 1)
-        rows = Rows(windowed(problem.forcing(model.alpha), samples), ())
+    def _innovations(
+        self, observed: Observed
+    ) -> Callable[[Parameters, LogNoise, Forcing, Forcing | None], Innovations]:
+        """The innovations of all segments, as a function of the parameters, the noise, and what `_forced` returns."""
+        problem, model, dt = self.problem, self.model, self.flight.dt
 
-        def evaluate(parameters: Parameters, noise: LogNoise) -> Innovations:
-            forced = problem.with_forcing(rows, parameters, inputs=inputs, index=samples)
-            forcing, tangents = jax.tree.map(
-                lambda leaf: jnp.moveaxis(leaf, 0, -1), (forced.forcing, forced.forcing_tangents)
-            )
+        def at(parameters: Parameters, noise: LogNoise, forcing: Forcing, tangents: Forcing | None) -> Innovations:
             return innovate(
                 problem.step,
                 model.observe,
@@ -241,7 +266,43 @@ class InnovationsProblem(AbstractProblem):
                 forcing_parameters=model.forcing_parameters,
             )
 
-        return evaluate
+        return at
+
+    def _forced(self) -> Callable[[Parameters], tuple[Forcing, Forcing | None]]:
+        """The forcing of all segments and its tangents, as functions of the parameters; segments are the last axis."""
+        problem, inputs = self.problem, self.flight.inputs
+        samples = np.minimum(self.index, self.flight.time.shape[0] - 1)
+        rows = Rows(windowed(problem.forcing(self.model.alpha), samples), ())
+
+        def forced(parameters: Parameters) -> tuple[Forcing, Forcing | None]:
+            found = problem.with_forcing(rows, parameters, inputs=inputs, index=samples)
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (found.forcing, found.forcing_tangents))
+
+        return forced
+
+    def _lift(self) -> Callable[[Parameters, Forcing, Forcing | None], tuple[Scalar, Parameters]] | None:
+        """By how many standard deviations the thrust exceeds the weight, and the slopes; `None` without a balance."""
+        balance, model = self.balance, self.model
+        if balance is None or not isinstance(model, FlightModel) or 2 not in model.force_axes:
+            return None
+        index, samples = self.index, self.flight.time.shape[0]
+        settling = self.settling if index.shape[0] > 1 else 0
+        own = ((np.arange(index.shape[1]) >= settling) | (index[:, :1] == 0)) & (index < samples)
+        weight = jnp.where(own, balance.weight[np.minimum(index, samples - 1)], 0.0).T
+        positions = np.asarray(model.forcing_parameters, dtype=int)
+
+        def excess(parameters: Parameters, thrust: Array, forcing: Forcing) -> Scalar:
+            force = model.specific_force(thrust, forcing, tuple(parameters))[2]
+            return ((weight * force).sum() - balance.gravity) / balance.sigma
+
+        def lift(parameters: Parameters, forcing: Forcing, tangents: Forcing | None) -> tuple[Scalar, Parameters]:
+            at = parameters, forcing.specific_thrust, forcing
+            value, (slopes, by_thrust) = jax.value_and_grad(excess, argnums=(0, 1))(*at)
+            if tangents is not None:
+                slopes = slopes.at[positions].add(jnp.einsum("ts,tps->p", by_thrust, tangents.specific_thrust))
+            return value, slopes
+
+        return lift
 
 
 def joined(
@@ -276,5 +337,5 @@ def _first_noise(measured: Float[Array, "samples channels"], dt: Scalar) -> LogN
     change = jnp.sqrt(power(jnp.diff(measured, axis=0))) / dt / 2
     mean = jnp.nansum(measured, axis=0) / jnp.maximum((~jnp.isnan(measured)).sum(axis=0), 1)
     spread = jnp.sqrt(power(measured - mean)) / 2
-    strength, sensor = jnp.where(is_rate, change, spread), jnp.where(is_rate, sensor, spread)
+    strength = jnp.where(is_rate, change, spread)
     return LogNoise(logarithm(strength), jnp.full(strength.shape, np.log(_TIMES[0])), logarithm(sensor))

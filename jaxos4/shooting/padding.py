@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from ..flight import Flight
 from .problem import ShootingProblem
 
 # A flight is padded to the first of these numbers of samples that is enough. A longer flight is not padded: to compile
@@ -20,23 +21,28 @@ def padded(problem: ShootingProblem) -> ShootingProblem:
 
     A flight in windows is not padded.
     """
-    flight, samples = problem.flight, problem.flight.time.shape[0]
+    samples = problem.flight.time.shape[0]
     capacity = next((capacity for capacity in _CAPACITIES if capacity >= samples), None)
     if capacity is None or problem.windows > 1 or problem.length is not None:
         return problem
+    longer, length = pad_flight(problem.flight, capacity), jax.device_put(np.asarray(samples))
+    return eqx.tree_at(lambda p: (p.flight, p.length), problem, (longer, length), is_leaf=lambda leaf: leaf is None)
+
+
+def pad_flight(flight: Flight, capacity: int) -> Flight:
+    """The flight with more rows, up to `capacity`, in which nothing was measured and the inputs stay as they were."""
+    samples = flight.time.shape[0]
 
     def pad(values: jax.Array | None, fill: float | None = None) -> jax.Array | None:
-        """With more rows, which repeat the last row or hold `fill`."""
         if values is None:
             return None
         rows = np.asarray(values)
         more = np.repeat(rows[-1:] if fill is None else np.full_like(rows[-1:], fill), capacity - samples, axis=0)
         return jax.device_put(np.concatenate([rows, more]))
 
-    time = np.asarray(flight.time)
-    longer = dataclasses.replace(
+    return dataclasses.replace(
         flight,
-        time=time[0] + float(flight.dt) * np.arange(capacity),
+        time=np.asarray(flight.time)[0] + float(flight.dt) * np.arange(capacity),
         omega=pad(flight.omega),
         states=pad(flight.states, np.nan),
         specific_force=pad(flight.specific_force, np.nan),
@@ -44,5 +50,3 @@ def padded(problem: ShootingProblem) -> ShootingProblem:
         stretch=pad(flight.stretch),
         voltage=pad(flight.voltage),
     )
-    length = jax.device_put(np.asarray(samples))
-    return eqx.tree_at(lambda p: (p.flight, p.length), problem, (longer, length), is_leaf=lambda leaf: leaf is None)

@@ -7,17 +7,13 @@ of a segment settle the filter.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from .._custom_types import Scalar
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, CHANNELS
 from .filters import Observed
 from .problem import ShootingProblem
 
-# Specific force is compared as means over this time [s]: accelerometers feel vibrations, and their low-pass filters
-# differ. The least share of a block that must be measured.
-BLOCK, _MEASURED = 0.25, 0.125
 # A gap of this length ends what a filter knows [s].
 _GAP = 0.1
 
@@ -61,10 +57,7 @@ def observe_in_segments(problem: ShootingProblem, index: Int[np.ndarray, "segmen
         known = jnp.where(is_first, rates[:, None], 0.0)
     restarts = in_segments(restart) | begins | ~exists
     measured = jnp.where(exists[:, None], in_segments(measured), jnp.nan)
-    means, in_block, closes = _block_means(measured[:, 3:], restarts, flight.dt)
-    counts = in_segments(settled) & exists & own
-    measured = jnp.concatenate([measured[:, :3], means], axis=1)
-    return Observed(measured, restarts, counts, in_block, closes, known)
+    return Observed(measured, restarts, in_segments(settled) & exists & own, known)
 
 
 def _restarts(
@@ -85,25 +78,3 @@ def _restarts(
     another = jnp.concatenate([jnp.zeros(1, dtype=bool), jnp.diff(stretch) != 0])
     first = jnp.zeros((), dtype=int), jnp.full((), settling if flight.stretch is None else -1, dtype=int)
     return jax.lax.scan(follow, first, (missing, another))[1]
-
-
-def _block_means(
-    forces: Float[Array, "time forces segments"], restart: Bool[Array, "time segments"], dt: Scalar
-) -> tuple[Array, Array, Array]:
-    """Means over blocks at the last sample of each block and NaN elsewhere; the samples so far; where blocks end."""
-    block = jnp.floor(np.arange(restart.shape[0] + 1) * dt / BLOCK + 1e-6)
-    closes = jnp.broadcast_to((jnp.diff(block) != 0)[:, None], restart.shape)
-
-    def add(carry, row):
-        force, restart, closes = row
-        total, measured, count = (jnp.where(restart, 0, leaf) for leaf in carry)
-        known = ~jnp.isnan(force)
-        total, measured, count = total + jnp.where(known, force, 0.0), measured + known, count + 1
-        usable = closes & (measured >= _MEASURED * count) & (count * dt > BLOCK / 2)
-        mean = jnp.where(usable, total / jnp.maximum(measured, 1), jnp.nan)
-        return tuple(jnp.where(closes, 0, leaf) for leaf in (total, measured, count)), (mean, count)
-
-    shape = forces.shape[1:]
-    first = jnp.zeros(shape, dtype=float), jnp.zeros(shape, dtype=int), jnp.zeros(shape[1:], dtype=int)
-    _, (means, count) = jax.lax.scan(add, first, (forces, restart, closes))
-    return means, count, closes

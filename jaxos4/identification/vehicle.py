@@ -1,0 +1,247 @@
+"""From recordings of a vehicle to the problem that an estimator solves, and the measurements that test the answer."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from ..airframe import Airframe
+from ..analysis.prediction import HORIZONS, starts
+from ..bracket import Bracket
+from ..errors import InputError, TrainingError
+from ..estimate import AbstractEstimator
+from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
+from ..flight import Flight
+from ..models.terms import FULL_SCALE, TERMS, VOLTAGE, default_terms
+from ..models.vehicle import FlightModel
+from ..recording import preparation
+from ..recording.preparation import Prepared
+from ..recording.reading import Recording
+from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, pad_flight
+from ..shooting.innovations import SEGMENT, SETTLING, Balance
+from .network import GivenNetwork, vehicle_network_for
+from .prepare import Case, HeldOut, Progress
+from .problem import Intervals, bracket_of
+from .provenance import airframe_name, name_and_class, versions
+from .results import Provenance
+from .settings import VehicleSettings
+
+# The scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
+_FIRST_SIGMA = 0.5
+# A flight has at least so many segments, whose disagreement shows errors of the model, unless they would be too short.
+_FEWEST_SEGMENTS, _SHORTEST_SEGMENT = 8, 80
+# A filter has settled after this time [s].
+_SETTLED = 0.512
+# The cost has kinks where a delay passes a sample. Slopes jump closer to the minimum than this [standard deviations].
+_KINKS = 0.05
+# The thrust carries the weight but for the velocity that a stretch gains [m/s], and for this share of the weight.
+_GAINED, _CARRIED = 1.0, 0.003
+# The estimator of a vehicle, which flies in closed loop.
+DEFAULT = "filter-error"
+
+
+def prepare_vehicle(
+    recordings: Sequence[Recording],
+    airframe: Airframe,
+    settings: VehicleSettings,
+    *,
+    estimator: str | AbstractEstimator | None,
+    bracket: Intervals,
+    network: GivenNetwork,
+    validate: Recording | None,
+) -> list[Case]:
+    """Recordings of a vehicle at several sample times, the shortest first. Arguments as of `identify`."""
+    name, kind = name_and_class(DEFAULT if estimator is None else estimator)
+    if not kind.in_closed_loop:
+        fitting = ", ".join(each for each, other in ESTIMATORS.items() if other.in_closed_loop)
+        raise InputError(
+            f"`estimator` {name}: is biased by a controller that answers gusts, as every vehicle has; use one of "
+            f"{fitting}."
+        )
+    if network is not None:
+        raise InputError("`network`: a vehicle's network is trained for its own flights; leave it out.")
+    holdout = settings.share(validated=validate is not None)
+    usable = preparation.usable_parts(
+        recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
+    )
+    times = usable.sample_times if settings.sample_time is None else (settings.sample_time,)
+
+    prepared = [preparation.sampled(usable, airframe, sample_time=step, holdout=holdout) for step in times]
+    # All but the shortest sample time share one program: their flights get as many rows.
+    likes = [prepared[0], *(prepared[1] for _ in prepared[1:])]
+    return [
+        _case(recordings, airframe, settings, each, like, name, bracket=bracket, validate=validate)
+        for each, like in zip(prepared, likes, strict=True)
+    ]
+
+
+def _case(
+    recordings: Sequence[Recording],
+    airframe: Airframe,
+    settings: VehicleSettings,
+    prepared: Prepared,
+    like: Prepared,
+    name: str,
+    *,
+    bracket: Intervals,
+    validate: Recording | None,
+) -> Case:
+    terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
+    model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
+    shooting = _vehicle_shooting(model, prepared, bracket_of(bracket, model), recordings[0].name)
+    held_out, notes = _held_out(recordings, validate, prepared, shooting, model)
+    stretch = prepared.fitted.stretch
+    number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
+    powered = any(VOLTAGE in TERMS[term].needs for term in terms)
+    provenance = Provenance(
+        flights=[recording.name for recording in recordings],
+        validate=None if validate is None else validate.name,
+        airframe=airframe_name(airframe),
+        terms=list(terms),
+        sample_time=float(prepared.fitted.dt),
+        fitted_seconds=prepared.seconds[0],
+        tested_seconds=0.0 if held_out is None else held_out.seconds,
+        battery_voltage=voltage if powered and voltage is not None else msgspec.UNSET,
+        notes=list(notes),
+        **versions(shooting),
+    )
+    recording = np.asarray(prepared.recordings)[number]
+    problem = _innovations(shooting, prepared, like, airframe)
+    return Case(problem, shooting, FilterError(), name, "flight", FilterError.prior, held_out, recording, provenance)
+
+
+def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int, progress: Progress) -> Case:
+    """The case, to be searched by an estimator; a network is trained for it if the estimator needs one."""
+    if not isinstance(estimator, str):
+        return case._replace(estimator=estimator)
+    if not ESTIMATORS[estimator].needs_network:
+        return case._replace(estimator=_coarser(make_estimator(estimator)))
+    progress("training a network for these flights")
+    try:
+        name = str((case.provenance.flights or ["flight"])[0])
+        trained = vehicle_network_for(case.shooting, name, seed=seed)
+    except TrainingError as error:
+        note = f"no network for these flights ({error}); IBSS searched the whole bracket"
+        provenance = msgspec.structs.replace(case.provenance, notes=[*case.provenance.notes, note])
+        return case._replace(estimator=_coarser(IBSS()), provenance=provenance)
+    return case._replace(estimator=_coarser(make_estimator(estimator, trained)))
+
+
+def _coarser(method: AbstractEstimator) -> AbstractEstimator:
+    """The estimator, which ends a bisection where the kinks of a vehicle's cost begin to matter."""
+    if isinstance(method, Hybrid):
+        return dataclasses.replace(method, ibss=dataclasses.replace(method.ibss, tolerance=_KINKS))
+    return dataclasses.replace(method, tolerance=_KINKS) if isinstance(method, IBSS) else method
+
+
+def _vehicle_shooting(model: FlightModel, prepared: Prepared, bracket: Bracket, name: str) -> ShootingProblem:
+    shooting = ShootingProblem(
+        model,
+        prepared.fitted,
+        sigma=np.full(12, _FIRST_SIGMA),
+        channels="rates",
+        method="rk4",
+        windows=prepared.windows,
+        unknowns=Unknowns.of(model, bracket),
+    )
+    measured, unknowns = np.count_nonzero(~np.isnan(shooting.recorded())), len(model.parameter_names)
+    if measured <= unknowns:
+        raise InputError(f"{name}: {measured} measurements for {unknowns} unknowns; give a longer flight.")
+    return shooting
+
+
+def _innovations(
+    shooting: ShootingProblem, prepared: Prepared, like: Prepared, airframe: Airframe
+) -> InnovationsProblem:
+    """The likelihood of a vehicle, in a program for flights as long as `like`."""
+    capacity = max(like.fitted.time.shape[0], prepared.fitted.time.shape[0])
+    flight = pad_flight(prepared.fitted, capacity)
+    segment = min(SEGMENT, max(capacity // _FEWEST_SEGMENTS, _SHORTEST_SEGMENT))
+    settling = min(SETTLING, max(round(_SETTLED / float(like.fitted.dt)), 1))
+    balance = _balance(prepared, airframe, capacity)
+    # The likelihood knows no windows.
+    padded = dataclasses.replace(shooting, flight=flight, windows=1)
+    return InnovationsProblem(padded, segment=segment, settling=settling, balance=balance)
+
+
+def _balance(prepared: Prepared, airframe: Airframe, capacity: int) -> Balance | None:
+    """What the weight says, if the tilt is known: over each stretch the vehicle gains a velocity of about 1 m/s."""
+    if prepared.upright is None:
+        return None
+    samples, gravity = prepared.upright.size, float(airframe.gravity)
+    gained = _GAINED * np.sqrt(len(prepared.recordings)) / (samples * float(prepared.fitted.dt))
+    weight = np.pad(prepared.upright / samples, (0, capacity - samples))
+    return Balance(weight, gravity, np.hypot(gained, _CARRIED * gravity))
+
+
+def _held_out(
+    recordings: Sequence[Recording],
+    validate: Recording | None,
+    prepared: Prepared,
+    fitted: ShootingProblem,
+    model: FlightModel,
+) -> tuple[HeldOut | None, tuple[str, ...]]:
+    """The data that are predicted and not fitted, if there are any; and the notes about all data."""
+    held_out, notes = None, prepared.notes
+    if validate is not None:
+        other = _prepare_other(recordings, validate, prepared, model)
+        held_out, notes = (
+            HeldOut(_on(fitted, model, other.fitted), validate.name, other.seconds[0]),
+            notes + other.notes,
+        )
+    elif prepared.tested is not None:
+        whole = dataclasses.replace(fitted, flight=prepared.tested)
+        held_out = HeldOut(whole, recordings[0].name, prepared.seconds[1], fitted_vehicle=True)
+    if held_out is None:
+        return None, (*notes, "nothing was held out, so no prediction checks the fit")
+    try:
+        starts(held_out.problem.flight)
+    except ValueError:
+        remedy = "give `holdout` 0 or `validate`" if held_out.fitted_vehicle else "give another flight"
+        raise InputError(
+            f"{held_out.name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
+        ) from None
+    return held_out, notes
+
+
+def _on(fitted: ShootingProblem, model: FlightModel, flight: Flight) -> ShootingProblem:
+    """The problem of another flight, which counts as one recording."""
+    stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
+    other = dataclasses.replace(model, recordings=(0,) * stretches)
+    return ShootingProblem(other, flight, sigma=fitted.sigma, channels="rates", method="rk4")
+
+
+def _prepare_other(
+    recordings: Sequence[Recording], validate: Recording, prepared: Prepared, model: FlightModel
+) -> Prepared:
+    """The recording to predict, with the sample time of those that are fitted."""
+    if any(validate.same_data(recording) for recording in recordings):
+        raise InputError(
+            f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
+        )
+    step = float(prepared.fitted.dt)
+    other = preparation.prepare([validate], model.airframe, sample_time=step, holdout=0.0, predicted=True)
+    for term in model.terms:
+        if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
+            raise InputError(
+                f"{validate.name}: `validate` did not measure what the term {term} needs; give `terms` without it."
+            )
+    return other
+
+
+def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tuple[str, ...]:
+    """The terms in the order of `TERMS`. Raises `InputError` for one that is unknown or not available."""
+    if terms is None:
+        return default_terms(available)
+    for term in terms:
+        if term not in TERMS:
+            raise InputError(f"`terms`: knows no `{term[:40]}`; the terms are {', '.join(TERMS)}.")
+    for term in terms:
+        missing = TERMS[term].needs - available
+        if FULL_SCALE in missing:
+            raise InputError(f"`terms`: {term} needs `max_rotor_speed` in the airframe; set it or leave it out.")
+        if missing:
+            what = " and ".join(sorted(missing))
+            raise InputError(f"`terms`: {term} needs {what}, which these logs did not measure; leave it out.")
+    return tuple(term for term in TERMS if term in terms)
