@@ -11,8 +11,7 @@ from helpers import DT, OS4, doublet_problem, noisy_states, standard_flight, sta
 from lanes import HALF, LANES, assert_chi_square, assert_covered, assert_nothing_invented, bound, errors, lost, names
 
 import jaxos4
-from jaxos4.estimators.equation_error import EquationError
-from jaxos4.estimators.recursive_least_squares import RecursiveLeastSquares
+from jaxos4.estimators.equation_error import EquationError, RecursiveLeastSquares
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 RATES = np.array([jaxos4.STATE_NAMES.index(name) for name in "pqr"])

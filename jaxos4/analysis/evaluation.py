@@ -112,12 +112,8 @@ def evaluate(
 @quick_jit
 def _fly(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
-) -> tuple[
-    Float[Array, "samples columns"],
-    Float[Array, "unknowns samples columns"],
-    Float[Array, "samples 3"],
-    Parameters,
-]:
+) -> tuple[Array, Float[Array, "unknowns samples columns"], Float[Array, "samples 3"], Parameters]:
+    """`predicted`, `slopes`, `torques` and `nominal` of an `Evaluation`."""
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     count, free = parameters.shape[0], problem.free_size
 

@@ -25,11 +25,7 @@ _STRIDE = 0.1  # the information that keeps the predicted steps along an unknown
 
 
 class Stage(NamedTuple):
-    """A stage of a problem, see `Stages`: its likelihood, and where its search may go.
-
-    - `last`: whether it is the last stage.
-    - `prior`: the information about unknowns of which the cost has no prior of its own.
-    """
+    """A stage of a problem, see `Stages`. `prior`: the information about unknowns of which the cost has no prior."""
 
     problem: AbstractProblem
     last: Flag

@@ -18,49 +18,30 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Count, InitialStates, Parameters, Scalar, as_float, as_int
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import (
-    REACH,
-    AbstractEstimator,
-    Estimate,
-    as_estimate,
-    check_count,
-    check_dynamic_count,
-    check_positive,
-    from_starts,
-)
-from ..linalg import (
-    coordinate_directions,
-    covariance_of_shared,
-    gram,
-    joint_factor,
-    movable,
-    room_to_limits,
-    slopes_along,
-)
+from ..estimate import REACH, AbstractEstimator, Estimate, check_count, check_positive, estimate_at, from_starts
+from ..linalg import coordinate_directions, gram, joint_factor, movable, room_to_limits, slopes_along
 from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
 from ..shooting.abstract import WindowUnknowns
 from .bisection import Flag, Lines, PerDirection, Stage, View, prior_std
 
 DIRECTIONS = {"whitened": joint_factor, "coordinate": coordinate_directions}
 
-# A stage that is not the last ends once no direction has more than this many standard deviations to go.
-_COARSE = 0.5
+_COARSE = 0.5  # a stage that is not the last ends once no direction has more than this many standard deviations to go
 # The first brackets reach this many of the start's standard deviations, in brackets of this share of them.
 _OPENING, _FIRST = 4.0, 0.05
 # A later bracket is the last relative error of the predictions, at least the second number, times the first.
 _SAFETY, _LEAST = 2.0, 0.01
 _GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose search ended at one of its ends, and of all together
 _CHANCE = 1.0  # a sweep that raises the cost by no more may have done so by chance
-# After a sweep that raised the cost, the next goes at most this share of the predicted steps.
-_RETREAT = 0.25
-# After a sweep that did not, the next may go this many times as far. If the share were back at 1 at once, every second
-# sweep of a strongly nonlinear search would fail.
-_ADVANCE = 1.4
+# After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far. If
+# the share were back at 1 at once, every second sweep of a strongly nonlinear search would fail.
+_RETREAT, _ADVANCE = 0.25, 1.4
 
 
 class State(NamedTuple):
@@ -87,7 +68,7 @@ class State(NamedTuple):
     sweeps: Count
     rollouts: Count
     done: Flag
-    record: Float[Array, "record 2 parameters"] | None
+    record: Float[Array, "record 2 parameters"]
 
 
 # The narrowed brackets, the last shot's place and curvature, and the number of shots.
@@ -110,14 +91,11 @@ class IBSS(AbstractEstimator):
       rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     - `record`: how many sweeps' brackets the estimate keeps, to show how the search went.
-
-    A free initial state is searched like the parameters, from the first measurement of each channel.
     """
 
     looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = True
     prior: ClassVar[float] = NO_PRIOR
-    needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = True
 
     directions: str = eqx.field(static=True, default="whitened")
@@ -132,7 +110,7 @@ class IBSS(AbstractEstimator):
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
         check_count("halvings", self.halvings, 2)
         check_count("record", self.record, 0)
-        check_dynamic_count("max_sweeps", self.max_sweeps, 1)
+        check_count("max_sweeps", self.max_sweeps, 1)
         check_positive("tolerance", self.tolerance)
         check_positive("reach", self.reach)
 
@@ -177,9 +155,6 @@ class IBSS(AbstractEstimator):
         - `cascade`: whether to go through all stages. A `start` that is close needs the last one only.
         - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
         """
-        count = problem.unknowns.count
-        if start is not None and jnp.shape(start) != (count,):
-            raise ValueError(f"`start` must hold {count} unknowns, got shape {jnp.shape(start)}.")
         known = problem.first_state()[0] if initial_state is None else initial_state
         stages = problem.stages(cascade=self.directions == "whitened")
 
@@ -194,21 +169,9 @@ class IBSS(AbstractEstimator):
                 return jax.lax.while_loop(ongoing, sweep, state._replace(**anew))
 
             # One loop, so that the search is compiled once for all stages.
-            last = jax.lax.fori_loop(jnp.where(cascade, 0, stages.number - 1), stages.number, fit, first)
-            return as_estimate(
-                problem,
-                parameters=last.unknowns[0, :count],
-                covariance=covariance_of_shared(last.curvature.information, count),
-                initial_state=last.unknowns[:, count:].ravel() if problem.free_size else known,
-                cost=last.curvature.shot.cost.sum(),
-                rollouts=last.rollouts,
-                sweeps=last.sweeps,
-                sound=last.curvature.shot.sound.all(),
-                done=last.done,
-                reach=self.reach,
-                brackets=last.record,
-                parts=last.curvature.parts,
-            )
+            end = jax.lax.fori_loop(jnp.where(cascade, 0, stages.number - 1), stages.number, fit, first)
+            more = {"reach": self.reach, "brackets": end.record if self.record else None}
+            return estimate_at(problem, end.unknowns, end.curvature, end.rollouts, end.sweeps, done=end.done, **more)
 
         return from_starts(problem, start, from_one)
 
@@ -219,9 +182,8 @@ class IBSS(AbstractEstimator):
         unknowns = jnp.clip(start, *problem.limits(self.reach))
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem)))
         if spread is not None:
-            known = spread.shape[0]
-            own = jnp.where(skip, covariance[:, :known, :known], spread)
-            covariance = covariance.at[:, :known, :known].set(own)
+            known = np.s_[:, : spread.shape[0], : spread.shape[0]]
+            covariance = covariance.at[known].set(jnp.where(skip, covariance[known], spread))
         none = jnp.zeros((), dtype=int)
         shapes = jax.eval_shape(stages.evaluate, none, unknowns)
         return State(
@@ -235,7 +197,7 @@ class IBSS(AbstractEstimator):
             sweeps=none,
             rollouts=none,
             done=jnp.asarray(skip),
-            record=jnp.full((self.record, 2, problem.unknowns.count), jnp.nan) if self.record else None,
+            record=jnp.full((self.record, 2, problem.unknowns.count), jnp.nan),
         )
 
     def sweep(self, stage: Stage, state: State) -> State:
@@ -333,7 +295,7 @@ class IBSS(AbstractEstimator):
             sweeps=state.sweeps + counts,
             rollouts=state.rollouts + shots * stage.searched.sum(),
             done=near | (first & ~finite),
-            record=_recorded(state, view, lines, counts),
+            record=_recorded(state, view, lines, counts) if self.record else state.record,
         )
 
     def _slopes(self, stage: Stage, view: View, curvature: Curvature) -> PerDirection:
@@ -351,10 +313,8 @@ class IBSS(AbstractEstimator):
         return self.max_sweeps * (1 if self.directions == "whitened" else stage.searched.sum())
 
 
-def _recorded(state: State, view: View, lines: Lines, counts: Flag) -> Float[Array, "record 2 parameters"] | None:
+def _recorded(state: State, view: View, lines: Lines, counts: Flag) -> Float[Array, "record 2 parameters"]:
     """The record with the bracket of each parameter in one more sweep; sweeps beyond its length are dropped."""
-    if state.record is None:
-        return None
     length, _, count = state.record.shape
     widest = jnp.abs(view.basis * ((lines.upper - lines.lower) / 2)[:, None, :]).max(axis=(0, 2))[:count]
     bracket = state.unknowns[0, :count] + jnp.stack([-widest, widest])
