@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._custom_types import InitialStates, Parameters, as_float
 from .._xla import quick_jit
@@ -73,13 +73,6 @@ class Evaluation(NamedTuple):
         """The Fisher information of each window, in the parameters and the window's own initial state."""
         jacobian = self.jacobian
         return jacobian @ np.swapaxes(jacobian, 1, 2)
-
-    def of_parameters(self, places: Int[np.ndarray, " free"]) -> "Evaluation":
-        """The same simulation with the other parameters known."""
-        count, unknowns = self.parameters.size, self.slopes.shape[0]
-        rows = np.concatenate([places, np.arange(count, unknowns)])
-        some = {"parameters": self.parameters[places], "nominal": self.nominal[places], "slopes": self.slopes[rows]}
-        return self._replace(**some)
 
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
