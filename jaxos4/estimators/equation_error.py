@@ -86,9 +86,8 @@ class EquationError(AbstractEstimator):
 class RecursiveLeastSquares(AbstractEstimator):
     """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
 
-    The recursion carries the normal matrix and its right-hand side: unlike a covariance, they stay symmetric and
-    positive in single precision. A diffuse prior (a million half-widths) is added only to solve and is not forgotten.
-    A parameter stays at the bracket's center until it is excited.
+    The recursion carries the normal matrix and its right-hand side, which stay symmetric and positive in single
+    precision. A parameter stays at the bracket's center until it is excited.
 
     **Arguments:**
 
@@ -98,9 +97,9 @@ class RecursiveLeastSquares(AbstractEstimator):
     - `memory`, `bridge`: as in `EquationError`. A `forgetting` below 1 also forgets the means, and a known initial
       state then counts like one sample.
 
-    The estimate's `history` holds the parameters after each sample; its last row is `parameters`. A bridged gap needs
-    the sample at its end, so rows inside a gap are known only after the gap. The covariance is that of the last
-    estimate: the noise of the measured rates, to first order, without the lag behind parameters that change.
+    The estimate's `history` holds the parameters after each sample; its last row is `parameters`. Rows inside a bridged
+    gap are known only after the gap. The covariance is that of the last estimate, without its lag behind parameters
+    that change.
 
     Reference: Ljung, System Identification, section 11.2, with exponential forgetting.
     """

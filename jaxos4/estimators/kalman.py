@@ -95,7 +95,7 @@ class JointEKF(AbstractEstimator):
             done = jnp.where(first, self.passes == 1, ~(moved > _SETTLED))
             return (joint, root, history), passes + 1, done
 
-        joint, unknowns = _joint(start, prior.center, problem.free_size), count + problem.free_size
+        joint, unknowns = jnp.concatenate([start, prior.center, start[: problem.free_size]]), count + problem.free_size
         root, history = jnp.zeros((joint.size, unknowns)), jnp.zeros((rows.measured[0].size, count))
         none = (joint, root, history), jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
         # The first pass is one of the loop too, so that the filter is compiled once.
@@ -118,10 +118,6 @@ class JointEKF(AbstractEstimator):
         )
 
 
-def _joint(state: Float[Array, " size"], parameters: Parameters, free_size: int) -> Float[Array, " joint"]:
-    return jnp.concatenate([state, parameters, state[:free_size]])
-
-
 def _run(
     problem: ShootingProblem,
     rows: Rows,
@@ -141,7 +137,7 @@ def _run(
     # A known initial state has no tangent of its own.
     moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])
     filter_ = _Filter(
-        estimate=_joint(start, prior.center, problem.free_size),
+        estimate=jnp.concatenate([start, prior.center, start[: problem.free_size]]),
         root=jnp.concatenate([moving, constants]),
         nominal=about[1],
     )

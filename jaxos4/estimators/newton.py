@@ -191,16 +191,17 @@ class OutputError(AbstractEstimator):
         first, off = problem.first_state()
         unknowns, count = problem.join(problem.unknowns.usable.center, first), problem.unknowns.count
         scale = problem.join(problem.unknowns.usable.half_width, off)
-        steps, rollouts, done, curvature = jnp.zeros((), dtype=int), jnp.zeros((), dtype=int), None, None
+        steps, rollouts, searches = jnp.zeros((), dtype=int), jnp.zeros((), dtype=int), []
         for stage in problem.cascade():
             own = count + stage.free_size
             tolerance = self.tolerance if stage is problem else jnp.maximum(self.tolerance, _COARSE)
             # A damping in units of the bracket hardly changes the first step of a flight with information.
             method = Newton(stage, damping=1.0, scale=scale[:, :own], tolerance=tolerance)
-            best, curvature, _, _, taken, done = method.minimum(unknowns[:, :own], self.max_steps)
-            unknowns, steps = unknowns.at[:, :own].set(best), steps + taken
-            rollouts = rollouts + (taken + 1) * (1 + count + problem.windows * stage.free_size)
-        return estimate_at(problem, unknowns, curvature, rollouts, steps, done=done)
+            search = method.minimum(unknowns[:, :own], self.max_steps)
+            searches.append(search)
+            unknowns, steps = unknowns.at[:, :own].set(search.best), steps + search.steps
+            rollouts = rollouts + (search.steps + 1) * (1 + count + problem.windows * stage.free_size)
+        return estimate_at(problem, unknowns, searches[-1].curvature, rollouts, steps, done=searches[-1].done)
 
 
 class FilterError(AbstractEstimator):
