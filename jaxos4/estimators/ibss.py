@@ -1,15 +1,7 @@
 """Iterative Bi-Section Shooting (IBSS): halve brackets on the slope of the trajectory mismatch.
 
-The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md).
-
-A *shot* simulates the flight at trial unknowns, with its derivatives. **The sign of the cost's slope along a direction
-decides** which side of the trial holds the minimum, and so which part of the bracket is dropped. The quadratic model of
-the cost and the secant through the last slopes only **propose** where to shoot. A *sweep* is one iteration, in five
-steps: look around, predict, open, bisect, judge. A *stage* repeats sweeps on some of the data until the minimum is
-near; the last stage fits all of them.
-
-If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
-windows' slopes, initial states on their own window's.
+The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md). They are
+the five lines of `IBSS.sweep`.
 """
 
 import functools
@@ -77,6 +69,13 @@ Bisected = tuple[Lines, WindowUnknowns, Curvature, Count]
 
 class IBSS(AbstractEstimator):
     """Iterative Bi-Section Shooting.
+
+    A *shot* simulates the flight at trial unknowns, with its derivatives. **The sign of the cost's slope along a
+    direction decides** which side of the trial holds the minimum, and so which part of the bracket is dropped. The
+    quadratic model of the cost and the secant through the last slopes only **propose** where to shoot. A *sweep* is one
+    iteration. A *stage* repeats sweeps on some of the data until the minimum is near; the last stage fits all of them.
+    If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
+    windows' slopes, initial states on their own window's.
 
     **Arguments:**
 
