@@ -37,9 +37,12 @@ from .airframe import (
     load_airframe as load_airframe,
     plus_layout as plus_layout,
 )
-from .analysis.center_of_mass import CenterOfMass as CenterOfMass, center_of_mass as center_of_mass
+from .analysis.covariance import (
+    cramer_rao_bound as cramer_rao_bound,
+    fisher_information as fisher_information,
+    robust_covariance as robust_covariance,
+)
 from .analysis.diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
-from .analysis.fisher import cramer_rao_bound as cramer_rao_bound, fisher_information as fisher_information
 from .analysis.frequency_response import (
     Agreement as Agreement,
     AxisResponse as AxisResponse,
@@ -47,9 +50,13 @@ from .analysis.frequency_response import (
     frequency_response as frequency_response,
 )
 from .analysis.identifiability import Identifiability as Identifiability, identifiability as identifiability
-from .analysis.inertia import InertiaFit as InertiaFit, fit_inertia as fit_inertia
+from .analysis.inertia import (
+    CenterOfMass as CenterOfMass,
+    InertiaFit as InertiaFit,
+    center_of_mass as center_of_mass,
+    fit_inertia as fit_inertia,
+)
 from .analysis.prediction import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
-from .analysis.sandwich import robust_covariance as robust_covariance
 from .bracket import Bracket as Bracket
 from .closed_loop import (
     ClosedLoop as ClosedLoop,

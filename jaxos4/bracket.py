@@ -1,7 +1,6 @@
 """A bracket: for each parameter the interval in which an estimator searches."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
@@ -57,32 +56,19 @@ class Bracket(eqx.Module):
     def center(self) -> Parameters:
         """The middle of each interval."""
         lower, upper = self._ends
-        return as_float((lower + upper) / 2)
+        with np.errstate(all="ignore"):
+            return as_float((lower + upper) / 2)
 
     @property
     def half_width(self) -> Parameters:
         """Half the length of each interval."""
         lower, upper = self._ends
-        return as_float((upper - lower) / 2)
+        with np.errstate(all="ignore"):
+            return as_float((upper - lower) / 2)
 
     @property
     def _ends(self) -> tuple[Numeric, Numeric]:
         return _numpy_if_known(self.lower, self.upper)
-
-    @property
-    def valid(self) -> Bool[Array, ""]:
-        """Whether every interval is finite and its lower end is below its upper end."""
-        width = self.upper - self.lower
-        return ((width > 0) & (width < float("inf"))).all()
-
-    def identifies(self, std: Float[ArrayLike, " parameters"], prior: float = NO_PRIOR) -> Bool[Numeric, " parameters"]:
-        """See `is_identifiable`."""
-        return is_identifiable(std, self.half_width, prior)
-
-    @property
-    def usable(self) -> "Bracket":
-        """The bracket itself if it is valid, else 0 +- 1, so that a computation in a batch stays finite."""
-        return Bracket.around(jnp.where(self.valid, self.center, 0.0), jnp.where(self.valid, self.half_width, 1.0))
 
 
 def _numpy_if_known(a: Array, b: Array) -> tuple[Numeric, Numeric]:

@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import LARGEST, Parameters, Scalar
 from .bracket import Bracket
-from .linalg import invert
+from .linalg import covariance_of_shared, invert
 from .results import RESULTS
-from .shooting import AbstractProblem, Parts, ShootingProblem
+from .shooting import AbstractProblem, Curvature, Parts, ShootingProblem
+from .shooting.abstract import WindowUnknowns
 
 if TYPE_CHECKING:
     from typing import ClassVar as AbstractClassVar  # what type checkers understand
@@ -166,6 +167,33 @@ def as_estimate(
     )
 
 
+def estimate_at(
+    problem: AbstractProblem,
+    unknowns: WindowUnknowns,
+    curvature: Curvature,
+    rollouts: Int[Array, ""],
+    sweeps: Int[Array, ""],
+    *,
+    done: Bool[Array, ""],
+    **more: Any,
+) -> Estimate:
+    """`as_estimate` of a search that ended at these unknowns, with this curvature of the cost."""
+    count = problem.unknowns.count
+    return as_estimate(
+        problem,
+        parameters=unknowns[0, :count],
+        covariance=covariance_of_shared(curvature.information, count),
+        initial_state=unknowns[:, count:].ravel() if problem.free_size else problem.first_state()[0],
+        cost=curvature.shot.cost.sum(),
+        rollouts=rollouts,
+        sweeps=sweeps,
+        sound=curvature.shot.sound.all(),
+        done=done,
+        parts=curvature.parts,
+        **more,
+    )
+
+
 def from_starts(
     problem: AbstractProblem, start: Float[Array, " unknowns"] | None, search: Callable[[Parameters], Estimate]
 ) -> Estimate:
@@ -173,7 +201,9 @@ def from_starts(
 
     `start`: where to start instead, unless it is NaN.
     """
-    starts, own = problem.starts, len(problem.model.parameter_names)
+    starts, own, count = problem.starts, len(problem.model.parameter_names), problem.unknowns.count
+    if start is not None and jnp.shape(start) != (count,):
+        raise ValueError(f"`start` must hold {count} unknowns, got shape {jnp.shape(start)}.")
     firsts = starts if start is None else jnp.where(jnp.isnan(start), starts, start)
     if starts.shape[0] == 1:
         return search(firsts[0])
@@ -238,17 +268,12 @@ def check_recursive(problem: ShootingProblem) -> None:
         )
 
 
-def check_dynamic_count(name: str, value: Any, least: int) -> None:
-    """`check_count` for a setting that is data, which may be an integer array; the value of a traced one is unknown."""
+def check_count(name: str, value: Any, least: int) -> None:
+    """Raises `ValueError` for a setting that is not an integer of at least `least`, or a traced array of integers."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
         if isinstance(value, Tracer):
             return
         value = int(value)
-    check_count(name, value, least)
-
-
-def check_count(name: str, value: Any, least: int) -> None:
-    """Raises `ValueError` for a setting that is not an integer of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
     if value > LARGEST:
@@ -280,7 +305,7 @@ class AbstractEstimator(eqx.Module):
     looks_at: AbstractClassVar[str]
     shoots: AbstractClassVar[bool]
     prior: AbstractClassVar[float]
-    needs_network: AbstractClassVar[bool]
+    needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = False
 
     @classmethod

@@ -13,7 +13,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+PerWindow = Float[Array, "windows n"]
 
 
 class JointFactor(NamedTuple):
@@ -63,9 +65,40 @@ def joint_factor(information: Float[Array, "windows n n"], count: int) -> JointF
     return JointFactor(factor, jnp.swapaxes(inverse, 1, 2)[:, back] / scale[:, :, None])
 
 
-def covariances(information: Float[Array, "windows n n"], count: int) -> Float[Array, "windows n n"]:
-    """The covariance of each window's unknowns, when the unknowns of all windows are estimated together."""
-    return gram(joint_factor(information, count).basis)
+def coordinate_directions(information: Float[Array, "windows n n"], count: int) -> JointFactor:
+    """The unknowns themselves as directions, each scaled to unit information: the diagonal of A, and of A^-T."""
+    size = information.shape[-1]
+    diagonal = jnp.diagonal(information, axis1=1, axis2=2)
+    scale = jnp.sqrt(jnp.where(np.arange(size) < count, diagonal.sum(axis=0), diagonal))[:, :, None]
+    columns = jnp.eye(size)[:, np.roll(np.arange(size), -count)]
+    return JointFactor(scale * columns, columns / scale)
+
+
+def slopes_along(
+    basis: Float[Array, "windows unknowns n"], gradient: Float[Array, "windows unknowns"], count: int
+) -> PerWindow:
+    """The slope along each column of `basis`: summed over the windows along the last `count` columns."""
+    slopes, own = jnp.einsum("wud,wu->wd", basis, gradient), gradient.shape[1] - count
+    return slopes.at[:, own:].set(slopes[:, own:].sum(axis=0))
+
+
+def movable(
+    unknowns: PerWindow, gradient: PerWindow, limits: tuple[PerWindow, PerWindow], count: int
+) -> Bool[Array, "windows n"]:
+    """The unknowns that a search may move: not those at one of their limits, beyond which the cost falls."""
+    total = gradient.at[:, :count].set(gradient[:, :count].sum(axis=0))
+    return ~(((unknowns <= limits[0]) & (total > 0)) | ((unknowns >= limits[1]) & (total < 0)))
+
+
+def room_to_limits(
+    unknowns: PerWindow, basis: Float[Array, "windows n n"], limits: tuple[PerWindow, PerWindow]
+) -> tuple[PerWindow, PerWindow]:
+    """How far each window can go against and along each direction until an unknown reaches its limit."""
+    moves = basis != 0
+    to_lower, to_upper = ((limit - unknowns)[:, :, None] / jnp.where(moves, basis, 1.0) for limit in limits)
+    above = jnp.where(moves, jnp.maximum(to_lower, to_upper), jnp.inf).min(axis=1)
+    below = jnp.where(moves, -jnp.minimum(to_lower, to_upper), jnp.inf).min(axis=1)
+    return jnp.maximum(below, 0.0), jnp.maximum(above, 0.0)
 
 
 def covariance_of_shared(information: Float[Array, "windows n n"], count: int) -> Float[Array, "count count"]:

@@ -16,7 +16,6 @@ def test_a_bracket_reaches_one_half_width_to_each_side():
     np.testing.assert_array_equal(bracket.upper, ALPHA + HALF)
     np.testing.assert_allclose(bracket.center, ALPHA, rtol=1e-15, atol=1e-15)
     np.testing.assert_allclose(bracket.half_width, HALF, rtol=1e-13)
-    assert bool(bracket.valid)
 
 
 def test_the_default_bracket_is_the_models_own():
@@ -49,13 +48,9 @@ def test_takes_arrays_of_any_kind_and_keeps_strong_floats(kind):
     ],
 )
 def test_says_when_it_is_none(lower, upper):
-    assert not bool(jaxos4.Bracket(np.array(lower), np.array(upper)).valid)
-
-
-def test_validity_is_each_lanes_own():
-    lower, upper = jnp.zeros((3, 2)), jnp.array([[1.0, 1.0], [1.0, -1.0], [jnp.inf, 1.0]])
-    valid = eqx.filter_vmap(lambda a, b: jaxos4.Bracket(a, b).valid)(lower, upper)
-    assert valid.tolist() == [True, False, False]
+    unknowns = jaxos4.Unknowns.of(jaxos4.PublishedOS4())
+    assert bool(unknowns.valid)
+    assert not bool(unknowns.within(jaxos4.Bracket(np.resize(lower, 8), np.resize(upper, 8))).valid)
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ def test_spectra_are_those_of_scipy():
     np.testing.assert_allclose(found.frequency, frequency[1:-1], rtol=1e-12)
     np.testing.assert_allclose(found.gain * np.exp(1j * found.phase), expected, rtol=1e-9)
     np.testing.assert_allclose(found.coherence, signal.coherence(u, y, **settings)[1][1:-1], rtol=1e-9)
+    assert found.averages == pytest.approx(0.947 * len(begins(u.size)), rel=1e-3)
 
 
 def test_bands_hold_the_truth_as_often_as_they_say():
@@ -63,36 +64,49 @@ def test_bands_hold_the_truth_as_often_as_they_say():
     assert np.mean(ratios) == pytest.approx(0.95, abs=4 * np.sqrt(0.05 * 0.95 / trials))
 
 
-def test_gain_and_phase_of_a_known_system():
-    rng = np.random.default_rng(2)
-    u = rng.normal(size=200 * LENGTH)
-    system = ([0.3], [1, -0.7])
-    found = response(u, noisy(u, system, 0.1, rng), begins(u.size), LENGTH, DT)
-    _, exact = signal.freqz(*system, worN=2 * np.pi * found.frequency * DT)
-    quotient = found.gain * np.exp(1j * found.phase) / exact
-    assert np.abs(np.log(np.abs(quotient)) / found.error).max() < 5
-    assert np.abs(np.angle(quotient) / found.error).max() < 5
-    assert found.error.max() < 0.05
-    assert found.averages == pytest.approx(0.947 * 399, rel=1e-3)
-
-
-@pytest.fixture(scope="module")
-def flown():
-    """30 s of noise on the rotors' speeds, with the rates that the model says and gyro noise."""
-    rng = np.random.default_rng(0)
-    samples = round(30 / DT) + 1
-    slow = signal.lfilter([0.05], [1, -0.95], rng.normal(size=(samples, 4)), axis=0)
-    omega = float(jaxos4.OS4.hover_speed) * (1 + 0.02 * slow / slow.std())
+def fly(*, gyro, excited=(True, True, True)):
+    """30 s of noise on the torques of some axes, with the rates that the model says and gyro noise [rad/s]."""
+    rng, mixer = np.random.default_rng(0), np.asarray(MODEL.airframe.mixer)
+    samples, square = round(30 / DT) + 1, float(jaxos4.OS4.hover_speed) ** 2
+    slow = signal.lfilter([0.05], [1, -0.95], rng.normal(size=(samples, 3)), axis=0)
+    torque = 0.04 * square * np.abs(mixer[:3]).max(axis=1) * excited * slow / slow.std(axis=0)
+    omega = np.sqrt(square + np.linalg.solve(mixer, np.pad(torque, ((0, 0), (0, 1))).T).T)
     values = MODEL.alpha.at[8:].set(jnp.array([0.1, -0.1, 0.05, 4.0, 4.0, 2.0, 0.05]))
     blank = jaxos4.Flight(DT * np.arange(samples), omega, np.full((samples, 12), np.nan), commanded=True)
     problem = jaxos4.ShootingProblem(
         MODEL, blank, sigma=np.ones(12), channels="rates", method="rk4", initial_state=np.zeros(12)
     )
-    rates = np.array(problem.predict(values, jnp.zeros(3))) + rng.normal(0, 0.002, (samples, 3))
     states = np.full((samples, 12), np.nan)
-    states[:, [7, 9, 11]] = rates
+    states[:, [7, 9, 11]] = problem.predict(values, jnp.zeros(3)) + rng.normal(0, gyro, (samples, 3))
     flight = eqx.tree_at(lambda f: f.states, blank, jnp.asarray(states))
     return jaxos4.ShootingProblem(MODEL, flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates", method="rk4"), values
+
+
+@pytest.fixture(scope="module")
+def flown():
+    return fly(gyro=0.002)
+
+
+@pytest.mark.parametrize("gyro", [0.002, 0.01])
+def test_an_axis_that_is_hardly_excited_has_no_clear_response(gyro):
+    """The gyro's noise, which damping brings into the model's acceleration too, is no answer to torque."""
+    roll, pitch, yaw = jaxos4.frequency_response(*fly(gyro=gyro, excited=(True, False, 0.01)))
+    assert math.isnan(pitch.agreement().ratio)
+    assert math.isnan(yaw.agreement().ratio)
+    assert not (pitch.clear | yaw.clear)[pitch.frequency >= 4].any()
+    assert abs(math.log(roll.agreement().ratio)) < 4 * roll.agreement().error + 2e-3
+
+
+def test_only_coherent_frequencies_count_and_each_as_much_as_its_coherence():
+    frequency = np.arange(1.0, 31.0)
+    coherence = np.select([frequency <= 8, frequency <= 14], [0.9, 0.7], 0.1)
+    gain = np.select([frequency <= 8, frequency <= 14], [2.0, 1.0], 100.0)
+    axis = jaxos4.AxisResponse(frequency, gain, 0 * gain, coherence, 0.1 / coherence, 0.2 / coherence, 40.0)
+    assert axis.agreement().high == 12
+    assert axis.agreement(1, 6).ratio == pytest.approx(2.0)
+    # Coherences as means over five frequencies: 0.9, 0.86, 0.82; 0.78, 0.74, 0.7.
+    assert axis.agreement(6, 11).ratio == pytest.approx(2 ** (2.58 / 4.8))
+    assert math.isnan(axis.agreement(16, 30).ratio)
 
 
 def test_the_right_model_has_gain_one_and_phase_zero(flown):

@@ -10,7 +10,7 @@ import scipy.stats
 from helpers import DT, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.estimators.output_error import OutputError
+from jaxos4.estimators.newton import OutputError
 
 MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
 

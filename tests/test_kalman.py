@@ -97,15 +97,6 @@ def test_a_free_initial_state_is_estimated():
     assert (rms < 0.5 * jaxos4.SENSOR_SIGMA[ORDER[:3]]).all(), rms
 
 
-def test_tiny_noise_gives_the_truth():
-    case = "published-rates"
-    problem, *rest = data(case, noisy_states(LANES, scale=1e-5))
-    problem = eqx.tree_at(lambda p: p.sigma, problem, 1e-5 * problem.sigma)
-    estimates = identify(JointEKF(), problem, *rest)
-    assert set(names(estimates)) == {"successful"}
-    assert np.abs(errors(estimates) / HALF).max() < 1e-5
-
-
 # Against other ways to the same numbers.
 
 

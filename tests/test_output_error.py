@@ -8,7 +8,7 @@ from helpers import noisy_states, random_starts, standard_problem
 from lanes import LANES, bound, identify, lanes
 
 import jaxos4
-from jaxos4.estimators.output_error import OutputError
+from jaxos4.estimators.newton import OutputError
 
 every_case = pytest.mark.parametrize(
     ("model_class", "channels"), [(jaxos4.PublishedOS4, "all"), (jaxos4.CorrectedOS4, "rates")]

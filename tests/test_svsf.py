@@ -57,12 +57,6 @@ def test_history_is_what_was_averaged():
     assert (np.asarray(estimates.rollouts) == 4 * 12 + 1).all()
 
 
-def test_tiny_noise_gives_the_truth():
-    estimates = identify(SVSF(passes=8), *lanes(noisy_states(8, seed=50, scale=1e-3), scale=1e-3))
-    assert set(names(estimates)) == {"successful"}
-    assert np.abs(errors(estimates) / HALF).max() < 2e-3
-
-
 def test_a_free_initial_state_is_better_than_the_first_measurement():
     states = noisy_states(LANES, seed=50)
     estimates = identify(SVSF(), *lanes(states, free=True))

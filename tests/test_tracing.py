@@ -15,7 +15,6 @@ import jaxos4
 from jaxos4.simulation import METHODS
 
 DURATION = 0.1
-once = eqx.debug.assert_max_traces(max_traces=1)
 
 
 @pytest.fixture
@@ -72,25 +71,13 @@ def test_shoots_at_another_problem_without_another_trace(counted, what):
     assert counts[0] == counts[-1]
 
 
-def test_identifies_another_flight_with_other_settings_without_another_trace():
-    @eqx.filter_jit
-    @once
-    def identify(estimator, problem, bracket):
-        return estimator(problem, bracket)
-
-    for trial, (tolerance, reach) in enumerate([(0.02, 4.0), (0.05, 3.0), (1, 2)]):
-        problem = problem_of(jaxos4.PublishedOS4, trial)
-        bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
-        eqx.filter_eval_shape(identify, jaxos4.IBSS(tolerance=tolerance, reach=reach), problem, bracket)
-
-
 def test_the_estimator_itself_traces_once(counted):
     model_class, count = counted
     counts = []
     for trial in range(3):
         problem = problem_of(model_class, trial)
         bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
-        eqx.filter_eval_shape(jaxos4.IBSS(tolerance=0.01 * (1 + trial)), problem, bracket)
+        eqx.filter_eval_shape(jaxos4.IBSS(tolerance=0.01 * (1 + trial), reach=4 - trial), problem, bracket)
         counts.append(count[0])
     assert counts[0] == counts[-1]
     # Another kind of problem is seen.

@@ -26,15 +26,6 @@ def test_agrees_with_the_library_to_about_one_ulp(dtype, turns):
         np.testing.assert_allclose(cos, np.cos(exact), rtol=3 * eps)
 
 
-def test_is_odd_and_even_and_on_the_circle():
-    angle = jnp.linspace(0, 30, 1001)
-    sin, cos = sincos(angle)
-    mirrored_sin, mirrored_cos = sincos(-angle)
-    np.testing.assert_array_equal(sin, -mirrored_sin)
-    np.testing.assert_array_equal(cos, mirrored_cos)
-    np.testing.assert_allclose(sin**2 + cos**2, 1, rtol=0, atol=5e-16)
-
-
 def test_nan_and_infinity_give_nan():
     for value in sincos(jnp.array([jnp.nan, jnp.inf, -jnp.inf])):
         assert np.isnan(value).all()

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from .._custom_types import InitialStates, Parameters
 from ..shooting import ROUNDING, ShootingProblem
@@ -122,10 +122,10 @@ def diagnostics_of(evaluation: Evaluation, *, fitted: bool, lags: int) -> Diagno
 
 
 def _dependence(
-    errors: Float[np.ndarray, "samples size"],
-    measured: Bool[np.ndarray, "samples size"],
-    autocorrelation: Float[np.ndarray, "size lags"],
-    torques: Float[np.ndarray, "samples 3"],
+    errors: np.ndarray,
+    measured: np.ndarray,
+    autocorrelation: np.ndarray,
+    torques: np.ndarray,
     rounding: float,
     lags: int,
 ) -> tuple[Float[np.ndarray, "size 3"], Float[np.ndarray, " size"]]:
@@ -152,15 +152,11 @@ def _dependence(
 
 
 def _correlations(
-    a: Float[np.ndarray, "samples size"],
-    b: Float[np.ndarray, "samples size_or_one"],
-    of_a: Bool[np.ndarray, "samples size"],
-    of_b: Bool[np.ndarray, "samples size_or_one"],
-    lags: int,
+    a: np.ndarray, b: np.ndarray, of_a: np.ndarray, of_b: np.ndarray, lags: int
 ) -> tuple[Float[np.ndarray, "size both"], Float[np.ndarray, "size both"]]:
     """Correlation of a(t + lag) with b(t) for lags from -`lags` to `lags`, and the number of pairs at each lag.
 
-    `of_a`, `of_b`: which samples were measured; the others are 0. Columns of `a` and `b` are paired.
+    `of_a`, `of_b`: which samples (rows) were measured; the others are 0. Columns of `a` and `b` are paired.
     """
     pairs = np.round(_lagged_sums(of_a, of_b, lags))
     power = [np.square(x).sum(axis=0) / np.maximum(of_x.sum(axis=0), 1) for x, of_x in ((a, of_a), (b, of_b))]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._custom_types import InitialStates, Parameters, as_float
 from .._xla import quick_jit
@@ -74,13 +74,6 @@ class Evaluation(NamedTuple):
         jacobian = self.jacobian
         return jacobian @ np.swapaxes(jacobian, 1, 2)
 
-    def of_parameters(self, places: Int[np.ndarray, " free"]) -> "Evaluation":
-        """The same simulation with the other parameters known."""
-        count, unknowns = self.parameters.size, self.slopes.shape[0]
-        rows = np.concatenate([places, np.arange(count, unknowns)])
-        some = {"parameters": self.parameters[places], "nominal": self.nominal[places], "slopes": self.slopes[rows]}
-        return self._replace(**some)
-
     @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
         """The Cramer-Rao bound of the parameters; infinite if the trajectory is not sound."""
@@ -112,12 +105,8 @@ def evaluate(
 @quick_jit
 def _fly(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
-) -> tuple[
-    Float[Array, "samples columns"],
-    Float[Array, "unknowns samples columns"],
-    Float[Array, "samples 3"],
-    Parameters,
-]:
+) -> tuple[Array, Float[Array, "unknowns samples columns"], Float[Array, "samples 3"], Parameters]:
+    """`predicted`, `slopes`, `torques` and `nominal` of an `Evaluation`."""
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
     count, free = parameters.shape[0], problem.free_size
 

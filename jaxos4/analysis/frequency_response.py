@@ -31,6 +31,8 @@ _OVERLAP, _NEIGHBOURS = 1 / 6, (1.0, 4 / 9, 1 / 36)
 class Agreement(NamedTuple):
     """The measured response divided by the model's: its geometric mean over frequencies with a clear response.
 
+    Each frequency weighs as much as the coherence around it.
+
     - `ratio`: 1 if the model is right, 2 if the vehicle answers twice as strongly as the model says. NaN: no part of
       the band has a coherence above 0.6.
     - `error`: standard deviation of the ratio's logarithm.
@@ -77,17 +79,23 @@ class AxisResponse(NamedTuple):
         frequency, error = self.frequency[clear], self.error[clear]
         apart = np.rint(np.abs(frequency[:, None] - frequency) / self.frequency[0]).astype(int)
         correlation = np.append(_NEIGHBOURS, 0.0)[np.minimum(apart, len(_NEIGHBOURS))]
-        # Without weights: by chance, a gain that is too large comes with a coherence that is too large.
-        ratio = math.exp(np.log(self.gain[clear]).mean())
-        deviation = math.sqrt(error @ correlation @ error) / error.size
+        # Not the frequency's own coherence: by chance, a gain that is too large comes with one that is too large.
+        weight = self._smoothed[clear] / self._smoothed[clear].sum()
+        ratio = math.exp(weight @ np.log(self.gain[clear]))
+        deviation = math.sqrt((weight * error) @ correlation @ (weight * error))
         return Agreement(ratio, deviation, float(frequency[0]), float(frequency[-1]))
 
     @property
     def clear(self) -> Bool[np.ndarray, " frequencies"]:
         """Where the coherence exceeds 0.6, as the mean over five frequencies: one can pass by chance."""
+        return np.isfinite(self.coherence) & (self._smoothed > _COHERENT)
+
+    @property
+    def _smoothed(self) -> Float[np.ndarray, " frequencies"]:
+        """The mean coherence of five frequencies."""
         kernel, known = np.ones(2 * _AROUND + 1), np.isfinite(self.coherence)
         total, count = (np.convolve(x, kernel)[_AROUND:-_AROUND] for x in (np.where(known, self.coherence, 0.0), known))
-        return known & (total > _COHERENT * count)
+        return total / np.maximum(count, 1)
 
 
 class FrequencyResponse(NamedTuple):
@@ -99,11 +107,13 @@ class FrequencyResponse(NamedTuple):
 
 
 def frequency_response(problem: ShootingProblem, parameters: Parameters) -> FrequencyResponse:
-    """The frequency response from the angular acceleration that the model says to the measured one, for each axis.
+    """The frequency response from the angular acceleration that the rotors cause in the model to the measured one.
 
-    The input is the model's p', q', r' at the measured rates and rotor speeds. The output is the difference of measured
-    rates over the sample time. Spectra are averaged over segments of 1 s that overlap by half (Welch 1967), in all
-    stretches in which p, q and r were measured. No simulation is involved, so that errors do not add up over time.
+    The input is the model's p', q', r' from the rotor speeds, at rates of 0. The output is the difference of measured
+    rates over the sample time, less what the model says about these rates: damping, and moments of turning rotors. In
+    the input, they would bring the gyro's noise to both sides, and an axis that is hardly excited would seem to answer
+    clearly. Spectra are averaged over segments of 1 s that overlap by half (Welch 1967), in all stretches in which p, q
+    and r were measured. No simulation is involved, so that errors do not add up over time.
 
     **In closed loop** the response is biased where disturbances dominate. The flight controller answers a disturbance
     by torque against it, and the vehicle then seems to answer torque too weakly, or in the other direction, with high
@@ -119,13 +129,14 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     dt = float(problem.flight.dt)
     known = ~np.isnan(rates.sum(axis=1))
     modelled = modelled_acceleration(problem, parameters)
-    measured = np.diff(rates, axis=0) / dt
+    caused = np.asarray(_modelled(problem, as_float(parameters), as_float(np.zeros(rates.shape))))
+    measured = np.diff(rates, axis=0) / dt - (modelled - caused)
     usable = known[1:] & known[:-1] & np.isfinite(modelled).all(axis=1)
     if problem.flight.stretch is not None:
         usable &= np.diff(np.asarray(problem.flight.stretch)) == 0
     length = max(round(_SEGMENT / dt / 2) * 2, 8)
     begins = _segments(usable, length)
-    axes = [response(modelled[:, i], measured[:, i], begins, length, dt) for i in range(3)]
+    axes = [response(caused[:, i], measured[:, i], begins, length, dt) for i in range(3)]
     return FrequencyResponse(*axes)
 
 

@@ -38,12 +38,12 @@ class Identifiability(eqx.Module):
     @property
     def identifiable(self) -> Bool[np.ndarray, " parameters"]:
         """Whether each parameter is identifiable, by the rule of `jaxos4.bracket.is_identifiable`."""
-        return np.asarray(is_identifiable(self.std, self.half_width))
+        return is_identifiable(self.std, self.half_width)  # pyright: ignore[reportReturnType]
 
     @property
     def excited(self) -> Bool[np.ndarray, " parameters"]:
         """Whether each parameter would be identifiable if all others were known."""
-        return np.asarray(is_identifiable(self.std_alone, self.half_width))
+        return is_identifiable(self.std_alone, self.half_width)  # pyright: ignore[reportReturnType]
 
     @property
     def noise_limit(self) -> Values:
@@ -52,11 +52,11 @@ class Identifiability(eqx.Module):
 
     def reasons(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of one flight that is not identifiable, the reason."""
-        excited, std, reasons = np.asarray(self.excited), np.asarray(self.std), {}
-        for i in np.flatnonzero(~np.asarray(self.identifiable)).tolist():
-            if not np.isfinite(std[i]):
+        reasons = {}
+        for i in np.flatnonzero(~self.identifiable).tolist():
+            if not np.isfinite(self.std[i]):
                 reasons[names[i]] = "the trajectory is not finite, or the bracket is not valid"
-            elif not excited[i]:
+            elif not self.excited[i]:
                 reasons[names[i]] = "not excited"
             else:
                 reasons[names[i]] = f"only together with {', '.join(names[j] for j in self._partners(i))}"
@@ -64,18 +64,15 @@ class Identifiability(eqx.Module):
 
     def notes(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of one flight that is not identifiable or below the noise floor, a note to the user."""
-        limit, nominal = np.asarray(self.noise_limit), np.asarray(self.nominal)
-        reasons, notes = self.reasons(names), {}
-        for i, name in enumerate(names):
-            if name in reasons:
-                notes[name] = f"not identifiable: {reasons[name]}"
-            elif limit[i] < 1 and nominal[i] != 0:
-                notes[name] = f"below the noise floor: identifiable below {limit[i]:.2g} times this noise"
+        notes = {name: f"not identifiable: {reason}" for name, reason in self.reasons(names).items()}
+        for name, limit, nominal in zip(names, self.noise_limit, self.nominal, strict=True):
+            if name not in notes and limit < 1 and nominal != 0:
+                notes[name] = f"below the noise floor: identifiable below {limit:.2g} times this noise"
         return notes
 
     def _partners(self, i: int) -> list[int]:
         """The parameters that can change together with parameter `i` with the least effect on the flight."""
-        vectors = np.asarray(self.directions) / np.sqrt(np.maximum(np.asarray(self.eigenvalues), 1e-300))
+        vectors = self.directions / np.sqrt(np.maximum(self.eigenvalues, 1e-300))
         weakest = vectors[:, np.argmax(np.abs(vectors[i]))]
         share = np.abs(weakest) / np.abs(weakest).max()
         return [j for j in range(len(share)) if j != i and share[j] > _PARTNER] or [int(np.argsort(share)[-2])]
@@ -89,10 +86,8 @@ def identifiability(
     **Arguments:**
 
     - `bracket`: its half-widths say how well each parameter is known without the flight.
-    - `parameters`, `initial_state`: where the information is computed. A free initial state is estimated too.
-
-    **Returns:** an `Identifiability`. Its standard deviations are infinite if the trajectory diverges at `parameters`
-    or the bracket is not valid.
+    - `parameters`, `initial_state`: where the information is computed. A free initial state is estimated too. If the
+      trajectory diverges there, or the bracket is not valid, the standard deviations are infinite.
 
     **Raises:** `ValueError` for a wrong number of parameters.
     """

@@ -1,12 +1,16 @@
-"""The constants Ix, Iy, Iz, J_R of a rigid body, fitted to alpha_1..8 and their covariance.
+"""The constants of a rigid body from a fit: Ix, Iy, Iz, J_R from alpha_1..8, and the place of the centre of mass.
 
-The fit is a few small matrix products, computed by NumPy: a compiled program would cost seconds and save nothing.
+These are a few small matrix products, computed by NumPy: a compiled program would cost seconds and save nothing.
 """
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
+from ..airframe import Airframe
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from .evaluation import inverse, unit_eigen
 
@@ -22,6 +26,9 @@ _NUMERATOR = np.zeros((8, 4))
 _NUMERATOR[0, [1, 2]] = _NUMERATOR[3, [2, 0]] = _NUMERATOR[6, [0, 1]] = 1.0, -1.0
 _NUMERATOR[[1, 4], 3] = 1.0
 _TRIANGLE = np.ones((3, 3)) - 2 * np.eye(3)
+# A coordinate of the centre of mass [m] is the slope of torque over thrust, divided by an alpha and the mass, with this
+# sign.
+_COORDINATES = (("x", "pitch_thrust", "alpha6", 1.0), ("y", "roll_thrust", "alpha3", -1.0))
 
 
 class InertiaFit(eqx.Module):
@@ -104,16 +111,14 @@ def _alphas(constants: np.ndarray) -> np.ndarray:
     return (constants @ _NUMERATOR.T + _OFFSET) / constants[..., _DENOMINATOR]
 
 
-def _gauss_newton(
-    alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) -> tuple[np.ndarray, ...]:
     """The constants, the curvature of the cost, and the weighted residuals."""
     first = 1 / alpha[..., [2, 5, 7]]
     first = np.where((first > inertia / _FAR) & (first < _FAR * inertia), first, inertia)
     rotor = (alpha[..., 1] * first[..., 0] + alpha[..., 4] * first[..., 1]) / 2
     constants = np.concatenate([first, rotor[..., None]], axis=-1)
 
-    def linearised(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def linearised(constants: np.ndarray) -> tuple[np.ndarray, ...]:
         predicted = _alphas(constants)
         slopes = _NUMERATOR - predicted[..., None] * np.eye(4)[_DENOMINATOR]
         slopes = whiten @ (slopes / constants[..., _DENOMINATOR, None])
@@ -131,3 +136,37 @@ def _whitening(covariance: np.ndarray) -> np.ndarray:
     """W with W C W^T = 1; directions without variance count as known to rounding errors."""
     scale, values, vectors = unit_eigen(covariance)
     return np.swapaxes(vectors, -1, -2) / np.sqrt(values)[..., :, None] / scale[..., None, :]
+
+
+class CenterOfMass(NamedTuple):
+    """A coordinate of the centre of mass in the frame of the rotor positions: x forward, y left [m].
+
+    `std`: its standard deviation [m].
+    """
+
+    axis: str
+    value: float
+    std: float
+
+
+def center_of_mass(
+    names: Sequence[str], parameters: Float[ArrayLike, " n"], covariance: Float[ArrayLike, "n n"], airframe: Airframe
+) -> tuple[CenterOfMass, ...]:
+    """The coordinates of the centre of mass whose parameters were estimated; none without the term `center_of_mass`.
+
+    Rotors of unequal thrust cause the same torque: 5 % more thrust of the two left rotors is the same as a centre of
+    mass that lies 2.5 % of their y to the right.
+
+    **Arguments:** the names, values and covariance of the estimated parameters, and the airframe (its mass).
+    """
+    places, values, spread = list(names), np.asarray(parameters, dtype=float), np.asarray(covariance, dtype=float)
+    found = []
+    for axis, slope, inverse_inertia, sign in _COORDINATES:
+        if {slope, inverse_inertia} <= set(places):
+            both = [places.index(slope), places.index(inverse_inertia)]
+            top, bottom = values[both]
+            value = sign * top / (bottom * float(airframe.mass))
+            gradient = np.array([sign / (bottom * float(airframe.mass)), -value / bottom])
+            std = np.sqrt(gradient @ spread[np.ix_(both, both)] @ gradient)
+            found.append(CenterOfMass(axis, float(value), float(std)))
+    return tuple(found)

@@ -1,4 +1,4 @@
-"""Predictions of the body rates some tenths of a second ahead, and their skill."""
+"""Predictions of the body rates some tenths of a second ahead, with the disturbance at their start, and their skill."""
 
 import dataclasses
 from typing import NamedTuple
@@ -6,15 +6,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Parameters, as_float
+from .._custom_types import Parameters, Scalar, as_float
 from .._xla import quick_jit
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
-from ..shooting.filters import transition
-from .disturbance import Disturbances
+from ..shooting.filters import LogNoise, Observed, gains_of, transition
+from .frequency_response import modelled_acceleration
 
 HORIZONS = (0.1, 0.25, 0.5)
 RATES = CASCADE_ORDER[:3]
@@ -22,6 +22,17 @@ RATES = CASCADE_ORDER[:3]
 _EVERY, _AROUND = 0.05, 0.02
 # Number of parts of the flight for the jackknife, which omits one part at a time.
 _PARTS = 10
+
+
+class Disturbances(NamedTuple):
+    """Angular accelerations that act on the body rates besides the model.
+
+    - `value`: at each sample, from the measurements until then [rad/s^2].
+    - `time_constant`: with which they fade [s].
+    """
+
+    value: Float[np.ndarray, "samples 3"]
+    time_constant: Float[np.ndarray, "3"]
 
 
 class Predictions(NamedTuple):
@@ -80,11 +91,10 @@ def predictions(
     rate_problem = dataclasses.replace(problem, channels="rates", windows=1, initial_state=None, length=None)
     if disturbance is None:
         disturbance = Disturbances(np.zeros(rates.shape), np.ones(3))
-    first, fading = as_float(disturbance.value[start]), as_float(disturbance.time_constant)
-    begin = jnp.asarray(start), jnp.asarray(initial), first
-    predicted = _predict(rate_problem, parameters, *begin, fading, int(ahead.max()))
-    at = start[:, None] + ahead
-    return Predictions(start, ahead * dt, initial, np.asarray(predicted)[:, ahead], rates[at])
+    pushed, fading = as_float(disturbance.value[start]), as_float(disturbance.time_constant)
+    begin = jnp.asarray(start), jnp.asarray(initial), pushed
+    predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
+    return Predictions(start, ahead * dt, initial, predicted[:, ahead], rates[start[:, None] + ahead])
 
 
 def starts(
@@ -122,9 +132,7 @@ def _predict(
     model, scalars, forcing = problem.model, tuple(parameters), problem.forcing(parameters)
     kept, reach = transition(time_constant, problem.flight.dt)
 
-    def fly(
-        first: Int[Array, ""], measured: Float[Array, "3"], pushed: Float[Array, "3"]
-    ) -> Float[Array, "steps_and_one 3"]:
+    def fly(first: Int[Array, ""], measured: Array, pushed: Array) -> Float[Array, "steps_and_one 3"]:
         rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
         row = jax.tree.map(lambda leaf: leaf[0], rows)
         # A gyro bias is part of the measurement, not of the state.
@@ -154,17 +162,56 @@ def skill(predicted: Predictions) -> Skill:
         with np.errstate(divide="ignore", invalid="ignore"):
             return 1 - squares[kept].sum(axis=0) / reference
 
-    everything = np.arange(errors.shape[0])
+    everything, count = np.arange(errors.shape[0]), np.maximum(measured.sum(axis=0), 1)
     without = np.stack([skill_of(np.setdiff1d(everything, part)) for part in parts])
-    count = np.maximum(measured.sum(axis=0), 1)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt((len(parts) - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
-    if len(parts) == 1:
-        spread = np.full_like(spread, np.nan)
     return Skill(
         rmse=np.sqrt(squares.sum(axis=0) / count),
         persistence=np.sqrt(np.square(changes).sum(axis=0) / count),
         skill=skill_of(everything),
-        std=spread,
+        std=spread if len(parts) > 1 else np.full_like(spread, np.nan),
         starts=errors.shape[0],
     )
+
+
+def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Disturbances:
+    """The disturbance of each body rate by Kalman filters, for the noise that `FilterError` found.
+
+    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r.
+    """
+    rates = np.asarray(problem.flight.states)[:, RATES]
+    modelled = np.zeros(rates.shape)
+    modelled[:-1] = modelled_acceleration(problem, parameters)
+    own = LogNoise(*(as_float(np.asarray(leaf)[:3]) for leaf in noise))
+    begins = np.arange(rates.shape[0]) == 0
+    if problem.flight.stretch is not None:
+        begins = np.diff(np.asarray(problem.flight.stretch), prepend=-1) != 0
+    value = _filtered(own, as_float(rates), as_float(modelled), jnp.asarray(begins), problem.flight.dt)
+    return Disturbances(np.asarray(value), np.exp(np.asarray(own.time_constant)))
+
+
+@quick_jit
+def _filtered(
+    noise: LogNoise,
+    rates: Float[Array, "samples 3"],
+    modelled: Float[Array, "samples 3"],
+    begins: Bool[Array, " samples"],
+    dt: Scalar,
+) -> Float[Array, "samples 3"]:
+    measured = ~jnp.isnan(rates)
+    observed = Observed(rates[:, :, None], begins[:, None], begins[:, None])
+    gains = gains_of(observed, noise, dt)
+    kept, reach = transition(jnp.exp(noise.time_constant), dt)
+
+    def step(known: tuple[Array, Array], row) -> tuple[tuple[Array, Array], Array]:
+        (rate, disturbance), (y, measured, added, begins, by_rate, by_disturbance) = known, row
+        rate, disturbance = (jnp.where(begins, 0.0, x) for x in (rate, disturbance))
+        error = jnp.where(measured, y - rate, 0.0)
+        disturbance = disturbance + by_disturbance * error
+        moved = rate + by_rate * error + added * dt + reach * disturbance
+        return (moved, kept * disturbance), disturbance
+
+    zero = jnp.zeros(3, dtype=float)
+    rows = rates, measured, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]
+    return jax.lax.scan(step, (zero, zero), rows)[1]

@@ -20,16 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Count, Key, Scalar, as_float, as_int
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import (
-    REACH,
-    AbstractEstimator,
-    Estimate,
-    as_estimate,
-    check_count,
-    check_dynamic_count,
-    check_positive,
-)
-from ..linalg import covariance_of_shared
+from ..estimate import REACH, AbstractEstimator, Estimate, check_count, check_positive, estimate_at
 from ..shooting import ROUNDING, AbstractProblem
 
 Points = Float[Array, "archive unknowns"]
@@ -70,7 +61,6 @@ class AntColony(AbstractEstimator):
     looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = True
     prior: ClassVar[float] = NO_PRIOR
-    needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = True
 
     archive: int = eqx.field(static=True, default=50)
@@ -84,8 +74,8 @@ class AntColony(AbstractEstimator):
     def __check_init__(self):
         check_count("archive", self.archive, 2)
         check_count("ants", self.ants, 1)
-        check_dynamic_count("max_sweeps", self.max_sweeps, 1)
-        check_dynamic_count("seed", self.seed, 0)
+        check_count("max_sweeps", self.max_sweeps, 1)
+        check_count("seed", self.seed, 0)
         for name in ("q", "xi", "tolerance"):
             check_positive(name, getattr(self, name), finite=True)
 
@@ -124,18 +114,11 @@ class AntColony(AbstractEstimator):
         colony = jax.lax.while_loop(lambda c: ~self._settled(c.costs) & (c.sweeps < self.max_sweeps), sweep, colony)
         parameters, initial_state = split(colony.points[0])
         curvature = problem.curvatures(parameters, initial_state)
-        return as_estimate(
-            problem,
-            parameters=parameters,
-            covariance=covariance_of_shared(curvature.information, count),
-            initial_state=initial_state,
-            cost=curvature.shot.cost.sum(),
-            rollouts=self.archive + self.ants * colony.sweeps + 1 + unknowns,
-            sweeps=colony.sweeps,
-            sound=curvature.shot.sound.all(),
-            done=self._settled(colony.costs),
-            parts=curvature.parts,
+        answer, rollouts = (
+            problem.join(parameters, initial_state),
+            self.archive + self.ants * colony.sweeps + 1 + unknowns,
         )
+        return estimate_at(problem, answer, curvature, rollouts, colony.sweeps, done=self._settled(colony.costs))
 
     def _best(self, points: Float[Array, "tried unknowns"], costs: Float[Array, " tried"]) -> tuple[Points, Costs]:
         """The best points, as many as the archive holds, in order of their cost; equal ones by age."""

@@ -1,23 +1,21 @@
-"""Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares."""
+"""Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares.
 
+`EquationError` uses all samples in one step, `RecursiveLeastSquares` one sample after the other, with forgetting.
+"""
+
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 
 from .._custom_types import Count, Parameters, Scalar, as_float, as_int
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate
+from ..estimate import AbstractEstimator, Estimate, check_recursive
 from ..shooting import ShootingProblem, in_blocks
-from ._regression import (
-    answer,
-    check_linear,
-    check_settings,
-    normal_equations,
-    propagated_covariance,
-    regression,
-    solve,
-)
+from .regression import Regression, check_linear, check_settings, normal_equations, solve
 
 
 class EquationError(AbstractEstimator):
@@ -49,7 +47,6 @@ class EquationError(AbstractEstimator):
     looks_at: ClassVar[str] = "rates"
     shoots: ClassVar[bool] = False
     prior: ClassVar[float] = NO_PRIOR
-    needs_network: ClassVar[bool] = False
 
     memory: Scalar = eqx.field(converter=as_float, default=1.0)
     bridge: Count = eqx.field(converter=as_int, default=4)
@@ -64,18 +61,14 @@ class EquationError(AbstractEstimator):
         linear in those that are not held.
         """
         check_linear(problem)
-        return self._blocks(problem.within(bracket))
-
-    @quick_jit
-    def _blocks(self, problem: ShootingProblem) -> Estimate:
-        return in_blocks(self._identify, problem)
+        return _in_blocks(self._identify, problem.within(bracket))
 
     def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
-        data = regression(problem, memory=self.memory, bridge=self.bridge)
+        data = self._regression(problem)
         rows, back = data.rows()
         steps, inverse = solve(*normal_equations(rows))
-        return answer(data, steps, propagated_covariance(data, rows, back, steps, inverse))
+        return data.answer(steps, data.covariance(rows, back, steps, inverse))
 
     @quick_jit
     def solution(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Parameters:
@@ -83,5 +76,71 @@ class EquationError(AbstractEstimator):
 
         Parameters in which the rate equations are not linear stay at the center of their bracket.
         """
-        data = regression(problem.within(bracket), memory=self.memory, bridge=self.bridge)
+        data = self._regression(problem.within(bracket))
         return data.center + data.half_width * solve(*normal_equations(data.rows()[0]))[0]
+
+    def _regression(self, problem: ShootingProblem) -> Regression:
+        return Regression.of(problem, self.memory, self.bridge, as_float(1.0))
+
+
+class RecursiveLeastSquares(AbstractEstimator):
+    """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
+
+    The recursion carries the normal matrix and its right-hand side, which stay symmetric and positive in single
+    precision. A parameter stays at the bracket's center until it is excited.
+
+    **Arguments:**
+
+    - `forgetting`: the weight of a sample relative to its successor, above 0 and up to 1. The estimate describes the
+      last 1 / (1 - forgetting) samples or so, and follows parameters that change within this time. With the default of
+      1 nothing is forgotten, and the last estimate is that of `EquationError` with the same settings.
+    - `memory`, `bridge`: as in `EquationError`. A `forgetting` below 1 also forgets the means, and a known initial
+      state then counts like one sample.
+
+    The estimate's `history` holds the parameters after each sample; its last row is `parameters`. Rows inside a bridged
+    gap are known only after the gap. The covariance is that of the last estimate, without its lag behind parameters
+    that change.
+
+    Reference: Ljung, System Identification, section 11.2, with exponential forgetting.
+    """
+
+    looks_at: ClassVar[str] = "rates"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = NO_PRIOR
+
+    forgetting: Scalar = eqx.field(converter=as_float, default=1.0)
+    memory: Scalar = eqx.field(converter=as_float, default=1.0)
+    bridge: Count = eqx.field(converter=as_int, default=4)
+
+    def __check_init__(self):
+        check_settings(self.memory, self.bridge, self.forgetting)
+
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight.
+
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model that is not linear
+        in those that are not held, or a flight that is cut into windows.
+        """
+        check_recursive(problem)
+        check_linear(problem)
+        return _in_blocks(self._identify, problem.within(bracket))
+
+    def _identify(self, problem: ShootingProblem) -> Estimate:
+        """One flight, or a block of flights."""
+        count, data = problem.unknowns.count, Regression.of(problem, self.memory, self.bridge, self.forgetting)
+        rows, back = data.rows()
+
+        def update(carry, row):
+            added, (information, moment, _) = normal_equations(row), carry
+            carry = self.forgetting * information + added[0], self.forgetting * moment + added[1]
+            steps, inverse = solve(*carry)
+            return (*carry, inverse), steps
+
+        zero = jnp.zeros((count, count), dtype=float)
+        (*_, inverse), steps = jax.lax.scan(update, (zero, jnp.zeros(count, dtype=float), zero), rows)
+        return data.answer(steps[-1], data.covariance(rows, back, steps[-1], inverse), steps)
+
+
+@quick_jit
+def _in_blocks(identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem) -> Estimate:
+    return in_blocks(identify, problem)

@@ -100,7 +100,6 @@ def search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
 
 
 def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
-    """The search of one flight, or of a block of flights."""
     answered, unknowns, count = jnp.isfinite(seed.covariance).all(), problem.unknowns.usable, seed.parameters.shape[0]
     # The half-width is two standard deviations.
     wide_spread = jnp.diag(jnp.square(unknowns.half_width[:count] / 2))

@@ -1,75 +1,81 @@
 """Iterative Bi-Section Shooting (IBSS): halve brackets on the slope of the trajectory mismatch.
 
-The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md).
-
-A *shot* simulates the flight at trial unknowns, with its derivatives. **The sign of the cost's slope along a direction
-decides** which side of the trial holds the minimum, and so which part of the bracket is dropped. The quadratic model of
-the cost and the secant through the last slopes only **propose** where to shoot. A *sweep* is one iteration: look
-around, predict, open, bisect, judge. A *stage* repeats sweeps on some of the data until the minimum is near; the last
-stage fits all of them.
-
-If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
-windows' slopes, initial states on their own window's.
+The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md). They are
+the five lines of `IBSS.sweep`.
 """
 
 import functools
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Float
 
 from .._custom_types import Count, InitialStates, Parameters, Scalar, as_float, as_int
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import (
-    REACH,
-    AbstractEstimator,
-    Estimate,
-    as_estimate,
-    check_count,
-    check_dynamic_count,
-    check_positive,
-    from_starts,
-)
-from ..linalg import covariance_of_shared, gram, joint_factor
+from ..estimate import REACH, AbstractEstimator, Estimate, check_count, check_positive, estimate_at, from_starts
+from ..linalg import coordinate_directions, gram, joint_factor, movable, room_to_limits, slopes_along
 from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
 from ..shooting.abstract import WindowUnknowns
-from .bisection import (
-    Around,
-    Lines,
-    PerDirection,
-    Stage,
-    State,
-    bisected_in,
-    coordinate_directions,
-    narrow,
-    no_worse,
-    open_lines,
-    prior_std,
-    record_bracket,
-    room_to_limits,
-)
+from .bisection import Flag, Lines, PerDirection, Stage, View, prior_std
 
-DIRECTIONS = ("whitened", "coordinate")
+DIRECTIONS = {"whitened": joint_factor, "coordinate": coordinate_directions}
 
-# A stage that is not the last ends once no direction has more than this many standard deviations to go.
-_COARSE = 0.5
+_COARSE = 0.5  # a stage that is not the last ends once no direction has more than this many standard deviations to go
 # The first brackets reach this many of the start's standard deviations, in brackets of this share of them.
 _OPENING, _FIRST = 4.0, 0.05
 # A later bracket is the last relative error of the predictions, at least the second number, times the first.
 _SAFETY, _LEAST = 2.0, 0.01
 _GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose search ended at one of its ends, and of all together
-# After a sweep that raised the cost, the next goes at most this share of the predicted steps.
-_RETREAT = 0.25
-# After a sweep that did not, the next may go this many times as far. If the share were back at 1 at once, every second
-# sweep of a strongly nonlinear search would fail.
-_ADVANCE = 1.4
+_CHANCE = 1.0  # a sweep that raises the cost by no more may have done so by chance
+# After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far. If
+# the share were back at 1 at once, every second sweep of a strongly nonlinear search would fail.
+_RETREAT, _ADVANCE = 0.25, 1.4
+
+
+class State(NamedTuple):
+    """The search after a sweep.
+
+    - `unknowns`, `curvature`: where it is, and the curvature of the cost there.
+    - `spread`: the covariance of the unknowns, which sizes the first brackets of a stage.
+    - `error`: how far the last predictions were off, as a share of the longest step.
+    - `growth`: by how much each direction's bracket is wider than this error asks for.
+    - `trust`: the share of the longest predicted step that a sweep may go.
+    - `sweep`: the number of the next sweep in its stage; -1 for the first shot, which is at the start.
+    - `sweeps`, `rollouts`: how many sweeps bisected, and how many flights were simulated, in all stages.
+    - `done`: whether the stage ended by itself.
+    - `record`: the bracket of each parameter in each sweep.
+    """
+
+    unknowns: WindowUnknowns
+    curvature: Curvature
+    spread: Float[Array, "windows unknowns unknowns"]
+    error: Scalar
+    growth: PerDirection
+    trust: Scalar
+    sweep: Count
+    sweeps: Count
+    rollouts: Count
+    done: Flag
+    record: Float[Array, "record 2 parameters"]
+
+
+# The narrowed brackets, the last shot's place and curvature, and the number of shots.
+Bisected = tuple[Lines, WindowUnknowns, Curvature, Count]
 
 
 class IBSS(AbstractEstimator):
     """Iterative Bi-Section Shooting.
+
+    A *shot* simulates the flight at trial unknowns, with its derivatives. **The sign of the cost's slope along a
+    direction decides** which side of the trial holds the minimum, and so which part of the bracket is dropped. The
+    quadratic model of the cost and the secant through the last slopes only **propose** where to shoot. A *sweep* is one
+    iteration. A *stage* repeats sweeps on some of the data until the minimum is near; the last stage fits all of them.
+    If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
+    windows' slopes, initial states on their own window's.
 
     **Arguments:**
 
@@ -84,14 +90,11 @@ class IBSS(AbstractEstimator):
       rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     - `record`: how many sweeps' brackets the estimate keeps, to show how the search went.
-
-    A free initial state is searched like the parameters, from the first measurement of each channel.
     """
 
     looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = True
     prior: ClassVar[float] = NO_PRIOR
-    needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = True
 
     directions: str = eqx.field(static=True, default="whitened")
@@ -106,7 +109,7 @@ class IBSS(AbstractEstimator):
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
         check_count("halvings", self.halvings, 2)
         check_count("record", self.record, 0)
-        check_dynamic_count("max_sweeps", self.max_sweeps, 1)
+        check_count("max_sweeps", self.max_sweeps, 1)
         check_positive("tolerance", self.tolerance)
         check_positive("reach", self.reach)
 
@@ -131,21 +134,17 @@ class IBSS(AbstractEstimator):
 
         **Raises:** `ValueError` for a bracket or a start of another length than the unknowns.
         """
-
-        def one(ibss: IBSS, problem: AbstractProblem, start, spread) -> Estimate:
-            return ibss.search(problem, start=start, spread=spread)
-
-        return in_blocks(one, self, problem.within(bracket), start, spread)
+        return in_blocks(self.search, problem.within(bracket), start, spread)
 
     def search(
         self,
         problem: AbstractProblem,
-        *,
         start: Float[Array, " unknowns"] | None = None,
         spread: Float[Array, "known known"] | None = None,
+        *,
         initial_state: InitialStates | None = None,
-        cascade: Bool[Array, ""] | bool = True,
-        skip: Bool[Array, ""] | bool = False,
+        cascade: Flag | bool = True,
+        skip: Flag | bool = False,
     ) -> Estimate:
         """Identifies one flight, inside the program of another estimator.
 
@@ -155,41 +154,36 @@ class IBSS(AbstractEstimator):
         - `cascade`: whether to go through all stages. A `start` that is close needs the last one only.
         - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
         """
-        count = problem.unknowns.count
-        if start is not None and jnp.shape(start) != (count,):
-            raise ValueError(f"`start` must hold {count} unknowns, got shape {jnp.shape(start)}.")
         known = problem.first_state()[0] if initial_state is None else initial_state
         stages = problem.stages(cascade=self.directions == "whitened")
-        first = jnp.where(cascade, 0, stages.number - 1)
 
         def from_one(start: Parameters) -> Estimate:
-            state = self.init(problem, stages, start, known, spread, skip)
+            first = self.init(problem, stages, problem.join(start, known), spread, skip)
 
-            def fit(number: Int[Array, ""], state: State) -> State:
-                return self._fit_stage(Stage.of(problem, stages, number, self.reach), state, skip)
+            def fit(number: Count, state: State) -> State:
+                """One stage: sweeps from where the last stage ended."""
+                stage = Stage.of(problem, stages, number, self.reach)
+                anew = {name: getattr(first, name) for name in ("error", "growth", "trust", "sweep", "done")}
+                ongoing, sweep = lambda state: ~self.terminate(stage, state), functools.partial(self.sweep, stage)
+                return jax.lax.while_loop(ongoing, sweep, state._replace(**anew))
 
             # One loop, so that the search is compiled once for all stages.
-            return self._estimate(problem, known, jax.lax.fori_loop(first, stages.number, fit, state))
+            end = jax.lax.fori_loop(jnp.where(cascade, 0, stages.number - 1), stages.number, fit, first)
+            more = {"reach": self.reach, "brackets": end.record if self.record else None}
+            return estimate_at(problem, end.unknowns, end.curvature, end.rollouts, end.sweeps, done=end.done, **more)
 
         return from_starts(problem, start, from_one)
 
     def init(
-        self,
-        problem: AbstractProblem,
-        stages: Stages,
-        start: Float[Array, " unknowns"],
-        initial_state: InitialStates,
-        spread: Float[Array, "known known"] | None,
-        skip: Bool[Array, ""] | bool,
+        self, problem: AbstractProblem, stages: Stages, start: WindowUnknowns, spread: Array | None, skip: Flag | bool
     ) -> State:
         """The search before its first shot."""
-        unknowns = jnp.clip(problem.join(start, initial_state), *problem.limits(self.reach))
+        unknowns = jnp.clip(start, *problem.limits(self.reach))
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem)))
         if spread is not None:
-            known = spread.shape[0]
-            own = jnp.where(skip, covariance[:, :known, :known], spread)
-            covariance = covariance.at[:, :known, :known].set(own)
-        count, none = problem.unknowns.count, jnp.zeros((), dtype=int)
+            known = np.s_[:, : spread.shape[0], : spread.shape[0]]
+            covariance = covariance.at[known].set(jnp.where(skip, covariance[known], spread))
+        none = jnp.zeros((), dtype=int)
         shapes = jax.eval_shape(stages.evaluate, none, unknowns)
         return State(
             unknowns=unknowns,
@@ -198,158 +192,129 @@ class IBSS(AbstractEstimator):
             error=jnp.zeros((), dtype=float),
             growth=jnp.ones_like(unknowns),
             trust=jnp.ones((), dtype=float),
+            sweep=none - 1,
             sweeps=none,
-            earlier=none,
             rollouts=none,
             done=jnp.asarray(skip),
-            record=jnp.full((self.record, 2, count), jnp.nan) if self.record else None,
+            record=jnp.full((self.record, 2, problem.unknowns.count), jnp.nan),
         )
 
     def sweep(self, stage: Stage, state: State) -> State:
-        """One iteration."""
-        around = self._look_around(stage, state)
-        predicted = -stage.along(around.basis, state.curvature.gradient, around.moves)
-        lines = self._open(stage, state, around, predicted)
-        lines, unknowns, curvature, shots = self._bisect(stage, state, around, lines)
-        return self._judge(stage, state, around, lines, unknowns, curvature, shots)
+        """One iteration, in the five steps of docs/method/ibss.md."""
+        view = self._look_around(stage, state)
+        predicted, near = self._predict(stage, state, view)
+        lines = self._open(stage, state, view, predicted)
+        found = self._bisect(stage, state, view, near, lines)
+        return self._judge(stage, state, view, near, found)
 
-    def terminate(self, stage: Stage, state: State) -> Bool[Array, ""]:
-        """Whether the stage has ended."""
-        return state.done | (state.sweeps > self._most_sweeps(stage))
+    def terminate(self, stage: Stage, state: State) -> Flag:
+        """Whether the stage has ended. After its last sweep, it looks around once more, whether the minimum is near."""
+        return state.done | (state.sweep > self._most_sweeps(stage))
 
-    def _look_around(self, stage: Stage, state: State) -> Around:
-        """Choose directions in which the cost is nearly separable, from its curvature where the sweep begins."""
-        choose = joint_factor if self.directions == "whitened" else coordinate_directions
-        problem, unknowns, (lower, upper) = stage.problem, state.unknowns, stage.limits
-        count, gradient = problem.unknowns.count, state.curvature.gradient
-        total = gradient.at[:, :count].set(gradient[:, :count].sum(axis=0))
-        moves = ~(((unknowns <= lower) & (total > 0)) | ((unknowns >= upper) & (total < 0)))
-        information = jnp.where(moves[:, :, None] & moves[:, None, :], state.curvature.information, 0.0)
-        factor, basis = choose(information + stage.prior, count)
-        nearest = (jnp.where(moves, limit, unknowns) for limit in stage.limits)
-        below, above = room_to_limits(unknowns, basis, *nearest)
-        steps = jnp.clip(-stage.along(basis, gradient, moves), -below, above)
-        longest = jnp.abs(steps).max()
-        near = (state.sweeps >= 0) & (stage.distance(steps) <= self._close_enough(stage, state.curvature))
-        spent = state.sweeps >= self._most_sweeps(stage)
-        return Around(factor, basis, moves, below, above, longest, near, spent)
+    def _look_around(self, stage: Stage, state: State) -> View:
+        """1. Choose directions in which the cost is nearly separable, from its curvature where the sweep begins."""
+        unknowns, curvature, count = state.unknowns, state.curvature, stage.problem.unknowns.count
+        moves = movable(unknowns, curvature.gradient, stage.limits, count)
+        information = jnp.where(moves[:, :, None] & moves[:, None, :], curvature.information, 0.0)
+        factor, basis = DIRECTIONS[self.directions](information + stage.prior, count)
+        lower, upper = (jnp.where(moves, limit, unknowns) for limit in stage.limits)
+        return View(factor, basis, moves, *room_to_limits(unknowns, basis, (lower, upper)))
 
-    def _open(self, stage: Stage, state: State, around: Around, predicted: PerDirection) -> Lines:
-        """Open a bracket around the predicted step in each direction."""
-        opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", around.factor, state.spread, around.factor))
-        later = jnp.maximum(state.error * around.longest, stage.smallest_step) * state.growth
-        is_first = state.sweeps == 0
+    def _predict(self, stage: Stage, state: State, view: View) -> tuple[PerDirection, Flag]:
+        """2. The step to the minimum of the quadratic model, and whether all steps are so short that the stage ends.
+
+        The information along each direction is 1, so the step is minus the slope.
+        """
+        steps = jnp.clip(-self._slopes(stage, view, state.curvature), -view.below, view.above)
+        return steps, (state.sweep >= 0) & self._is_near(stage, state.curvature, steps)
+
+    def _open(self, stage: Stage, state: State, view: View, predicted: PerDirection) -> Lines:
+        """3. Open a bracket around the predicted step in each direction."""
+        opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", view.factor, state.spread, view.factor))
+        longest, is_first = jnp.abs(predicted).max(), state.sweep == 0
+        later = jnp.maximum(state.error * longest, stage.smallest_step) * state.growth
         half_width = jnp.where(is_first, _FIRST * opening, later)
-        longest = jnp.where(is_first, opening, jnp.inf)
-        longest = jnp.where(state.trust < 1, state.trust * around.longest, longest)
+        reach = jnp.where(is_first, opening, jnp.inf)
+        reach = jnp.where(state.trust < 1, state.trust * longest, reach)
         # Nothing is known before the first shot, which is at the start.
-        longest = jnp.where(state.sweeps < 0, 0.0, longest)
-        if self.directions == "coordinate":
-            is_next = bisected_in(state.sweeps, stage.searched, stage.problem.unknowns.count)
-            longest = jnp.where(is_next, longest, 0.0)
-        below, above = jnp.minimum(around.below, longest), jnp.minimum(around.above, longest)
-        return open_lines(predicted, half_width, below, above)
+        reach = jnp.where(state.sweep < 0, 0.0, reach)
+        if self.directions == "coordinate":  # each searched unknown has its turn
+            rank, searched = jnp.cumsum(stage.searched) - 1, stage.searched
+            turn = searched & (rank == state.sweep % jnp.maximum(searched.sum(), 1))
+            reach = jnp.where(jnp.roll(turn, -stage.problem.unknowns.count), reach, 0.0)
+        return Lines.around(predicted, half_width, jnp.minimum(view.below, reach), jnp.minimum(view.above, reach))
 
-    def _bisect(
-        self, stage: Stage, state: State, around: Around, lines: Lines
-    ) -> tuple[Lines, WindowUnknowns, Curvature, Int[Array, ""]]:
-        """Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
+    def _bisect(self, stage: Stage, state: State, view: View, near: Flag, lines: Lines) -> Bisected:
+        """4. Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
 
         The last shot does not narrow brackets: it is at what the others found. No shot is left if the minimum is near,
         or after the last sweep.
         """
-        shots = jnp.where(state.sweeps < 0, 1, jnp.where(around.near | around.spent, 0, self.halvings + 1))
+        over = near | (state.sweep >= self._most_sweeps(stage))
+        shots = jnp.where(state.sweep < 0, 1, jnp.where(over, 0, self.halvings + 1))
 
         def shoot(carry):
             lines, _, _, taken, _ = carry
-            unknowns = jnp.clip(state.unknowns + jnp.einsum("wud,wd->wu", around.basis, lines.trial), *stage.limits)
-            curvature = stage.stages.evaluate(stage.number, unknowns)
-            slope = stage.along(around.basis, curvature.gradient, around.moves)
-            close = stage.distance(slope) <= self._close_enough(stage, curvature)
+            unknowns = jnp.clip(state.unknowns + jnp.einsum("wud,wd->wu", view.basis, lines.trial), *stage.limits)
+            curvature = stage.evaluate(unknowns)
+            slope = self._slopes(stage, view, curvature)
+            close = curvature.shot.sound.all() & self._is_near(stage, curvature, slope)
             # A failed shot points back to the beginning.
-            lines = narrow(lines, jnp.where(jnp.isfinite(slope), slope, lines.trial))
-            return lines, unknowns, curvature, taken + 1, curvature.shot.sound.all() & close
+            lines = lines.halved(jnp.where(jnp.isfinite(slope), slope, lines.trial))
+            return lines, unknowns, curvature, taken + 1, close
 
         first = lines, state.unknowns, state.curvature, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
-        lines, unknowns, curvature, taken, _ = jax.lax.while_loop(lambda x: (x[3] < shots) & ~x[4], shoot, first)
-        return lines, unknowns, curvature, taken
+        return jax.lax.while_loop(lambda carry: (carry[3] < shots) & ~carry[4], shoot, first)[:4]
 
-    def _judge(
-        self,
-        stage: Stage,
-        state: State,
-        around: Around,
-        lines: Lines,
-        unknowns: WindowUnknowns,
-        curvature: Curvature,
-        shots: Int[Array, ""],
-    ) -> State:
-        """Keep the new point, or go back and stay closer if the sweep made things worse."""
-        first = state.sweeps < 0
-        finite = jnp.isfinite(unknowns).all() & jnp.isfinite(curvature.shot.cost).all()
-        failed = ~first & ~(finite & no_worse(curvature.shot, state.curvature.shot))
+    def _judge(self, stage: Stage, state: State, view: View, near: Flag, found: Bisected) -> State:
+        """5. Keep the new point, or go back and stay closer if the sweep made things worse."""
+        (lines, unknowns, curvature, shots), first = found, state.sweep < 0
+        shot, before = curvature.shot, state.curvature.shot
+        finite = jnp.isfinite(unknowns).all() & jnp.isfinite(shot.cost).all()
+        # The cost of a flight that fails means nothing.
+        lower = shot.sound.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
+        failed = ~first & ~(finite & (~before.sound.all() | lower))
         kept, there = jax.tree.map(
             lambda new, old: jnp.where(failed, old, new), (unknowns, curvature), (state.unknowns, state.curvature)
         )
         steps, bisected = lines.last, lines.upper > lines.lower
-        share = _SAFETY * jnp.abs(steps - lines.predicted).max()
-        error = jnp.clip(share / jnp.maximum(jnp.abs(steps).max(), stage.smallest_step), _LEAST, 1.0)
+        off = _SAFETY * jnp.abs(steps - lines.predicted).max()
         at_end = (steps == lines.lower) | (steps == lines.upper)
-        growth = jnp.where(bisected, jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0), state.growth)
-        trust = jnp.where(failed, state.trust * _RETREAT, jnp.minimum(state.trust * _ADVANCE, 1.0))
-        known = jnp.square(jnp.maximum(stage.misfit(state.curvature), 1.0)) * gram(around.basis)
-        searched = stage.searched & stage.searched[:, None] & ~first
+        growth = jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0)
+        known = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(view.basis)
+        searched, counts = stage.searched & stage.searched[:, None] & ~first, ~first & (shots > 0)
         return State(
             unknowns=kept,
             curvature=there,
             spread=jnp.where(searched, known, state.spread),
-            error=error,
-            growth=growth,
-            trust=trust,
-            sweeps=state.sweeps + jnp.where(around.near, 0, 1),
-            earlier=state.earlier,
+            error=jnp.clip(off / jnp.maximum(jnp.abs(steps).max(), stage.smallest_step), _LEAST, 1.0),
+            growth=jnp.where(bisected, growth, state.growth),
+            trust=jnp.where(failed, state.trust * _RETREAT, jnp.minimum(state.trust * _ADVANCE, 1.0)),
+            sweep=state.sweep + 1,
+            sweeps=state.sweeps + counts,
             rollouts=state.rollouts + shots * stage.searched.sum(),
-            done=around.near | (first & ~finite),
-            record=record_bracket(state, around, (lines.upper - lines.lower) / 2),
+            done=near | (first & ~finite),
+            record=_recorded(state, view, lines, counts) if self.record else state.record,
         )
 
-    def _most_sweeps(self, stage: Stage) -> Int[Array, ""]:
+    def _slopes(self, stage: Stage, view: View, curvature: Curvature) -> PerDirection:
+        """The slope of the cost along each direction, of the unknowns that move."""
+        gradient = jnp.where(view.moves, curvature.gradient, 0.0)
+        return slopes_along(view.basis, gradient, stage.problem.unknowns.count)
+
+    def _is_near(self, stage: Stage, curvature: Curvature, steps: PerDirection) -> Flag:
+        """Whether so short steps to the minimum end a stage: the last stage is searched finely, the others coarsely."""
+        noise = stage.misfit(curvature.shot.cost.sum())
+        fine = jnp.maximum(self.tolerance * noise, stage.smallest_step)
+        return stage.distance(steps) <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(noise, 1.0))
+
+    def _most_sweeps(self, stage: Stage) -> Count:
         return self.max_sweeps * (1 if self.directions == "whitened" else stage.searched.sum())
 
-    def _close_enough(self, stage: Stage, curvature: Curvature) -> Scalar:
-        """The search of a stage ends if the minimum is at most so far away along each direction."""
-        noise, last = stage.misfit(curvature), stage.number == stage.stages.number - 1
-        fine = jnp.maximum(self.tolerance * noise, stage.smallest_step)
-        return jnp.where(last, fine, _COARSE * jnp.maximum(noise, 1.0))
 
-    def _fit_stage(self, stage: Stage, state: State, skip: Bool[Array, ""] | bool) -> State:
-        """Sweeps until little is left to go; the last stage down to `tolerance`, the others coarsely."""
-        state = state._replace(
-            error=jnp.zeros((), dtype=float),
-            growth=jnp.ones_like(state.growth),
-            trust=jnp.ones((), dtype=float),
-            sweeps=-jnp.ones((), dtype=int),
-            earlier=state.earlier + jnp.maximum(state.sweeps, 0),
-            done=jnp.asarray(skip),
-        )
-        state = jax.lax.while_loop(
-            lambda state: ~self.terminate(stage, state), functools.partial(self.sweep, stage), state
-        )
-        return state._replace(sweeps=jnp.minimum(state.sweeps, self._most_sweeps(stage)))
-
-    def _estimate(self, problem: AbstractProblem, initial_state: InitialStates, state: State) -> Estimate:
-        count, curvature = problem.unknowns.count, state.curvature
-        return as_estimate(
-            problem,
-            parameters=state.unknowns[0, :count],
-            covariance=covariance_of_shared(curvature.information, count),
-            initial_state=state.unknowns[:, count:].ravel() if problem.free_size else initial_state,
-            cost=curvature.shot.cost.sum(),
-            rollouts=state.rollouts,
-            sweeps=state.earlier + jnp.maximum(state.sweeps, 0),
-            sound=curvature.shot.sound.all(),
-            done=state.done,
-            reach=self.reach,
-            brackets=state.record,
-            parts=curvature.parts,
-        )
+def _recorded(state: State, view: View, lines: Lines, counts: Flag) -> Float[Array, "record 2 parameters"]:
+    """The record with the bracket of each parameter in one more sweep; sweeps beyond its length are dropped."""
+    length, _, count = state.record.shape
+    widest = jnp.abs(view.basis * ((lines.upper - lines.lower) / 2)[:, None, :]).max(axis=(0, 2))[:count]
+    bracket = state.unknowns[0, :count] + jnp.stack([-widest, widest])
+    return state.record.at[jnp.where(counts, state.sweeps, length)].set(bracket, mode="drop")

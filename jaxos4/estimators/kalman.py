@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Count, Parameters, Scalar, as_int
 from .._xla import quick_jit
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, as_estimate, check_dynamic_count, check_recursive
+from ..estimate import AbstractEstimator, Estimate, as_estimate, check_count, check_recursive
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, Unknowns, in_blocks
@@ -33,16 +33,6 @@ class _Filter(NamedTuple):
     estimate: Float[Array, " joint"]
     root: Float[Array, "joint unknowns"]
     nominal: Float[Array, " size"]
-
-
-class _Pass(NamedTuple):
-    """The result of a pass, the number of passes so far, and whether they are over."""
-
-    joint: Float[Array, " joint"]
-    root: Float[Array, "joint unknowns"]
-    history: Float[Array, "samples parameters"]
-    passes: Int[Array, ""]
-    done: Bool[Array, ""]
 
 
 class JointEKF(AbstractEstimator):
@@ -69,12 +59,11 @@ class JointEKF(AbstractEstimator):
     looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = False
     prior: ClassVar[float] = GAUSSIAN_PRIOR
-    needs_network: ClassVar[bool] = False
 
     passes: Count = eqx.field(converter=as_int, default=10)
 
     def __check_init__(self):
-        check_dynamic_count("passes", self.passes, 1)
+        check_count("passes", self.passes, 1)
 
     @quick_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
@@ -95,45 +84,38 @@ class JointEKF(AbstractEstimator):
         def split(joint: Float[Array, " joint"]) -> tuple[Parameters, Float[Array, " size"]]:
             return joint[size : size + count], joint[size + count :] if problem.free_size else start
 
-        def again(last: _Pass) -> _Pass:
-            before, first = split(last.joint), last.passes == 0
+        def again(carry):
+            """One more pass: its result, the number of passes so far, and whether they are over."""
+            (joint, *_), passes, _ = carry
+            before, first = split(joint), passes == 0
             joint, root, history = _run(problem, rows, prior, before, first=first)
             std = jnp.sqrt(jnp.square(root[size : size + count]).sum(axis=1))
             moved = (jnp.abs(split(joint)[0] - before[0]) / jnp.where(prior.free, std, 1.0)).max()
             # A NaN ends the passes: it stays NaN.
             done = jnp.where(first, self.passes == 1, ~(moved > _SETTLED))
-            return _Pass(joint, root, history, last.passes + 1, done)
+            return (joint, root, history), passes + 1, done
 
-        joint, unknowns = _joint(start, prior.center, problem.free_size), count + problem.free_size
-        none = _Pass(
-            joint=joint,
-            root=jnp.zeros((joint.size, unknowns), dtype=float),
-            history=jnp.zeros((rows.measured[0].size, count), dtype=float),
-            passes=jnp.zeros((), dtype=int),
-            done=jnp.zeros((), dtype=bool),
-        )
+        joint, unknowns = jnp.concatenate([start, prior.center, start[: problem.free_size]]), count + problem.free_size
+        root, history = jnp.zeros((joint.size, unknowns)), jnp.zeros((rows.measured[0].size, count))
+        none = (joint, root, history), jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
         # The first pass is one of the loop too, so that the filter is compiled once.
-        last = jax.lax.while_loop(lambda f: ~f.done & (f.passes < self.passes), again, none)
-        parameters, initial_state = split(last.joint)
+        found = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < self.passes), again, none)
+        (joint, root, history), passes, done = found
+        parameters, initial_state = split(joint)
         cost, sound = problem.shots(parameters, initial_state)
-        factor = last.root[size : size + count]
         return as_estimate(
             problem,
             parameters=parameters,
-            covariance=gram(factor),
+            covariance=gram(root[size : size + count]),
             initial_state=initial_state,
             cost=cost,
-            rollouts=last.passes * (unknowns + 1) + 1,
-            sweeps=last.passes,
+            rollouts=passes * (unknowns + 1) + 1,
+            sweeps=passes,
             sound=sound,
             prior=self.prior,
-            done=last.done,
-            history=last.history,
+            done=done,
+            history=history,
         )
-
-
-def _joint(state: Float[Array, " size"], parameters: Parameters, free_size: int) -> Float[Array, " joint"]:
-    return jnp.concatenate([state, parameters, state[:free_size]])
 
 
 def _run(
@@ -155,7 +137,7 @@ def _run(
     # A known initial state has no tangent of its own.
     moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])
     filter_ = _Filter(
-        estimate=_joint(start, prior.center, problem.free_size),
+        estimate=jnp.concatenate([start, prior.center, start[: problem.free_size]]),
         root=jnp.concatenate([moving, constants]),
         nominal=about[1],
     )

@@ -56,7 +56,5 @@ def profile_likelihood(
 
 
 @quick_jit
-def _held(
-    estimator: AbstractEstimator, problem: ShootingProblem, name: str, values: Float[Array, " values"]
-) -> Estimate:
+def _held(estimator: AbstractEstimator, problem: ShootingProblem, name: str, values: Array) -> Estimate:
     return eqx.filter_vmap(lambda value: estimator(problem.hold({name: value})))(values)

@@ -11,6 +11,7 @@ Phi12 is the derivative of the rates with respect to the parameters, and Phi22 =
 Habibi divides by e and multiplies by it again; this code does neither, so that e = 0 is no special case.
 """
 
+import functools
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -40,7 +41,7 @@ _AVERAGED = 0.5  # the share of the last pass over which the parameters are aver
 
 
 class _Filter(NamedTuple):
-    """The filter before a measurement; parameters are in half-widths from the bracket's center.
+    """The filter before a measurement; parameters in half-widths from the bracket's center.
 
     - `residual`: size of the rates' error after the last correction.
     - `influence`: Phi12, the derivative of the rates with respect to the parameters.
@@ -81,9 +82,9 @@ class SVSF(AbstractEstimator):
     that pass. Only the body rates are used. A free initial state is not filtered for: each pass begins from the first
     measurements, and the returned state is fitted to the parameters at the end.
 
-    The method itself gives no covariance. Ours follows the errors through the slope of each correction, from the
-    bracket's half-widths on (in the manner of Gadsden and Habibi 2010). It ignores that all passes see the same noise:
-    only its size is right. A pass counts as one rollout for each rate and parameter, and one for the state.
+    The method gives no covariance. Ours follows the errors through the slope of each correction, from the bracket's
+    half-widths on (in the manner of Gadsden and Habibi 2010). It ignores that all passes see the same noise: only its
+    size is right. A pass counts as one rollout for each rate and parameter, and one for the state.
 
     Reference: Habibi 2007, Proc. IEEE 95(5), 1026-1059; Al-Shabi and Habibi 2011, ISRN Signal Processing 725108, for
     the idea of iterating it.
@@ -92,7 +93,6 @@ class SVSF(AbstractEstimator):
     looks_at: ClassVar[str] = "rates"
     shoots: ClassVar[bool] = False
     prior: ClassVar[float] = GAUSSIAN_PRIOR
-    needs_network: ClassVar[bool] = False
 
     gamma: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
     rates_layer: Float[Array, ""] = eqx.field(converter=as_float, default=110.0)
@@ -131,28 +131,25 @@ class SVSF(AbstractEstimator):
         # The second part of `first_state` is three standard deviations.
         spread = jnp.concatenate([start[1] / 3, jnp.ones(count), jnp.zeros(count)])
         kept = (jnp.arange(spread.size) >= 3) & (jnp.arange(spread.size) < 3 + count)
-        anew, zeros = jnp.diag(jnp.where(kept, 0.0, jnp.square(spread))), jnp.zeros((3, count), dtype=float)
-
-        def fly(previous: tuple[_Filter, Array], _) -> tuple[tuple[_Filter, Array], None]:
-            """One pass: rates and average begin anew, the parameters do not."""
-            last = previous[0]
-            begin = last._replace(
-                rates=start[0],
-                residual=jnp.zeros(3, dtype=float),
-                influence=zeros,
-                covariance=jnp.where(kept[:, None] & kept, last.covariance, 0.0) + anew,
-            )
-            return jax.lax.scan(lambda f, row: self._step(rates, box, f, *row), begin, (rows, shares)), None
-
+        anew = jnp.diag(jnp.where(kept, 0.0, jnp.square(spread)))
         at_center = _Filter(
             rates=start[0],
             parameters=jnp.zeros(count, dtype=float),
             residual=jnp.zeros(3, dtype=float),
-            influence=zeros,
+            influence=jnp.zeros((3, count), dtype=float),
             energy=jnp.zeros(count, dtype=float),
             samples=jnp.zeros((), dtype=float),
             covariance=jnp.diag(jnp.square(spread)),
         )
+
+        def fly(previous: tuple[_Filter, Array], _) -> tuple[tuple[_Filter, Array], None]:
+            """One pass: rates and average begin anew, the parameters do not."""
+            last = previous[0]
+            covariance = jnp.where(kept[:, None] & kept, last.covariance, 0.0) + anew
+            kept_fields = {"parameters": last.parameters, "energy": last.energy, "samples": last.samples}
+            begin = at_center._replace(**kept_fields, covariance=covariance)
+            return jax.lax.scan(lambda f, row: self._step(rates, box, f, *row), begin, (rows, shares)), None
+
         none = jnp.zeros((samples, count), dtype=float)
         (last, history), _ = jax.lax.scan(fly, (at_center, none), length=self.passes)
         parameters = box.center + box.width * (shares[:, None] * history).sum(axis=0)
@@ -232,5 +229,4 @@ def _gain(
     return gain, jnp.where(outside, 1.0, (2 * size + before) / layer)
 
 
-def _product(a: Float[Array, "m k"], b: Float[Array, "k n"]) -> Float[Array, "m n"]:
-    return jnp.matmul(a, b, precision="highest")
+_product = functools.partial(jnp.matmul, precision="highest")

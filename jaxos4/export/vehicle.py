@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import Airframe
-from ..analysis.center_of_mass import center_of_mass
+from ..analysis.inertia import center_of_mass
 
 AXES = ("roll", "pitch", "yaw")
 _INERTIAS = (("Ix", "alpha3"), ("Iy", "alpha6"), ("Iz", "alpha8"))

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .._custom_types import as_float
+from ..analysis.covariance import robust_covariance_of
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.evaluation import Evaluation
-from ..analysis.sandwich import robust_covariance_of
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
 from ..results import RESULTS

@@ -9,9 +9,8 @@ from jaxtyping import Array
 
 from .._custom_types import as_float
 from .._xla import quick_jit
-from ..analysis.disturbance import disturbances
 from ..analysis.evaluation import evaluate
-from ..analysis.prediction import Predictions, Skill, predictions, skill
+from ..analysis.prediction import Predictions, Skill, disturbances, predictions, skill
 from ..estimate import fit_start
 from ..estimators import EquationError
 from ..shooting import ShootingProblem, padded

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from .._xla import quick_jit
-from ..analysis.fisher import cramer_rao_bound
+from ..analysis.covariance import cramer_rao_bound
 from ..bracket import Bracket
 from ..flight import Flight
 from ..models import MODELS

@@ -1,9 +1,17 @@
-"""The sandwich covariance: the covariance of a fit whose residuals are coloured, or not as large as sigma says."""
+"""Information and covariance of parameters: Fisher information, Cramer-Rao bound, and the sandwich covariance.
 
+The sandwich covariance is that of a fit whose residuals are coloured, or not as large as sigma says.
+"""
+
+import functools
+
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from .._custom_types import InitialStates, Parameters
+from .._custom_types import Covariance, InitialStates, Parameters, as_float
+from .._xla import quick_jit
+from ..linalg import covariance_of_shared, gram, joint_factor
 from ..shooting import ShootingProblem
 from .evaluation import Evaluation, evaluate, inverse, shared_information
 
@@ -12,12 +20,50 @@ _LAGS = 0.1
 # The covariance of a window's residuals is estimated from at least so many windows, each of at most so many residuals.
 _MANY_WINDOWS, _LARGEST_WINDOW = 20, 4000
 
-Covariance = Float[np.ndarray, "parameters parameters"]
+Spread = Float[np.ndarray, "parameters parameters"]
+
+
+def fisher_information(
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
+) -> Covariance:
+    """J^T W^2 J in the parameters, with the Jacobian J at `parameters` and the weights W = 1 / sigma.
+
+    A free initial state is unknown too and is eliminated (Schur complement). `initial_state` is where J is computed, by
+    default the measured one.
+    """
+    return _information_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
+
+
+def cramer_rao_bound(
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
+) -> Covariance:
+    """The smallest covariance that an unbiased estimate can have: the inverse of `fisher_information`.
+
+    A parameter that is not excited has a huge variance, but not an infinite one.
+    """
+    return _covariance_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
+
+
+# A program of its own: information and bound share it, and the simulation is what takes long to compile.
+@quick_jit
+def _information(
+    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
+) -> Float[Array, "windows unknowns unknowns"]:
+    start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
+    return problem.curvatures(as_float(parameters), start).information
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _information_of_shared(information: Float[Array, "windows unknowns unknowns"], count: int) -> Covariance:
+    return gram(joint_factor(information, count).factor[0, :count, -count:])
+
+
+_covariance_of_shared = jax.jit(covariance_of_shared, static_argnums=1)
 
 
 def robust_covariance(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
-) -> Covariance:
+) -> Spread:
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
@@ -33,7 +79,7 @@ def robust_covariance(
     return robust_covariance_of(evaluate(problem, parameters, initial_state))
 
 
-def robust_covariance_of(evaluation: Evaluation) -> Covariance:
+def robust_covariance_of(evaluation: Evaluation) -> Spread:
     """`robust_covariance` of a flight that was simulated already."""
     count, measured = evaluation.parameters.size, ~np.isnan(evaluation.measured)
     if not (evaluation.sound and measured.any()):
@@ -54,12 +100,8 @@ def robust_covariance_of(evaluation: Evaluation) -> Covariance:
     return _stationary(errors[within], measured[within], moves.reshape(*errors.shape, count)[within])
 
 
-def _stationary(
-    errors: Float[np.ndarray, "samples columns"],
-    measured: Float[np.ndarray, "samples columns"],
-    moves: Float[np.ndarray, "samples columns parameters"],
-) -> Covariance:
-    """The covariance for stationary noise: R(t, s) depends on t - s only.
+def _stationary(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
+    """The covariance for stationary noise: R(t, s) depends on t - s only. The first axis of all arrays is time.
 
     Bartlett's weights make the sum over lags positive. Sums over lags are products of spectra.
     """
@@ -79,21 +121,16 @@ def _stationary(
     return np.fft.irfft(density, length, axis=0)[0]
 
 
-def _window_by_window(
-    errors: Float[np.ndarray, "windows residuals"],
-    measured: Float[np.ndarray, "windows residuals"],
-    moves: Float[np.ndarray, "windows residuals parameters"],
-) -> Covariance:
+def _window_by_window(errors: np.ndarray, measured: np.ndarray, moves: np.ndarray) -> Spread:
     """The covariance for many windows: the residuals of the windows are draws of one random vector.
 
     The initial state of a window absorbs some slow noise, more at its ends than in its middle, so residuals are not
     stationary. The covariance of the vector, and of the vector with its successor, is the mean over the windows.
     """
-    windows = len(moves)
 
-    def contribution(apart: int) -> Covariance:
+    def contribution(apart: int) -> Spread:
         """The contribution of all pairs of windows that are `apart` windows apart."""
-        count = windows - apart
+        count = len(moves) - apart
         pairs = measured[:count].T @ measured[apart:]
         covariance = errors[:count].T @ errors[apart:] / np.maximum(pairs, 1)
         return np.tensordot(moves[:count], covariance @ moves[apart:], axes=((0, 1), (0, 1)))

@@ -17,12 +17,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar
-from ..estimate import Estimate, as_estimate, best_start, check_dynamic_count
+from ..estimate import Estimate, as_estimate, best_start, check_count
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
 
 Rows = Float[Array, "samples 3 columns"]
+Matrix = Float[Array, "parameters parameters"]
 
 # Standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It matters only
 # for parameters that are not excited.
@@ -35,7 +36,7 @@ class Regression(NamedTuple):
     - `center`, `half_width`: of the bracket; a half-width of 0 holds a parameter.
     - `rates`: NaN if not measured, and at the first sample if the initial state is known.
     - `anchor`: the known initial rates; NaN if they are free. `anchored`: whether they are known.
-    - `memory`, `forgetting`, `bridge`: see `RecursiveLeastSquares`.
+    - `memory`, `bridge`, `forgetting`: see `RecursiveLeastSquares`.
     """
 
     problem: ShootingProblem
@@ -45,8 +46,23 @@ class Regression(NamedTuple):
     anchor: Float[Array, "3"]
     anchored: bool
     memory: Scalar
-    forgetting: Scalar
     bridge: Count
+    forgetting: Scalar
+
+    @classmethod
+    def of(cls, problem: ShootingProblem, memory: Scalar, bridge: Count, forgetting: Scalar) -> "Regression":
+        """The regression of a flight's body rates. Parameters in which it is not linear stay at their center."""
+        unknowns, rates = problem.unknowns.usable, problem.restrict("rates")
+        linear = np.array([each.linear and not each.in_forcing for each in problem.model.parameters])
+        anchored = problem.initial_state is not None
+        anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
+        half_width, measured = jnp.where(linear, unknowns.width, 0.0), rates.measured()[:, :3]
+        return cls(problem, unknowns.center, half_width, measured, anchor, anchored, memory, bridge, forgetting)
+
+    @property
+    def sigma(self) -> Float[Array, "3"]:
+        """The noise of the rates [rad/s]."""
+        return self.problem.sigma[CASCADE_ORDER[:3]]
 
     def rows(self) -> tuple[Rows, Callable[[Rows], Float[Array, "samples 3"]]]:
         """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
@@ -65,7 +81,7 @@ class Regression(NamedTuple):
         if self.problem.flight.stretch is not None:
             usable &= (jnp.diff(self.problem.flight.stretch, append=-1) == 0)[:, None]
         increments = jnp.where(usable[..., None], increments, 0.0)
-        output = filled / self.problem.sigma[CASCADE_ORDER[:3]]
+        output = filled / self.sigma
         decay = self.memory * self.forgetting
 
         def step(carry, sample):
@@ -80,7 +96,7 @@ class Regression(NamedTuple):
             return (integral, mean, count), jnp.where(measured[:, None], scale[:, None] * deviation, 0.0)
 
         exact = jnp.where(decay < 1, 1.0, jnp.inf)
-        first = jnp.where(jnp.isnan(self.anchor), 0.0, self.anchor) / self.problem.sigma[CASCADE_ORDER[:3]]
+        first = jnp.where(jnp.isnan(self.anchor), 0.0, self.anchor) / self.sigma
         zero = jnp.zeros_like(increments[0])
         start = (zero, zero.at[:, -1].set(first), jnp.where(self.anchored, exact, 0.0) * jnp.ones(3))
         return jax.lax.scan(step, start, (increments, usable, output, measured))[1]
@@ -106,7 +122,7 @@ class Regression(NamedTuple):
         The input of row k acts from t_k to t_{k+1}. Forward Euler uses the rates at t_k; any other method uses the mean
         of both ends (the trapezoidal rule), with an error of the order T^2.
         """
-        model, sigma, dt = self.problem.model, self.problem.sigma[CASCADE_ORDER[:3]], self.problem.flight.dt
+        model, sigma, dt = self.problem.model, self.sigma, self.problem.flight.dt
         center, half_width = self.center, self.half_width
 
         def acceleration(steps, rates, forcing):
@@ -123,26 +139,68 @@ class Regression(NamedTuple):
             increments = (increments + jax.vmap(at)(rates[1:], forcing)) / 2
         return jnp.concatenate([increments, jnp.zeros_like(increments[:1])])
 
+    def covariance(
+        self, rows: Rows, back: Callable[[Rows], Float[Array, "samples 3"]], steps: Parameters, inverse: Matrix
+    ) -> Matrix:
+        """The covariance of the solution `steps` from white noise in the measured rates, to first order.
 
-def regression(
-    problem: ShootingProblem, *, memory: Scalar, bridge: Count, forgetting: Scalar | float = 1.0
-) -> Regression:
-    """The regression of a flight's body rates. Parameters in which it is not linear stay at their center."""
-    unknowns, rates = problem.unknowns.usable, problem.restrict("rates")
-    linear = np.array([each.linear and not each.in_forcing for each in problem.model.parameters])
-    anchored = problem.initial_state is not None
-    anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
-    return Regression(
-        problem=problem,
-        center=unknowns.center,
-        half_width=jnp.where(linear, unknowns.width, 0.0),
-        rates=rates.measured()[:, :3],
-        anchor=anchor,
-        anchored=anchored,
-        memory=memory,
-        forgetting=jnp.asarray(forgetting, dtype=float),
-        bridge=bridge,
-    )
+        The solution satisfies g(Y) = X(Y)^T (y(Y) - X(Y) steps) = 0. The derivative of g with respect to each measured
+        rate carries the noise through both the regressors and the outputs. So errors in variables are included, and the
+        result holds for coloured differences and any weights. The bias, a second-order effect of the noise, is not
+        included.
+        """
+        age = jnp.arange(rows.shape[0])[::-1]
+        weight = (self.forgetting**age)[:, None, None]
+        regressors, output = rows[..., :-1], rows[..., -1]
+        residuals = output - (regressors * steps).sum(axis=-1)
+
+        def sensitivity_of(one: Parameters) -> Float[Array, "samples 3"]:
+            """The derivative of one element of g; `one` is 1 at the element."""
+            regressor = (regressors * one).sum(axis=-1)[..., None]
+            by_regressors = residuals[..., None] * one - regressor * steps
+            return back(weight * jnp.concatenate([by_regressors, regressor], axis=-1))
+
+        count = steps.shape[0]
+        sensitivity = (jax.vmap(sensitivity_of)(jnp.eye(count, dtype=float)) * self.sigma).reshape(count, -1)
+        spread = gram(sensitivity) + _prior(count)
+        half = (inverse[:, :, None] * spread[None, :, :]).sum(axis=1)
+        covariance = (half[:, :, None] * inverse[None, :, :]).sum(axis=1)
+        return (covariance + covariance.T) / 2
+
+    def answer(
+        self, steps: Parameters, covariance: Matrix, history: Float[Array, "samples parameters"] | None = None
+    ) -> Estimate:
+        """A solution as an estimate, with the initial state and the cost of a simulation.
+
+        A parameter that is not identifiable can have any value. If the flight cannot be simulated with it, the estimate
+        is the bracket's center. `history`: the solution after each sample, in half-widths from the center.
+        """
+        problem, center, half_width = self.problem, self.center, self.half_width
+        history = None if history is None else center + half_width * history
+        parameters = center + half_width * steps if history is None else history[-1]
+        covariance = half_width[:, None] * covariance * half_width[None, :]
+        identifiable = problem.unknowns.usable.identifiable(jnp.sqrt(jnp.diagonal(covariance))).all()
+        initial_state, rollouts = best_start(problem, parameters)
+        choices = (parameters, initial_state), (center, problem.first_state()[0])
+        choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
+        # One after the other, so that the simulation is compiled once.
+        shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
+        flies = shots.sound[0] & jnp.isfinite(shots.cost[0])
+        (parameters, initial_state), shot = jax.tree.map(
+            lambda both: jnp.where(identifiable | flies, *both), (choices, shots)
+        )
+        return as_estimate(
+            problem,
+            parameters=parameters,
+            covariance=covariance,
+            initial_state=initial_state,
+            cost=shot.cost,
+            rollouts=rollouts + 2,
+            sweeps=1,
+            sound=shot.sound,
+            done=jnp.ones((), dtype=bool),
+            history=history,
+        )
 
 
 def check_linear(problem: ShootingProblem) -> None:
@@ -159,9 +217,7 @@ def check_linear(problem: ShootingProblem) -> None:
         )
 
 
-def normal_equations(
-    rows: Float[Array, "*rows columns"],
-) -> tuple[Float[Array, "parameters parameters"], Float[Array, " parameters"]]:
+def normal_equations(rows: Float[Array, "*rows columns"]) -> tuple[Matrix, Float[Array, " parameters"]]:
     """X^T X and X^T y of rows [X, y]. Plain sums give the same digits alone and in a batch."""
     rows = rows.reshape(-1, rows.shape[-1])
     regressors, output = rows[:, :-1], rows[:, -1]
@@ -169,96 +225,21 @@ def normal_equations(
     return information, (regressors * output[:, None]).sum(axis=0)
 
 
-def solve(
-    information: Float[Array, "parameters parameters"], moment: Float[Array, " parameters"]
-) -> tuple[Float[Array, " parameters"], Float[Array, "parameters parameters"]]:
+def solve(information: Matrix, moment: Float[Array, " parameters"]) -> tuple[Float[Array, " parameters"], Matrix]:
     """The least-squares solution under the diffuse prior, and the inverse of the normal matrix."""
-    inverse = invert(information + prior(moment.shape[0]))
+    inverse = invert(information + _prior(moment.shape[0]))
     return (inverse * moment).sum(axis=-1), inverse
 
 
-def prior(count: int) -> Float[Array, "parameters parameters"]:
-    """The information of the diffuse prior."""
+def _prior(count: int) -> Matrix:
     return jnp.eye(count, dtype=float) / DIFFUSE**2
 
 
-def propagated_covariance(
-    regression: Regression,
-    rows: Rows,
-    back: Callable[[Rows], Float[Array, "samples 3"]],
-    steps: Float[Array, " parameters"],
-    inverse: Float[Array, "parameters parameters"],
-) -> Float[Array, "parameters parameters"]:
-    """The covariance of the solution `steps` from white noise in the measured rates, to first order.
-
-    The solution satisfies g(Y) = X(Y)^T (y(Y) - X(Y) steps) = 0. The derivative of g with respect to each measured rate
-    carries the noise through both the regressors and the outputs. So errors in variables are included, and the result
-    holds for coloured differences and any weights. The bias, a second-order effect of the noise, is not included.
-    """
-    age = jnp.arange(rows.shape[0])[::-1]
-    weight = (regression.forgetting**age)[:, None, None]
-    regressors, output = rows[..., :-1], rows[..., -1]
-    residuals = output - (regressors * steps).sum(axis=-1)
-
-    def sensitivity_of(one: Float[Array, " parameters"]) -> Float[Array, "samples 3"]:
-        """The derivative of one element of g; `one` is 1 at the element."""
-        regressor = (regressors * one).sum(axis=-1)[..., None]
-        by_regressors = residuals[..., None] * one - regressor * steps
-        return back(weight * jnp.concatenate([by_regressors, regressor], axis=-1))
-
-    identity = jnp.eye(steps.shape[0], dtype=float)
-    sensitivity = jax.vmap(sensitivity_of)(identity) * regression.problem.sigma[CASCADE_ORDER[:3]]
-    sensitivity = sensitivity.reshape(steps.shape[0], -1)
-    spread = gram(sensitivity) + prior(steps.shape[0])
-    half = (inverse[:, :, None] * spread[None, :, :]).sum(axis=1)
-    covariance = (half[:, :, None] * inverse[None, :, :]).sum(axis=1)
-    return (covariance + covariance.T) / 2
-
-
-def check_settings(memory: Scalar, bridge: Count, forgetting: Scalar | None = None) -> None:
+def check_settings(memory: Scalar, bridge: Count, forgetting: Scalar | float = 1.0) -> None:
     """Raises `ValueError` for a setting of a regression that is out of range."""
     for name, value, positive in (("forgetting", forgetting, True), ("memory", memory, False)):
-        if value is not None and not isinstance(value, Tracer):
+        if not isinstance(value, Tracer):
             number = np.asarray(value)
             if number.shape != () or not ((number > 0 if positive else number >= 0) and number <= 1):
                 raise ValueError(f"`{name}` must lie in {'(' if positive else '['}0, 1], got {number}.")
-    check_dynamic_count("bridge", bridge, 0)
-
-
-def answer(
-    data: Regression,
-    steps: Float[Array, " parameters"],
-    covariance: Float[Array, "parameters parameters"],
-    *,
-    history: Float[Array, "samples parameters"] | None = None,
-) -> Estimate:
-    """A regression's solution as an estimate, with the initial state and the cost of a simulation.
-
-    A parameter that is not identifiable can have any value. If the flight cannot be simulated with it, the estimate is
-    the bracket's center. If there is a `history`, its last row is the estimate.
-    """
-    problem, center, half_width = data.problem, data.center, data.half_width
-    parameters = center + half_width * steps if history is None else history[-1]
-    covariance = half_width[:, None] * covariance * half_width[None, :]
-    identifiable = problem.unknowns.usable.identifiable(jnp.sqrt(jnp.diagonal(covariance))).all()
-    initial_state, rollouts = best_start(problem, parameters)
-    choices = (parameters, initial_state), (center, problem.first_state()[0])
-    choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
-    # One after the other, so that the simulation is compiled once.
-    shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
-    flies = shots.sound[0] & jnp.isfinite(shots.cost[0])
-    (parameters, initial_state), shot = jax.tree.map(
-        lambda both: jnp.where(identifiable | flies, *both), (choices, shots)
-    )
-    return as_estimate(
-        problem,
-        parameters=parameters,
-        covariance=covariance,
-        initial_state=initial_state,
-        cost=shot.cost,
-        rollouts=rollouts + 2,
-        sweeps=1,
-        sound=shot.sound,
-        done=jnp.ones((), dtype=bool),
-        history=history,
-    )
+    check_count("bridge", bridge, 0)
