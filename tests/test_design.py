@@ -30,7 +30,7 @@ from jaxos4 import design
 from jaxos4.cli import main
 from jaxos4.cli.design import Criterion
 from jaxos4.design import Envelope
-from jaxos4.design.fleet import LANES as BATCH, Filters, Fleet, batch_of, fly_batch
+from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
 from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
 from jaxos4.design.task import CRITERIA, bounds_of, criterion_of
 
@@ -170,7 +170,7 @@ def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, run):
     refused(run("simulate", "--speeds", str(path), "--out", "x.csv", "--duration", "5"), "--duration: ")
     np.testing.assert_allclose(np.asarray(jaxos4.read_flight("flight.csv").omega), omega, rtol=1e-6)
     from jaxos4.study import load_study
-    from jaxos4.study.flights import fleet_of
+    from jaxos4.study.cell import fleet_of
 
     study = 'excitations = ["best"]\ndurations = [{}]\n[input]\nbest = "new.csv"\n'
     (folder / "study.toml").write_text(study.format(2))
@@ -223,7 +223,7 @@ def test_the_bounds_are_those_of_filter_error(references):
 
 def test_repeated_references_add_the_same_information(references):
     """Half of the flight without references leaves half of what they add: bounds fall with the root of the duration."""
-    filters, designed = Filters.of(LOOP, LOOP_BRACKET.half_width), references.found.designed
+    fleet, designed = references.found.task.fleet, references.found.designed
     quiet = dataclasses.replace(LOOP, gust=0.0, gyro_noise=0.0, attitude_noise=0.0, force_noise=0.0)
     period = round(designed.period / LOOP_DT)
     some = np.zeros((BATCH, *designed.inputs.shape))
@@ -231,7 +231,7 @@ def test_repeated_references_add_the_same_information(references):
     for repeats in range(1, whole + 1):
         some[repeats, : repeats * period] = designed.inputs[: repeats * period]
     flights = fly_batch(batch_of(quiet), jnp.asarray(some), jnp.asarray(LOOP_DT), jax.random.key(0))
-    information = np.asarray(filters.informations(flights)[1])[: whole + 1].sum(axis=1)
+    information = np.asarray(fleet.informations(flights)[1])[: whole + 1].sum(axis=1)
     added = np.diff(np.stack([np.diagonal(one)[[2, 5, 7]] for one in information]), axis=0)
     # The first period begins, and the last one ends, with a step.
     np.testing.assert_allclose(added / added.mean(axis=0), 1, atol=0.1)
