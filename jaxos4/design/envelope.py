@@ -66,10 +66,7 @@ class Envelope(eqx.Module):
     def of(
         cls, omega: Float[Numeric, "*inputs samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
     ) -> "Envelope":
-        """The limits that flights with these rotor speeds just keep.
-
-        `dt` is the sample time of the rotor speeds. The states may be sampled more often.
-        """
+        """The limits that flights just keep. `dt`: of the rotor speeds; the states may be sampled more often."""
         return cls(**_needs(omega, states, dt))
 
     def limited(self, limits: "Envelope | Mapping[str, float]") -> "Envelope":

@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..excitation import standard_references, with_largest
 from . import task
 from .envelope import ANGLES, RATES, Envelope, Uses
-from .fleet import INERTIAS, LANES, Filters, Fleet, batch_of, fly_batch, model_of
+from .fleet import INERTIAS, LANES, Fleet, batch_of, fly_batch, model_of
 from .task import Coefficients, Designed, Flown
 
 _LARGEST_ANGLE, _LARGEST_ACCELERATION = 1.0, 5.0
@@ -38,13 +38,10 @@ _POINTS = np.arange(200) / 200
 
 
 class Tones(NamedTuple):
-    """The tones of references, each a whole number of cycles in a period of the references.
+    """The tones of references, each a whole number of cycles in a period of the references."""
 
-    - `period`: in samples. `number`: of the tones, which are the multiples of 1 / period.
-    """
-
-    period: int
-    number: int
+    period: int  # in samples
+    number: int  # of the tones, which are the multiples of 1 / period
 
     @classmethod
     def up_to(cls, bandwidth: float, samples: int, dt: float) -> "Tones":
@@ -69,7 +66,6 @@ def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
 
 def _response(
     fleet: Fleet,
-    filters: Filters,
     envelope: Envelope,
     largest: Float[np.ndarray, "4"],
     tones: Tones,
@@ -88,13 +84,13 @@ def _response(
     references[number : 2 * number, :, 3] = _SMALL[3] * np.real(turns).T
     in_gusts = np.arange(LANES) > 2 * number  # the one before is in still air, and has no reference
     flights = fly_batch(batch_of(fleet.loop, in_gusts), jnp.asarray(references), as_float(fleet.dt), key)
-    states, (whole, channels) = np.asarray(flights.states), map(np.asarray, filters.informations(flights))
+    states, (whole, channels) = np.asarray(flights.states), map(np.asarray, fleet.informations(flights))
     excess = channels - channels[2 * number]
     each = np.stack([*np.moveaxis(excess[:number, :3], 1, 0), excess[number : 2 * number].sum(axis=1)])
     # In still air nothing is learned about the noise.
     beyond = whole.shape[-1] - channels.shape[-1]
-    each = filters.about_inertias(np.pad(each, ((0, 0), (0, 0), (0, beyond), (0, beyond))))
-    base = filters.with_prior(whole[in_gusts].mean(axis=0))
+    each = fleet.about_inertias(np.pad(each, ((0, 0), (0, 0), (0, beyond), (0, beyond))))
+    base = fleet.with_prior(whole[in_gusts].mean(axis=0))
     scale = np.sqrt(np.diagonal(base))
     scale[: len(INERTIAS)] = 1  # their bounds are relative already
     unit = np.outer(scale, scale)
@@ -133,7 +129,6 @@ class References(task.AbstractTask):
     scale: Float[Numeric, "3"]
     unexcited: Float[Numeric, " parameters"]
     fleet: Fleet
-    filters: Filters
     base: Float[Numeric, "unknowns unknowns"]
     added: Float[Numeric, "references tones unknowns unknowns"]
     signals: dict[str, Float[Numeric, "axes points coefficients"]]
@@ -188,7 +183,7 @@ class References(task.AbstractTask):
 
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
         """See `AbstractTask`. The bounds are those of filter error, after a flight through gusts."""
-        bounds = self.fleet.bounds(self.filters, {name: references for name, (references, _) in flown.items()})
+        bounds = self.fleet.bounds({name: references for name, (references, _) in flown.items()})
         dt = self.fleet.dt
         return {
             name: Designed(inputs, dt, bounds[name], uses, dt * self.tones.period)
@@ -242,25 +237,24 @@ def design_references(
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model_of(loop)) if bracket is None else bracket
     samples, largest = round(duration / dt) + 1, np.array([angle, angle, angle, acceleration])
-    fleet, filters = Fleet.of(loop, bracket, dt, key), Filters.of(loop, bracket.half_width)
+    fleet = Fleet.of(loop, bracket, dt, key)
     envelope = fleet.envelope(standard_references(samples, dt, largest)["3211"], limits or {})
     tones = Tones.up_to(bandwidth, samples, dt)
     progress("flying tones")
     references = References(
         envelope=envelope,
         scale=np.asarray(loop.airframe.inertia),
-        unexcited=_LITTLE * filters.bounds(np.zeros((filters.prior.shape[0],) * 2)),
+        unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
-        filters=filters,
         largest=largest,
         basis=as_float(tones.basis(_POINTS)),
         tones=tones,
         samples=samples,
         size=8 * tones.number,
-        names=filters.targets_first(INERTIAS, filters.model.parameter_names),
-        units=filters.targets_first(("kg m^2",) * 3, filters.model.parameter_units),
+        names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
+        units=fleet.inertias_first(("kg m^2",) * 3, fleet.model.parameter_units),
         criterion=criterion,
-        **_response(fleet, filters, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
+        **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )
     return task.solve(references, compare=compare, key=key, progress=progress)
 

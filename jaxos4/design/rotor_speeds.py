@@ -141,10 +141,7 @@ class RotorSpeeds(task.AbstractTask):
         return self._within_limits(np.asarray(self.make(as_float(coefficients))))
 
     def _within_limits(self, inputs: Inputs) -> Flown:
-        """The input with the largest amplitude that all vehicles can fly.
-
-        It is found at the sample time, and corrected until the limits hold at a tenth of it.
-        """
+        """The input with the largest amplitude that all vehicles can fly, also at a tenth of the sample time."""
         hover = hover_squares(self.model.airframe, self.envelope)
 
         def amplified(factor: float) -> Inputs:

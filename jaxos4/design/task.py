@@ -153,8 +153,7 @@ class Design(NamedTuple):
     def gain(self, name: str) -> tuple[float, int]:
         """The designed bounds over those of a standard input.
 
-        **Returns:** the geometric mean over the targets that the standard input excites, NaN without any; and their
-        number.
+        **Returns:** the geometric mean over the targets that it excites, NaN without any; and the number of these.
         """
         count = self.task.scale.size
         own, other = (one.bounds[:count] for one in (self.designed, self.standard[name]))
@@ -202,7 +201,7 @@ def _minimise(
 def bounds_of(information: Float[Array, "unknowns unknowns"], count: int) -> tuple[Float[Array, "count count"], Scalar]:
     """The smallest covariance of the first `count` unknowns, and the logarithm of its determinant.
 
-    The other unknowns are nuisances: estimated too, and eliminated by the Schur complement.
+    The others are estimated too, and eliminated by the Schur complement.
     """
     factor, basis = joint_factor(information[None], count)
     determinant = -2 * jnp.log(jnp.diagonal(factor[0, :count, -count:])).sum()
