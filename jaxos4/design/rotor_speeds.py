@@ -290,13 +290,11 @@ def design_input(
       (`envelope_of`).
     - `bracket`: the knowledge of the parameters before the flight; by default the model's.
     - `duration`, `dt`: length and sample time [s].
-    - `channels`: the channels that will be measured: `"rates"`, `"attitude"` or `"all"`.
-    - `sigma`: their noise, in the order of `STATE_NAMES`.
+    - `channels`: what will be measured: `"rates"`, `"attitude"` or `"all"`. `sigma`: its noise, as `STATE_NAMES`.
     - `start_is_known`: whether the flight starts exactly at rest. If not, the initial state will be estimated too.
     - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
       bound. Bounds are shares of the bracket's half-widths.
-    - `bandwidth`: the highest frequency [Hz].
-    - `compare`: whether to judge the standard inputs in the same envelope too.
+    - `bandwidth`: the highest frequency [Hz]. `compare`: whether to judge the standard inputs in the envelope too.
     - `key`: for the draws and the starts, or a seed. `progress`: called with the name of each stage.
 
     **Raises:** `InputError` if an argument is out of range, the vehicle cannot hover within the envelope, or no input
@@ -310,13 +308,12 @@ def design_input(
     progress("envelope")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
-    envelope = limits
-    if not isinstance(envelope, Envelope):
-        envelope = envelope_of(model, bracket=bracket, duration=duration, dt=dt, key=key).limited(limits or {})
+    if not isinstance(limits, Envelope):
+        limits = envelope_of(model, bracket=bracket, duration=duration, dt=dt, key=key).limited(limits or {})
     center, others = np.asarray(bracket.center)[None], drawn(bracket, jax.random.fold_in(key, 1), _DRAWS - 1)
-    make = Multisine.within(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
+    make = Multisine.within(model.airframe, limits, round(duration / dt) + 1, dt, bandwidth)
     rotor_speeds = RotorSpeeds(
-        envelope=envelope,
+        envelope=limits,
         scale=np.asarray(bracket.half_width),
         unexcited=np.asarray(model.half_width),
         model=model,
