@@ -5,10 +5,14 @@ import json
 import numpy as np
 import xarray as xr
 
+import jaxos4
+from jaxos4.flight import STATE_NAMES, STATE_UNITS
 from jaxos4.study import OUTCOMES as RESULTS
+from jaxos4.study.cell import LEVELS
+from jaxos4.study.metrics import SCENARIO
 
-PARAMETERS = tuple(f"alpha{i}" for i in range(1, 9))
-UNITS = ("1", "1/s", "1/(kg m^2)", "1", "1/s", "1/(kg m^2)", "1", "1/(kg m^2)")
+MODEL = jaxos4.PublishedOS4()
+UNITS = MODEL.parameter_units
 TRUTH = np.array([-0.73333333, 6e-9, 133.33333, 0.73333333, 6e-9, 133.33333, 0.0, 76.923077])
 HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
 # Cramer-Rao standard deviations of the standard flight at a noise scale of 1.
@@ -28,11 +32,7 @@ ESTIMATORS = {
     "svsf": (4.0, 3.0, 0, True),
     "kalman": (1.3, 0.2, 24, False),
 }
-LEVELS = np.array([0.5, 0.9, 0.95, 0.99])
-GAUSSIAN = np.array([0.67449, 1.64485, 1.95996, 2.57583])
-SCENARIO = ("model", "airframe", "excitation", "duration", "method", "noise", "scale", "width", "channels", "estimator")
-STATES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
-STATE_UNITS = ("m", "m/s") * 3 + ("rad", "rad/s") * 3
+GAUSSIAN = np.array([0.67449, 1.64485, 1.95996, 2.57583])  # for LEVELS
 
 
 def synthetic_study(
@@ -53,24 +53,13 @@ def synthetic_study(
     truth, drawn over 60 % of the bracket.
     """
     rng = np.random.default_rng(seed)
-    coordinates = {
-        "model": list(models),
-        "airframe": ["os4"],
-        "excitation": ["multisine"],
-        "duration": [5.0],
-        "method": ["euler"],
-        "noise": ["white"],
-        "scale": list(scales),
-        "width": [1.0],
-        "channels": list(channels),
-        "estimator": list(estimators),
-    }
-    shape = tuple(len(values) for values in coordinates.values())
+    values = (models, ["os4"], ["multisine"], [5.0], ["euler"], ["white"], scales, [1.0], channels, estimators)
+    coordinates = {name: list(some) for name, some in zip(SCENARIO, values, strict=True)}
+    shape = tuple(map(len, values))
     truth = np.broadcast_to(TRUTH, (*shape[:-1], flights, 8)).copy()
     if drawn:
         truth += 0.6 * HALF_WIDTH * rng.uniform(-1, 1, truth.shape)
-    estimate = np.full((*shape, flights, 8), np.nan)
-    std, bound = estimate.copy(), estimate.copy()
+    estimate, std, bound = (np.full((*shape, flights, 8), np.nan) for _ in range(3))
     half_width = np.full((*shape, flights, 8, 4), np.nan)
     result = np.full((*shape, flights), RESULTS.index("successful"), dtype=np.int8)
     rollouts = np.zeros((*shape, flights), dtype=np.int32)
@@ -89,24 +78,27 @@ def synthetic_study(
         cost[index] = 0.5 * rng.chisquare(500, flights)
         if estimators[index[-1]] == "hybrid":
             hit[index] = rng.random(flights) < 0.97
+
+    def spoil(scale, estimator, names):
+        """Flights of a cell end without an estimate."""
+        cell = (*[0] * 6, scale, 0, 0, estimator)
+        for flight, name in names.items():
+            result[cell][flight] = RESULTS.index(name)
+            for numbers in (estimate, std, half_width):
+                numbers[cell][flight] = np.nan
+        return cell
+
     if spoiled:
-        last, slow = len(estimators) - 1, tuple(0 for _ in shape)
-        _spoil(result, estimate, std, half_width, slow[:-1] + (0,), {1: "at_bound", 3: "nonfinite_trajectory"})
-        _spoil(result, estimate, std, half_width, slow[:6] + (len(scales) - 1, 0, 0, 0), {2: "max_sweeps"})
-        result[slow[:6] + (len(scales) - 1, 0, 0, 1)][5:8] = RESULTS.index("unidentifiable")
-        for scale, name in ((len(scales) - 1, "failed"), (0, "not_run")):
-            cell = slow[:6] + (scale, 0, 0, last)
-            _spoil(result, estimate, std, half_width, cell, dict.fromkeys(range(flights), name))
+        worst, last = len(scales) - 1, len(estimators) - 1
+        spoil(0, 0, {1: "at_bound", 3: "nonfinite_trajectory"})
+        spoil(worst, 0, {2: "max_sweeps"})
+        result[(*[0] * 6, worst, 0, 0, 1)][5:8] = RESULTS.index("unidentifiable")
+        for scale, name in ((worst, "failed"), (0, "not_run")):
+            cell = spoil(scale, last, dict.fromkeys(range(flights), name))
             rollouts[cell], cost[cell] = 0, np.nan
             bound[cell] = np.nan if name == "not_run" else bound[cell]
-        failures.append(
-            {
-                "cell": 7,
-                **{name: values[-1] for name, values in coordinates.items()},
-                "estimator": estimators[last],
-                "message": "FloatingPointError: <b>the filter's covariance</b> is not positive definite",
-            }
-        )
+        message = "FloatingPointError: <b>the filter's covariance</b> is not positive definite"
+        failures.append({"cell": 7, **{name: some[-1] for name, some in coordinates.items()}, "message": message})
     per_flight, per_parameter = (*SCENARIO, "flight"), (*SCENARIO, "flight", "parameter")
     wide = ("model", "airframe", "width", "parameter")
     center = np.broadcast_to(TRUTH + 0.2 * HALF_WIDTH * (not drawn), (len(models), 1, 1, 8))
@@ -128,9 +120,9 @@ def synthetic_study(
         coords={
             **coordinates,
             "flight": np.arange(flights),
-            "parameter": list(PARAMETERS),
+            "parameter": list(MODEL.parameter_names),
             "unit": ("parameter", list(UNITS)),
-            "level": LEVELS,
+            "level": list(LEVELS),
         },
         attrs={
             "title": "A synthetic study",
@@ -150,46 +142,37 @@ def synthetic_study(
         dataset[name].attrs = {"long_name": str(name).replace("_", " "), "units": "1"}
     for name in ("truth", "center", "bracket_half_width", "estimate", "std", "half_width", "bound"):
         dataset[name].attrs["units"] = "unit"
-    dataset["result"].attrs |= {
-        "flag_values": np.arange(len(RESULTS), dtype=np.int8),
-        "flag_meanings": " ".join(RESULTS),
-    }
+    flags = {"flag_values": np.arange(len(RESULTS), dtype=np.int8), "flag_meanings": " ".join(RESULTS)}
+    dataset["result"].attrs |= flags
     return dataset
-
-
-def _spoil(result, estimate, std, half_width, cell, flights):
-    for flight, name in flights.items():
-        result[cell][flight] = RESULTS.index(name)
-        for numbers in (estimate, std, half_width):
-            numbers[cell][flight] = np.nan
 
 
 def _example(rng, estimators):
     time = np.arange(0, 5.001, 0.02)
     phase = np.arange(12)[:, None]
     true = (np.sin(2 * np.pi * (0.3 + 0.05 * phase) * time + phase) * (0.2 + 0.05 * phase)).T
-    sigma = np.array([0.005, 0.02] * 3 + [0.005, 0.01] * 3)
     growth = 0.002 + 0.003 * np.arange(len(estimators))[:, None, None]
     drift = growth * time[:, None] * np.cos(3 * time[:, None] + phase.T)
+    noise = np.asarray(jaxos4.SENSOR_SIGMA) * rng.standard_normal(true.shape)
     variables = {
         "example_true": (("sample", "state"), true),
-        "example_measured": (("sample", "state"), true + sigma * rng.standard_normal(true.shape)),
+        "example_measured": (("sample", "state"), true + noise),
         "example_simulated": (("estimator", "sample", "state"), true + drift),
     }
-    coordinates = {"time": ("sample", time), "state": list(STATES), "state_unit": ("state", list(STATE_UNITS))}
+    state = {"state": list(STATE_NAMES), "state_unit": ("state", list(STATE_UNITS))}
+    coordinates = {"time": ("sample", time), **state}
     if "ibss" in estimators:
-        sweeps = np.arange(9)
+        coordinates["sweep"] = sweeps = np.arange(9)
         shrink = np.maximum(0.35 ** sweeps[:, None], 2e-4) * (1 + 0.3 * rng.random((9, 8)))
         variables["search_half_width"] = (("sweep", "parameter"), HALF_WIDTH * shrink)
         errors = HALF_WIDTH * 0.4 * 0.3 ** sweeps[:, None] * rng.standard_normal((9, 8)) + BOUND["all"]
         variables["search_estimate"] = (("sweep", "parameter"), TRUTH + errors)
-        coordinates["sweep"] = sweeps
     if "network" in estimators:
         steps = np.arange(0, 3001, 250.0)
         loss = 0.02 + np.exp(-steps / 700)
         pad = np.where(np.arange(13) < 10, 1.0, np.nan)
-        variables["training_step"] = (("training", "check"), np.stack([steps, steps * pad]))
-        variables["training_loss"] = (("training", "check"), np.stack([loss, 1.5 * loss * pad]))
-        variables["validation_loss"] = (("training", "check"), np.stack([1.1 * loss, 1.7 * loss * pad]))
+        pairs = {"training_step": (steps, steps), "training_loss": (loss, 1.5 * loss)}
+        pairs |= {"validation_loss": (1.1 * loss, 1.7 * loss)}
+        variables |= {name: (("training", "check"), np.stack([a, b * pad])) for name, (a, b) in pairs.items()}
         coordinates["training"] = ["network, rates", "hybrid, all"]
     return xr.Dataset(variables, coords=coordinates)

@@ -30,10 +30,8 @@ from jaxos4 import design
 from jaxos4.cli import main
 from jaxos4.cli.design import Criterion
 from jaxos4.design import Envelope
-from jaxos4.design.envelope import largest
-from jaxos4.design.filtered import Filters
 from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
-from jaxos4.design.open_loop import VEHICLES, drawn, fly_finely
+from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
 from jaxos4.design.task import CRITERIA, bounds_of, criterion_of
 
 MODEL = jaxos4.PublishedOS4()
@@ -136,7 +134,7 @@ def test_a_designed_input_tells_more_than_the_standard_inputs(speeds):
 def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(speeds):
     others, designed, limits = drawn(BRACKET, jax.random.key(77), VEHICLES), speeds.found.designed, speeds.found.task
     states = fly_finely(MODEL, others, jnp.asarray(designed.inputs), jnp.asarray(DT, float))
-    shares = limits.envelope.shares_of(Envelope.of(designed.inputs, states, float(DT)))
+    shares = limits.envelope.shares(designed.inputs, states, float(DT))
     assert max(shares.values()) <= 1
     assert 0.9 < max(designed.uses.values()) <= 1
 
@@ -172,7 +170,7 @@ def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, run):
     refused(run("simulate", "--speeds", str(path), "--out", "x.csv", "--duration", "5"), "--duration: ")
     np.testing.assert_allclose(np.asarray(jaxos4.read_flight("flight.csv").omega), omega, rtol=1e-6)
     from jaxos4.study import load_study
-    from jaxos4.study.flights import fleet_of
+    from jaxos4.study.cell import fleet_of
 
     study = 'excitations = ["best"]\ndurations = [{}]\n[input]\nbest = "new.csv"\n'
     (folder / "study.toml").write_text(study.format(2))
@@ -225,7 +223,7 @@ def test_the_bounds_are_those_of_filter_error(references):
 
 def test_repeated_references_add_the_same_information(references):
     """Half of the flight without references leaves half of what they add: bounds fall with the root of the duration."""
-    filters, designed = Filters.of(LOOP, LOOP_BRACKET.half_width), references.found.designed
+    fleet, designed = references.found.task.fleet, references.found.designed
     quiet = dataclasses.replace(LOOP, gust=0.0, gyro_noise=0.0, attitude_noise=0.0, force_noise=0.0)
     period = round(designed.period / LOOP_DT)
     some = np.zeros((BATCH, *designed.inputs.shape))
@@ -233,7 +231,7 @@ def test_repeated_references_add_the_same_information(references):
     for repeats in range(1, whole + 1):
         some[repeats, : repeats * period] = designed.inputs[: repeats * period]
     flights = fly_batch(batch_of(quiet), jnp.asarray(some), jnp.asarray(LOOP_DT), jax.random.key(0))
-    information = np.asarray(filters.informations(flights).channels)[: whole + 1].sum(axis=1)
+    information = np.asarray(fleet.informations(flights)[1])[: whole + 1].sum(axis=1)
     added = np.diff(np.stack([np.diagonal(one)[[2, 5, 7]] for one in information]), axis=0)
     # The first period begins, and the last one ends, with a step.
     np.testing.assert_allclose(added / added.mean(axis=0), 1, atol=0.1)
@@ -326,20 +324,17 @@ def test_criteria_are_means_of_the_relative_bounds_without_the_nuisances():
     assert [str(one) for one in Criterion] == list(CRITERIA)
 
 
-@jax.jit
-def largest_uses(envelope, omega, states):
-    return largest(envelope.uses_of_rotors(omega, jnp.asarray(DT)) | envelope.uses_of_states(states))
-
-
 def test_an_envelope_is_just_kept_by_its_flight_and_a_limit_must_be_a_positive_number():
     flight = standard_flight()
-    envelope = Envelope.of(flight.omega, flight.states, float(DT))
-    uses = largest_uses(envelope, flight.omega, flight.states)
-    np.testing.assert_allclose(np.concatenate(list(uses.values())).max(), 1, rtol=1e-6)
-    assert set(envelope.shares_of(envelope).values()) == {1.0}
-    half = envelope.limited({"slowest": 2 * float(envelope.slowest), "angle": 0.5 * envelope.angle, "velocity": 1e-3})
-    shares = envelope.shares_of(half)
+    envelope, flown = Envelope.of(flight.omega, flight.states, float(DT)), (flight.omega, flight.states, float(DT))
+    uses = jax.jit(Envelope.uses)(envelope, *flown)
+    np.testing.assert_allclose([np.abs(use).max() for use in uses.values()], 1, rtol=1e-6)
+    assert set(envelope.shares(*flown).values()) == {1.0}
+    half = envelope.limited({"slowest": float(envelope.slowest) / 2, "angle": 2 * envelope.angle, "velocity": 1e3})
+    shares = half.shares(*flown)
     assert (shares["slowest"], shares["angle"], shares["rate"]) == pytest.approx((0.5, 0.5, 1))
+    failed = envelope.shares(flight.omega, flight.states.at[200:].set(np.nan), float(DT))
+    assert failed["angle"] == failed["distance"] == np.inf
     for name, value, message in (
         ("angle", [0.1, 0.2], "one number or three"),
         ("distance", np.inf, "positive and finite"),

@@ -14,8 +14,7 @@ from lanes import LANES, lost
 
 import jaxos4
 from jaxos4.estimators.hybrid import search_from_seed
-from jaxos4.networks.architecture import Regressor, first_regressor
-from jaxos4.networks.features import FEATURES, Coordinates, Purpose, draw_chunks
+from jaxos4.networks.features import FEATURES, Coordinates, Features
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 DURATION = 3.0
@@ -101,7 +100,7 @@ def names(estimates):
 @eqx.filter_jit
 def features_of(kind, free=False):
     problem = problem_of(free=free)
-    return FEATURES[kind].of(problem, Coordinates.of(problem, BRACKET, jnp.asarray(1.0)))
+    return Features.of(kind, problem, Coordinates.of(problem, BRACKET, jnp.asarray(1.0)))
 
 
 @pytest.mark.parametrize("kind", FEATURES)
@@ -151,42 +150,7 @@ def test_the_score_is_one_gauss_newton_step():
     np.testing.assert_allclose(step.values * BRACKET.half_width, alpha - BRACKET.center, rtol=0.05, atol=1e-3)
 
 
-def test_features_of_flights_that_diverge_are_not_a_number():
-    problem = problem_of(model=CORRECTED())
-    wild = jaxos4.Bracket.around(CORRECTED().alpha, 100 * CORRECTED().half_width)
-    features = eqx.filter_jit(lambda: FEATURES["score"].of(problem, Coordinates.of(problem, wild, jnp.asarray(1.0))))()
-    (chunk,) = draw_chunks(features, 200, key=jax.random.key(0), purpose=Purpose.VALIDATION)
-    flown = np.isfinite(chunk.features).all(axis=1)
-    assert 0 <= flown.mean() < 1
-
-
 # Training.
-
-
-def test_first_weights_are_uniform_as_those_of_equinox():
-    linear_map, size = jnp.ones((8, 9)), {"width": 128, "depth": 3}
-    draw = eqx.filter_jit(lambda key: first_regressor(linear_map, "mlp", **size, key=key))
-    first, second = draw(jax.random.key(0)), draw(jax.random.key(1))
-    expected = eqx.filter_eval_shape(lambda key: Regressor(linear_map, "mlp", **size, key=key), jax.random.key(0))
-    assert jax.tree.structure(first) == jax.tree.structure(expected)
-    shapes = [[getattr(leaf, "shape", None) for leaf in jax.tree.leaves(regressor)] for regressor in (first, expected)]
-    assert shapes[0] == shapes[1]
-    np.testing.assert_array_equal(first.skip, linear_map)
-    used = set()
-
-    def layers(regressor):
-        approximator = regressor.approximator
-        return *approximator.hidden.layers, approximator.gate, approximator.last, *regressor.spread.layers
-
-    for layer, elsewhere in zip(layers(first), layers(second), strict=True):
-        for x, y in ((layer.weight, elsewhere.weight), (layer.bias, elsewhere.bias)):
-            u = np.asarray(x).ravel() * np.sqrt(layer.in_features)
-            assert np.abs(u).max() <= 1
-            assert abs(u.mean()) < 4.5 * np.sqrt(1 / 3 / u.size)
-            assert abs(np.mean(u**2) - 1 / 3) < 4.5 * np.sqrt(4 / 45 / u.size)
-            assert not np.isclose(x, y).any()
-            assert used.isdisjoint(u.tolist())  # no number is used twice
-            used.update(u.tolist())
 
 
 @pytest.mark.usefixtures("optimised")
@@ -234,14 +198,10 @@ def test_errors_have_the_size_of_the_covariance():
 
 
 def test_the_same_key_gives_the_same_network_and_another_another():
-    small, reports = jaxos4.NetworkEstimator(**SHORT), []
-    a, b, c = (
-        small.fit(problem_of(), BRACKET, key=jax.random.key(k), progress=lambda *report: reports.append(report))
-        for k in (0, 0, 1)
-    )
+    small = jaxos4.NetworkEstimator(**SHORT)
+    a, b, c = (small.fit(problem_of(), BRACKET, key=jax.random.key(k), progress=k == 1) for k in (0, 0, 1))
     assert same(a, b)
     assert not same(a.regressor, c.regressor)
-    assert reports == [(5, 5, float(network.history[0, 1])) for network in (a, b, c)]
 
 
 def test_a_second_training_of_the_same_shapes_compiles_nothing():
@@ -302,15 +262,17 @@ def test_settings_out_of_range_are_named(changes, message):
         jaxos4.NetworkEstimator(**changes)
 
 
-def test_brackets_and_channels_that_cannot_be_trained_for_are_named():
-    small, key = jaxos4.NetworkEstimator(**SMALL), jax.random.key(0)
-    flat = jaxos4.Bracket(BRACKET.lower, BRACKET.upper.at[2].set(BRACKET.lower[2]))
-    with pytest.raises(ValueError, match=r"`bracket` of alpha3 must have a positive, finite width"):
-        small.fit(problem_of(), flat, key=key)
-    with pytest.raises(ValueError, match=r"`bracket` must hold 8 parameters, got 7"):
-        small.fit(problem_of(), jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)), key=key)
-    with pytest.raises(ValueError, match=r"`channels` 'attitude' are more than the problem's 'rates'"):
-        jaxos4.NetworkEstimator(**SMALL, channels="attitude").fit(problem_of(), BRACKET, key=key)
+@pytest.mark.parametrize(
+    ("changes", "bracket", "message"),
+    [
+        ({}, (BRACKET.lower, BRACKET.upper.at[2].set(BRACKET.lower[2])), "`bracket` of alpha3 must have a positive"),
+        ({}, (jnp.zeros(7), jnp.ones(7)), "`bracket` must hold 8 parameters, got 7"),
+        ({"channels": "attitude"}, (BRACKET.lower, BRACKET.upper), "`channels` 'attitude' are more than the problem's"),
+    ],
+)
+def test_brackets_and_channels_that_cannot_be_trained_for_are_named(changes, bracket, message):
+    with pytest.raises(ValueError, match=message):
+        jaxos4.NetworkEstimator(**changes).fit(problem_of(), jaxos4.Bracket(*bracket), key=jax.random.key(0))
 
 
 # Flights that it was not trained for.
@@ -336,8 +298,9 @@ def test_another_problem_is_an_error_that_says_what_differs(what):
         network(problem_of(**changes), BRACKET)
 
 
-def test_a_problem_may_be_a_constant_of_a_traced_function():
+def test_a_problem_may_be_a_constant_of_a_traced_function_and_an_invalid_bracket_is_a_result():
     network, problem = trained(), problem_of()
+    assert names(network(problem, jaxos4.Bracket(BRACKET.upper, BRACKET.lower))) == "bracket_invalid"
     traced = eqx.filter_jit(lambda bracket: (network.mismatch(problem), network(problem, bracket).parameters))
     assert traced(BRACKET)[0] is None
     np.testing.assert_allclose(traced(BRACKET)[1], network(problem, BRACKET).parameters, rtol=1e-12)
@@ -379,16 +342,10 @@ def test_in_a_batch_each_lane_has_its_own_result_and_leaves_the_others_alone():
     def answers(states, omega, noise):
         return network(problem_of(states, omega=omega, noise=noise), BRACKET)
 
-    def sound(*data):
-        return jax.tree.map(np.asarray, answers(*data))
-
-    before = sound(states, omega, noise)
+    before = jax.tree.map(np.asarray, answers(states, omega, noise))
     assert names(before) == ["successful"] * lanes
-    broken = sound(
-        states.at[1, 7, 7].set(jnp.inf).at[3].set(jnp.nan).at[5].multiply(4.0),
-        omega.at[2, 9, 1].add(1.0),
-        noise.at[4].set(20.0),
-    )
+    states = states.at[1, 7, 7].set(jnp.inf).at[3].set(jnp.nan).at[5].multiply(4.0)
+    broken = jax.tree.map(np.asarray, answers(states, omega.at[2, 9, 1].add(1.0), noise.at[4].set(20.0)))
     results = names(broken)
     assert results[1] == "nonfinite_trajectory"
     assert results[2] == results[3] == results[4] == "network_mismatch"
@@ -428,11 +385,6 @@ def test_a_column_that_is_missing_is_named_and_one_that_begins_late_is_not_anoth
     late = network(problem_of(states[0].at[:20, 9].set(jnp.nan), free=True), BRACKET)
     assert names(late) != "network_mismatch"
     assert np.isfinite(late.std).all()
-
-
-def test_an_invalid_bracket_is_a_result():
-    invalid = jaxos4.Bracket(BRACKET.upper, BRACKET.lower)
-    assert names(trained()(problem_of(), invalid)) == "bracket_invalid"
 
 
 def test_a_free_initial_state_is_estimated_too():
@@ -477,19 +429,19 @@ def test_a_model_of_ones_own_cannot_be_saved(tmp_path):
 def network_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("network") / "whole.net"
     jaxos4.save_network(trained(), path)
-    return path.read_bytes()
+    return path
 
 
 @settings(max_examples=30)
 @given(st.data())
-def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(tmp_path_factory, network_file, data):
-    content = bytearray(network_file)
+def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(network_file, data):
+    content = bytearray(network_file.read_bytes())
     if data.draw(st.booleans()):
         content = content[: data.draw(st.integers(0, len(content) - 1))]
     else:
         for _ in range(data.draw(st.integers(1, 4))):
             content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    path = tmp_path_factory.mktemp("fuzz") / "altered.net"
+    path = network_file.with_name("altered.net")
     path.write_bytes(content)
     message = ""
     try:
@@ -499,14 +451,14 @@ def test_a_file_that_was_cut_or_altered_is_refused_or_harmless(tmp_path_factory,
     assert "\n" not in message
 
 
-def test_a_file_of_another_version_or_with_objects_is_refused_and_not_run(tmp_path, network_file):
-    class Trap:
-        def __reduce__(self):
-            return (pytest.fail, ("the file was executed",))
+class Trap:
+    def __reduce__(self):
+        return (pytest.fail, ("the file was executed",))
 
-    path, whole = tmp_path / "made.npz", tmp_path / "whole.net"
-    whole.write_bytes(network_file)
-    with np.load(whole) as file:
+
+def test_a_file_of_another_version_or_with_objects_is_refused_and_not_run(tmp_path, network_file):
+    path = tmp_path / "made.npz"
+    with np.load(network_file) as file:
         arrays = dict(file)
     header = json.loads(str(arrays["header"])) | {"format": 2}
     for content, words in (
@@ -555,13 +507,8 @@ def test_the_hybrid_begins_at_the_initial_state_that_the_network_saw():
 
 def seed_of(result, parameters=BRACKET.center, std=np.inf):
     covariance = np.full((8, 8), np.inf) if np.isinf(std).all() else np.diag(np.square(std))
-    numbers = {
-        "initial_state": np.zeros(3),
-        "cost": np.asarray(np.inf),
-        "rollouts": np.asarray(1),
-        "sweeps": np.asarray(0),
-    }
-    numbers |= {"parameters": parameters, "covariance": covariance}
+    numbers = {"parameters": parameters, "covariance": covariance, "initial_state": np.zeros(3)}
+    numbers |= {"cost": np.asarray(np.inf), "rollouts": np.asarray(1), "sweeps": np.asarray(0)}
     return jaxos4.Estimate(result=result, **{name: jnp.asarray(value) for name, value in numbers.items()})
 
 
@@ -590,12 +537,11 @@ def test_a_seed_without_an_answer_is_never_passed_on(name):
 
 
 def test_a_poisoned_lane_of_the_hybrid_leaves_the_others_alone():
-    hybrid, poisoned = jaxos4.Hybrid(trained()), 3
-    _, states = flights(LANES, seed=20)
-    before, after = (identify(hybrid, s, channels="all") for s in (states, states.at[poisoned, 5, 7].set(jnp.inf)))
-    others = np.arange(LANES) != poisoned
-    assert names(after)[poisoned] == "nonfinite_trajectory"
-    assert set(np.array(names(after))[others]) == {"successful"}
+    hybrid, states, others = jaxos4.Hybrid(trained()), flights(LANES, seed=20)[1], np.arange(LANES) != 3
+    before, after = (identify(hybrid, s, channels="all") for s in (states, states.at[3, 5, 7].set(jnp.inf)))
+    results = np.array(names(after))
+    assert results[3] == "nonfinite_trajectory"
+    assert set(results[others]) == {"successful"}
     np.testing.assert_array_equal(after.parameters[others], before.parameters[others])
 
 

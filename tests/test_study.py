@@ -23,7 +23,6 @@ from jaxos4.study import (
     OUTCOMES,
     Study,
     cell as cell_module,
-    flights as flights_module,
     load_study,
     open_store,
     plan,
@@ -193,9 +192,8 @@ def test_a_dry_run_writes_nothing_and_counts(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert [path.name for path in tmp_path.iterdir()] == ["spec.toml"]
-    rows = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines() if line.split()}
-    for name in ("ibss", "kalman"):
-        assert rows[name] == ["30", "3000", "1", "0", "-"]
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert all([name, "30", "3000", "1", "0", "-"] in rows for name in ("ibss", "kalman"))
     devices = len(os.sched_getaffinity(0))
     assert f"60 of 60 cells to be run, 6000 flights to be identified, on {devices} x cpu" in done.stdout
 
@@ -241,36 +239,24 @@ def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
 
 
 def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
-    study = Study(
-        durations=(1.0,),
-        scales=(0.0, 0.1, 1.0, 10.0),
-        widths=(1.0, 0.5),
-        channels=("rates", "all"),
-        estimators=("ibss", "kalman"),
-        truth="drawn",
-        flights=8,
-        batch=4,
-    )
+    sizes = {"durations": (1.0,), "widths": (1.0, 0.5), "flights": 8, "batch": 4, "truth": "drawn"}
+    study = Study(scales=(0.0, 0.1, 1.0, 10.0), channels=("rates", "all"), estimators=("ibss", "kalman"), **sizes)
     truths, noises, draws = {}, {}, {}
     for cell in study.cells():
-        fleet = flights_module.fleet_of(study, cell.scenario)
-        truth, true, measured = (np.asarray(x) for x in flights_module.fly(study, fleet, cell))
-        scenario, first = cell.scenario, cell.first
-        for known, key, value in (
-            (truths, (scenario.width, first), truth),
-            (noises, (scenario.width, scenario.scale, first), measured),
-        ):
-            np.testing.assert_array_equal(known.setdefault(key, value), value)
+        fleet = cell_module.fleet_of(study, cell.scenario)
+        truth, true, measured = (np.asarray(x) for x in cell_module.fly(study, fleet, cell))
+        width, scale, first = cell.scenario.width, cell.scenario.scale, cell.first
+        np.testing.assert_array_equal(truths.setdefault((width, first), truth), truth)
+        np.testing.assert_array_equal(noises.setdefault((width, scale, first), measured), measured)
         # The same uniform numbers for every width, and the same normal ones for every scale.
         u = (truth - fleet.bracket.center) / fleet.bracket.half_width
         np.testing.assert_allclose(draws.setdefault(first, u), u, rtol=1e-9, atol=1e-9)
-        if scenario.scale:
-            normal = (measured - true) / (scenario.scale * jaxos4.SENSOR_SIGMA)
+        if scale:
+            normal = (measured - true) / (scale * jaxos4.SENSOR_SIGMA)
             np.testing.assert_allclose(draws.setdefault(("noise", first), normal), normal, rtol=0, atol=1e-8)
         else:
             np.testing.assert_array_equal(measured, true)
-    assert len(truths) == 4
-    assert len(noises) == 16
+    assert (len(truths), len(noises)) == (4, 16)
     assert not np.allclose(draws[0], draws[4], atol=0.1)
     assert np.std(draws["noise", 0]) == pytest.approx(1, abs=4 / np.sqrt(2 * 4 * 101 * 12))
 
@@ -371,11 +357,10 @@ def same(ours, theirs, scale=0.0) -> None:
 
 
 def test_all_brackets_are_off_the_airframe_by_one_draw():
-    study = Study(widths=(1.0, 3.0), seed=7)
-    model = jaxos4.PublishedOS4(jaxos4.OS4)
+    study, model = Study(widths=(1.0, 3.0), seed=7), jaxos4.PublishedOS4()
     u = jax.random.uniform(jax.random.fold_in(jax.random.key(7), 0), (8,), minval=-0.8, maxval=0.8)
     for width in study.widths:
-        bracket = flights_module.fleet_of(study, study.cell(0).scenario._replace(width=width)).bracket
+        bracket = cell_module.fleet_of(study, study.cell(0).scenario._replace(width=width)).bracket
         same(bracket.center, model.alpha + u * width * model.half_width, model.half_width)
         same(bracket.half_width, width * model.half_width)
         assert np.all((bracket.lower < model.alpha) & (model.alpha < bracket.upper))
@@ -397,13 +382,11 @@ def test_every_variable_has_a_name_and_a_unit(dataset):
 def test_the_attributes_are_those_of_the_study_and_not_of_the_run(whole, dataset, tmp_path):
     study = load_study(specification(tmp_path, SPECIFICATION))
     attributes = dict(dataset.attrs)
-    assert attributes.pop("device") == "these tests"
-    assert attributes.pop("version") == jaxos4.__version__
-    assert attributes.pop("jax") == jax.__version__
-    assert attributes.pop("command") == "jaxos4 study study.toml --out DIR"
     (tmp_path / "again.toml").write_text(attributes.pop("specification"))
     assert load_study(tmp_path / "again.toml") == study
-    assert attributes == {"title": study.title, "precision": "float64", "seed": 5, "failures": "[]"}
+    software = {"version": jaxos4.__version__, "jax": jax.__version__, "command": "jaxos4 study study.toml --out DIR"}
+    numbers = {"title": study.title, "precision": "float64", "seed": 5, "failures": "[]"}
+    assert attributes == {"device": "these tests", **software, **numbers}
 
 
 # Flights and cells that fail.
@@ -416,8 +399,10 @@ def test_a_poisoned_flight_leaves_its_neighbours_alone(tmp_path, monkeypatch, es
     cell = next(cell for cell in study.cells() if cell.scenario.estimator == estimator)
     clean = run_cell(study, cell, None)
 
+    fly = cell_module.fly
+
     def poisoned(*arguments):
-        flights = flights_module.fly(*arguments)
+        flights = fly(*arguments)
         return flights._replace(measured=flights.measured.at[2, 50:].set(poison).at[2, 0].set(poison))
 
     monkeypatch.setattr(cell_module, "fly", poisoned)
@@ -473,11 +458,8 @@ def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path,
         np.testing.assert_array_equal(found["result"].to_numpy()[~lost], dataset["result"].to_numpy()[~lost])
         # No estimator ran on flights 4 to 7 at scale 1, but their truth is known.
         np.testing.assert_array_equal(found["truth"], dataset["truth"])
-    assert [(f["cell"], f["first"], f["estimator"], f["scale"]) for f in failures] == [
-        (1, 4, "ibss", 1.0),
-        (7, 4, "equation-error", 1.0),
-        (10, 4, "equation-error", 0.1),
-    ]
+    where = [(1, 4, "ibss", 1.0), (7, 4, "equation-error", 1.0), (10, 4, "equation-error", 0.1)]
+    assert [(f["cell"], f["first"], f["estimator"], f["scale"]) for f in failures] == where
     assert {f["message"] for f in failures} == {"the moon was in the way"}
     for index in (1, 7, 10):
         (tmp_path / "out" / "cells" / f"{index:08d}.npz").unlink()

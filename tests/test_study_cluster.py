@@ -35,7 +35,7 @@ def cluster():
         forked = dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})  # with Dask imported
         with forked:
             # Workers are forked with the library, instead of importing it each. The first call sets Dask's own list.
-            get_mp_context().set_forkserver_preload(["distributed", "jaxos4.study.cluster"])
+            get_mp_context().set_forkserver_preload(["distributed", "jaxos4.study.run"])
             with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
                 yield cluster
 
@@ -96,17 +96,12 @@ def test_a_damaged_network_is_named(whole, client, tmp_path, run):
     assert cells(tmp_path / "out") == cells(whole)
 
 
-def test_a_cluster_that_is_not_there_is_refused(run, tmp_path):
+def test_a_cluster_that_is_not_there_or_without_workers_is_refused(run, tmp_path):
     specification(tmp_path, NETWORKED)
     study = ("study", "spec.toml", "--out", "out")
     refused(run(*study, "--executor", "dask"), "--scheduler")
     refused(run(*study, "--scheduler", "tcp://127.0.0.1:1"), "--executor dask")
     refused(run(*study, "--executor", "dask", "--scheduler", "nonsense://x"), "--scheduler nonsense://x")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_cluster_without_workers_is_refused(run, tmp_path):
-    specification(tmp_path, NETWORKED)
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
-        options = ("--executor", "dask", "--scheduler", empty.scheduler_address)
-        refused(run("study", "spec.toml", "--out", "out", *options), "no workers")
+        refused(run(*study, "--executor", "dask", "--scheduler", empty.scheduler_address), "no workers")

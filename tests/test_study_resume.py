@@ -164,10 +164,7 @@ def test_a_damaged_cell_is_named_and_is_computed_again_once_deleted(copy, whole,
 @pytest.mark.parametrize(
     ("content", "fragment"),
     [
-        ("", "not the specification of a study"),
-        ("\x00\x01", "not the specification of a study"),
-        ("[1, 2]", "not the specification of a study"),
-        ("[" * 100_000, "not the specification of a study"),
+        *((damaged, "not the specification of a study") for damaged in ("", "\x00\x01", "[1, 2]", "[" * 100_000)),
         ('{"version": "0.0.1", "device": "d", "study": {"of": "old"}}', "begun by jaxos4 0.0.1"),
     ],
 )
@@ -181,12 +178,11 @@ def test_a_folder_whose_specification_is_damaged_is_refused(copy, run, content, 
 def test_a_folder_with_other_files_is_refused_and_unchanged(run, tmp_path):
     specification(tmp_path)
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "thesis.tex").write_text("mine")
-    (tmp_path / "file").write_text("mine")
+    for name in ("out/thesis.tex", "file"):
+        (tmp_path / name).write_text("mine")
     for option in ((), ("--dry-run",)):
-        refused(run("study", "spec.toml", "--out", "out", *option), "out", "thesis.tex")
-        refused(run("study", "spec.toml", "--out", "file", *option), "file", "a file")
-        refused(run("study", "spec.toml", "--out", ".", *option), "holds file and no study")
+        for out, fragment in (("out", "thesis.tex"), ("file", "a file"), (".", "holds file and no study")):
+            refused(run("study", "spec.toml", "--out", out, *option), fragment)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.tex"]
 
 

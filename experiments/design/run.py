@@ -17,8 +17,8 @@ import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.design import Design, Envelope
-from jaxos4.design.open_loop import VEHICLES, drawn, fly_finely
+from jaxos4.design import Design
+from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
 from jaxos4.models import MODELS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -53,7 +53,7 @@ def excess(model: jaxos4.AbstractModel, found: Design, width: float, seed: int) 
     bracket = jaxos4.Bracket.around(model.alpha, width * np.asarray(model.half_width))
     others = drawn(bracket, jax.random.key(seed + 1000), VEHICLES)
     states = fly_finely(model, others, jnp.asarray(found.designed.inputs), jnp.asarray(DT))
-    return max(found.task.envelope.shares_of(Envelope.of(found.designed.inputs, states, DT)).values())
+    return max(found.task.envelope.shares(found.designed.inputs, states, DT).values())
 
 
 def efficiency(model: jaxos4.AbstractModel, found: Design, channels: str, flights: int, seed: int) -> dict:

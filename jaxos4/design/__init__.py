@@ -2,14 +2,15 @@
 
 from ..excitation import standard_references as standard_references
 from .envelope import Envelope as Envelope
-from .files import (
+from .fleet import model_of as model_of
+from .references import References as References, design_references as design_references
+from .rotor_speeds import RotorSpeeds as RotorSpeeds, design_input as design_input, envelope_of as envelope_of
+from .task import (
+    AbstractTask as AbstractTask,
+    Design as Design,
+    Designed as Designed,
     read_input as read_input,
     read_references as read_references,
     write_input as write_input,
     write_references as write_references,
 )
-from .filtered import model_of as model_of
-from .open_loop import envelope_of as envelope_of
-from .references import References as References, design_references as design_references
-from .rotor_speeds import RotorSpeeds as RotorSpeeds, design_input as design_input
-from .task import AbstractTask as AbstractTask, Design as Design, Designed as Designed

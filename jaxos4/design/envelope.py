@@ -1,9 +1,9 @@
 """The envelope: limits of rotor speeds, angles, rates, velocity and distance."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -22,14 +22,13 @@ ANGLES, RATES, POSITION, VELOCITY = (
 Uses = dict[str, Float[Array, "..."]]
 
 
-def _limit(name: str, *, axes: bool = False) -> Callable:
-    """A field's converter: one positive number, or one for each of three `axes`."""
-    shape = (3,) if axes else ()
+def _limit(name: str, shape: tuple[int, ...] = ()) -> Callable:
+    """A field's converter: one positive number, or one for each of three axes."""
 
     def convert(value) -> Array:
         array = as_float(np.asarray(value, dtype=float) if isinstance(value, list | tuple) else value)
         if array.shape not in ((), shape):
-            raise ValueError(f"`{name}` must be one number{' or three' * axes}, got shape {array.shape}.")
+            raise ValueError(f"`{name}` must be one number{' or three' * len(shape)}, got shape {array.shape}.")
         if not isinstance(array, Tracer) and not np.all((np.asarray(array) > 0) & np.isfinite(array)):
             raise ValueError(f"`{name}` must be positive and finite, got {np.asarray(array).tolist()}.")
         return jnp.broadcast_to(array, shape)
@@ -53,8 +52,8 @@ class Envelope(eqx.Module):
     slowest: Scalar = eqx.field(converter=_limit("slowest"))
     fastest: Scalar = eqx.field(converter=_limit("fastest"))
     slew: Scalar = eqx.field(converter=_limit("slew"))
-    angle: Float[Array, "3"] = eqx.field(converter=_limit("angle", axes=True))
-    rate: Float[Array, "3"] = eqx.field(converter=_limit("rate", axes=True))
+    angle: Float[Array, "3"] = eqx.field(converter=_limit("angle", (3,)))
+    rate: Float[Array, "3"] = eqx.field(converter=_limit("rate", (3,)))
     velocity: Scalar = eqx.field(converter=_limit("velocity"))
     distance: Scalar = eqx.field(converter=_limit("distance"))
 
@@ -67,20 +66,8 @@ class Envelope(eqx.Module):
     def of(
         cls, omega: Float[Numeric, "*inputs samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
     ) -> "Envelope":
-        """The limits that flights with these rotor speeds just keep.
-
-        `dt` is the sample time of the rotor speeds. The states may be sampled more often.
-        """
-        held, states = np.asarray(omega)[..., :-1, :], np.asarray(states)  # the last row drives nothing
-        return cls(
-            slowest=held.min(),
-            fastest=held.max(),
-            slew=np.abs(np.diff(held, axis=-2)).max() / dt,
-            angle=np.abs(states[..., ANGLES]).reshape(-1, 3).max(axis=0),
-            rate=np.abs(states[..., RATES]).reshape(-1, 3).max(axis=0),
-            velocity=np.linalg.norm(states[..., VELOCITY], axis=-1).max(),
-            distance=np.linalg.norm((states - states[..., :1, :])[..., POSITION], axis=-1).max(),
-        )
+        """The limits that flights just keep. `dt`: of the rotor speeds; the states may be sampled more often."""
+        return cls(**_needs(omega, states, dt))
 
     def limited(self, limits: "Envelope | Mapping[str, float]") -> "Envelope":
         """This envelope with some limits replaced, or all. Raises `InputError` if one of them is impossible."""
@@ -91,31 +78,44 @@ class Envelope(eqx.Module):
         except ValueError as error:
             raise InputError(f"the envelope: {error}") from None
 
-    def shares_of(self, needed: "Envelope") -> dict[str, float]:
-        """The largest share of each limit that flights need: 1 is the limit."""
+    def shares(
+        self, omega: Float[Numeric, "*inputs samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
+    ) -> dict[str, float]:
+        """The largest share of each limit that flights use, see `of`: 1 is the limit. Infinite if a flight failed."""
         shares = {
-            name: float(np.max(np.asarray(getattr(needed, name)) / np.asarray(getattr(self, name))))
-            for name in Envelope.__annotations__
+            name: np.max(need / np.asarray(getattr(self, name))) for name, need in _needs(omega, states, dt).items()
         }
-        return shares | {"slowest": 1 / shares["slowest"]}
+        with np.errstate(divide="ignore"):  # a rotor that stands still
+            shares["slowest"] = 1 / shares["slowest"]
+        return {name: float(np.nan_to_num(share, nan=np.inf, posinf=np.inf)) for name, share in shares.items()}
 
-    def uses_of_rotors(self, omega: RotorSpeeds, dt: Scalar) -> Uses:
-        """The share of each limit of the rotors that is used at each sample: 1 is the limit."""
+    def uses(self, omega: RotorSpeeds, states: Float[Array, "times *vehicles 12"], dt: Scalar) -> Uses:
+        """The share of each limit at each sample, with derivatives. The columns are rotors, or axes of all vehicles."""
         held = omega[:-1]
+        of_states = {
+            "angle": states[..., ANGLES] / self.angle,
+            "rate": states[..., RATES] / self.rate,
+            "velocity": _norm(states[..., VELOCITY]) / self.velocity,
+            "distance": _norm(states[..., POSITION] - states[0][..., POSITION]) / self.distance,
+        }
         return {
             "slowest": self.slowest / held,
             "fastest": held / self.fastest,
             "slew": jnp.diff(held, axis=0) / (self.slew * dt),
-        }
+        } | {name: share.reshape(share.shape[0], -1) for name, share in of_states.items()}
 
-    def uses_of_states(self, states: Float[Array, "times 12"]) -> Uses:
-        """The share of each limit of the states that is used at each time, with one column for each axis."""
-        return {
-            "angle": states[:, ANGLES] / self.angle,
-            "rate": states[:, RATES] / self.rate,
-            "velocity": _norm(states[:, VELOCITY]) / self.velocity,
-            "distance": _norm(states[:, POSITION] - states[0, POSITION]) / self.distance,
-        }
+
+def _needs(omega: Numeric, states: Numeric, dt: float) -> dict[str, Any]:
+    held, states = np.asarray(omega)[..., :-1, :], np.asarray(states)  # the last row drives nothing
+    return {
+        "slowest": held.min(),
+        "fastest": held.max(),
+        "slew": np.abs(np.diff(held, axis=-2)).max() / dt,
+        "angle": np.abs(states[..., ANGLES]).reshape(-1, 3).max(axis=0),
+        "rate": np.abs(states[..., RATES]).reshape(-1, 3).max(axis=0),
+        "velocity": np.linalg.norm(states[..., VELOCITY], axis=-1).max(),
+        "distance": np.linalg.norm((states - states[..., :1, :])[..., POSITION], axis=-1).max(),
+    }
 
 
 def hover_squares(airframe: Airframe, envelope: Envelope) -> Float[np.ndarray, "4"]:
@@ -131,11 +131,6 @@ def hover_squares(airframe: Airframe, envelope: Envelope) -> Float[np.ndarray, "
     return squares
 
 
-def largest(uses: Uses) -> dict[str, Float[Array, " columns"]]:
-    """The largest share of each limit, for each column; infinite for a flight that failed."""
-    return jax.tree.map(lambda share: jnp.where(jnp.isnan(share), jnp.inf, jnp.abs(share)).max(axis=0), uses)
-
-
-def _norm(vectors: Float[Numeric, "times 3"]) -> Float[Array, "times 1"]:
+def _norm(vectors: Float[Array, "*some 3"]) -> Float[Array, "*some 1"]:
     """The length of each vector, with a derivative at 0."""
     return jnp.sqrt(jnp.square(vectors).sum(axis=-1, keepdims=True) + 1e-12)

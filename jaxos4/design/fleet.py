@@ -1,8 +1,8 @@
-"""Vehicles in closed loop that fly references through gusts, in batches of one size that share one program."""
+"""Vehicles in closed loop that fly references through gusts, and what filter error can learn from their flights."""
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,22 +10,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._custom_types import Key, Scalar, as_float
+from .._custom_types import Key, Numeric, Parameters, Scalar, as_float
 from .._xla import quick_jit
 from ..bracket import Bracket
 from ..closed_loop import ClosedLoop, References, fly_closed_loop
 from ..errors import InputError
 from ..flight import Flight
+from ..models.abstract import PARAMETER_NAMES
 from ..models.rotation import to_earth
 from ..models.state import Attitude
+from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, default_terms, has_full_scale
+from ..models.vehicle import FlightModel
+from ..shooting import InnovationsProblem, ShootingProblem
+from ..shooting.filters import LogNoise
+from ..shooting.innovations import NOISE_PRECISION, joined
 from .envelope import ANGLES, POSITION, VELOCITY, Envelope, hover_squares
-from .filtered import INVERSE, Filters
-from .open_loop import drawn
+from .rotor_speeds import drawn
 from .task import Inputs
 
 LANES = 64
-"""The number of flights in a batch."""
+"""The number of flights in a batch. All batches share one program."""
 
+INERTIAS = ("Ix", "Iy", "Iz")
+# The place of the alpha that is torque over each moment of inertia.
+_INVERSE = [PARAMETER_NAMES.index(name) for name in ("alpha3", "alpha6", "alpha8")]
+# Disturbances are taken to have at least this standard deviation [rad/s^2, m/s^2]: less changes nothing.
+_LEAST = 1e-3
 # Physics steps in a sample: twice as many as `fly_closed_loop` takes by default.
 _SUBSTEPS = 8
 # Rotors turn at least with this share of the speed in hover, and at most with this multiple if no maximum is known.
@@ -34,6 +44,14 @@ _SLOWEST, _FASTEST = 0.1, 2.0
 _GUSTS = 0.8
 # So many vehicles fly in still air: gusts carry a vehicle without a position controller away, whatever its references.
 _STILL = 16
+
+
+def model_of(loop: ClosedLoop) -> FlightModel:
+    """The model that `jaxos4.identify` chooses for the log of this vehicle."""
+    offers = {LATERAL_FORCE, VERTICAL_FORCE}
+    offers |= {COMMANDS} if loop.logged == "commands" else set()
+    offers |= {FULL_SCALE} if has_full_scale(loop.airframe) else set()
+    return FlightModel(loop.airframe, terms=default_terms(frozenset(offers)))
 
 
 def batch_of(loop: ClosedLoop, in_gusts: np.ndarray | None = None, **values: Float[ArrayLike, "lanes ..."]):
@@ -70,41 +88,106 @@ def fly_batch(loops: ClosedLoop, references: Float[Array, "lanes samples 4"], dt
     return eqx.filter_vmap(one)(loops, references, jax.random.split(key, LANES))
 
 
-class Fleet(NamedTuple):
-    """Vehicles with moments of inertia that are drawn from a bracket, and gusts of their own.
+class Fleet(eqx.Module):
+    """A vehicle in gusts, and vehicles with moments of inertia that are drawn from a bracket, and gusts of their own.
+
+    Parameters and noise are estimated together: a controller answers gusts, so their errors are correlated.
 
     - `loop`: the vehicle of the airframe. `loops`: the drawn ones, as a batch. All have the controller of the airframe.
       Some fly in still air. Only they show velocity and distance.
+    - `model`, `parameters`: of the filters, which know the true parameters, gusts and noise of `loop`.
+    - `prior`: the information of the bracket, of which the half-widths are standard deviations.
     """
 
     loop: ClosedLoop
     loops: ClosedLoop
-    dt: float
+    model: FlightModel
+    parameters: Parameters
+    prior: Float[Array, " parameters"]
+    dt: float = eqx.field(static=True)
     key: Key
 
     @classmethod
     def of(cls, loop: ClosedLoop, bracket: Bracket, dt: float, key: Key) -> "Fleet":
-        """Vehicles from a bracket of the parameters of a `FlightModel`."""
-        inertia = 1 / np.asarray(drawn(bracket, key, LANES))[:, INVERSE]
+        """Vehicles from a bracket of the parameters of `model_of(loop)`."""
+        inertia = 1 / np.asarray(drawn(bracket, key, LANES))[:, _INVERSE]
         if not (np.isfinite(inertia).all() and (inertia > 0).all()):
             raise InputError("`bracket`: alpha3, alpha6 and alpha8 must be positive.")
         loops = batch_of(loop, np.arange(LANES) >= _STILL, inertia=inertia, force_noise=np.zeros(LANES))
-        return cls(loop, loops, dt, jax.random.fold_in(key, 1))
+        model, prior = model_of(loop), jnp.asarray(1 / np.square(np.asarray(bracket.half_width)))
+        known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": loop.rotor_delay if loop.logged == "commands" else 0.0}
+        for i, axis in enumerate(("roll", "pitch", "yaw")):
+            known |= {f"{axis}_offset": loop.offset[i], f"{axis}_damping": loop.damping[i]}
+        names, alpha = model.parameter_names, np.asarray(model.alpha)
+        parameters = np.array([float(known.get(name, value)) for name, value in zip(names, alpha, strict=True)])
+        return cls(loop, loops, model, jnp.asarray(parameters), prior, dt, jax.random.fold_in(key, 1))
 
-    def needs(self, references: Inputs) -> Envelope | None:
-        """The limits that these flights just keep; `None` if a vehicle turns over."""
+    def inertias_first(self, of_inertias: tuple, of_parameters: tuple) -> tuple:
+        """Something of Ix, Iy and Iz, then the same of the model's parameters that are not their reciprocals."""
+        return (*of_inertias, *(one for i, one in enumerate(of_parameters) if i not in _INVERSE))
+
+    def about_inertias(self, information: Float[Numeric, "*some n n"]) -> Float[np.ndarray, "*some n n"]:
+        """From information about the model's unknowns to that about log Ix, log Iy, log Iz, and the others."""
+        alpha, slopes = np.asarray(self.parameters), np.eye(information.shape[-1])
+        for place in _INVERSE:  # the inertia is thrust_gain / alpha, as in the table that `jaxos4 estimate` prints
+            slopes[place, place] = -alpha[place]
+            if "thrust_gain" in self.model.parameter_names:
+                slopes[place, self.model.parameter_names.index("thrust_gain")] = alpha[place]
+        slopes = slopes[:, self.inertias_first(tuple(_INVERSE), tuple(range(len(slopes))))]
+        return slopes.T @ np.asarray(information) @ slopes
+
+    def with_prior(self, information: Float[Numeric, "n n"]) -> Float[np.ndarray, "n n"]:
+        """The information, about the inertias first, with what the bracket says."""
+        beyond = information.shape[-1] - self.prior.shape[0]
+        return self.about_inertias(information + np.diag(np.pad(np.asarray(self.prior), (0, beyond))))
+
+    def bounds_from(self, information: Float[Numeric, "n n"]) -> Float[np.ndarray, " parameters"]:
+        """The smallest standard deviations of Ix, Iy, Iz and the others, from information and prior."""
+        total, count = self.with_prior(information), self.prior.shape[0]
+        scale = np.sqrt(np.diagonal(total))
+        relative = np.sqrt(np.diagonal(np.linalg.inv(total / np.outer(scale, scale)))) / scale
+        unit = np.append(np.asarray(self.model.airframe.inertia), np.ones(count - len(INERTIAS)))
+        return relative[:count] * unit
+
+    @quick_jit
+    def informations(
+        self, flights: Flight
+    ) -> tuple[Float[Array, "flights n n"], Float[Array, "flights channels parameters parameters"]]:
+        """The Fisher information of each flight's innovations. All that the design knows of filter error is here.
+
+        **Returns:** the information about all unknowns: the parameters, then the noise of each channel, with its weak
+        prior; and the information of each channel about the parameters.
+        """
+        loop, count = self.loop, self.parameters.shape[0]
+        strength = jnp.maximum(jnp.append(loop.gust, loop.thrust_gust), _LEAST)
+
+        def one(omega: Array, states: Array, force: Array | None) -> tuple[Array, Array]:
+            flight = Flight(flights.time[0], omega, states, specific_force=force, commanded=flights.commanded)
+            problem = ShootingProblem(self.model, flight, sigma=np.ones(12), channels="rates", method="rk4")
+            sensor = jnp.append(jnp.repeat(loop.gyro_noise, 3), loop.force_noise)
+            noise = LogNoise(jnp.log(strength), jnp.log(jnp.repeat(loop.gust_time, 4)), jnp.log(sensor))
+            innovations = InnovationsProblem(problem, segment=flight.time.shape[0])
+            found = innovations.innovations(self.parameters, noise)
+            information = found.information.sum(axis=-1)
+            whole = joined(found.gradient.sum(axis=-1), information, count)[1]
+            prior = NOISE_PRECISION * (np.arange(whole.shape[0]) >= count)
+            return whole + jnp.diag(prior), information[:, :count, :count]
+
+        return jax.vmap(one)(flights.omega, flights.states, flights.specific_force)
+
+    def _fly(self, references: Inputs) -> tuple[np.ndarray, np.ndarray, float]:
+        """Rotor speeds, states and sample time; velocity and distance only of vehicles in still air."""
         every = jnp.broadcast_to(jnp.asarray(references), (LANES, *references.shape))
         flights = fly_batch(self.loops, every, as_float(self.dt), self.key)
-        omega, states = np.array(flights.omega), np.array(flights.states)
-        if not np.isfinite(states).all():
-            return None
-        states[_STILL:, :, [*POSITION, *VELOCITY]] = 0
-        return Envelope.of(omega, states, self.dt)
+        states = np.array(flights.states)
+        if np.isfinite(states).all():  # no vehicle turned over
+            states[_STILL:, :, [*POSITION, *VELOCITY]] = 0
+        return np.asarray(flights.omega), states, self.dt
 
     def envelope(self, references: Inputs, limits: Envelope | Mapping[str, float]) -> Envelope:
         """The limits that these references need, with some replaced. Limits of rotors are those of the airframe.
 
-        **Raises:** `InputError` for a limit that is not positive, or if a vehicle turns over or cannot hover.
+        Raises `InputError` for a limit that is not positive, or if a vehicle turns over or cannot hover.
         """
         airframe = self.loop.airframe
         hover, fastest = float(airframe.hover_speed), float(airframe.max_rotor_speed)
@@ -112,12 +195,13 @@ class Fleet(NamedTuple):
         rotors = {"slowest": slowest, "fastest": fastest, "slew": (fastest - slowest) / self.dt}
         unknown = Envelope(**rotors, **dict.fromkeys(("angle", "rate", "velocity", "distance"), 1.0))
         hover_squares(airframe, unknown.limited(limits))
-        needed, still = self.needs(references), self.needs(0 * references)
-        if needed is None or still is None:
+        flights = self._fly(references), self._fly(0 * references)
+        if not all(np.isfinite(states).all() for _, states, _ in flights):
             raise InputError(
                 "some of the vehicles turn over in 3-2-1-1 references; give weaker gusts or a smaller `angle`, or "
                 "narrow the `bracket`."
             )
+        needed, still = (Envelope.of(*flown) for flown in flights)
         flown = {"velocity": needed.velocity, "distance": needed.distance}
         for name in ("angle", "rate"):  # roll and pitch may do the same
             alone = np.asarray(getattr(still, name)) / _GUSTS
@@ -127,18 +211,15 @@ class Fleet(NamedTuple):
 
     def uses(self, references: Inputs, envelope: Envelope) -> dict[str, float]:
         """The largest share of each limit that a vehicle uses. A controller has no limit of slew."""
-        needed = self.needs(references)
-        shares = dict.fromkeys(Envelope.__annotations__, math.inf) if needed is None else envelope.shares_of(needed)
+        shares = envelope.shares(*self._fly(references))
         return {name: share for name, share in shares.items() if name != "slew"}
 
-    def bounds(self, filters: Filters, references: Mapping[str, Inputs]) -> dict[str, Float[np.ndarray, " parameters"]]:
-        """The bounds of the airframe's vehicle after a flight with each of several references, in gusts.
-
-        The information is a mean over flights, because gusts and noise differ from flight to flight.
-        """
+    def bounds(self, references: Mapping[str, Inputs]) -> dict[str, Float[np.ndarray, " parameters"]]:
+        """The bounds of the airframe's vehicle after a flight with each of several references, in gusts."""
         names = list(references)
         order = np.arange(LANES) % len(names)
         flown = jnp.asarray(np.stack([references[name] for name in names]))[order]
         flights = fly_batch(batch_of(self.loop), flown, as_float(self.dt), jax.random.fold_in(self.key, 1))
-        found = np.asarray(filters.informations(flights).whole)
-        return {name: filters.bounds(found[order == i].mean(axis=0)) for i, name in enumerate(names)}
+        found = np.asarray(self.informations(flights)[0])
+        # A mean over flights, because gusts and noise differ from flight to flight.
+        return {name: self.bounds_from(found[order == i].mean(axis=0)) for i, name in enumerate(names)}

@@ -6,8 +6,7 @@ takes them.
 
 import math
 from collections.abc import Mapping
-from os import PathLike
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,23 +19,11 @@ from ..bracket import Bracket
 from ..closed_loop import ClosedLoop
 from ..errors import InputError
 from ..excitation import standard_references, with_largest
+from . import task
 from .envelope import ANGLES, RATES, Envelope, Uses
-from .files import write_references
-from .filtered import INERTIAS, Filters, model_of
-from .fleet import LANES, Fleet, batch_of, fly_batch
-from .task import (
-    AbstractTask,
-    Coefficients,
-    Design,
-    Designed,
-    Flown,
-    Progress,
-    Ranges,
-    criterion_of,
-    solve,
-)
+from .fleet import INERTIAS, LANES, Fleet, batch_of, fly_batch, model_of
+from .task import Coefficients, Designed, Flown
 
-_RANGES = Ranges(samples=(250, 20_000), cycles=2, fastest=0.1, remedy="; longer flights repeat the references")
 _LARGEST_ANGLE, _LARGEST_ACCELERATION = 1.0, 5.0
 # References that need too much are reduced: to about this share of a limit, so often, each time not below this factor.
 _TARGET, _MOST_REDUCTIONS, _LEAST_STEP = 0.995, 8, 0.7
@@ -51,13 +38,10 @@ _POINTS = np.arange(200) / 200
 
 
 class Tones(NamedTuple):
-    """The tones of references, each a whole number of cycles in a period of the references.
+    """The tones of references, each a whole number of cycles in a period of the references."""
 
-    - `period`: in samples. `count`: the number of tones, which are the multiples of 1 / period.
-    """
-
-    period: int
-    count: int  # type: ignore[assignment]
+    period: int  # in samples
+    number: int  # of the tones, which are the multiples of 1 / period
 
     @classmethod
     def up_to(cls, bandwidth: float, samples: int, dt: float) -> "Tones":
@@ -68,7 +52,7 @@ class Tones(NamedTuple):
 
     def turns(self, periods: Float[np.ndarray, " points"]) -> np.ndarray:
         """exp(i angle) of each tone, at times in periods."""
-        return np.exp(2j * math.pi * np.outer(periods, np.arange(1, self.count + 1)))
+        return np.exp(2j * math.pi * np.outer(periods, np.arange(1, self.number + 1)))
 
     def basis(self, periods: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points coefficients"]:
         """Cosines of all tones, then their sines, at times in periods."""
@@ -80,73 +64,59 @@ def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
     return np.concatenate([np.real(turns), np.imag(turns)], axis=-1)
 
 
-class Response(NamedTuple):
-    """The response of a vehicle under its controller to small tones. Coefficients are cosines, then sines.
+def _response(
+    fleet: Fleet,
+    envelope: Envelope,
+    largest: Float[np.ndarray, "4"],
+    tones: Tones,
+    samples: int,
+    key: Key,
+) -> dict[str, Any]:
+    """The fields `base`, `added` and `signals` of `References`: each tone is flown once in still air, by the simulator.
 
-    - `base`: information of a flight in gusts without references, with the prior.
-    - `tones`: the information that a unit of each tone of each reference adds. Both are about the inertias first.
-    - `signals`: the change of the angles and rates of an axis by a unit of the coefficients of its reference, as a
-      share of the part of the limit that gusts leave; by the name of the limit.
+    For small tones the vehicle is linear. So the information of a sum of tones is the sum of their informations.
+
+    **Raises:** `InputError` if gusts alone use a limit.
     """
-
-    base: Float[Numeric, "unknowns unknowns"]
-    tones: Float[Numeric, "references count unknowns unknowns"]
-    signals: dict[str, Float[Numeric, "axes points coefficients"]]
-
-    @classmethod
-    def of(
-        cls,
-        fleet: Fleet,
-        filters: Filters,
-        envelope: Envelope,
-        largest: Float[np.ndarray, "4"],
-        tones: Tones,
-        samples: int,
-        key: Key,
-    ) -> "Response":
-        """Fly each tone once in still air, by the simulator. A unit of a tone has the `largest` value of its reference.
-
-        For small tones the vehicle is linear. So the information of a sum of tones is the sum of their informations.
-
-        **Raises:** `InputError` if gusts alone use a limit.
-        """
-        count, turns = tones.count, tones.turns(np.arange(samples) / tones.period)
-        references = np.zeros((LANES, samples, 4))
-        references[:count, :, :3] = _SMALL[:3] * np.real(turns).T[:, :, None]
-        references[count : 2 * count, :, 3] = _SMALL[3] * np.real(turns).T
-        in_gusts = np.arange(LANES) > 2 * count  # the one before is in still air, and has no reference
-        flights = fly_batch(batch_of(fleet.loop, in_gusts), jnp.asarray(references), as_float(fleet.dt), key)
-        found, states = filters.informations(flights), np.asarray(flights.states)
-        whole, channels = np.asarray(found.whole), np.asarray(found.channels)
-        excess = channels - channels[2 * count]
-        each = np.stack([*np.moveaxis(excess[:count, :3], 1, 0), excess[count : 2 * count].sum(axis=1)])
-        # In still air nothing is learned about the noise.
-        beyond = whole.shape[-1] - channels.shape[-1]
-        each = filters.about_inertias(np.pad(each, ((0, 0), (0, 0), (0, beyond), (0, beyond))))
-        base = filters.with_prior(whole[in_gusts].mean(axis=0))
-        scale = np.sqrt(np.diagonal(base))
-        scale[: len(INERTIAS)] = 1  # their bounds are relative already
-        unit = np.outer(scale, scale)
-        # The answers in the last period, in which the beginning is forgotten.
-        last = np.conj(turns[-tones.period :]) * 2 / tones.period
-        signals = {}
-        for name, columns in (("angle", ANGLES), ("rate", RATES)):
-            left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
-            if (left <= 0).any():
-                raise _too_gusty(name)
-            answers = np.einsum("kta,tk->ak", states[:count, -tones.period :, columns], last) / _SMALL[:3, None]
-            moving = _parts(answers[:, None] * tones.turns(_POINTS))
-            signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
-        relative = np.square(largest / _SMALL)[:, None, None, None]
-        return cls(jnp.asarray(base / unit), jnp.asarray(relative * each / unit), signals)
+    number, turns = tones.number, tones.turns(np.arange(samples) / tones.period)
+    references = np.zeros((LANES, samples, 4))
+    references[:number, :, :3] = _SMALL[:3] * np.real(turns).T[:, :, None]
+    references[number : 2 * number, :, 3] = _SMALL[3] * np.real(turns).T
+    in_gusts = np.arange(LANES) > 2 * number  # the one before is in still air, and has no reference
+    flights = fly_batch(batch_of(fleet.loop, in_gusts), jnp.asarray(references), as_float(fleet.dt), key)
+    states, (whole, channels) = np.asarray(flights.states), map(np.asarray, fleet.informations(flights))
+    excess = channels - channels[2 * number]
+    each = np.stack([*np.moveaxis(excess[:number, :3], 1, 0), excess[number : 2 * number].sum(axis=1)])
+    # In still air nothing is learned about the noise.
+    beyond = whole.shape[-1] - channels.shape[-1]
+    each = fleet.about_inertias(np.pad(each, ((0, 0), (0, 0), (0, beyond), (0, beyond))))
+    base = fleet.with_prior(whole[in_gusts].mean(axis=0))
+    scale = np.sqrt(np.diagonal(base))
+    scale[: len(INERTIAS)] = 1  # their bounds are relative already
+    unit = np.outer(scale, scale)
+    # The answers in the last period, in which the beginning is forgotten.
+    last = np.conj(turns[-tones.period :]) * 2 / tones.period
+    signals = {}
+    for name, columns in (("angle", ANGLES), ("rate", RATES)):
+        left = np.asarray(getattr(envelope, name)) - np.abs(states[in_gusts][..., columns]).max(axis=(0, 1))
+        if (left <= 0).any():
+            raise _too_gusty(name)
+        answers = np.einsum("kta,tk->ak", states[:number, -tones.period :, columns], last) / _SMALL[:3, None]
+        moving = _parts(answers[:, None] * tones.turns(_POINTS))
+        signals[name] = jnp.asarray(moving * (largest[:3] / left)[:, None, None])
+    relative = np.square(largest / _SMALL)[:, None, None, None]
+    return {"base": jnp.asarray(base / unit), "added": jnp.asarray(relative * each / unit), "signals": signals}
 
 
-class References(AbstractTask):
+class References(task.AbstractTask):
     """References for a controller. The targets are Ix, Iy and Iz; a coefficient of 1 is a tone of the largest value.
 
     - `scale`: the moments of inertia [kg m^2]. `unexcited`: almost the standard deviations of the bracket.
-    - `largest`: the largest value of each reference.
-    - `basis`: the tones at the points of a period.
+    - `base`: information of a flight in gusts without references, with the prior. `added`: the information that a unit
+      of each tone of each reference adds. Both are about the inertias first.
+    - `signals`: the change of the angles and rates of an axis by a unit of the coefficients of its reference, cosines
+      first, as a share of the part of the limit that gusts leave; by the name of the limit.
+    - `largest`: the largest value of each reference. `basis`: the tones at the points of a period.
     """
 
     kind: ClassVar[str] = "references"
@@ -159,8 +129,9 @@ class References(AbstractTask):
     scale: Float[Numeric, "3"]
     unexcited: Float[Numeric, " parameters"]
     fleet: Fleet
-    filters: Filters
-    response: Response
+    base: Float[Numeric, "unknowns unknowns"]
+    added: Float[Numeric, "references tones unknowns unknowns"]
+    signals: dict[str, Float[Numeric, "axes points coefficients"]]
     largest: Float[Numeric, "4"]
     basis: Float[Array, "points coefficients"]
     tones: Tones = eqx.field(static=True)
@@ -170,21 +141,19 @@ class References(AbstractTask):
     units: tuple[str, ...] = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
+    write = staticmethod(task.write_references)
+
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
         cosines, sines = jnp.moveaxis(coefficients.reshape(4, 2, -1), 1, 0)
-        added = jnp.einsum("rk,rkuv->uv", jnp.square(cosines) + jnp.square(sines), self.response.tones)
-        return criterion_of(
-            jnp.asarray(self.response.base) + added, jnp.ones(len(INERTIAS), dtype=float), self.criterion
-        )
+        added = jnp.einsum("rk,rkuv->uv", jnp.square(cosines) + jnp.square(sines), self.added)
+        return task.criterion_of(jnp.asarray(self.base) + added, jnp.ones(len(INERTIAS), dtype=float), self.criterion)
 
     def uses(self, coefficients: Coefficients) -> Uses:
         """See `AbstractTask`."""
         each = coefficients.reshape(4, -1)
-        signals = self.response.signals.items()
-        return {name: jnp.einsum("apk,ak->pa", signal, each[:3]) for name, signal in signals} | {
-            "reference": self.basis @ each.T
-        }
+        moved = {name: jnp.einsum("apk,ak->pa", some, each[:3]) for name, some in self.signals.items()}
+        return moved | {"reference": self.basis @ each.T}
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`. The references have their largest values, or are reduced to a share of them."""
@@ -214,16 +183,12 @@ class References(AbstractTask):
 
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
         """See `AbstractTask`. The bounds are those of filter error, after a flight through gusts."""
-        bounds = self.fleet.bounds(self.filters, {name: references for name, (references, _) in flown.items()})
+        bounds = self.fleet.bounds({name: references for name, (references, _) in flown.items()})
         dt = self.fleet.dt
         return {
-            name: Designed(references, dt, bounds[name], uses, dt * self.tones.period)
-            for name, (references, uses) in flown.items()
+            name: Designed(inputs, dt, bounds[name], uses, dt * self.tones.period)
+            for name, (inputs, uses) in flown.items()
         }
-
-    def write(self, designed: Designed, path: str | PathLike[str]) -> None:
-        """See `write_references`."""
-        write_references(designed, path)
 
 
 def design_references(
@@ -239,8 +204,8 @@ def design_references(
     bandwidth: float = 6.0,
     compare: bool = False,
     key: Key | int,
-    progress: Progress = lambda _: None,
-) -> Design:
+    progress: task.Progress = lambda _: None,
+) -> task.Design:
     """Design the references with which filter error identifies the moments of inertia of a vehicle most accurately.
 
     Each reference is a sum of tones, which repeats. The simulator flies each tone once; the search for the amplitudes
@@ -266,33 +231,32 @@ def design_references(
     for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
         if not 0 < value <= most:
             raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
-    _RANGES.check(duration, dt, bandwidth, criterion)
+    remedy = "; longer flights repeat the references"
+    task.check_ranges(duration, dt, bandwidth, criterion, samples=(250, 20_000), cycles=2, fastest=0.1, remedy=remedy)
     progress("limits")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model_of(loop)) if bracket is None else bracket
     samples, largest = round(duration / dt) + 1, np.array([angle, angle, angle, acceleration])
-    fleet, filters = Fleet.of(loop, bracket, dt, key), Filters.of(loop, bracket.half_width)
+    fleet = Fleet.of(loop, bracket, dt, key)
     envelope = fleet.envelope(standard_references(samples, dt, largest)["3211"], limits or {})
     tones = Tones.up_to(bandwidth, samples, dt)
     progress("flying tones")
-    response = Response.of(fleet, filters, envelope, largest, tones, samples, jax.random.fold_in(key, 3))
-    task = References(
+    references = References(
         envelope=envelope,
         scale=np.asarray(loop.airframe.inertia),
-        unexcited=_LITTLE * filters.bounds(np.zeros((filters.prior.shape[0],) * 2)),
+        unexcited=_LITTLE * fleet.bounds_from(np.zeros((fleet.prior.shape[0],) * 2)),
         fleet=fleet,
-        filters=filters,
-        response=response,
         largest=largest,
         basis=as_float(tones.basis(_POINTS)),
         tones=tones,
         samples=samples,
-        size=8 * tones.count,
-        names=filters.names,
-        units=filters.units,
+        size=8 * tones.number,
+        names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
+        units=fleet.inertias_first(("kg m^2",) * 3, fleet.model.parameter_units),
         criterion=criterion,
+        **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )
-    return solve(task, compare=compare, key=key, progress=progress)
+    return task.solve(references, compare=compare, key=key, progress=progress)
 
 
 def _too_gusty(name: str) -> InputError:

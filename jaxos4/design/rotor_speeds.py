@@ -1,7 +1,8 @@
 """The design of rotor speeds for an OS4 without feedback: a multisine that all vehicles of a bracket can fly."""
 
+import functools
+import math
 from collections.abc import Mapping
-from os import PathLike
 from typing import ClassVar
 
 import equinox as eqx
@@ -13,31 +14,21 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Parameters, RotorSpeeds as Speeds, Scalar, as_float
 from .._xla import quick_jit
+from ..airframe import Airframe
 from ..bracket import Bracket
 from ..errors import InputError
-from ..excitation import EXCITATIONS
+from ..excitation import EXCITATIONS, multisine
+from ..flight import Inputs as Rotors
 from ..models.abstract import AbstractModel
-from ..models.state import CASCADE_ORDER, CHANNELS
+from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State, unstack
 from ..noise import SENSOR_SIGMA
-from ..simulation import simulate
-from .envelope import Envelope, Uses, hover_squares, largest
-from .files import write_input
-from .open_loop import FINER, VEHICLES, Multisine, drawn, envelope_of, fly_finely, sense
-from .task import (
-    AbstractTask,
-    Coefficients,
-    Design,
-    Designed,
-    Flown,
-    Inputs,
-    Progress,
-    Ranges,
-    bounds_of,
-    criterion_of,
-    solve,
-)
+from ..simulation import euler_step, simulate
+from . import task
+from .envelope import Envelope, Uses, hover_squares
+from .task import Coefficients, Designed, Flown, Inputs
 
-_RANGES = Ranges(samples=(50, 2500), cycles=1, fastest=0.25)
+# Vehicles that must stay within the envelope, and the finer step at which they are flown.
+VEHICLES, FINER = 200, 10
 # The number of vehicles that keep the limits during the search; at the end all of them do.
 _LIMITED = 64
 # The number of vehicles over which the criterion is averaged.
@@ -45,9 +36,56 @@ _DRAWS = 4
 # The share of a limit that an input uses at most: other vehicles from the bracket may need a little more.
 _TARGET, _PRECISION = 0.95, 1e-3
 _MOST_CORRECTIONS, _MOST_AMPLIFIED, _FAR = 5, 100.0, 10.0
+# The amplitude of tones below this frequency [Hz] is that at this frequency: angles would allow almost none.
+_SLOWEST = 0.3
+# Squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
+_LEAST = 1e-6
 
 
-class RotorSpeeds(AbstractTask):
+class Multisine(eqx.Module):
+    """Rotor speeds as a function of coefficients: angular and vertical accelerations are sums of cosines.
+
+    The frequencies are the multiples of 1 / (2 duration) up to a bandwidth. Such cosines can make every input of this
+    bandwidth, so only amplitudes are searched: a phase follows from neighbouring tones.
+
+    - `tones`: each tone at each sample.
+    - `scale`: the amplitude of each tone for a coefficient of 1, about as large as the envelope allows: for roll,
+      pitch, yaw [rad/s^2] and vertical acceleration [m/s^2].
+    - `hover`: squared rotor speeds that carry the weight [rad^2/s^2]. `action`: their change by a unit of each
+      acceleration.
+    """
+
+    tones: Float[Array, "samples tones"] = eqx.field(converter=as_float)
+    scale: Float[Array, "4 tones"] = eqx.field(converter=as_float)
+    hover: Float[Array, "4"] = eqx.field(converter=as_float)
+    action: Float[Array, "4 4"] = eqx.field(converter=as_float)
+
+    @classmethod
+    def within(cls, airframe: Airframe, envelope: Envelope, samples: int, dt: float, bandwidth: float) -> "Multisine":
+        """Tones up to `bandwidth` [Hz] in so many samples, scaled to the envelope."""
+        duration = (samples - 1) * dt
+        frequency = np.arange(math.floor(2 * duration * bandwidth + 1e-9) + 1) / (2 * duration)
+        hover = hover_squares(airframe, envelope)
+        action = np.linalg.solve(np.asarray(airframe.mixer), np.diag(np.append(airframe.inertia, airframe.mass)))
+        speed, limits = np.sqrt(hover), np.asarray([envelope.slowest, envelope.fastest])
+        change = (np.abs(action) / (2 * speed)[:, None]).max(axis=0)[:, None]  # of rotor speed, by one unit
+        angular = 2 * math.pi * np.maximum(frequency, _SLOWEST)
+        uses = (
+            change / np.abs(speed[:, None] - limits).min(),
+            change * angular / np.asarray(envelope.slew),
+            1 / (angular * np.append(envelope.rate, envelope.velocity)[:, None]),
+            1 / (angular**2 * np.append(envelope.angle, envelope.distance)[:, None]),
+        )
+        tones = np.cos(2 * math.pi * frequency * dt * np.arange(samples)[:, None])
+        return cls(tones, 1 / np.linalg.norm(np.broadcast_arrays(*uses), axis=0), hover, action)
+
+    def __call__(self, coefficients: Coefficients) -> Speeds:
+        """The rotor speeds [rad/s]."""
+        acceleration = self.tones @ (self.scale * coefficients.reshape(self.scale.shape)).T
+        return jnp.sqrt(jnp.maximum(self.hover + acceleration @ self.action.T, _LEAST))
+
+
+class RotorSpeeds(task.AbstractTask):
     """Rotor speeds, as a multisine. The objective is the mean of the criterion over `draws`.
 
     - `scale`: the half-widths of the bracket. `unexcited`: those of the model's default bracket.
@@ -79,13 +117,16 @@ class RotorSpeeds(AbstractTask):
     start_is_known: bool = eqx.field(static=True)
     criterion: str = eqx.field(static=True)
 
+    write = staticmethod(task.write_input)
+
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
         omega = self.make(coefficients)
 
         def one(parameters: Parameters) -> Scalar:
-            slopes = sense(self.model, omega, parameters, self.dt, self.weights, self.start_is_known)
-            return criterion_of(jnp.einsum("tsu,tsv->uv", slopes, slopes), jnp.asarray(self.scale), self.criterion)
+            slopes = self._sense(omega, parameters)
+            information = jnp.einsum("tsu,tsv->uv", slopes, slopes)
+            return task.criterion_of(information, jnp.asarray(self.scale), self.criterion)
 
         return jax.vmap(one)(self.draws).mean()
 
@@ -93,19 +134,14 @@ class RotorSpeeds(AbstractTask):
         """See `AbstractTask`. The columns of a limit of the states are those of all vehicles."""
         omega = self.make(coefficients)
         fly = jax.vmap(lambda a: simulate(self.model, a, omega, dt=self.dt).states, out_axes=1)
-        of_states = jax.vmap(self.envelope.uses_of_states, in_axes=1, out_axes=1)(fly(self.fleet[:_LIMITED]))
-        of_states = {name: share.reshape(share.shape[0], -1) for name, share in of_states.items()}
-        return self.envelope.uses_of_rotors(omega, self.dt) | of_states
+        return self.envelope.uses(omega, fly(self.fleet[:_LIMITED]), self.dt)
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`."""
-        return self.within_limits(np.asarray(self.make(as_float(coefficients))))
+        return self._within_limits(np.asarray(self.make(as_float(coefficients))))
 
-    def within_limits(self, inputs: Inputs) -> Flown:
-        """The input with the largest amplitude that all vehicles can fly.
-
-        It is found at the sample time, and corrected until the limits hold at a tenth of it.
-        """
+    def _within_limits(self, inputs: Inputs) -> Flown:
+        """The input with the largest amplitude that all vehicles can fly, also at a tenth of the sample time."""
         hover = hover_squares(self.model.airframe, self.envelope)
 
         def amplified(factor: float) -> Inputs:
@@ -113,8 +149,9 @@ class RotorSpeeds(AbstractTask):
             return np.sqrt(np.maximum(hover + factor * (np.square(inputs) - hover), 0.0))
 
         def used(factor: float, finer: int = 1) -> dict[str, float]:
-            shares = _largest_uses(self, as_float(amplified(factor)), finer)
-            return {name: float(np.max(share)) for name, share in shares.items()}
+            omega = amplified(factor)
+            states = fly_finely(self.model, self.fleet, as_float(omega), self.dt, finer)
+            return dict(sorted(self.envelope.shares(omega, states, float(self.dt)).items()))
 
         def excess(factor: float, target: float) -> float:
             return min(max(used(factor).values()), _FAR) - target
@@ -143,20 +180,86 @@ class RotorSpeeds(AbstractTask):
                 omega = make(self.model.airframe, duration=(self.make.tones.shape[0] - 1) * dt, dt=dt)
             except ValueError:  # too short
                 continue
-            found[name] = self.within_limits(np.asarray(omega))
+            found[name] = self._within_limits(np.asarray(omega))
         return found
 
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
         """See `AbstractTask`. The bounds are those of the airframe's vehicle."""
         judged, dt = {}, float(self.dt)
         for name, (omega, uses) in flown.items():
-            history = np.asarray(_histories(self, as_float(omega)))
+            history = np.asarray(self._history(as_float(omega)))
             judged[name] = Designed(omega, dt, history[-1], uses, dt * (omega.shape[0] - 1), history)
         return judged
 
-    def write(self, designed: Designed, path: str | PathLike[str]) -> None:
-        """See `write_input`."""
-        write_input(designed, path)
+    @quick_jit
+    def _history(self, omega: Speeds) -> Float[Array, "samples parameters"]:
+        """The bounds after each sample of a flight of the airframe's vehicle."""
+        parameters = self.model.alpha
+        slopes = self._sense(omega, parameters)
+
+        def add(total: Float[Array, "unknowns unknowns"], slopes: Float[Array, "sensors unknowns"]):
+            total = total + slopes.T @ slopes
+            return total, jnp.sqrt(jnp.diagonal(task.bounds_of(total, parameters.shape[0])[0]))
+
+        return jax.lax.scan(add, jnp.zeros((slopes.shape[-1],) * 2, dtype=float), slopes)[1]
+
+    def _sense(self, omega: Speeds, parameters: Parameters) -> Float[Array, "samples sensors unknowns"]:
+        """The derivatives of the weighted outputs of a flight from rest, by forward Euler; fast in reverse mode.
+
+        The unknowns are the parameters and, if the start is not known, the initial state of the measured channels.
+        """
+        count, sensors = parameters.shape[0], self.weights.shape[0]
+        unknowns = count + (0 if self.start_is_known else sensors)
+        identity, scalars = np.eye(unknowns), tuple(parameters)
+        starts = np.zeros((12, unknowns))
+        starts[: unknowns - count, count:] = np.eye(unknowns - count)
+        first, first_slopes = unstack(jnp.zeros(12, dtype=float)), jax.vmap(unstack)(jnp.asarray(starts.T))
+
+        def step(carry: tuple[State, State], forcing: Forcing):
+            state, slopes = carry
+            following, push = jax.linearize(lambda x, a: euler_step(self.model, x, forcing, a, self.dt), state, scalars)
+            carry = following, jax.vmap(push)(slopes, tuple(identity[:, :count].T))
+            return carry, carry[1]
+
+        forcing = jax.tree.map(lambda leaf: leaf[:-1], self.model.forcing(Rotors(omega, self.dt), parameters))
+        # Recomputing a step is faster than keeping its intermediate values for the reverse pass.
+        slopes = jax.lax.scan(jax.checkpoint(step), (first, first_slopes), forcing)[1]
+        rows = jnp.concatenate([starts[None, :sensors], jnp.stack(jax.tree.leaves(slopes)[:sensors], axis=1)])
+        return self.weights[:, None] * rows
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def drawn(bracket: Bracket, key: Key, count: int) -> Float[Array, "count parameters"]:
+    """Vehicles drawn uniformly from the bracket."""
+    lower, upper = bracket.lower, bracket.upper
+    return lower + (upper - lower) * jax.random.uniform(key, (count, lower.shape[0]), dtype=float)
+
+
+@quick_jit
+def fly_finely(
+    model: AbstractModel, vehicles: Float[Array, "vehicles parameters"], omega: Speeds, dt: Scalar, finer: int = FINER
+) -> Float[Array, "vehicles times 12"]:
+    """The states of all vehicles from rest, at a `finer` step than the sample time."""
+    held = jnp.concatenate([jnp.repeat(omega[:-1], finer, axis=0), omega[-1:]])
+    return jax.vmap(lambda a: simulate(model, a, held, dt=dt / finer).states)(vehicles)
+
+
+def envelope_of(
+    model: AbstractModel, *, bracket: Bracket | None = None, duration: float = 5.0, dt: float = 0.01, key: Key
+) -> Envelope:
+    """The envelope that the standard multisine needs, for all vehicles of a bracket.
+
+    **Raises:** `InputError` if it cannot be flown.
+    """
+    bracket = Bracket.default(model) if bracket is None else bracket
+    try:
+        omega = multisine(model.airframe, duration=duration, dt=dt)
+    except ValueError as error:
+        raise InputError(f"the standard multisine, which sets the envelope: {error}") from None
+    states = np.asarray(fly_finely(model, drawn(bracket, key, VEHICLES), omega, as_float(dt)))
+    if not np.isfinite(states).all():
+        raise InputError("`bracket`: some of its vehicles turn over in the standard multisine; narrow it.")
+    return Envelope.of(omega, states, dt)
 
 
 def design_input(
@@ -173,8 +276,8 @@ def design_input(
     bandwidth: float = 4.0,
     compare: bool = False,
     key: Key | int,
-    progress: Progress = lambda _: None,
-) -> Design:
+    progress: task.Progress = lambda _: None,
+) -> task.Design:
     """Design the rotor speeds that identify a vehicle's parameters most accurately within an envelope.
 
     The input is a multisine. Its amplitudes are searched from random starts, by the gradient of the simulator. The
@@ -187,30 +290,30 @@ def design_input(
       (`envelope_of`).
     - `bracket`: the knowledge of the parameters before the flight; by default the model's.
     - `duration`, `dt`: length and sample time [s].
-    - `channels`: the channels that will be measured: `"rates"`, `"attitude"` or `"all"`.
-    - `sigma`: their noise, in the order of `STATE_NAMES`.
+    - `channels`: what will be measured: `"rates"`, `"attitude"` or `"all"`. `sigma`: its noise, as `STATE_NAMES`.
     - `start_is_known`: whether the flight starts exactly at rest. If not, the initial state will be estimated too.
     - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
       bound. Bounds are shares of the bracket's half-widths.
-    - `bandwidth`: the highest frequency [Hz].
-    - `compare`: whether to judge the standard inputs in the same envelope too.
+    - `bandwidth`: the highest frequency [Hz]. `compare`: whether to judge the standard inputs in the envelope too.
     - `key`: for the draws and the starts, or a seed. `progress`: called with the name of each stage.
 
     **Raises:** `InputError` if an argument is out of range, the vehicle cannot hover within the envelope, or no input
     within it excites a parameter.
     """
-    _RANGES.check(duration, dt, bandwidth, criterion)
-    _check(model, channels)
+    task.check_ranges(duration, dt, bandwidth, criterion, samples=(50, 2500), cycles=1, fastest=0.25)
+    if channels not in CHANNELS:
+        raise InputError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
+    if model.forcing_parameters or model.force_axes:
+        raise InputError("`model` must be an OS4 model: a real vehicle needs its controller, and `design_references`.")
     progress("envelope")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
-    envelope = limits
-    if not isinstance(envelope, Envelope):
-        envelope = envelope_of(model, bracket=bracket, duration=duration, dt=dt, key=key).limited(limits or {})
+    if not isinstance(limits, Envelope):
+        limits = envelope_of(model, bracket=bracket, duration=duration, dt=dt, key=key).limited(limits or {})
     center, others = np.asarray(bracket.center)[None], drawn(bracket, jax.random.fold_in(key, 1), _DRAWS - 1)
-    make = Multisine.within(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
-    task = RotorSpeeds(
-        envelope=envelope,
+    make = Multisine.within(model.airframe, limits, round(duration / dt) + 1, dt, bandwidth)
+    rotor_speeds = RotorSpeeds(
+        envelope=limits,
         scale=np.asarray(bracket.half_width),
         unexcited=np.asarray(model.half_width),
         model=model,
@@ -225,36 +328,7 @@ def design_input(
         start_is_known=start_is_known,
         criterion=criterion,
     )
-    found = solve(task, compare=compare, key=key, progress=progress)
-    if not (found.designed.bounds < task.unexcited).any():
+    found = task.solve(rotor_speeds, compare=compare, key=key, progress=progress)
+    if not (found.designed.bounds < rotor_speeds.unexcited).any():
         raise InputError("the limits are too narrow: no input within them excites a parameter; widen them.")
     return found
-
-
-def _check(model: AbstractModel, channels: str) -> None:
-    if channels not in CHANNELS:
-        raise InputError(f"`channels` must be one of {', '.join(CHANNELS)}, got {channels!r}.")
-    if model.forcing_parameters or model.force_axes:
-        raise InputError("`model` must be an OS4 model: a real vehicle needs its controller, and `design_references`.")
-
-
-@quick_jit
-def _largest_uses(task: RotorSpeeds, omega: Speeds, finer: int) -> dict[str, Float[Array, " columns"]]:
-    """The largest share of each limit that one of the vehicles uses."""
-    flown = fly_finely(task.model, task.fleet, omega, task.dt, finer)
-    of_states = jax.vmap(lambda states: largest(task.envelope.uses_of_states(states)))(flown)
-    return largest(task.envelope.uses_of_rotors(omega, task.dt)) | jax.tree.map(lambda x: x.max(axis=0), of_states)
-
-
-@quick_jit
-def _histories(task: RotorSpeeds, omega: Speeds) -> Float[Array, "samples parameters"]:
-    """The bounds after each sample of a flight of the airframe's vehicle."""
-    parameters = task.model.alpha
-    slopes = sense(task.model, omega, parameters, task.dt, task.weights, task.start_is_known)
-
-    def add(total: Float[Array, "unknowns unknowns"], slopes: Float[Array, "sensors unknowns"]):
-        total = total + slopes.T @ slopes
-        return total, jnp.sqrt(jnp.diagonal(bounds_of(total, parameters.shape[0])[0]))
-
-    nothing = jnp.zeros((slopes.shape[-1],) * 2, dtype=float)
-    return jax.lax.scan(add, nothing, slopes)[1]

@@ -1,4 +1,4 @@
-"""A design: the search for the most informative inputs within an envelope, and a comparison with standard inputs.
+"""A design: the search for the most informative inputs within an envelope, a comparison with standard inputs, files.
 
 The search minimises criterion + penalty by BFGS. The penalty grows from stage to stage, so that the limits hold better
 and better. They hold exactly only after the task has flown the inputs and has reduced their amplitude.
@@ -8,8 +8,8 @@ Reference: Nocedal and Wright, Numerical Optimization, ch. 6 (BFGS) and 17 (pena
 
 import abc
 import math
+import os
 from collections.abc import Callable, Mapping
-from os import PathLike
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -20,9 +20,15 @@ import optimistix
 from jaxtyping import Array, Float
 
 from .._custom_types import Key, Numeric, Scalar, as_float
+from .._files import write_atomically
 from .._xla import quick_jit
 from ..errors import InputError
+from ..flight import STATE_NAMES, Flight
 from ..linalg import gram, joint_factor
+from ..logs import write_flight
+from ..logs.assemble import SPEED_NAMES
+from ..logs.csv import read_table
+from ..logs.table import printable
 from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]
@@ -30,6 +36,7 @@ Inputs = Float[np.ndarray, "samples 4"]
 # Inputs, and the largest share of each limit that a vehicle uses.
 Flown = tuple[Inputs, dict[str, float]]
 Progress = Callable[[str], None]
+Path = str | os.PathLike[str]
 
 CRITERIA = ("D", "A", "worst")
 # In the criterion `worst`, the largest bound is replaced by this norm of the bounds, which has derivatives.
@@ -39,20 +46,22 @@ _PENALTIES = (10.0, 50.0, 250.0, 1250.0, 6000.0)
 # BFGS starts with a unit matrix as second derivative, so its unknowns are coefficients over their usual size.
 _UNIT = 0.1
 _TOLERANCE = 1e-6
+_REFERENCE_NAMES = ("roll_reference", "pitch_reference", "yaw_reference", "az_reference")
+# The largest error of a sample time in a file, as a share of it.
+_PRECISION = 1e-3
 
 
 class Designed(NamedTuple):
     """Inputs of a flight, and the accuracy of an estimate from it.
 
     - `inputs`: rotor speeds [rad/s], held from sample to sample; or references of roll, pitch and yaw angle [rad] and
-      vertical acceleration [m/s^2], as `fly_closed_loop` takes them.
-    - `dt`: the sample time [s].
+      vertical acceleration [m/s^2], as `fly_closed_loop` takes them. `dt`: their sample time [s].
     - `bounds`: the smallest standard deviation that each parameter can have after the flight.
     - `uses`: the largest share of each limit that any vehicle of the bracket uses, by the name of the limit; at most 1.
       Empty if no vehicle was flown to find out.
     - `period`: the time after which the inputs repeat [s]; the whole flight if they do not.
-    - `history`: the bounds after each sample. Infinite as long as a parameter is not excited. `None`: the bounds fall
-      with the square root of the duration.
+    - `history`: the bounds after each sample, infinite until a parameter is excited. `None`: the bounds fall with the
+      square root of the duration.
     """
 
     inputs: Inputs
@@ -124,8 +133,9 @@ class AbstractTask(eqx.Module):
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
         """The bounds of several inputs."""
 
+    @staticmethod
     @abc.abstractmethod
-    def write(self, designed: Designed, path: str | PathLike[str]) -> None:
+    def write(designed: Designed, path: Path) -> None:
         """Write the inputs as CSV."""
 
 
@@ -143,8 +153,7 @@ class Design(NamedTuple):
     def gain(self, name: str) -> tuple[float, int]:
         """The designed bounds over those of a standard input.
 
-        **Returns:** the geometric mean over the targets that the standard input excites, NaN without any; and their
-        number.
+        **Returns:** the geometric mean over the targets that it excites, NaN without any; and the number of these.
         """
         count = self.task.scale.size
         own, other = (one.bounds[:count] for one in (self.designed, self.standard[name]))
@@ -192,7 +201,7 @@ def _minimise(
 def bounds_of(information: Float[Array, "unknowns unknowns"], count: int) -> tuple[Float[Array, "count count"], Scalar]:
     """The smallest covariance of the first `count` unknowns, and the logarithm of its determinant.
 
-    The other unknowns are nuisances: estimated too, and eliminated by the Schur complement.
+    The others are estimated too, and eliminated by the Schur complement.
     """
     factor, basis = joint_factor(information[None], count)
     determinant = -2 * jnp.log(jnp.diagonal(factor[0, :count, -count:])).sum()
@@ -202,13 +211,10 @@ def bounds_of(information: Float[Array, "unknowns unknowns"], count: int) -> tup
 def criterion_of(
     information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str
 ) -> Scalar:
-    """The logarithm of a mean relative bound of the first unknowns. Smaller is better.
+    """The logarithm of a mean bound of the first unknowns, see `design_input`. Smaller is better.
 
-    A bound is a standard deviation as a share of the `half_width` of its parameter's bracket.
-
-    - `"D"`: the volume of the confidence ellipsoid, as the edge of a cube of that volume.
-    - `"A"`: the root of the mean of the squared bounds.
-    - `"worst"`: the largest bound.
+    A bound is a standard deviation as a share of the `half_width` of its parameter's bracket. The volume of `"D"` is
+    given as the edge of a cube.
     """
     count = half_width.shape[0]
     covariance, determinant = bounds_of(information, count)
@@ -221,31 +227,78 @@ def criterion_of(
     return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (_NORM / 2)).sum()) / _NORM
 
 
-class Ranges(NamedTuple):
-    """The settings that can be designed for.
+def check_ranges(
+    duration: float,
+    dt: float,
+    bandwidth: float,
+    criterion: str,
+    *,
+    samples: tuple[int, int],
+    cycles: int,
+    fastest: float,
+    remedy: str = "",
+) -> None:
+    """Raise `InputError` for settings that cannot be designed for.
 
-    - `samples`: the fewest and the most. `remedy`: the remedy if a flight is too long.
-    - `cycles`: the least number of cycles of the fastest tone. `fastest`: its largest frequency over the sample rate.
+    `samples`: the fewest and the most; `remedy`: if they are too many. `cycles`: the fewest of the fastest tone.
+    `fastest`: its largest frequency over the sample rate.
     """
+    for name, value in (("duration", duration), ("dt", dt)):
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"`{name}` must be positive and finite [s], got {value:g}.")
+    if not samples[0] <= duration / dt <= samples[1]:
+        allowed = f"{samples[0]} to {samples[1]} samples of {dt:g} s (`dt`)"
+        raise InputError(f"`duration` must be {allowed}, got {duration:g} s{remedy}.")
+    if criterion not in CRITERIA:
+        raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
+    low, high = cycles / duration, fastest / dt
+    if not low <= bandwidth <= high:
+        limits = f"{cycles} / `duration` and {fastest:g} / `dt`, {low:.3g} to {high:.3g} Hz"
+        raise InputError(f"`bandwidth` must lie between {limits}, got {bandwidth:g} Hz.")
 
-    samples: tuple[int, int]
-    cycles: int
-    fastest: float
-    remedy: str = ""
 
-    def check(self, duration: float, dt: float, bandwidth: float, criterion: str) -> None:
-        """Raise `InputError` for settings that are out of range."""
-        for name, value in (("duration", duration), ("dt", dt)):
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"`{name}` must be positive and finite [s], got {value:g}.")
-        if not self.samples[0] <= duration / dt <= self.samples[1]:
-            allowed = f"{self.samples[0]} to {self.samples[1]} samples of {dt:g} s (`dt`)"
-            raise InputError(f"`duration` must be {allowed}, got {duration:g} s{self.remedy}.")
-        if criterion not in CRITERIA:
-            raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
-        low, high = self.cycles / duration, self.fastest / dt
-        if not low <= bandwidth <= high:
-            raise InputError(
-                f"`bandwidth` must lie between {self.cycles} / `duration` and {self.fastest:g} / `dt`, {low:.3g} to "
-                f"{high:.3g} Hz, got {bandwidth:g} Hz."
-            )
+def write_input(designed: Designed, path: Path) -> None:
+    """Write rotor speeds as a flight CSV with the columns t and omega1..4."""
+    samples = designed.inputs.shape[0]
+    nothing = np.full((samples, len(STATE_NAMES)), np.nan)
+    write_flight(Flight(designed.dt * np.arange(samples), designed.inputs, nothing), path)
+
+
+def write_references(designed: Designed, path: Path) -> None:
+    """Write references as CSV, with the columns t, roll_reference, pitch_reference, yaw_reference and az_reference."""
+    rows = np.column_stack([designed.dt * np.arange(len(designed.inputs)), designed.inputs])
+    with write_atomically(path) as beside:
+        np.savetxt(beside, rows, delimiter=",", header=",".join(("t", *_REFERENCE_NAMES)), comments="", fmt="%.8g")
+
+
+def read_input(path: Path, dt: float) -> Float[np.ndarray, "samples 4"]:
+    """Read rotor speeds [rad/s] with the sample time `dt` [s]. Raises `InputError` as `read_references` does."""
+    time, omega, name = _read(path, SPEED_NAMES, "an input has t and omega1..4")
+    if not (np.isfinite(time).all() and (omega >= 0).all()):
+        raise InputError(f"{name}: a cell is empty or negative; give every rotor speed of every sample.")
+    if len(time) < 2 or np.abs(np.diff(time) - dt).max() > _PRECISION * dt:
+        raise InputError(f"{name}: is not sampled every {dt:g} s; design the input with this sample time.")
+    return omega
+
+
+def read_references(path: Path) -> tuple[Inputs, float]:
+    """Read references and their sample time [s]. Other columns are ignored.
+
+    **Raises:** `InputError`, one line: file, what is wrong and what to do.
+    """
+    time, references, name = _read(path, _REFERENCE_NAMES, f"references have t, {', '.join(_REFERENCE_NAMES)}")
+    if not (np.isfinite(time).all() and np.isfinite(references).all()):
+        raise InputError(f"{name}: a cell is empty; give every reference at every sample.")
+    steps = np.diff(time)
+    if not steps.size or not np.all(np.abs(steps - steps.mean()) < _PRECISION * steps.mean()):
+        raise InputError(f"{name}: is not sampled at equal times; give one row for each sample.")
+    return references, float(steps.mean())
+
+
+def _read(path: Path, names: tuple[str, ...], contents: str) -> tuple[np.ndarray, np.ndarray, str]:
+    """Times, the columns `names`, and the name of the file for messages."""
+    columns, name = read_table(path, ("t", *names)).columns, printable(os.fspath(path))
+    for column in ("t", *names):
+        if column not in columns:
+            raise InputError(f"{name}: column {column} is missing; {contents}.")
+    return columns["t"], np.stack([columns[column] for column in names], axis=1), name

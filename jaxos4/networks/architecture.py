@@ -17,9 +17,10 @@ from .._custom_types import Key, Scalar, as_float
 # Features grow linearly up to this size and logarithmically beyond: flights that nearly diverge have huge features.
 _LINEAR = 4.0
 _DRAWN = 1024  # random numbers at once, for the first weights
+_TILINGS, _CELLS = 8, 20  # of tile coding: grids, and cells along each side
+_SILU = jax.nn.silu
 # The perceptron that predicts the size of the error: its width and depth, and the limit of its logarithm.
 _SPREAD_WIDTH, _SPREAD_DEPTH, _LARGEST_LOGARITHM = 32, 2, 7.0
-
 
 # Levels of the calibrated intervals: evenly spaced in Gaussian standard deviations, from 50 to 99.9 %.
 _NORMAL = statistics.NormalDist()
@@ -42,10 +43,8 @@ class Scaling(eqx.Module):
     span: Scalar
 
     def bound(self, scale: Scalar) -> Float[Array, " unknowns"]:
-        """The smallest possible standard deviation of each unknown at a noise scale.
-
-        The bracket counts as data: a uniform distribution over it has the variance 1/3.
-        """
+        """The smallest possible standard deviation of each unknown at a noise scale."""
+        # The bracket counts as data: a uniform distribution over it has the variance 1/3.
         return jax.lax.rsqrt(1 / jnp.square(self.unit * scale) + 3)
 
 
@@ -59,24 +58,20 @@ class NetworkOutput(NamedTuple):
 class CMAC(eqx.Module):
     """Tile coding (cerebellar model articulation controller): shifted grids of cells cover every pair of inputs.
 
-    The output is a sum over the pairs. Each pair contributes the mean, over its grids, of the entry of the cell that
-    holds the two inputs.
+    A pair contributes the mean, over its grids, of the entry of the cell that holds the two inputs.
     """
 
     tables: Float[Array, "pairs tilings cells cells out"]
 
-    def __init__(self, in_size: int, out_size: int, *, tilings: int = 8, cells: int = 20):
-        pairs = in_size * (in_size - 1) // 2
-        self.tables = jnp.zeros((pairs, tilings, cells, cells, out_size))
+    def __init__(self, in_size: int, out_size: int):
+        self.tables = jnp.zeros((in_size * (in_size - 1) // 2, _TILINGS, _CELLS, _CELLS, out_size))
 
     def __call__(self, x: Float[Array, " in"]) -> Float[Array, " out"]:
         """The output for inputs `x`. The cells cover -3 to 3; the outermost cells also cover everything beyond."""
-        pairs, tilings, cells = self.tables.shape[:3]
-        shift = jnp.arange(tilings) / tilings
-        place = jnp.clip(x / 6 + 0.5, 0, 1) * (cells - 1)
-        cell = jnp.floor(place[:, None] + shift).astype(int)
+        place = jnp.clip(x / 6 + 0.5, 0, 1) * (_CELLS - 1)
+        cell = jnp.floor(place[:, None] + jnp.arange(_TILINGS) / _TILINGS).astype(int)
         first, second = np.array(list(itertools.combinations(range(x.shape[0]), 2))).T
-        entries = self.tables[jnp.arange(pairs)[:, None], jnp.arange(tilings), cell[first], cell[second]]
+        entries = self.tables[jnp.arange(first.size)[:, None], jnp.arange(_TILINGS), cell[first], cell[second]]
         return entries.mean(axis=1).sum(axis=0)
 
 
@@ -93,10 +88,7 @@ class GatedPerceptron(eqx.Module):
 
     def __init__(self, in_size: int, out_size: int, width: int, depth: int, *, key: Key):
         first, second, third = jax.random.split(key, 3)
-        silu = jax.nn.silu
-        self.hidden = eqx.nn.MLP(
-            in_size, width, width, depth - 1, activation=silu, final_activation=silu, dtype=float, key=first
-        )
+        self.hidden = eqx.nn.MLP(in_size, width, width, depth - 1, _SILU, _SILU, dtype=float, key=first)
         self.gate = eqx.nn.Linear(in_size, width, dtype=float, key=second)
         self.last = eqx.nn.Linear(width, out_size, dtype=float, key=third)
 
@@ -113,16 +105,11 @@ class Regressor(eqx.Module):
     spread: eqx.nn.MLP
 
     def __init__(self, skip: Float[Array, "unknowns features"], approximator: str, *, width: int, depth: int, key: Key):
-        unknowns, inputs = skip.shape[0], skip.shape[1] + 1
-        approximator_key, spread_key = jax.random.split(key)
-        self.skip = skip
-        if approximator == "cmac":
-            self.approximator = CMAC(inputs, unknowns)
-        else:
-            self.approximator = GatedPerceptron(inputs, unknowns, width, depth, key=approximator_key)
-        self.spread = eqx.nn.MLP(
-            inputs, unknowns, _SPREAD_WIDTH, _SPREAD_DEPTH, activation=jax.nn.silu, dtype=float, key=spread_key
-        )
+        self.skip, sizes = skip, (skip.shape[1] + 1, skip.shape[0])
+        first, second = jax.random.split(key)
+        is_cmac = approximator == "cmac"
+        self.approximator = CMAC(*sizes) if is_cmac else GatedPerceptron(*sizes, width, depth, key=first)
+        self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=second)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> NetworkOutput:
         """Unknowns of one flight, from its features and its noise scale."""
@@ -140,12 +127,9 @@ def first_regressor(
     All random numbers come from one draw: a draw for each array would take XLA five seconds to compile.
     """
 
-    def layers(regressor: Regressor) -> list[eqx.nn.Linear]:
-        nodes = jax.tree.leaves(regressor, is_leaf=lambda x: isinstance(x, eqx.nn.Linear))
-        return [layer for layer in nodes if isinstance(layer, eqx.nn.Linear)]
-
     def arrays(regressor: Regressor) -> list:
-        return [array for layer in layers(regressor) for array in (layer.weight, layer.bias)]
+        nodes = jax.tree.leaves(regressor, is_leaf=lambda x: isinstance(x, eqx.nn.Linear))
+        return [x for node in nodes if isinstance(node, eqx.nn.Linear) for x in (node.weight, node.bias)]
 
     def zero(leaf):
         return jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
@@ -153,8 +137,8 @@ def first_regressor(
     # All arrays outside the layers begin at 0, except the linear map.
     make = functools.partial(Regressor, linear_map, approximator, width=width, depth=depth)
     blank = jax.tree.map(zero, eqx.filter_eval_shape(make, key=key))
-    limits = [1 / math.sqrt(layer.weight.shape[1]) for layer in layers(blank) for _ in ("weight", "bias")]
     shapes = [array.shape for array in arrays(blank)]
+    limits = [1 / math.sqrt(weight[1]) for weight in shapes[::2] for _ in ("weight", "bias")]
     ends = np.cumsum([math.prod(shape) for shape in shapes])
     keys = jax.random.split(key, -(-int(ends[-1]) // _DRAWN))
     drawn = jax.lax.map(lambda k: jax.random.uniform(k, (_DRAWN,), minval=-1, maxval=1, dtype=float), keys).ravel()
@@ -172,11 +156,7 @@ def compress(x: Float[Array, "*batch features"]) -> Float[Array, "*batch feature
 
 
 def loss(
-    regressor: Regressor,
-    scaling: Scaling,
-    features: Float[Array, " features"],
-    scale: Scalar,
-    u: Float[Array, " unknowns"],
+    regressor: Regressor, scaling: Scaling, features: Float[Array, " features"], scale: Scalar, u: Float[Array, " u"]
 ) -> Scalar:
     """The loss of one flight: weighted square error in units of `Scaling.bound`, plus the likelihood of the spread.
 
@@ -212,7 +192,7 @@ class ErrorTable(NamedTuple):
         place = jnp.interp(jnp.log(scale), jnp.log(self.scales), as_float(rows))
         weights = jnp.maximum(1 - jnp.abs(place - rows), 0.0)  # of all rows: linear between the two nearest
         rms, correlation, factors, simultaneous = (
-            (weights.reshape(-1, *(1 for _ in table.shape[1:])) * table).sum(axis=0) for table in self[1:]
+            (weights.reshape(-1, *[1] * (table.ndim - 1)) * table).sum(axis=0) for table in self[1:]
         )
         return rms, correlation, factors, simultaneous
 
@@ -220,15 +200,3 @@ class ErrorTable(NamedTuple):
 def calibrated_scales(noise: tuple[float, float]) -> Float[Array, " scales"]:
     """The noise scales at which a network is calibrated, from the lowest to the highest of its training."""
     return as_float(np.geomspace(*noise, 1 if noise[0] == noise[1] else _SCALES))
-
-
-def uncalibrated(scales: Float[Array, " scales"], parameters: int) -> ErrorTable:
-    """The table of a network before training: ones for the errors."""
-    levels = scales.shape[0]
-    return ErrorTable(
-        scales,
-        jnp.ones((levels, parameters)),
-        jnp.tile(jnp.eye(parameters), (levels, 1, 1)),
-        jnp.ones((levels, len(LEVELS), parameters)),
-        jnp.ones((levels, len(LEVELS))),
-    )

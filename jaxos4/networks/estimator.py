@@ -3,8 +3,7 @@
 The paper does not describe its network; architecture, features and training are our choice.
 """
 
-import contextlib
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,9 +21,9 @@ from ..linalg import invert
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..results import RESULTS
 from ..shooting import ShootingProblem, Unknowns, in_blocks
-from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales, uncalibrated
-from .features import FEATURES, AbstractFeatures, Coordinates
-from .training import Progress, calibrate, train, training_bar, untrained
+from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
+from .features import FEATURES, Coordinates, Features
+from .training import calibrate, train, training_bar, untrained
 
 APPROXIMATORS = ("mlp", "cmac")
 
@@ -83,9 +82,7 @@ class NetworkEstimator(eqx.Module):
         if not (len(self.noise) == 2 and 0 < self.noise[0] <= self.noise[1] < np.inf):
             raise ValueError(f"`noise` must be (lowest, highest), positive and finite, got {self.noise}.")
 
-    def fit(
-        self, problem: ShootingProblem, bracket: Bracket, *, key: Key, progress: bool | Progress = False
-    ) -> "TrainedNetwork":
+    def fit(self, problem: ShootingProblem, bracket: Bracket, *, key: Key, progress: bool = False) -> "TrainedNetwork":
         """Trains a network for the inputs, sampling, start and missing samples of a problem, and calibrates it.
 
         **Arguments:**
@@ -93,8 +90,7 @@ class NetworkEstimator(eqx.Module):
         - `problem`: its measured values are not used, except the first if the initial state is free.
         - `bracket`: parameters of the simulated flights are uniform in it.
         - `key`: the random key: the same key gives the same network.
-        - `progress`: `True` shows a bar in the terminal; a function is called at every check with the steps done, the
-          number of steps, and the validation loss.
+        - `progress`: whether to show a bar in the terminal.
 
         **Raises:** `ValueError` for a bracket without width or channels that the problem lacks; `TrainingError` if
         training diverges, or if the flights of the bracket diverge.
@@ -103,34 +99,12 @@ class NetworkEstimator(eqx.Module):
         scales = np.asarray(self.noise, float)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
         scaling, regressor = untrained(features, scales, key, self.approximator, self.width, self.depth)
-        bar = training_bar(self.steps) if progress is True else contextlib.nullcontext(progress or None)
-        with bar as report:
-            regressor, history = train(
-                regressor,
-                scaling,
-                features,
-                scales,
-                batch=self.batch,
-                steps=self.steps,
-                learning_rate=self.learning_rate,
-                patience=self.patience,
-                key=key,
-                progress=report,
-            )
+        pace: dict[str, Any] = {"batch": self.batch, "steps": self.steps, "patience": self.patience}
+        pace["learning_rate"] = self.learning_rate
+        with training_bar(self.steps, shown=progress) as report:
+            regressor, history = train(regressor, scaling, features, scales, **pace, key=key, progress=report)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
-
-    def blank(self, problem: ShootingProblem, bracket: Bracket) -> "TrainedNetwork":
-        """A network with the shapes of a trained one and no values, for a problem with its channels."""
-        features = FEATURES[self.features].blank(problem, Coordinates.of(problem, bracket, as_float(self.noise[1])))
-        unknowns, size = features.coordinates.center.shape[0], features.size
-        scaling = Scaling(jnp.zeros(size), jnp.zeros(unknowns), jnp.zeros(unknowns), jnp.zeros(()))
-        regressor = Regressor(
-            jnp.zeros((unknowns, size)), self.approximator, width=self.width, depth=self.depth, key=jax.random.key(0)
-        )
-        errors = uncalibrated(calibrated_scales(self.noise), len(features.problem.model.parameter_names))
-        key = jax.random.key_data(jax.random.key(0))
-        return TrainedNetwork(self, features, scaling, regressor, errors, jnp.zeros((0, 2)), key)
 
     def _check(self, problem: ShootingProblem, bracket: Bracket) -> None:
         if CHANNELS[self.channels] > problem.size:
@@ -147,8 +121,8 @@ class NetworkEstimator(eqx.Module):
 
 
 @quick_jit
-def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> AbstractFeatures:
-    return FEATURES[features].of(problem, Coordinates.of(problem, bracket, as_float(noise)))
+def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> Features:
+    return Features.of(features, problem, Coordinates.of(problem, bracket, as_float(noise)))
 
 
 class TrainedNetwork(AbstractEstimator):
@@ -166,7 +140,7 @@ class TrainedNetwork(AbstractEstimator):
     needs_network: ClassVar[bool] = True
 
     settings: NetworkEstimator
-    features: AbstractFeatures
+    features: Features
     scaling: Scaling
     regressor: Regressor
     errors: ErrorTable
@@ -207,10 +181,7 @@ class TrainedNetwork(AbstractEstimator):
         return answer
 
     def mismatch(self, problem: ShootingProblem) -> str | None:
-        """Compares a problem with the problem of training: the difference in words, or `None`.
-
-        Inside `jit` or `vmap` numbers cannot be compared here; `__call__` compares them there.
-        """
+        """The difference from the problem of training, in words, or `None`. Traced numbers are not compared."""
         answer = self._compare(problem)
         return answer if isinstance(answer, str) else None
 
@@ -226,21 +197,23 @@ class TrainedNetwork(AbstractEstimator):
         return estimate
 
     def _other_kind(self, problem: ShootingProblem) -> str | None:
-        """The difference from the problem of training, apart from its numbers, in words; `None` if there is none."""
-        own = self.problem
+        """The difference in words as `mismatch` gives it, but not of numbers."""
         if CHANNELS[self.channels] > problem.size:
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"
-        if type(problem.model) is not type(own.model):
-            return f"it was trained for {type(own.model).__name__}, not {type(problem.model).__name__}"
-        if problem.model.parameter_names != own.model.parameter_names:
-            trained, given = (", ".join(p.model.parameter_names) for p in (own, problem))
-            return f"it was trained for the parameters {trained}, not {given}"
-        if problem.method != own.method:
-            return f"it was trained with the method {own.method!r}, not {problem.method!r}"
-        if problem.flight.omega.shape != own.flight.omega.shape:
-            return f"it was trained for {own.flight.omega.shape[0]} samples, not {problem.flight.omega.shape[0]}"
-        if problem.windows != own.windows:
-            return f"it was trained for {own.windows} windows, not {problem.windows}"
+        trained, given = (
+            {
+                "for {}": type(one.model).__name__,
+                "for the parameters {}": ", ".join(one.model.parameter_names),
+                "with the method {}": repr(one.method),
+                "for {} samples": one.flight.omega.shape[0],
+                "for {} windows": one.windows,
+            }
+            for one in (self.problem, problem)
+        )
+        for what, value in trained.items():
+            if value != given[what]:
+                return f"it was trained {what.format(value)}, not {given[what]}"
+        own = self.problem
         if (problem.initial_state is None) != (own.initial_state is None):
             return "it was trained for an initial state that is " + ("free" if own.initial_state is None else "known")
         if not isinstance(problem.flight.states, Tracer):
@@ -286,7 +259,8 @@ class TrainedNetwork(AbstractEstimator):
     def _answer(self, problem: ShootingProblem) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
         """The estimate of one flight, or of a block of flights, and `_differences`."""
         count, coordinates = len(problem.model.parameter_names), self.features.coordinates
-        scale = self._scale(problem)
+        order = CASCADE_ORDER[: CHANNELS[self.channels]]
+        scale = (problem.sigma[order] / self.problem.sigma[order]).max()  # of the noise, in multiples of the training's
         within = jnp.clip(scale, *self.settings.noise)
         features = self.features(problem)
         finite = jnp.isfinite(features.values).all()
@@ -323,11 +297,6 @@ class TrainedNetwork(AbstractEstimator):
             calibration=Calibration(as_float(LEVELS), factors, simultaneous),
         )
         return estimate, differences
-
-    def _scale(self, problem: ShootingProblem) -> Scalar:
-        """The problem's noise in multiples of that of training; the largest over the channels."""
-        order = CASCADE_ORDER[: CHANNELS[self.channels]]
-        return (problem.sigma[order] / self.problem.sigma[order]).max()
 
 
 def _given_held(

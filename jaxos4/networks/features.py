@@ -4,7 +4,6 @@ Unknowns are the parameters and, if it is free, the initial state. They are in *
 of the bracket, +-1 at its ends.
 """
 
-import abc
 import enum
 import math
 from typing import NamedTuple
@@ -26,19 +25,13 @@ CHUNK = 1000
 """Flights that are simulated at once. All chunks share one compiled program."""
 
 
-class Purpose(enum.IntEnum):
-    """Purposes of random numbers. Numbers are drawn from a key and a place; each purpose has its own places."""
+Purpose = enum.IntEnum("Purpose", "WEIGHTS LINEAR_MAP VALIDATION STEPS CALIBRATION FLIGHTS", start=0)
+"""Purposes of random numbers. Numbers are drawn from a key and a place; each purpose has its own places."""
 
-    WEIGHTS = 0
-    LINEAR_MAP = 1
-    VALIDATION = 2
-    STEPS = 3
-    CALIBRATION = 4
-    FLIGHTS = 5
 
-    def place(self, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
-        """The place of a number, or of each number."""
-        return np.asarray(len(Purpose) * np.asarray(number) + int(self))
+def place_of(purpose: Purpose, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
+    """The place of a number, or of each number."""
+    return np.asarray(len(Purpose) * np.asarray(number) + int(purpose))
 
 
 class FlightFeatures(NamedTuple):
@@ -62,15 +55,11 @@ class Coordinates(eqx.Module):
     @classmethod
     def of(cls, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> "Coordinates":
         """Coordinates of a problem's unknowns. The largest `noise` scale widens the bracket of a free initial state."""
-        first_state, off = problem.first_state()
-        free = problem.windows * problem.free_size
+        (first_state, off), free = problem.first_state(), problem.windows * problem.free_size
         sigma = jnp.tile(problem.sigma[CASCADE_ORDER[: problem.size]], problem.windows)
         off = off + 3 * jnp.maximum(noise - 1, 0) * sigma
-        return cls(
-            jnp.concatenate([bracket.center, first_state[:free]]),
-            jnp.concatenate([bracket.half_width, off[:free]]),
-            first_state,
-        )
+        center = jnp.concatenate([bracket.center, first_state[:free]])
+        return cls(center, jnp.concatenate([bracket.half_width, off[:free]]), first_state)
 
     def split(self, u: Float[Array, " unknowns"], parameters: int) -> tuple[Parameters, Float[Array, " starts"]]:
         """Parameters and initial state at coordinates `u`, in their units."""
@@ -79,32 +68,79 @@ class Coordinates(eqx.Module):
         return unknowns[:parameters], unknowns[parameters:] if free else self.first_state
 
 
-class AbstractFeatures(eqx.Module):
-    """Features prepared for one input, start, sampling and bracket; `reference` is the trajectory at its center.
+class Features(eqx.Module):
+    """The features of flights of one input, start, sampling and bracket.
 
-    Only the first state of `problem` is used, and which samples were measured.
+    *Raw* features are the whole trajectory W (y - x) as one vector, as in the paper, where x is the trajectory at the
+    bracket's center. The *score* F^-1 J^T W (y - x) is one Gauss-Newton step at the center, a number for each unknown.
+    If trajectories are nearly linear in the unknowns over the bracket, the score holds nearly all information that the
+    flight has about them (score compression; Alsing and Wandelt 2018). White noise passes through a linear map as
+    Gaussian noise of covariance F^-1, so that a simulated flight needs no noise for each sample.
+
+    - `problem`: only its first state is used, and which samples were measured.
+    - `reference`: the trajectory at the center.
+    - `jacobian`, `noise_factor`: of the score: J, and a factor of F^-1; `None` for raw features.
     """
 
-    problem: eqx.AbstractVar[ShootingProblem]
-    coordinates: eqx.AbstractVar[Coordinates]
-    reference: eqx.AbstractVar[Float[Array, "samples size"]]
+    problem: ShootingProblem
+    coordinates: Coordinates
+    reference: Float[Array, "samples size"]
+    jacobian: Float[Array, "samples size unknowns"] | None
+    noise_factor: Float[Array, "unknowns unknowns"] | None
+
+    @classmethod
+    def of(cls, kind: str, problem: ShootingProblem, coordinates: Coordinates) -> "Features":
+        """Prepares the features: one simulation gives the trajectory at the center, and its derivatives."""
+        blank, center = cls.blank("raw", problem, coordinates), jnp.zeros_like(coordinates.center)
+        if kind == "raw":
+            return cls(problem, coordinates, blank._trajectory(center), None, None)
+        trajectory_and_slope = jax.jacfwd(lambda u: (blank._deviation(u), blank._trajectory(u)), has_aux=True)
+        jacobian, reference = trajectory_and_slope(center)
+        return cls(problem, coordinates, reference, jacobian, _noise_factor(jacobian))
+
+    @classmethod
+    def blank(cls, kind: str, problem: ShootingProblem, coordinates: Coordinates) -> "Features":
+        """Features of the right shapes, and no values."""
+        nothing, size = jnp.zeros_like(problem.measured()), coordinates.center.shape[0]
+        score = (None, None) if kind == "raw" else (jnp.zeros((*nothing.shape, size)), jnp.eye(size))
+        return cls(problem, coordinates, nothing, *score)
 
     @property
-    @abc.abstractmethod
     def size(self) -> int:
         """The number of features."""
+        return self.reference.size if self.noise_factor is None else self.noise_factor.shape[0]
 
-    @abc.abstractmethod
     def __call__(self, problem: ShootingProblem) -> FlightFeatures:
-        """Features of a measured flight; NaN if its numbers are not finite."""
+        """Features of a measured flight; NaN if its numbers are not finite.
 
-    @abc.abstractmethod
+        Samples that were measured in training may be missing. That costs the score precision; raw features need all.
+        """
+        needed, measured = _measured(self.problem), _measured(problem)
+        mismatch = jnp.where(needed, self._weighted(problem, problem.measured()), 0.0)
+        parameters = len(self.problem.model.parameter_names)
+        if self.jacobian is None or self.noise_factor is None:
+            inflation = jnp.where((needed & ~measured).any(), jnp.inf, jnp.ones(parameters))
+            return FlightFeatures(mismatch.ravel(), inflation)
+        jacobian = jnp.where(measured[:, :, None], self.jacobian, 0.0)
+        noise_factor = _noise_factor(jacobian)
+        step = noise_factor @ (noise_factor.T @ jnp.einsum("tcu,tc->u", jacobian, mismatch))
+        inflation = jnp.linalg.norm(noise_factor, axis=1) / jnp.linalg.norm(self.noise_factor, axis=1)
+        return FlightFeatures(step, inflation[:parameters])
+
     def simulated(self, u: Float[Array, " unknowns"]) -> Float[Array, " features"]:
         """Features of the flight at `u` without noise; NaN if the flight diverges."""
+        deviation = self._deviation(u).ravel()
+        if self.jacobian is None or self.noise_factor is None:
+            return deviation
+        # As a product of matrices: `vmap` of an `einsum` takes five times as long.
+        slope = deviation @ self.jacobian.reshape(-1, self.size)
+        return self.noise_factor @ (self.noise_factor.T @ slope)
 
-    @abc.abstractmethod
     def noise(self, normal: Float[Array, " features"]) -> Float[Array, " features"]:
         """The effect of white noise on the features. `normal`: standard normal numbers, times the noise scale."""
+        if self.noise_factor is None:
+            return jnp.where(_measured(self.problem).ravel(), normal, 0.0)
+        return self.noise_factor @ normal
 
     def _deviation(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
         """W (x(u) - x(0)); 0 in samples that are not measured, NaN everywhere if the flight at `u` diverges."""
@@ -117,108 +153,12 @@ class AbstractFeatures(eqx.Module):
     def _trajectory(self, u: Float[Array, " unknowns"]) -> Float[Array, "samples size"]:
         return self.problem.predict(*self.coordinates.split(u, len(self.problem.model.parameter_names)))
 
-    def _mismatch(self, problem: ShootingProblem) -> Float[Array, "samples size"]:
-        """W (y - x(0)) of a measured flight, with the weights of training; 0 unless measured here and in training."""
-        mismatch = self._weighted(problem, problem.measured())
-        return jnp.where(_measured(self.problem), mismatch, 0.0)
-
     def _weighted(self, problem: ShootingProblem, trajectory: Array) -> Float[Array, "samples size"]:
         weight = 1 / self.problem.sigma[self.problem.columns]
         return jnp.where(_measured(problem), weight * (trajectory - self.reference), 0.0)
 
 
-class Score(AbstractFeatures):
-    """F^-1 J^T W (y - x) at the bracket's center: one Gauss-Newton step, a number for each unknown.
-
-    If trajectories are nearly linear in the unknowns over the bracket, these numbers hold nearly all information that
-    the flight has about them (score compression; Alsing and Wandelt 2018). White noise passes through a linear map as
-    Gaussian noise of covariance F^-1, so that a simulated flight needs no noise for each sample.
-    """
-
-    problem: ShootingProblem
-    coordinates: Coordinates
-    reference: Float[Array, "samples size"]
-    jacobian: Float[Array, "samples size unknowns"]
-    noise_factor: Float[Array, "unknowns unknowns"]
-
-    @classmethod
-    def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Score":
-        """Prepares the features."""
-        blank = cls.blank(problem, coordinates)
-        # One simulation gives the trajectory at the center, from which there is no deviation yet, and its derivatives.
-        trajectory_and_slope = jax.jacfwd(lambda u: (blank._deviation(u), blank._trajectory(u)), has_aux=True)
-        jacobian, reference = trajectory_and_slope(jnp.zeros_like(coordinates.center))
-        return cls(problem, coordinates, reference, jacobian, _noise_factor(jacobian))
-
-    @classmethod
-    def blank(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Score":
-        """Features of the right shapes, and no values."""
-        nothing, size = jnp.zeros_like(problem.measured()), coordinates.center.shape[0]
-        return cls(problem, coordinates, nothing, jnp.zeros((*nothing.shape, size)), jnp.eye(size))
-
-    @property
-    def size(self) -> int:
-        """One for each unknown."""
-        return self.noise_factor.shape[0]
-
-    def __call__(self, problem: ShootingProblem) -> FlightFeatures:
-        """See `AbstractFeatures`. Samples that were measured in training may be missing: they only cost precision."""
-        jacobian = jnp.where(_measured(problem)[:, :, None], self.jacobian, 0.0)
-        noise_factor = _noise_factor(jacobian)
-        step = noise_factor @ (noise_factor.T @ jnp.einsum("tcu,tc->u", jacobian, self._mismatch(problem)))
-        inflation = jnp.linalg.norm(noise_factor, axis=1) / jnp.linalg.norm(self.noise_factor, axis=1)
-        return FlightFeatures(step, inflation[: len(self.problem.model.parameter_names)])
-
-    def simulated(self, u: Float[Array, " unknowns"]) -> Float[Array, " features"]:
-        """See `AbstractFeatures`."""
-        # As a product of matrices: `vmap` of an `einsum` takes five times as long.
-        slope = self._deviation(u).ravel() @ self.jacobian.reshape(-1, self.size)
-        return self.noise_factor @ (self.noise_factor.T @ slope)
-
-    def noise(self, normal: Float[Array, " features"]) -> Float[Array, " features"]:
-        """See `AbstractFeatures`."""
-        return self.noise_factor @ normal
-
-
-class Raw(AbstractFeatures):
-    """The paper-style input: the whole trajectory as one vector, minus the trajectory at the bracket's center."""
-
-    problem: ShootingProblem
-    coordinates: Coordinates
-    reference: Float[Array, "samples size"]
-
-    @classmethod
-    def of(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Raw":
-        """Prepares the features."""
-        blank = cls.blank(problem, coordinates)
-        return cls(problem, coordinates, blank._trajectory(jnp.zeros_like(coordinates.center)))
-
-    @classmethod
-    def blank(cls, problem: ShootingProblem, coordinates: Coordinates) -> "Raw":
-        """Features of the right shapes, and no values."""
-        return cls(problem, coordinates, jnp.zeros_like(problem.measured()))
-
-    @property
-    def size(self) -> int:
-        """One for each sample and channel."""
-        return self.reference.size
-
-    def __call__(self, problem: ShootingProblem) -> FlightFeatures:
-        """See `AbstractFeatures`. Samples that were measured in training must be measured here."""
-        missing = (_measured(self.problem) & ~_measured(problem)).any()
-        inflation = jnp.where(missing, jnp.inf, jnp.ones(len(self.problem.model.parameter_names)))
-        return FlightFeatures(self._mismatch(problem).ravel(), inflation)
-
-    def simulated(self, u: Float[Array, " unknowns"]) -> Float[Array, " features"]:
-        """See `AbstractFeatures`."""
-        return self._deviation(u).ravel()
-
-    def noise(self, normal: Float[Array, " features"]) -> Float[Array, " features"]:
-        """See `AbstractFeatures`."""
-        return jnp.where(_measured(self.problem).ravel(), normal, 0.0)
-
-
-FEATURES: dict[str, type[Score] | type[Raw]] = {"score": Score, "raw": Raw}
+FEATURES = ("score", "raw")
 
 
 def _measured(problem: ShootingProblem) -> Bool[Array, "samples size"]:
@@ -228,9 +168,6 @@ def _measured(problem: ShootingProblem) -> Bool[Array, "samples size"]:
 def _noise_factor(jacobian: Float[Array, "samples size unknowns"]) -> Float[Array, "unknowns unknowns"]:
     """A factor of F^-1, the covariance of the score."""
     return unit_directions(jnp.einsum("tcu,tcv->uv", jacobian, jacobian))
-
-
-# Simulated flights.
 
 
 class Flights(NamedTuple):
@@ -249,7 +186,7 @@ class Pair(NamedTuple):
 
 
 def draw_chunks(
-    features: AbstractFeatures, count: int, *, key: Key, purpose: Purpose, first: int = 0, uniform: bool = False
+    features: Features, count: int, *, key: Key, purpose: Purpose, first: int = 0, uniform: bool = False
 ) -> list[Flights]:
     """Simulates at least `count` flights in chunks of `CHUNK`. Parameters are uniform in the bracket.
 
@@ -257,11 +194,11 @@ def draw_chunks(
     Chunk i is drawn from `key` at the place `first` + i of the `purpose`.
     """
     numbers = range(first, first + math.ceil(count / CHUNK))
-    return [_chunk(features, key, purpose.place(number), np.asarray(uniform)) for number in numbers]
+    return [_chunk(features, key, place_of(purpose, number), np.asarray(uniform)) for number in numbers]
 
 
 @quick_jit
-def _chunk(features: AbstractFeatures, key: Key, place: Int[Numeric, ""], uniform: Bool[Numeric, ""]) -> Flights:
+def _chunk(features: Features, key: Key, place: Int[Numeric, ""], uniform: Bool[Numeric, ""]) -> Flights:
     unknowns, parameters = features.coordinates.center.shape[0], len(features.problem.model.parameter_names)
     drawn = jax.random.uniform(jax.random.fold_in(key, place), (CHUNK, unknowns + 1), minval=-1, maxval=1, dtype=float)
     shrunk = jnp.where(uniform, 1.0, jnp.abs(drawn[:, -1:]))
@@ -270,7 +207,7 @@ def _chunk(features: AbstractFeatures, key: Key, place: Int[Numeric, ""], unifor
 
 
 def with_noise(
-    features: AbstractFeatures, flights: Flights, scales: Float[Numeric, "2"], uniform: Float[Array, "flights random"]
+    features: Features, flights: Flights, scales: Float[Numeric, "2"], uniform: Float[Array, "flights random"]
 ) -> Pair:
     """Adds noise to flights, with scales that are log-uniform between `scales`.
 
@@ -283,11 +220,19 @@ def with_noise(
     return Pair(flights.features + jax.vmap(features.noise)(scale[:, None] * normal), scale, flights.u)
 
 
+def noisy_chunks(
+    features: Features, chunks: list[Flights], scales: np.ndarray, key: Key, purpose: Purpose, turn: int = 1
+) -> list[Pair]:
+    """Adds noise to chunks of flights. It is drawn at the places of the `purpose` after those of `turn` such lists."""
+    numbers = turn * len(chunks) + np.arange(len(chunks))
+    places = zip(chunks, place_of(purpose, numbers), strict=True)
+    return [_noisy_chunk(features, chunk, scales, key, place) for chunk, place in places]
+
+
 @quick_jit
-def noisy_chunk(
-    features: AbstractFeatures, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
+def _noisy_chunk(
+    features: Features, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
 ) -> Pair:
-    """Adds noise to a chunk of flights, drawn from `key` at a place, by one compiled program for all chunks."""
     shape = CHUNK, 1 + features.size
     drawn = jax.random.uniform(jax.random.fold_in(key, place), shape, minval=-1, maxval=1, dtype=float)
     return with_noise(features, chunk, scales, drawn)

@@ -21,7 +21,9 @@ from ..errors import InputError
 from ..flight import Flight
 from ..models import MODELS
 from ..shooting import ShootingProblem
+from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
 from .estimator import NetworkEstimator, TrainedNetwork
+from .features import Coordinates, Features
 
 _FORMAT = 3
 _LARGEST = 2**30
@@ -35,10 +37,7 @@ def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
 
 
 def encode_network(network: TrainedNetwork) -> bytes:
-    """The bytes of a network's file, with its problem of training: model, airframe, inputs, sampling, bracket, noise.
-
-    **Raises:** `ValueError` for a model that is not in `MODELS`.
-    """
+    """The bytes of a network's file, with its problem of training. Raises `ValueError` for a model not in `MODELS`."""
     problem = network.problem
     kinds = {kind: name for name, kind in MODELS.items()}
     if type(problem.model) not in kinds:
@@ -70,7 +69,7 @@ def encode_network(network: TrainedNetwork) -> bytes:
 def load_network(path: str | os.PathLike[str] | io.BytesIO) -> TrainedNetwork:
     """Reads a network that `save_network` wrote, in the current precision. `path` can also be the open file.
 
-    **Raises:** `InputError` if it is no complete network file of this version; `OSError` if it cannot be read.
+    Raises `InputError` if it is no complete network file of this version; `OSError` if it cannot be read.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -106,9 +105,8 @@ def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
         method=header["method"],
         windows=header["windows"],
     )
-    blank = eqx.filter_eval_shape(lambda p: settings.blank(p, Bracket.default(p.model)), problem)
-    history = jax.ShapeDtypeStruct((header["checks"], 2), float)
-    blank = eqx.tree_at(lambda n: (n.features.problem, n.history), blank, (problem, history))
+    blank = eqx.filter_eval_shape(lambda p: _blank(settings, p, header["checks"]), problem)
+    blank = eqx.tree_at(lambda n: n.features.problem, blank, problem)
 
     def fill(place: tuple, leaf: Any) -> Any:
         if not isinstance(leaf, jax.ShapeDtypeStruct):
@@ -127,6 +125,21 @@ def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     if not all((np.asarray(scale) > 0).all() for scale in scales):
         raise ValueError("a scale is not positive")
     return network
+
+
+def _blank(settings: NetworkEstimator, problem: ShootingProblem, checks: int) -> TrainedNetwork:
+    """A network with the shapes of a trained one and no values."""
+    parameters, scales = len(problem.model.parameter_names), calibrated_scales(settings.noise)
+    coordinates = Coordinates.of(problem, Bracket.default(problem.model), as_float(1.0))
+    features = Features.blank(settings.features, problem, coordinates)
+    key, unknowns = jax.random.key(0), coordinates.center
+    linear_map = jnp.zeros((unknowns.size, features.size))
+    regressor = Regressor(linear_map, settings.approximator, width=settings.width, depth=settings.depth, key=key)
+    shapes = ((parameters,), (parameters, parameters), (len(LEVELS), parameters), (len(LEVELS),))
+    errors = ErrorTable(scales, *(jnp.zeros((scales.size, *shape)) for shape in shapes))
+    scaling = Scaling(linear_map[0], unknowns, unknowns, scales[0])
+    history = jnp.zeros((checks, 2))
+    return TrainedNetwork(settings, features, scaling, regressor, errors, history, jax.random.key_data(key))
 
 
 def _name(path: tuple) -> str:

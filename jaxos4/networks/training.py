@@ -1,7 +1,4 @@
-"""The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals.
-
-Between two checks, training simulates new flights. Each step takes some of them, with new noise.
-"""
+"""The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals."""
 
 import contextlib
 import math
@@ -18,7 +15,7 @@ from .._custom_types import Key, Numeric, Scalar, as_float
 from .._xla import quick_jit
 from ..errors import TrainingError
 from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
-from .features import CHUNK, AbstractFeatures, Flights, Pair, Purpose, Score, draw_chunks, noisy_chunk, with_noise
+from .features import CHUNK, Features, Flights, Pair, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
 
 if TYPE_CHECKING:
     import optax  # `_optimiser` imports it, because it is slow to import
@@ -26,8 +23,8 @@ if TYPE_CHECKING:
 CHECK = 250
 """Steps between two evaluations of the validation loss."""
 
-Progress = Callable[[int, int, float], None]
-"""Called at every check with the steps done, the number of steps, and the validation loss."""
+Progress = Callable[[int, float], None]
+"""Called at every check with the steps done and the validation loss."""
 
 _VALIDATION = 2  # chunks of the validation
 _USES = 4  # how often training uses a simulated flight, each time with new noise
@@ -44,20 +41,17 @@ _PER_FEATURE, _RIDGE = 4, 1e-6
 
 
 def untrained(
-    features: AbstractFeatures, scales: Float[np.ndarray, "2"], key: Key, approximator: str, width: int, depth: int
+    features: Features, scales: Float[np.ndarray, "2"], key: Key, approximator: str, width: int, depth: int
 ) -> tuple[Scaling, Regressor]:
     """Scaling and regressor before training, with a linear map that is fitted to simulated flights."""
     count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
-    chunks = draw_chunks(features, count, key=key, purpose=purpose)
-    samples = [
-        noisy_chunk(features, chunk, scales, key, purpose.place(len(chunks) + i)) for i, chunk in enumerate(chunks)
-    ]
-    return _untrained(features, samples, scales, key, approximator, width, depth)
+    chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)
+    return _untrained(features, chunks, scales, key, approximator, width, depth)
 
 
 @quick_jit
 def _untrained(
-    features: AbstractFeatures,
+    features: Features,
     chunks: list[Pair],
     scales: Float[Numeric, "2"],
     key: Key,
@@ -65,37 +59,30 @@ def _untrained(
     width: int,
     depth: int,
 ) -> tuple[Scaling, Regressor]:
-    scaling, linear_map = _scaling_and_linear_map(features, scales, chunks)
-    key = jax.random.fold_in(key, Purpose.WEIGHTS.place(0))
-    return scaling, first_regressor(linear_map, approximator, width=width, depth=depth, key=key)
-
-
-def _scaling_and_linear_map(
-    features: AbstractFeatures, scales: Float[Numeric, "2"], chunks: list[Pair]
-) -> tuple[Scaling, Float[Array, "unknowns features"]]:
-    """Measures the features' sizes on simulated flights, and fits the best linear map from features to unknowns."""
     samples = jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
     # The score's own derivatives give the bound.
-    score = features if isinstance(features, Score) else Score.of(features.problem, features.coordinates)
-    unit = jnp.linalg.norm(score.noise_factor, axis=1)
+    factor = features.noise_factor
+    if factor is None:
+        factor = Features.of("score", features.problem, features.coordinates).noise_factor
+    unit = jnp.linalg.norm(factor, axis=1)
 
     flown = jnp.isfinite(samples.features).all(axis=1)
-    width = 1.5 * jnp.nanmedian(jnp.where(flown[:, None], jnp.abs(samples.features), jnp.nan), axis=0)
+    sizes = 1.5 * jnp.nanmedian(jnp.where(flown[:, None], jnp.abs(samples.features), jnp.nan), axis=0)
     # Scaled so that one learning rate suits both kinds of features, however many they are.
-    width = jnp.where(width > 0, width, 1.0) * jnp.sqrt(features.size / unit.shape[0])
-    inputs = jnp.where(flown[:, None], compress(samples.features / width), 0.0)
+    sizes = jnp.where(sizes > 0, sizes, 1.0) * jnp.sqrt(features.size / unit.shape[0])
+    inputs = jnp.where(flown[:, None], compress(samples.features / sizes), 0.0)
     targets = jnp.where(flown[:, None], samples.u, 0.0)
     ridge = _RIDGE * jnp.trace(inputs.T @ inputs) / features.size
     linear_map = jnp.linalg.solve(inputs.T @ inputs + ridge * jnp.eye(features.size), inputs.T @ targets).T
-    gain = jnp.minimum(10 * unit, 1.0)
-    span = jnp.maximum(jnp.abs(jnp.log(scales)).max(), 1.0)
-    return Scaling(width, unit, gain, span), linear_map
+    scaling = Scaling(sizes, unit, jnp.minimum(10 * unit, 1.0), jnp.maximum(jnp.abs(jnp.log(scales)).max(), 1.0))
+    key = jax.random.fold_in(key, place_of(Purpose.WEIGHTS, 0))
+    return scaling, first_regressor(linear_map, approximator, width=width, depth=depth, key=key)
 
 
 def train(
     regressor: Regressor,
     scaling: Scaling,
-    features: AbstractFeatures,
+    features: Features,
     scales: Float[np.ndarray, "2"],
     *,
     batch: int,
@@ -103,19 +90,19 @@ def train(
     learning_rate: float,
     patience: int,
     key: Key,
-    progress: Progress | None = None,
+    progress: Progress,
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
+
+    Between two checks, training simulates new flights. Each step takes some of them, with new noise.
 
     **Returns:** the regressor as it was at the check with the best validation loss, and the losses of training and
     validation at every check.
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
-    held_out = [
-        noisy_chunk(features, chunk, scales, key, Purpose.VALIDATION.place(_VALIDATION + number))
-        for number, chunk in enumerate(draw_chunks(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION))
-    ]
+    held_out = draw_chunks(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION)
+    held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
     _check_trainable(held_out, regressor)
     # Single precision: rounding is far below the noise of a step's flights.
     given, held_out, data = regressor, _single(held_out), _single((scaling, features, scales))
@@ -124,11 +111,10 @@ def train(
     flown = batch * CHECK // _USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
     for number, first in enumerate(range(0, steps, CHECK)):
-        flights = draw_chunks(
-            features, flown, key=key, purpose=Purpose.FLIGHTS, first=number * math.ceil(flown / CHUNK)
-        )
+        place = number * math.ceil(flown / CHUNK)
+        flights = draw_chunks(features, flown, key=key, purpose=Purpose.FLIGHTS, first=place)
         count = min(CHECK, steps - first)
-        places = Purpose.STEPS.place(first + np.arange(CHECK))
+        places = place_of(Purpose.STEPS, first + np.arange(CHECK))
         rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
         regressor, state, *losses = _advance(
             regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
@@ -137,8 +123,7 @@ def train(
         value, current = history[-1]
         if not np.less(history[-1], _DIVERGED).all():
             raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
-        if progress is not None:
-            progress(first + count, steps, current)
+        progress(first + count, current)
         without_improvement += 1
         if current < lowest - _IMPROVEMENT * abs(current):
             best, lowest, without_improvement = regressor, current, 0
@@ -156,7 +141,7 @@ def train(
 def _advance(
     regressor: Regressor,
     state: PyTree,
-    data: tuple[Scaling, AbstractFeatures, Float[Array, "2"]],
+    data: tuple[Scaling, Features, Float[Array, "2"]],
     chunks: list[Flights],
     held_out: list[Pair],
     key: Key,
@@ -235,7 +220,7 @@ def _check_trainable(held_out: list[Pair], regressor: Regressor) -> None:
 def calibrate(
     regressor: Regressor,
     scaling: Scaling,
-    features: AbstractFeatures,
+    features: Features,
     scales: Float[Array, " scales"],
     count: int,
     key: Key,
@@ -246,14 +231,11 @@ def calibrate(
 
     **Raises:** `TrainingError` if too few flights can be flown.
     """
-    parameters, tables = len(features.problem.model.parameter_names), []
-    flights = draw_chunks(features, count, key=key, purpose=Purpose.CALIBRATION, uniform=True)
+    parameters, tables, purpose = len(features.problem.model.parameter_names), [], Purpose.CALIBRATION
+    flights = draw_chunks(features, count, key=key, purpose=purpose, uniform=True)
     for number, scale in enumerate(np.asarray(scales)):
-        first = (1 + number) * len(flights)  # behind the places of the flights
-        errors = [
-            _standardised(regressor, scaling, noisy_chunk(features, chunk, np.stack([scale, scale]), key, place), scale)
-            for place, chunk in zip(Purpose.CALIBRATION.place(first + np.arange(len(flights))), flights, strict=True)
-        ]
+        chunks = noisy_chunks(features, flights, np.stack([scale, scale]), key, purpose, 1 + number)
+        errors = [_standardised(regressor, scaling, chunk, scale) for chunk in chunks]
         tables.append(_table(np.concatenate(errors)[:, :parameters]))
     return ErrorTable(scales, *(as_float(np.stack(column)) for column in zip(*tables, strict=True)))
 
@@ -282,18 +264,14 @@ def _table(error: Float[np.ndarray, "flights parameters"]) -> tuple[np.ndarray, 
 
 
 @contextlib.contextmanager
-def training_bar(steps: int) -> Iterator[Progress]:
-    """Shows a bar on the error output while the block runs; shows nothing unless that is a terminal."""
+def training_bar(steps: int, *, shown: bool) -> Iterator[Progress]:
+    """Shows a bar on the error output while the block runs, if that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     name, loss = TextColumn("training the network"), TextColumn("loss {task.fields[loss]}")
     console = Console(stderr=True)
     columns = (name, BarColumn(), loss, TimeElapsedColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Bar(*columns, console=console, transient=True, disable=not (shown and console.is_terminal)) as bar:
         task = bar.add_task("", total=steps, loss="-")
-
-        def update(done: int, steps: int, loss: float) -> None:
-            bar.update(task, completed=done, total=steps, loss=f"{loss:.4g}")
-
-        yield update
+        yield lambda done, loss: bar.update(task, completed=done, loss=f"{loss:.4g}")

@@ -1,7 +1,6 @@
 """Noise studies: a specification, its cells, the folder that keeps them, and the Dataset of their results."""
 
 from .cell import OUTCOMES as OUTCOMES
-from .cluster import run_on_cluster as run_on_cluster
 from .dataset import assemble as assemble, provenance as provenance, save_dataset as save_dataset
 from .run import (
     Plan as Plan,
@@ -10,6 +9,7 @@ from .run import (
     device_name as device_name,
     plan as plan,
     run_here as run_here,
+    run_on_cluster as run_on_cluster,
     use_all_cores as use_all_cores,
 )
 from .specification import Study as Study, Training as Training, load_study as load_study

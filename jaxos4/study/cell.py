@@ -1,33 +1,39 @@
-"""The results of a cell: a pure function of the specification, the cell's index, and its network.
+"""The cells of a study: their flights, and the results of an estimator on them.
 
-A cell is one call of each of its programs, on one device. Last digits depend on the length of a batch and on the number
-of devices that share a program; with whole cells they are the same in any order and in any process.
+Flights are pure functions of the specification and of their numbers; results also of the network. A cell is one call of
+each of its programs, on one device. Last digits depend on the length of a batch and on the number of devices that share
+a program; with whole cells they are the same in any order and in any process.
 """
 
 import contextlib
 import dataclasses
-import io
+import functools
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._custom_types import States, as_float
+from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from .._xla import quick_jit
+from ..analysis.covariance import cramer_rao_bound
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, Hybrid, make_estimator
 from ..estimators.hybrid import Seed, search_near
-from ..models.state import CHANNELS
+from ..flight import Flight
+from ..models import MODELS
+from ..models.abstract import AbstractModel
+from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import TrainedNetwork
+from ..noise import NOISES, SENSOR_SIGMA
 from ..results import NAMES, result_names
 from ..shooting import ShootingProblem
-from .flights import Fleet, Flights, blank_problem, cramer_rao_std, fleet_of, fly, key_of, problem_of
+from ..simulation import simulate
 from .specification import Cell, Job, Scenario, Study
 
 OUTCOMES = (*NAMES, "failed", "not_run")
@@ -42,15 +48,130 @@ _RECORDED_SWEEPS = 64
 _KEPT = ("parameters", "std", "cost", "rollouts", "initial_state", "result", "seed", "brackets")
 # An estimator with more flights computes for longer than its fully optimised program compiles.
 _FEW_FLIGHTS = 2000
+# The largest offset of a bracket from the parameters that all flights have, as a share of its half-width.
+_LARGEST_OFFSET = 0.8
+
+
+class Fleet(NamedTuple):
+    """Model, bracket and inputs of a scenario. They are the same for all noises."""
+
+    model: AbstractModel
+    bracket: Bracket
+    omega: Array
+    dt: Scalar
+
+
+class Flights(NamedTuple):
+    """Flights of a cell: true parameters, true states and measured states."""
+
+    truth: Float[Array, "lanes parameters"]
+    exact: Float[Array, "lanes samples 12"]
+    measured: Float[Array, "lanes samples 12"]
+
+
+def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
+    """Model, bracket and rotor speeds of a scenario or of a network's job."""
+    with jax.enable_x64(study.double):
+        model = MODELS[scenario.model](study.vehicle(scenario.airframe))
+        offset = study.truth == "airframe"
+        bracket = _bracket(model, np.asarray(scenario.width), key_of(study.seed, 0), offset=offset)
+        omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)
+        return Fleet(model, bracket, omega, as_float(study.dt))
+
+
+@quick_jit
+def _bracket(model: AbstractModel, width: Float[Numeric, ""], key: Key, *, offset: bool) -> Bracket:
+    """The bracket of all searches and networks: around the airframe's parameters, or off them."""
+    center, half_width, most = model.alpha, width * model.half_width, _LARGEST_OFFSET
+    if offset:
+        center = center + half_width * jax.random.uniform(key, center.shape, minval=-most, maxval=most, dtype=float)
+    return Bracket.around(center, half_width)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def key_of(seed: int, number: int) -> Key:
+    """The random key of a seed and a number."""
+    return jax.random.fold_in(jax.random.key(seed), number)
+
+
+def blank_problem(study: Study, fleet: Fleet, scale: float, channels: str) -> ShootingProblem:
+    """The problem that all flights of a scenario share. `scale`: the noise in multiples of the standard sensors'."""
+    samples, dtype = fleet.omega.shape[0], jnp.result_type(float)
+    # By NumPy: outside jit, JAX would compile a program for each operation, on each device.
+    time = as_float(np.asarray(study.dt, dtype) * np.arange(samples, dtype=dtype))
+    return ShootingProblem(
+        fleet.model,
+        Flight(time, fleet.omega, as_float(np.zeros((samples, 12)))),
+        sigma=scale * SENSOR_SIGMA,
+        initial_state=as_float(np.zeros(12)) if study.initial_state == "known" else None,
+        channels=channels,
+        method=study.fit_method,
+    )
+
+
+def problem_of(blank: ShootingProblem, states: States) -> ShootingProblem:
+    """The problem of a flight with these measurements."""
+    return eqx.tree_at(lambda p: p.flight.states, blank, states)
+
+
+def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
+    """Simulates the flights of a cell. Flights of one number have the same random numbers in all scenarios."""
+    scenario, numbers = cell.scenario, cell.first + np.arange(study.batch)
+    kinds = {"method": scenario.method, "kind": scenario.noise, "drawn": study.truth == "drawn"}
+    with jax.enable_x64(study.double):
+        return _fly(fleet, numbers, key_of(study.seed, 1), as_float(scenario.scale), **kinds)
+
+
+@quick_jit
+def _fly(
+    fleet: Fleet, numbers: Int[Numeric, " lanes"], key: Key, scale: Scalar, *, method: str, kind: str, drawn: bool
+) -> Flights:
+    def simulated(number: Int[Array, ""]) -> tuple[Parameters, Flight, Key]:
+        truth_key, noise_key = jax.random.split(jax.random.fold_in(key, number))
+        truth = fleet.model.alpha
+        if drawn:
+            u = jax.random.uniform(truth_key, truth.shape, minval=-1, maxval=1, dtype=float)
+            truth = fleet.bracket.center + u * fleet.bracket.half_width
+        return truth, simulate(fleet.model, truth, fleet.omega, dt=fleet.dt, method=method), noise_key
+
+    def measured(exact_and_key: tuple[Flight, Key]) -> States:
+        exact, noise_key = exact_and_key
+        return NOISES[kind](scale * SENSOR_SIGMA)(exact, key=noise_key).states
+
+    truth, exact, noise_keys = jax.vmap(simulated)(jnp.asarray(numbers))
+    # XLA takes seconds to compile a batch of random numbers for a CPU; one flight after the other runs as fast there.
+    each = jax.lax.map if jax.default_backend() == "cpu" else lambda one, flights: jax.vmap(one)(flights)
+    return Flights(truth, exact.states, each(measured, (exact, noise_keys)))
+
+
+@quick_jit
+def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "lanes parameters"]:
+    """The Cramer-Rao standard deviations of each flight, at the noise of a problem."""
+
+    def one(states: States, parameters: Parameters) -> Parameters:
+        problem = problem_of(blank, states)
+        start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
+        return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem, parameters, start)))
+
+    return jax.vmap(one)(flights.exact, flights.truth)
+
+
+def fly_again(study: Study, scenario: Scenario, results: dict[str, np.ndarray]) -> Float[np.ndarray, "samples 12"]:
+    """A scenario's first flight as simulated with the estimate in the `results` of its cell; NaN without one."""
+    with jax.enable_x64(study.double):
+        fleet, start = fleet_of(study, scenario), np.zeros(12)
+        parameters, known = results["estimate"][0], results["initial_state"][0]
+        if not np.isfinite(parameters).all():
+            return np.full((fleet.omega.shape[0], 12), np.nan)
+        start[CASCADE_ORDER[: known.size]] = known
+        settings = {"dt": fleet.dt, "initial_state": as_float(start), "method": study.fit_method}
+        return np.asarray(simulate(fleet.model, as_float(parameters), fleet.omega, **settings).states)
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
-    """Identifies the flights of a cell on the default device. `network`: that of `Study.job`.
-
-    Raises as the estimator does.
-    """
+    """Identifies the flights of a cell on the default device; `network`: that of `Study.job`."""
+    scenario = cell.scenario
     with jax.enable_x64(study.double):
-        scenario = cell.scenario
         with one_core():
             fleet = fleet_of(study, scenario)
             flights = fly(study, fleet, cell)
@@ -70,12 +191,9 @@ def one_core() -> Iterator[None]:
 
 
 def programs_of(study: Study, scenario: Scenario) -> list[tuple]:
-    """The keys of the programs that identify the flights of a scenario, in the order of use.
-
-    IBSS and the hybrid share their search. The hybrid also runs its network's program.
-    """
+    """The keys of the programs that identify the flights of a scenario, in the order of use."""
     kind, shapes = ESTIMATORS[scenario.estimator], (scenario.model, scenario.duration)
-    if issubclass(kind, Hybrid):
+    if issubclass(kind, Hybrid):  # it shares its search with IBSS
         return [(TrainedNetwork, *shapes, study.seed_channels(scenario)), (IBSS, *shapes, scenario.seen)]
     return [(kind, *shapes, scenario.seen)]
 
@@ -144,7 +262,6 @@ def _results(
     study: Study, cell: Cell, flights: Flights, bound: np.ndarray, found: dict[str, Any]
 ) -> dict[str, np.ndarray]:
     """The arrays of a cell's file. A flight without an estimate has NaN, and a result that says why."""
-    count = min(study.batch, study.flights - cell.first)
     truth, seed, hit = np.asarray(flights.truth), found["seed"], np.full(study.batch, -1)
     if seed is not None:
         hit = ((truth >= seed.lower) & (truth <= seed.upper)).all(axis=-1)
@@ -165,34 +282,8 @@ def _results(
         "result": np.array([OUTCOMES.index(name) for name in result_names(found["result"])], np.int8),
         "hit": hit.astype(np.int8),
     }
-    results = {name: value[:count] for name, value in results.items()}
+    results = {name: value[: study.flights - cell.first] for name, value in results.items()}
     if cell.first == 0:  # the example flight of the report
         results |= {"true": np.asarray(flights.exact)[0], "measured": np.asarray(flights.measured)[0]}
-        if found["brackets"] is not None:
-            results["brackets"] = found["brackets"][0]
+        results |= {} if found["brackets"] is None else {"brackets": found["brackets"][0]}
     return results
-
-
-def encode(results: dict[str, np.ndarray]) -> bytes:
-    """The bytes of a cell's file; equal results give equal bytes."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **results)  # pyright: ignore[reportArgumentType]
-    return buffer.getvalue()
-
-
-def decode(data: bytes) -> dict[str, np.ndarray]:
-    """The results in the bytes of a cell's file. Raises an exception of `_files.BROKEN` for other bytes."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
-def train_network(study: Study, job: Job) -> TrainedNetwork:
-    """Trains a network for all noises and scales of a study. Raises as `NetworkEstimator.fit` does.
-
-    The numbers are the same bit for bit only on the same number of cores, which share the products of matrices.
-    """
-    with jax.enable_x64(study.double):
-        scales, fleet = [scale or 1.0 for scale in study.scales], fleet_of(study, job)
-        settings = study.network.estimator(job.channels, (min(scales), max(scales)))
-        problem = blank_problem(study, fleet, 1.0, job.channels)
-        return settings.fit(problem, fleet.bracket, key=key_of(study.network.seed, study.jobs()[job]))

@@ -5,6 +5,7 @@ import itertools
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import jax
 import msgspec
@@ -12,19 +13,16 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
-from .._files import write_atomically
 from ..errors import InputError
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
 from ..models.abstract import AbstractModel
 from ..networks import CHECK
-from .cell import LEVELS, OUTCOMES
-from .flights import fleet_of, fly, fly_again
+from .cell import LEVELS, OUTCOMES, fleet_of, fly, fly_again
 from .metrics import SCENARIO
-from .specification import AXES, Cell, Study
-from .store import RESULTS_FILE, Store
+from .specification import AXES, Study
+from .store import RESULTS_FILE, Store, write_file
 
-_LANES = (*SCENARIO, "flight")
 # For each variable of a flight: its further dimensions, type, unit and description.
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "truth": (("parameter",), "f8", "unit", "true parameter"),
@@ -62,11 +60,8 @@ def assemble(store: Store) -> xr.Dataset:
     """
     study = store.study
     model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
-    sizes = dict(zip(SCENARIO, study.shape, strict=True)) | {
-        "flight": study.flights,
-        "parameter": len(model.parameter_names),
-        "level": len(LEVELS),
-    }
+    coordinates = _coordinates(study, model)
+    sizes = {name: len(values) for name, (_, values, _) in coordinates.items()}
     arrays = {
         name: np.full([sizes[dim] for dim in _dims(name)], np.nan if kind == "f8" else -1, kind)
         for name, (_, kind, _, _) in _VARIABLES.items()
@@ -95,42 +90,32 @@ def assemble(store: Store) -> xr.Dataset:
         except (KeyError, ValueError):
             path = store.cell_file(cell.number)
             raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
-    dataset = xr.Dataset(
-        {
-            name: (_dims(name), arrays[name], _named(long_name, unit))
-            for name, (_, _, unit, long_name) in _VARIABLES.items()
-        },
-        coords=_coordinates(study, model),
-        attrs=provenance(study, store.device)
-        | {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)},
-    )
-    codes = np.arange(len(OUTCOMES), dtype=np.int8)
-    dataset["result"].attrs |= {"flag_values": codes, "flag_meanings": " ".join(OUTCOMES)}
-    return dataset.assign(_brackets(study) | _seen(study) | _example(store) | _training(store))
+    variables = {
+        name: (_dims(name), arrays[name], _named(long_name, unit))
+        for name, (_, _, unit, long_name) in _VARIABLES.items()
+    }
+    codes = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
+    variables["result"][-1].update(codes)
+    command = {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)}
+    variables |= _brackets(study) | _example(store) | _training(store)
+    return xr.Dataset(variables, coords=coordinates, attrs=provenance(study, store.device) | command)
 
 
 def _dims(name: str) -> tuple[str, ...]:
     """The dimensions of a variable; the truth is the same for all estimators."""
-    lanes = [dim for dim in _LANES if (name, dim) != ("truth", "estimator")]
-    return (*lanes, *_VARIABLES[name][0])
+    return (*(SCENARIO[:-1] if name == "truth" else SCENARIO), "flight", *_VARIABLES[name][0])
 
 
-def save_dataset(dataset: xr.Dataset, directory: Path) -> Path:
+def save_dataset(dataset: xr.Dataset, directory: Path) -> None:
     """Writes a study's Dataset into its folder, completely or not at all."""
-    path = directory / RESULTS_FILE
-    encoding = {
-        name: {"zlib": True, "complevel": 4}
-        for name, variable in dataset.data_vars.items()
-        if variable.dtype.kind in "fi" and variable.ndim
-    }
+    packed = {"zlib": True, "complevel": 4}
+    numbers = [name for name, data in dataset.data_vars.items() if data.dtype.kind in "fi" and data.ndim]
     # In memory first: HDF5 can crash on a full disk.
-    data = dataset.to_netcdf(engine="h5netcdf", encoding=encoding)
-    with write_atomically(path) as beside:
-        beside.write_bytes(data)
-    return path
+    data = dataset.to_netcdf(engine="h5netcdf", encoding=dict.fromkeys(numbers, packed))
+    write_file(directory / RESULTS_FILE, data)
 
 
-def _coordinates(study: Study, model: AbstractModel) -> dict:
+def _coordinates(study: Study, model: AbstractModel) -> dict[str, tuple]:
     values = {dim: list(getattr(study, axis)) for dim, axis in zip(SCENARIO, AXES, strict=True)}
     values |= {"flight": np.arange(study.flights), "parameter": list(model.parameter_names), "level": list(LEVELS)}
     coordinates = {dim: (dim, values[dim], _named(*attributes)) for dim, attributes in _AXES_ATTRIBUTES.items()}
@@ -150,47 +135,41 @@ def provenance(study: Study, device: str) -> dict[str, str | int]:
     }
 
 
-def _brackets(study: Study) -> dict:
-    """The brackets of all searches and networks, by model, airframe and width."""
-    shape = [len(study.models), len(study.airframes), len(study.widths)]
-    first = study.cell(0).scenario
-    scenarios = [
-        first._replace(model=model, airframe=airframe, width=width)
+def _brackets(study: Study) -> dict[str, tuple]:
+    """The brackets of all searches and networks, by model, airframe and width, and the channels that are seen."""
+    first, dims = study.cell(0).scenario, ("model", "airframe", "width", "parameter")
+    brackets = [
+        fleet_of(study, first._replace(model=model, airframe=airframe, width=width)).bracket
         for model, airframe, width in itertools.product(study.models, study.airframes, study.widths)
     ]
-    brackets = [fleet_of(study, scenario).bracket for scenario in scenarios]
-    lower, upper = (np.stack([getattr(b, end) for b in brackets]).reshape(*shape, -1) for end in ("lower", "upper"))
-    dims = ("model", "airframe", "width", "parameter")
+    shape = [len(study.models), len(study.airframes), len(study.widths), -1]
+    lower, upper = (np.stack([getattr(b, end) for b in brackets]).reshape(shape) for end in ("lower", "upper"))
+    seen = [[first._replace(channels=c, estimator=e).seen for e in study.estimators] for c in study.channels]
     return {
         "center": (dims, (lower + upper) / 2, _named("middle of the bracket", "unit")),
         "bracket_half_width": (dims, (upper - lower) / 2, _named("half the width of the bracket", "unit")),
+        "seen": (("channels", "estimator"), seen, _named("channels that the estimator looks at", "1")),
     }
 
 
-def _seen(study: Study) -> dict:
-    scenario = study.cell(0).scenario
-    seen = [[scenario._replace(channels=c, estimator=e).seen for e in study.estimators] for c in study.channels]
-    return {"seen": (("channels", "estimator"), seen, _named("channels that the estimator looks at", "1"))}
-
-
-def _example(store: Store) -> dict:
+def _example(store: Store) -> dict[str, tuple]:
     """The first flight of the first scenario whose noise is nearest the standard one, and a recorded search on it."""
     study = store.study
     scale = min(study.scales, key=lambda s: abs(math.log(s)) if s > 0 else math.inf)
     first = study.cell(0).scenario._replace(scale=scale)
-    cells: dict[str, Cell] = {
-        cell.scenario.estimator: cell
-        for cell in study.cells()
-        if cell.first == 0 and cell.scenario._replace(estimator=first.estimator) == first
-    }
-    found = {name: store.read(cell.number) for name, cell in cells.items()}
-    found = {name: results for name, results in found.items() if results is not None and "failed" not in results}
+    found = {}
+    for cell in study.cells():
+        if cell.first == 0 and cell.scenario._replace(estimator=first.estimator) == first:
+            results = store.read(cell.number)
+            if results is not None and "failed" not in results:
+                found[cell.scenario.estimator] = results
     if not found:
         return {}
-    name, some = next(iter(found.items()))
+    some = next(iter(found.values()))
     true, measured = some["true"], some["measured"]
     simulated = np.full((len(study.estimators), *true.shape), np.nan)
-    simulated[[study.estimators.index(name) for name in found]] = fly_again(study, cells[name], list(found.values()))
+    for name, results in found.items():
+        simulated[study.estimators.index(name)] = fly_again(study, first, results)
     both, along = ("sample", "state"), ("sweep", "parameter")
     about = _named("its states as simulated with the estimate", "state_unit")
     variables = {
@@ -213,14 +192,14 @@ def _example(store: Store) -> dict:
     return variables
 
 
-def _training(store: Store) -> dict:
+def _training(store: Store) -> dict[str, tuple]:
     """The losses of the networks during training."""
     needed = store.study.jobs()
     networks = [store.read_network(number) for number in range(len(needed))]
     histories = [np.zeros((0, 2)) if network is None else np.asarray(network.history) for network in networks]
-    if not any(len(history) for history in histories):
+    checks = max(map(len, histories), default=0)
+    if not checks:
         return {}
-    checks = max(map(len, histories))
     losses = np.stack([np.pad(h, ((0, checks - len(h)), (0, 0)), constant_values=np.nan) for h in histories])
     labels = [" ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in job) for job in needed]
     steps = np.minimum(CHECK * np.arange(1, checks + 1), store.study.network.steps)
@@ -233,5 +212,5 @@ def _training(store: Store) -> dict:
     }
 
 
-def _named(long_name: str, units: str) -> dict[str, str]:
+def _named(long_name: str, units: str) -> dict[str, Any]:
     return {"long_name": long_name, "units": units}

@@ -19,9 +19,6 @@ SCENARIO = Scenario._fields
 CONVERGED = ("successful", "unidentifiable")
 """The results of flights whose estimates count in errors."""
 
-WITHOUT_RUN = ("failed", "not_run")
-"""The results of flights that no estimator was run on."""
-
 NO_PERCENTAGE = ("", "the truth is 0", "below the noise floor")
 """Why a percentage has no meaning, by the codes of `no_percentage`."""
 
@@ -40,7 +37,7 @@ def converged(dataset: xr.Dataset) -> xr.DataArray:
 
 def was_run(dataset: xr.Dataset) -> xr.DataArray:
     """Which flights an estimator was run on, with any result."""
-    return ~_one_of(dataset, WITHOUT_RUN)
+    return ~_one_of(dataset, ("failed", "not_run"))
 
 
 def result_counts(dataset: xr.Dataset) -> xr.DataArray:
@@ -55,23 +52,25 @@ def error(dataset: xr.Dataset) -> xr.DataArray:
     return (dataset["estimate"] - dataset["truth"]).where(converged(dataset))
 
 
-def no_percentage(dataset: xr.Dataset) -> xr.DataArray:
+def no_percentage(dataset: xr.Dataset, bound: xr.DataArray | None = None) -> xr.DataArray:
     """Why percentages of the truth have no meaning, for each scenario and parameter: an index into `NO_PERCENTAGE`.
 
     1 if the truth of any flight is 0; else 2 if the truth of any flight is below its noise floor, `NINETY_FIVE` bounds:
     it cannot be distinguished from 0, so that its relative error is arbitrary. 0 otherwise.
     """
-    return _no_percentage(dataset, dataset["bound"])
+    truth, bound = dataset["truth"], dataset["bound"] if bound is None else bound
+    below = (abs(truth) < NINETY_FIVE * bound).any("flight")
+    return xr.where((truth == 0).any("flight"), 1, xr.where(below, 2, 0))
 
 
 def estimator_error(dataset: xr.Dataset) -> xr.Dataset:
     """Root mean square error of converged flights: in `percent` of each flight's truth, and `absolute`."""
-    return _both(dataset, error(dataset), dataset["bound"])
+    return _both(dataset, error(dataset))
 
 
 def bound_error(dataset: xr.Dataset) -> xr.Dataset:
     """The Cramer-Rao bound in the form of `estimator_error`: root mean square over all flights."""
-    return _both(dataset, dataset["bound"], dataset["bound"])
+    return _both(dataset, dataset["bound"])
 
 
 def center_error(dataset: xr.Dataset) -> xr.Dataset:
@@ -102,7 +101,7 @@ def coverage(dataset: xr.Dataset) -> xr.Dataset:
     """The share of converged flights whose interval holds the truth, at each level, with a 95 % Wilson interval."""
     distance, half_width = abs(error(dataset)), dataset["half_width"]
     measured = distance.notnull() & half_width.notnull()
-    return _share((distance <= half_width) & measured, measured).rename({"share": "coverage"})
+    return _share("coverage", (distance <= half_width) & measured, measured)
 
 
 def mean_coverage(dataset: xr.Dataset) -> xr.Dataset:
@@ -111,15 +110,13 @@ def mean_coverage(dataset: xr.Dataset) -> xr.Dataset:
     Errors of one flight's parameters are correlated, so that this interval is conservative.
     """
     each = coverage(dataset)
-    share, count = each["coverage"].mean("parameter"), each["count"].min("parameter")
-    low, high = _wilson(share, count.where(count > 0))
-    return xr.Dataset({"coverage": share, "low": low, "high": high, "count": count})
+    return _wilson("coverage", each["coverage"].mean("parameter"), each["count"].min("parameter"))
 
 
 def hit_rate(dataset: xr.Dataset) -> xr.Dataset:
     """The share of flights whose seed bracket held the truth, with a 95 % Wilson interval; NaN without seeds."""
     hit = dataset["hit"]
-    return _share(hit == 1, (hit >= 0) & was_run(dataset)).rename({"share": "hit_rate"})
+    return _share("hit_rate", hit == 1, (hit >= 0) & was_run(dataset))
 
 
 def mean_rollouts(dataset: xr.Dataset) -> xr.DataArray:
@@ -152,14 +149,8 @@ def _one_of(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
     return dataset["result"].isin([known[name] for name in names if name in known])
 
 
-def _no_percentage(dataset: xr.Dataset, bound: xr.DataArray) -> xr.DataArray:
-    truth = dataset["truth"]
-    below = (abs(truth) < NINETY_FIVE * bound).any("flight")
-    return xr.where((truth == 0).any("flight"), 1, xr.where(below, 2, 0))
-
-
-def _both(dataset: xr.Dataset, values: xr.DataArray, bound: xr.DataArray) -> xr.Dataset:
-    truth, reason = dataset["truth"], _no_percentage(dataset, bound)
+def _both(dataset: xr.Dataset, values: xr.DataArray, bound: xr.DataArray | None = None) -> xr.Dataset:
+    truth, reason = dataset["truth"], no_percentage(dataset, bound)
     percent = (100 * values / abs(truth.where(truth != 0))).where(reason == 0)
     return xr.Dataset({"percent": _rms(percent), "absolute": _rms(values), "reason": reason})
 
@@ -168,20 +159,18 @@ def _rms(values: xr.DataArray) -> xr.DataArray:
     return (values**2).mean("flight") ** 0.5
 
 
-def _share(yes: xr.DataArray, counted: xr.DataArray) -> xr.Dataset:
+def _share(name: str, yes: xr.DataArray, counted: xr.DataArray) -> xr.Dataset:
     count = counted.sum("flight")
-    some = count.where(count > 0)
-    share = (yes & counted).sum("flight") / some
-    low, high = _wilson(share, some)
-    return xr.Dataset({"share": share, "low": low, "high": high, "count": count})
+    return _wilson(name, (yes & counted).sum("flight") / count.where(count > 0), count)
 
 
-def _wilson(share: xr.DataArray, count: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
-    """Wilson's 95 % interval of a probability, from a share of `count` draws."""
-    z2 = NINETY_FIVE**2
-    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = math.sqrt(z2) * np.sqrt(share * (1 - share) / count + z2 / (4 * count**2)) / (1 + z2 / count)
-    return (middle - half).clip(0, 1), (middle + half).clip(0, 1)
+def _wilson(name: str, share: xr.DataArray, count: xr.DataArray) -> xr.Dataset:
+    """A share of `count` draws, with Wilson's 95 % interval of the probability."""
+    z2, some = NINETY_FIVE**2, count.where(count > 0)
+    middle = (share + z2 / (2 * some)) / (1 + z2 / some)
+    half = math.sqrt(z2) * np.sqrt(share * (1 - share) / some + z2 / (4 * some**2)) / (1 + z2 / some)
+    low, high = (middle - half).clip(0, 1), (middle + half).clip(0, 1)
+    return xr.Dataset({name: share, "low": low, "high": high, "count": count})
 
 
 def _chi_squared(freedom: xr.DataArray, deviations: float) -> xr.DataArray:

@@ -1,31 +1,48 @@
-"""Runs a study on the devices of this process, from its specification to its Dataset."""
+"""Runs a study from its specification to its Dataset: on the devices of this process, or on a Dask cluster.
+
+The results are the same bit for bit. Workers of a cluster need only this package. If a worker is lost, another worker
+repeats its tasks.
+"""
 
 import concurrent.futures
 import contextlib
 import ctypes
+import functools
+import io
 import itertools
 import os
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Container, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import msgspec
 import numpy as np
 import xarray as xr
 
 from ..errors import InputError, TrainingError
-from ..networks import TrainedNetwork, encode_network
-from .cell import encode, programs_of, run_cell, train_network
+from ..networks import TrainedNetwork, encode_network, load_network
+from .cell import blank_problem, fleet_of, key_of, programs_of, run_cell
 from .dataset import assemble, save_dataset
 from .specification import Cell, Job, Study
 from .store import Store, check_store, open_store
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+# A trained network, or a message that says why there is none; `None` for an estimator without a network.
+Trained = TrainedNetwork | str | None
 
 # Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
 # A device joins the program of another device if at least this number of cells waits: it must compile the program too.
 _WORTH_COMPILING = 8
+# Cells that wait on a cluster for each of its threads: enough to keep it busy.
+_AHEAD = 3
+# How often a task that raises an unexpected exception is repeated. The cluster itself counts lost workers.
+_RETRIES = 2
 
 
 class Step(NamedTuple):
@@ -52,10 +69,7 @@ class Plan(NamedTuple):
 
 
 def use_all_cores() -> None:
-    """Makes each core of this process a device, so that cells run side by side. Call it before any computation.
-
-    `JAX_NUM_CPU_DEVICES` overrides the number of devices.
-    """
+    """Makes each core a device, or as many as `JAX_NUM_CPU_DEVICES` says. Call it before any computation."""
     if os.environ.get("JAX_NUM_CPU_DEVICES"):
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -69,10 +83,7 @@ def device_name() -> str:
 
 
 def plan(study: Study, directory: Path) -> list[Plan]:
-    """A row for each estimator. Programs and networks count for the first estimator that needs them.
-
-    Raises `InputError` as `open_store`.
-    """
+    """A row for each estimator. Programs and networks count for the first that needs them. Raises as `open_store`."""
     store, seconds, rows = check_store(directory, study), defaultdict(list), []
     for entry in store.read_log():
         if "cell" in entry:
@@ -81,13 +92,12 @@ def plan(study: Study, directory: Path) -> list[Plan]:
     trained = {job for job, number in study.jobs().items() if store.network_file(number).exists()}
     compiled: set[tuple] = set()
     for estimator in study.estimators:
-        cells = [cell for cell in remaining if cell.scenario.estimator == estimator]
+        cells, times = [cell for cell in remaining if cell.scenario.estimator == estimator], seconds[estimator]
         flights = sum(min(study.batch, study.flights - cell.first) for cell in cells)
         programs = {program for cell in cells for program in programs_of(study, cell.scenario)} - compiled
         networks = {job for cell in cells if (job := study.job(cell.scenario))} - trained
         compiled |= programs
         trained |= networks
-        times = seconds[estimator]
         expected = sum(times) / len(times) * len(cells) / len(jax.local_devices()) if times else None
         rows.append(Plan(estimator, len(cells), flights, len(programs), len(networks), expected))
     return rows
@@ -113,7 +123,7 @@ def run_here(store: Store) -> Iterator[Step]:
         programs[programs_of(study, cell.scenario)[-1]].waiting.append(cell)
     untrained = deque(dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None))
     # A cell without a network never waits for one.
-    networks: dict[Job | None, TrainedNetwork | str | None] = {None: None}
+    networks: dict[Job | None, Trained] = {None: None}
     free = deque(jax.local_devices())
     running: dict[concurrent.futures.Future, tuple[Any, Job | Cell]] = {}
     pool = concurrent.futures.ThreadPoolExecutor(len(free))
@@ -124,7 +134,7 @@ def run_here(store: Store) -> Iterator[Step]:
                     task = untrained.popleft()
                     future = pool.submit(_train, store, task, device)
                 elif task := _next_cell(study, list(programs.values()), networks, device):
-                    future = pool.submit(_compute_on, device, study, task, networks[study.job(task.scenario)])
+                    future = pool.submit(compute, study, task, networks[study.job(task.scenario)], device)
                 else:  # all remaining cells wait for networks
                     continue
                 free.remove(device)
@@ -160,18 +170,13 @@ def _next_cell(study: Study, programs: list[_Program], networks: Container[Job |
     return program.waiting.popleft()
 
 
-def _compute_on(device: Any, study: Study, cell: Cell, network: TrainedNetwork | str | None) -> tuple[bytes, float]:
-    with jax.default_device(device):
-        return compute(study, cell, network)
-
-
 def _give_memory_back() -> None:
     """Returns the compiler's freed memory to the system; the C library keeps half a gigabyte of a large program."""
     with contextlib.suppress(OSError, AttributeError, TypeError):  # not every C library can
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _train(store: Store, job: Job, device: Any) -> TrainedNetwork | str | None:
+def _train(store: Store, job: Job, device: Any) -> Trained:
     """The network, read from its file as in a resumed run; or a message that says why there is none."""
     begin, number = time.perf_counter(), store.study.jobs()[job]
     with jax.default_device(device):
@@ -185,28 +190,36 @@ def _train(store: Store, job: Job, device: Any) -> TrainedNetwork | str | None:
 
 
 def train(study: Study, job: Job) -> bytes | str:
-    """The bytes of a network's file, or a message that says why there is none."""
+    """The bytes of a network's file, or a message that says why there is none. It serves all noises and scales.
+
+    The numbers are the same bit for bit only on the same number of cores, which share the products of matrices.
+    """
+    scales = [scale or 1.0 for scale in study.scales]
     try:
         with jax.enable_x64(study.double):
-            return encode_network(train_network(study, job))
+            fleet, key = fleet_of(study, job), key_of(study.network.seed, study.jobs()[job])
+            settings = study.network.estimator(job.channels, (min(scales), max(scales)))
+            return encode_network(settings.fit(blank_problem(study, fleet, 1.0, job.channels), fleet.bracket, key=key))
     except FAILURES as error:
         return str(error)
 
 
-def compute(study: Study, cell: Cell, network: TrainedNetwork | str | None) -> tuple[bytes, float]:
-    """The bytes of a cell's file, and the seconds of its computation. `network` is a message if there is none."""
+def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> tuple[bytes, float]:
+    """The bytes of a cell's file, and the seconds of its computation. Equal results give equal bytes."""
     begin = time.perf_counter()
     try:
         if isinstance(network, str):
             raise TrainingError(network)
-        results = run_cell(study, cell, network)
+        with jax.default_device(device):
+            results = run_cell(study, cell, network)
     except FAILURES as error:
         if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
-            raise InputError(
-                "out of memory: free some and run the study again, or start another study with a smaller `batch`."
-            ) from None
+            remedy = "free some and run the study again, or start another study with a smaller `batch`"
+            raise InputError(f"out of memory: {remedy}.") from None
         results = {"failed": np.asarray(" ".join(str(error).split())[:500])}
-    return encode(results), round(time.perf_counter() - begin, 3)
+    file = io.BytesIO()
+    np.savez(file, **results)  # pyright: ignore[reportArgumentType]
+    return file.getvalue(), round(time.perf_counter() - begin, 3)
 
 
 def label_of(study: Study, task: Job | Cell) -> str:
@@ -215,6 +228,79 @@ def label_of(study: Study, task: Job | Cell) -> str:
         return f"training for {task.channels}"
     *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in task.scenario)
     return " ".join([estimator, *itertools.compress(shared, (length > 1 for length in study.shape))])
+
+
+def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
+    """Computes the remaining cells on a cluster, in the order in which they finish.
+
+    `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
+    lock of the cluster. Raises `InputError` if the cluster has no workers, or loses a cell more often than it allows.
+    """
+    from distributed import as_completed
+
+    study, waiting = store.study, deque(store.missing())
+    specification, numbers = msgspec.json.encode(study).decode(), {None: None} | study.jobs()
+    done = study.count - len(waiting)
+    networks: dict[int | None, Any] = {None: None}
+    running: dict[Future, tuple[int, int | None]] = {}
+    finished = as_completed(loop=client.loop, raise_errors=False)
+    threads: Any = client.nthreads
+    if waiting and not threads():
+        raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
+
+    def network_of(number: int) -> Any:
+        if store.read_network(number) is None:
+            return client.submit(remote_training, specification, number, retries=_RETRIES, pure=False)
+        # Read here, and not on a worker, because it may be damaged. As a task: data of a lost worker are lost with it.
+        return client.submit(bytes, store.network_file(number).read_bytes(), pure=False)
+
+    def submit() -> None:
+        room = _AHEAD * max(sum(threads().values()), 1) - len(running)
+        for _ in range(min(room, len(waiting))):
+            index = waiting.popleft()
+            number = numbers[study.job(study.cell(index).scenario)]
+            if number is not None and number not in networks:
+                networks[number] = network_of(number)
+            future = client.submit(remote_cell, specification, index, networks[number], retries=_RETRIES, pure=False)
+            running[future] = index, number
+            finished.add(future)
+
+    submit()
+    while running:
+        future = next(finished)
+        index, number = running.pop(future)
+        try:
+            data, seconds = future.result()
+            trained = None if number is None or store.network_file(number).exists() else networks[number].result()
+        except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
+            what = " ".join(str(error).split())[:300] or type(error).__name__
+            raise InputError(f"cell {index}: lost by the cluster ({what}); run the study again to resume.") from None
+        if number is not None and isinstance(trained, bytes):
+            store.write_network(number, trained)
+        store.write_cell(index, data, seconds)
+        done += 1
+        yield Step(done, label_of(study, study.cell(index)))
+        submit()
+    yield Step(done, "")
+
+
+def remote_training(specification: str, number: int) -> bytes | str:
+    """`train` on a worker. `number`: the place in `Study.jobs`."""
+    study = msgspec.json.decode(specification, type=Study)
+    return train(study, list(study.jobs())[number])
+
+
+def remote_cell(specification: str, index: int, network: bytes | str | None) -> tuple[bytes, float]:
+    """`compute` on a worker."""
+    study = msgspec.json.decode(specification, type=Study)
+    trained = _loaded(network, study.double) if isinstance(network, bytes) else network
+    return compute(study, study.cell(index), trained)
+
+
+@functools.lru_cache(maxsize=2)
+def _loaded(network: bytes, double: bool) -> TrainedNetwork:
+    with jax.enable_x64(double):
+        return load_network(io.BytesIO(network))
 
 
 def carry_out(

@@ -61,9 +61,8 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def estimator(self, channels: str, noise: tuple[float, float]) -> NetworkEstimator:
         """The network to be trained. Raises `ValueError` as `NetworkEstimator` does."""
-        return NetworkEstimator(
-            self.features, self.approximator, channels, noise, steps=self.steps, held_out=self.held_out
-        )
+        sizes = {"steps": self.steps, "held_out": self.held_out}
+        return NetworkEstimator(self.features, self.approximator, channels, noise, **sizes)
 
 
 class Scenario(NamedTuple):
@@ -190,8 +189,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise InputError(f"`durations`: {duration:g} s at `dt` {self.dt:g} s is not {limits}; change one.")
         if self.count > _MOST_CELLS:
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
-        estimates = math.prod(self.shape) * self.flights
-        if estimates > _MOST_ESTIMATES:
+        if (estimates := math.prod(self.shape) * self.flights) > _MOST_ESTIMATES:
             most = f"more than {_MOST_ESTIMATES}"
             raise InputError(f"{estimates} estimates, {most}; reduce `flights`, or shorten an axis.")
 
@@ -277,14 +275,11 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     def cells(self) -> Iterator[Cell]:
         """All cells in their order."""
-        return (self.cell(index) for index in range(self.count))
+        return map(self.cell, range(self.count))
 
 
 def load_study(path: Path) -> Study:
-    """Reads the specification of a study from a TOML file.
-
-    **Raises:** `InputError` with one line: which key, what is wrong, what to do; `OSError` if it cannot be read.
-    """
+    """Reads the specification of a study from a TOML file. Raises `InputError`; `OSError` if it cannot be read."""
     table = read_toml(path)
     try:
         table = table | _inputs(table, Path(path).parent)
@@ -302,17 +297,13 @@ def _inputs(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     files, dt = table.get("input"), table.get("dt", 0.01)
     if not isinstance(files, dict) or not isinstance(dt, int | float) or not dt > 0:
         return {}
-    taken = next((name for name in files if name in EXCITATIONS), None)
-    if taken is not None:
-        raise InputError(f"`input`: {taken} is a standard excitation; give the file another name.")
+    for name in files:
+        if name in EXCITATIONS:
+            raise InputError(f"`input`: {name} is a standard excitation; give the file another name.")
     from ..design import read_input  # needs the simulator, and most studies have no such files
 
-    return {
-        "input": {
-            name: read_input(folder / file, dt).tolist() if isinstance(file, str) else file
-            for name, file in files.items()
-        }
-    }
+    read = {name: read_input(folder / file, dt).tolist() for name, file in files.items() if isinstance(file, str)}
+    return {"input": files | read}
 
 
 def _in_words(message: str) -> str:

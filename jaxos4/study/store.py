@@ -7,8 +7,8 @@ ends with its process, even if the process is killed.
 import contextlib
 import dataclasses
 import importlib.metadata
+import io
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ import numpy as np
 from .._files import BROKEN, write_atomically
 from ..errors import InputError
 from ..networks import TrainedNetwork, load_network
-from .cell import decode
 from .specification import Study
 
 RESULTS_FILE = "results.nc"
@@ -56,7 +55,8 @@ class Store:
         """The results of a cell, or `None` if it is not finished. Raises `InputError` if its file is damaged."""
         path = self.cell_file(index)
         try:
-            return decode(path.read_bytes())
+            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+                return {name: file[name] for name in file.files}
         except FileNotFoundError:
             return None
         except BROKEN as error:
@@ -65,24 +65,18 @@ class Store:
 
     def write_cell(self, index: int, data: bytes, seconds: float) -> None:
         """Writes the file of a cell, and an entry of the log with the seconds that it took."""
-        _write(self.cell_file(index), data)
+        write_file(self.cell_file(index), data)
         self.log(cell=index, seconds=seconds)
 
     def write_network(self, number: int, data: bytes, **entry: Any) -> None:
         """Writes the file of a network, and an entry of the log."""
-        _write(self.network_file(number), data)
+        write_file(self.network_file(number), data)
         self.log(network=number, **entry)
 
     def log(self, **entry: Any) -> None:
         """Adds an entry to the log."""
         with open(self.directory / _LOG, "a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
-
-    def end_line(self) -> None:
-        """Ends a line of the log that a kill or a full disk cut."""
-        with contextlib.suppress(FileNotFoundError), open(self.directory / _LOG, "rb+") as file:
-            if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_END), file.read(1))[1] != b"\n":
-                file.write(b"\n")
 
     def read_log(self) -> list[dict[str, Any]]:
         """The entries of the log in their order, without lines that a kill cut."""
@@ -122,18 +116,21 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
     try:
         lock.acquire()
     except filelock.Timeout:
-        what = "another run is at work on this study; wait for its end, or give another folder."
-        raise InputError(f"{directory}: {what}") from None
+        remedy = "wait for its end, or give another folder"
+        raise InputError(f"{directory}: another run is at work on this study; {remedy}.") from None
     try:
         store = check_store(directory, study, device)
         if not (directory / _SPECIFICATION).exists():
             header = {"version": store.version, "device": device, "study": study}
-            _write(directory / _SPECIFICATION, msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
+            write_file(directory / _SPECIFICATION, msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
         for folder in (directory, directory / "cells", directory / "networks"):
             folder.mkdir(exist_ok=True)
             for unfinished in folder.glob(_UNFINISHED):
                 unfinished.unlink(missing_ok=True)
-        store.end_line()
+        log = directory / _LOG
+        if log.exists() and not log.read_bytes().endswith(b"\n"):  # a kill or a full disk cut a line
+            with open(log, "ab") as file:
+                file.write(b"\n")
         yield store
     finally:
         lock.release()
@@ -194,6 +191,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _write(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes | memoryview) -> None:
+    """Writes a file of a study, completely or not at all."""
     with write_atomically(path) as beside:
         beside.write_bytes(data)
