@@ -322,7 +322,7 @@ def test_wrong_options_are_refused(run, tmp_path, write, options, fragments):
 
 
 def test_names_of_files_cannot_break_a_file(write):
-    name = "a--b\n'''-->.json"
+    name = "a---b\n'''-->.json"
     found = read_result(write(os4_result(), name))
     for target in ("mujoco", "sdf"):
         ElementTree.fromstring(export_vehicle(found, target).text)

@@ -18,7 +18,6 @@ from ..results import NAMES, meaning
 from .vehicle import RigidVehicle, rigid_vehicle
 
 _VEHICLE = "flight"
-_SUCCESSFUL = "successful"
 # An inertia of the rotors counts if it differs from 0 by this many standard deviations, a thrust curve if from 1.
 _SURE = 3.0
 # Numbers that no vehicle has below 0, although an estimate can be.
@@ -96,7 +95,7 @@ class Identified(NamedTuple):
     @property
     def successful(self) -> bool:
         """True if the estimate can be trusted."""
-        return self.result == _SUCCESSFUL
+        return self.result == "successful"
 
     @property
     def reason(self) -> str:

@@ -16,12 +16,6 @@ _HOVER = 9.81
 # The full-scale rotor speed if nobody knows it, in hover speeds.
 _FULL_SCALE = 2.0
 
-# Differences that several simulators have.
-NO_ROTOR_INERTIA = (
-    "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
-)
-DRAG_OF_ROTORS = "drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw"
-
 
 class RigidVehicle(NamedTuple):
     """A rigid body with four rotors, in a frame with x forward, y left, z up and the centre of mass at its origin.
@@ -65,6 +59,11 @@ class RigidVehicle(NamedTuple):
     def hover_speed(self) -> float:
         """The rotor speed [rad/s] at which four equal rotors carry the weight."""
         return float(np.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient)))
+
+    @property
+    def torque_ratio(self) -> float:
+        """The yaw torque of a rotor over its thrust [m]."""
+        return self.drag_coefficient / self.thrust_coefficient
 
     @property
     def hover_thrust(self) -> Float[np.ndarray, "4"]:
@@ -118,11 +117,6 @@ class RigidVehicle(NamedTuple):
         return ""
 
 
-def differences(*lines: tuple[object, str]) -> tuple[str, ...]:
-    """The lines whose condition holds."""
-    return tuple(line for applies, line in lines if applies)
-
-
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
     """The vehicle with an airframe and the parameters that were identified.
 
@@ -137,7 +131,8 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
         elif inverse in values:
             # Torques exceed the airframe's by the same factor as thrust.
             inertia[axis] = gain / values[inverse]
-    offset = np.array([_mean([x for name, x in values.items() if name.startswith(f"{axis}_offset")]) for axis in AXES])
+    offsets = ([x for name, x in values.items() if name.startswith(f"{axis}_offset")] for axis in AXES)
+    offset = np.array([np.mean(of_axis or [0.0]) for of_axis in offsets])
     slopes = {name: values.get(name, 0.0) for name in ("roll_thrust", "pitch_thrust")}
     offset[:2] -= _HOVER * np.array(list(slopes.values()))
     # The centre of mass, x and y, in the frame of the airframe's rotor positions [m].
@@ -167,7 +162,3 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     )
     unknown = not np.isfinite(speed) and gain > 0
     return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed) if unknown else vehicle
-
-
-def _mean(values: list[float]) -> float:
-    return float(np.mean(values)) if values else 0.0
