@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from helpers import compiled_programs, refused
 
-from jaxos4.cli import compare as command
+from jaxos4.cli import studies
 from jaxos4.report import write_report
 from jaxos4.study import OUTCOMES, Training
 
@@ -27,8 +27,8 @@ def draw_few(dataset, directory, **options):
 @pytest.fixture(autouse=True)
 def cut(monkeypatch):
     monkeypatch.setattr("jaxos4.report.write_report", draw_few)
-    whole = command.comparison
-    monkeypatch.setattr(command, "comparison", lambda *, quick: msgspec.structs.replace(whole(quick=quick), **SMALL))
+    whole = studies.comparison
+    monkeypatch.setattr(studies, "comparison", lambda *, quick: msgspec.structs.replace(whole(quick=quick), **SMALL))
 
 
 def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monkeypatch):

@@ -243,11 +243,11 @@ def test_what_is_not_a_study_is_refused_and_nothing_is_written(write, tmp_path, 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
     study = study[["search_half_width", "search_estimate"]]
-    before = study_page.draw(study_page.OF_EXAMPLE, study)
+    before = study_page.draw(study_page.EXAMPLE_FIGURES, study)
     assert list(before) == ["search"]
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):
         settings = dict(matplotlib.rcParams)
-        assert study_page.draw(study_page.OF_EXAMPLE, study) == before
+        assert study_page.draw(study_page.EXAMPLE_FIGURES, study) == before
         assert dict(matplotlib.rcParams) == settings
 
 

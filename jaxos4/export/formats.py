@@ -41,7 +41,7 @@ _DRAG_OF_ROTORS = "drag: as drag of the rotors, the mean of x and y, right at th
 class Target(NamedTuple):
     """A simulator's format.
 
-    - `label`: the name of the format. `suffix`: that of its files.
+    - `label`: the name of the format. `suffix`: the suffix of its files.
     - `text`: the file for a vehicle, with lines of comment at its top.
     - `limits`: the effects that the simulator does not have, or has differently; one line each.
     """
@@ -193,8 +193,8 @@ def _render(template: str, vehicle: RigidVehicle, comments: Sequence[str], **val
 @functools.cache
 def _templates() -> jinja2.Environment:
     loader, undefined = jinja2.PackageLoader("jaxos4.export", "."), jinja2.StrictUndefined
-    layout = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
-    made = jinja2.Environment(loader=loader, undefined=undefined, **layout)
+    made = jinja2.Environment(loader=loader, undefined=undefined, trim_blocks=True, lstrip_blocks=True)
+    made.keep_trailing_newline = True
     # An XML comment must not contain two hyphens in a row.
     made.filters["hyphens_apart"] = lambda line: re.sub("-(?=-)", "- ", line)
     made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}

@@ -10,7 +10,8 @@ from ..airframe import Airframe
 from ..analysis.center_of_mass import center_of_mass
 
 AXES = ("roll", "pitch", "yaw")
-_INERTIAS = (("Ix", "alpha3"), ("Iy", "alpha6"), ("Iz", "alpha8"))
+# Moments of inertia, each with the parameter that is `thrust_gain` divided by it.
+INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 # At this specific thrust, the term `center_of_mass` adds no torque (`FlightModel`) [m/s^2].
 _HOVER = 9.81
 # The full-scale rotor speed if nobody knows it, in hover speeds.
@@ -100,7 +101,7 @@ class RigidVehicle(NamedTuple):
     @property
     def impossible(self) -> str:
         """Why no vehicle is like this; empty if nothing speaks against it."""
-        for (name, _), moment in zip(_INERTIAS, self.inertia, strict=True):
+        for name, moment in zip(INERTIAS, self.inertia, strict=True):
             if not moment > 0:
                 return f"{name} = {moment:.3g} kg m^2 is not positive"
             if 2 * moment > self.inertia.sum():
@@ -125,7 +126,7 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     """
     mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)
-    for axis, (name, inverse) in enumerate(_INERTIAS):
+    for axis, (name, inverse) in enumerate(INERTIAS.items()):
         if name in values:
             inertia[axis] = values[name]
         elif inverse in values:
