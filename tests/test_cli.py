@@ -142,7 +142,7 @@ def test_a_flight_without_excitation_fails_with_a_message(run, tmp_path):
 
 
 def samples(names, values, count, dt):
-    """A log: rotor speeds of `values[0]`, and constants in the columns `names`."""
+    """A log with rotor speeds of `values[0]`, and constants in the columns `names`."""
     lines = [",".join([f"{dt * i:g}", *[values[0]] * 4, *values[1:]]) for i in range(count)]
     return "\n".join([f"t,omega1,omega2,omega3,omega4,{names}", *lines, ""])
 
@@ -236,20 +236,15 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(run, inputs, mo
     assert {path: path.stat().st_mtime_ns for path in inputs.iterdir()} == before
 
 
-def test_without_arguments_the_help_is_shown(run):
+def test_the_help_shows_each_text_whole(run):
+    """Units stand in brackets, which are easily taken for markup. Without arguments the help is shown, too."""
     code, out, err = run()
-    assert code == 2
-    assert "identifiability" in out + err
-
-
-@pytest.mark.parametrize("command", ["simulate", "design", "estimate"])
-def test_the_help_shows_each_text_whole(run, command):
-    """Units stand in brackets, which are easily taken for markup."""
-    code, out, _ = run(command, "--help")
-    assert code == 0
-    texts = [vars(option)["help"] for option in typer.main.get_group(_app.app).commands[command].params]
-    assert len(texts) > 10
-    assert all("".join(text.split()) in "".join(out.split()) for text in texts)
+    assert (code, "identifiability" in out + err) == (2, True)
+    for command in ("simulate", "design", "estimate"):
+        code, out, _ = run(command, "--help")
+        texts = [vars(option)["help"] for option in typer.main.get_group(_app.app).commands[command].params]
+        assert (code, len(texts) > 10) == (0, True)
+        assert all("".join(text.split()) in "".join(out.split()) for text in texts)
 
 
 def test_a_flight_that_ends_in_a_singularity_is_not_written(run, tmp_path):
@@ -270,22 +265,17 @@ def test_a_real_flight_is_read_and_fitted(run, tmp_path, shared_flights):
     assert "are not white noise" in out or "No estimate" in out
 
 
-# Networks.
-
-
 @pytest.fixture(scope="module")
 def network_file(tmp_path_factory):
     """A small network for the standard flight, and that flight."""
     folder = tmp_path_factory.mktemp("network")
     small = functools.partial(NetworkEstimator, width=32, depth=2, batch=64, held_out=4000)
     flight, network = folder / "flight.csv", folder / "flight.net"
-    for arguments in (
-        ["simulate", "--noise", "1", "--out", str(flight)],
-        ["train", str(flight), "--steps", "1000", "--out", str(network)],
-    ):
+    lines = f"simulate --noise 1 --out {flight}", f"train {flight} --steps 1000 --out {network}"
+    for line in lines:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("jaxos4.networks.NetworkEstimator", small)
-            patch.setattr(sys, "argv", ["jaxos4", *arguments])
+            patch.setattr(sys, "argv", ["jaxos4", *line.split()])
             with pytest.raises(SystemExit) as stop:
                 main()
         assert not stop.value.code
@@ -296,8 +286,7 @@ def network_file(tmp_path_factory):
 def test_a_trained_network_identifies_other_flights_of_its_inputs(run, network_file, estimator):
     simulate(run, "flight.csv", "--noise", "2", "--seed", "5", "--duration", "5")
     code, out, err, report = estimate(run, "--estimator", estimator, "--network", str(network_file[0]))
-    assert code == 0, err
-    assert f"{estimator}, published model" in out
+    assert (code, f"{estimator}, published model" in out) == (0, True), err
     assert (report["estimator"], report["result"]) == (estimator, "successful")
     for name, row in report["parameters"].items():
         assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4.5 * row["std"]

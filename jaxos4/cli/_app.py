@@ -23,7 +23,7 @@ _EPILOG = f"Compiled programs are kept in your cache folder, at most 1 GB. {NO_C
 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, with JAX prepared first. Its arguments are parsed before that: help and mistakes need no JAX."""
+    """The command, which prepares JAX first. Its arguments are parsed before: help and mistakes need no JAX."""
 
     @functools.wraps(command)
     def run(*args, **kwargs) -> None:
@@ -104,7 +104,7 @@ def console() -> None:
 
 
 def _parser_message(error: Any) -> str:
-    """A mistake in the arguments in one line; or the help, if there are no arguments."""
+    """A mistake in the arguments in one line. If there are no arguments: the help."""
     message = error.format_message().removesuffix(".").replace("Value error, ", "")
     if "\n" in message:
         return message

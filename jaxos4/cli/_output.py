@@ -53,7 +53,7 @@ def option_names(**files: Path | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stages(first: str) -> Iterator[Callable[[str], None]]:
-    """Shows a stage and the time; gives a function that changes the stage. Shows nothing if stderr is no terminal."""
+    """Shows a stage and the time. Yields a function that changes the stage. Shows nothing if stderr is no terminal."""
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 

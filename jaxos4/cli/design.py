@@ -15,7 +15,7 @@ from ._output import check_outputs, option_names, stages
 if TYPE_CHECKING:
     from ..design import Design
 
-# A table keeps the capitals of the library, a list would not.
+# A list would make the names lower-case.
 Criterion = StrEnum("Criterion", {"D": "D", "A": "A", "worst": "worst"})
 SlowestOption = Annotated[float | None, Option(help="Slowest rotor speed [rad/s].")]
 FastestOption = Annotated[float | None, Option(help="Fastest rotor speed [rad/s].")]

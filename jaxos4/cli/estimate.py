@@ -3,7 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
@@ -71,16 +71,9 @@ def estimate(
     check_outputs(*flights, airframe, bracket, network, validate, out=out, report=report)
     if report is not None and model not in (None, "flight"):
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
-    asked: dict[str, Any] = {
-        "channels": options.chosen(channels),
-        "initial_state": initial_state.value,
-        "window": window,
-        "terms": None if terms is None else [name.strip() for name in terms.split(",") if name.strip()],
-        "begin": begin,
-        "end": end,
-        "sample_time": sample_time,
-        "holdout": holdout,
-    }
+    listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
+    asked = {"channels": options.chosen(channels), "initial_state": initial_state.value, "window": window}
+    asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
     with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
         from ..airframe import load_airframe
         from ..identification import identify, settings_for
@@ -123,16 +116,14 @@ def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "
     """The identification with the command in its provenance, all notes and doubts in the words of the command line."""
     import msgspec
 
-    from ..identification.results import Doubt
-
     provenance = msgspec.structs.replace(
         found.provenance,
         airframe=airframe,
         notes=[*notes, *(in_options(note) for note in found.provenance.notes)],
         command=shlex.join(["jaxos4", *sys.argv[1:]]),
     )
-    doubts = tuple(Doubt(doubt.result, doubt.cause, in_options(doubt.remedy)) for doubt in found.doubts)
-    return msgspec.structs.replace(found, doubts=doubts, provenance=provenance)
+    doubts = (msgspec.structs.replace(doubt, remedy=in_options(doubt.remedy)) for doubt in found.doubts)
+    return msgspec.structs.replace(found, doubts=tuple(doubts), provenance=provenance)
 
 
 def _publish(found: "Identification", out: Path | None, report: Path | None, *, title: str) -> None:

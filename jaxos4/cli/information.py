@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..identification import FlightInformation
     from ..recording.inspection import IdentifiableParameters, Inspection
 
-# At most so many parts are printed, the longest ones.
+# If a log has more parts, only the longest are printed.
 _MOST_PARTS = 14
 _CHANNELS = (
     (("p", "q", "r"), "rad/s"),

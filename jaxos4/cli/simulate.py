@@ -97,7 +97,7 @@ def simulate(
 
 
 def _check_not_given(file: Path | None, **given: object) -> None:
-    """Refuses options whose values are in the file."""
+    """Refuses options if the file has their values."""
     for name, value in given.items():
         if file is not None and value is not None:
             raise InputError(f"--{name}: {file} has its own; leave it out.")
@@ -106,7 +106,7 @@ def _check_not_given(file: Path | None, **given: object) -> None:
 def _closed_loop(
     loop: "ClosedLoop", references: Path | None, duration: float, dt: float, seed: int
 ) -> tuple["Flight", float]:
-    """A flight under the controller, with random references or those of a file, and its sample time."""
+    """A flight under the controller, with random references or those of a file. Returns its sample time [s] too."""
     from ..closed_loop import fly_standard
 
     flown = None

@@ -21,7 +21,7 @@ _VEHICLE = "flight"
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
 # differs from 1 by as many.
 _SIGNIFICANT = 3.0
-# Numbers that no vehicle has below 0, although an estimate can be.
+# Parameters that no vehicle has below 0, although an estimate can be negative.
 _NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping", "x_drag", "y_drag")
 # Parameters without a place in a simulator's vehicle, and why.
 _NOT_EXPORTED = {
@@ -33,7 +33,7 @@ _NOT_EXPORTED = {
 }
 # Each simulator's note on the rotors' inertia names these parameters.
 _GYROSCOPIC = ("alpha2", "alpha5")
-# Draws for one sample before the uncertainty counts as too large.
+# The uncertainty is too large if so many draws for one sample are impossible.
 _MOST_DRAWS = 1000
 
 
@@ -195,7 +195,7 @@ def _identified(name: str, file: _File) -> Identified:
 
 
 def _clipped(values: dict[str, float]) -> dict[str, float]:
-    """`values` with 0 for what is negative, and cannot be."""
+    """Replaces negative values by 0 if no vehicle has them."""
     return {name: max(value, 0.0) if name in _NOT_NEGATIVE else value for name, value in values.items()}
 
 

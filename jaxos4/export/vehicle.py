@@ -14,7 +14,7 @@ AXES = ("roll", "pitch", "yaw")
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 # At this specific thrust, the term `center_of_mass` adds no torque (`FlightModel`) [m/s^2].
 _HOVER = 9.81
-# The full-scale rotor speed if nobody knows it, in hover speeds.
+# The full-scale rotor speed, in hover speeds, if the airframe does not have it.
 _FULL_SCALE = 2.0
 
 
@@ -80,7 +80,7 @@ class RigidVehicle(NamedTuple):
 
     @property
     def thrust_share(self) -> str:
-        """The share of `full_thrust` that the command u of full scale makes, as a formula; empty if it is u^2."""
+        """Thrust over `full_thrust` as a formula of the command u (1: full scale). Empty if it is u^2."""
         curve = self.thrust_curve
         if curve > 1:
             return f"max(0, {curve:.4g} u^2 - {curve - 1:.4g} u)"
@@ -100,7 +100,7 @@ class RigidVehicle(NamedTuple):
 
     @property
     def impossible(self) -> str:
-        """Why no vehicle is like this; empty if nothing speaks against it."""
+        """The reason why no vehicle can be like this. Empty if there is none."""
         for name, moment in zip(INERTIAS, self.inertia, strict=True):
             if not moment > 0:
                 return f"{name} = {moment:.3g} kg m^2 is not positive"

@@ -16,7 +16,7 @@ from ..analysis.frequency_response import AxisResponse, FrequencyResponse
 from ..analysis.prediction import Predictions
 from ..identification.results import Identification
 from ..results import NINETY_FIVE
-from .html import Drawing, drawings, render
+from .html import drawings, render
 from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg, ticks_at
 from .text import MISSING, plain
 
@@ -40,13 +40,17 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     look = styles([found.estimator])[found.estimator]
     predictions, responses = (), ()
     with drawing():
-        if found.predictions is not None:
-            predictions = _predictions(found.predictions, found.provenance.sample_time, look)
+        if (predicted := found.predictions) is not None:
+            labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
+            rates = (predicted_rates(predicted, found.provenance.sample_time, at, look) for at in range(len(labels)))
+            files = dict(zip(labels, map(svg, rates), strict=True))
+            chosen = list(files).index(labels[int(np.argmin(np.abs(predicted.horizons - _SHOWN)))])
+            description = "Measured and predicted body rates p, q, r"
+            predictions = drawings(files, chosen, stem="predictions", description=description)
         if found.response is not None:
-            file = svg(frequency_responses(found.response, look))
-            responses = drawings(
-                {"": file}, 0, stem="response", description="Frequency response of roll, pitch and yaw"
-            )
+            files = {"": svg(frequency_responses(found.response, look))}
+            description = "Frequency response of roll, pitch and yaw"
+            responses = drawings(files, 0, stem="response", description=description)
     text = render(
         "identification.html.j2",
         filters={"number": _number, "interval": _interval, "share": _share, "plain": plain},
@@ -84,14 +88,6 @@ def _text(x: Any) -> str:
     if isinstance(x, str):
         return x
     return MISSING if x is None else json.dumps(x, ensure_ascii=False)
-
-
-def _predictions(predicted: Predictions, sample_time: float, look: Style) -> tuple[Drawing, ...]:
-    """A drawing for each horizon."""
-    labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
-    files = {label: svg(predicted_rates(predicted, sample_time, at, look)) for at, label in enumerate(labels)}
-    chosen = list(files).index(labels[int(np.argmin(np.abs(predicted.horizons - _SHOWN)))])
-    return drawings(files, chosen, stem="predictions", description="Measured and predicted body rates p, q, r")
 
 
 def predicted_rates(predicted: Predictions, sample_time: float, horizon: int, look: Style) -> Figure:

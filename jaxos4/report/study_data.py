@@ -60,7 +60,7 @@ def read_results(directory: Path) -> xr.Dataset:
 
 
 def _missing(dataset: xr.Dataset) -> str:
-    """Why a Dataset is not the results of a study, or an empty string."""
+    """The reason why a Dataset is not the results of a study. Empty if it is."""
     for name, dimensions in _VARIABLES.items():
         if name not in dataset.variables:
             return f"no variable `{name}`"
@@ -80,7 +80,7 @@ def _missing(dataset: xr.Dataset) -> str:
 
 
 class Scenario(NamedTuple):
-    """The data of one value on each axis except noise scale and estimator, which a table or figure compares."""
+    """The data that one table or figure compares: all noise scales and estimators, one value on each other axis."""
 
     number: int
     label: str

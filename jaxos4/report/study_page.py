@@ -39,21 +39,20 @@ EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "search": study_figures.search,
     "training": study_figures.training,
 }
-# These show one noise scale: the files the one nearest 1, the page the one that the reader chooses.
+# These figures show one noise scale: in the files, the scale nearest 1; on the page, the scale that the reader chooses.
 _ONE_SCALE = ("distribution",)
 
 
 class Drawn(NamedTuple):
-    """A figure of one study.
+    """A figure of a study.
 
     - `stem`: the name of its files, without the suffix.
-    - `svg`, `pdf`: the bytes of its files.
-    - `choices`: the figures among which the reader of the page chooses, by label; `svg` is one of them.
+    - `files`: the bytes of its files, by suffix.
+    - `choices`: the SVG figures among which the reader of the page chooses, by label. The file is one of them.
     """
 
     stem: str
-    svg: bytes
-    pdf: bytes | None
+    files: dict[str, bytes]
     choices: dict[str, bytes]
 
 
@@ -76,8 +75,7 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
     folder.mkdir(exist_ok=True)
     files: dict[Path, bytes] = {}
     for drawn in [drawn for figures in (*(of for _, of in sections), example) for drawn in figures.values()]:
-        contents = {"svg": drawn.svg, "pdf": drawn.pdf}
-        files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in contents.items() if content}
+        files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in drawn.files.items()}
     for path, content in (*files.items(), (target, page)):
         with write_atomically(path) as beside:
             beside.write_bytes(content)
@@ -98,13 +96,13 @@ def draw(
             figure = draw_figure(data)
             if figure is None:
                 continue
-            as_svg, as_pdf, choices = svg(figure), pdf(figure) if with_pdf else None, {}
+            files, choices = {"svg": svg(figure)} | ({"pdf": pdf(figure)} if with_pdf else {}), {}
             for place, label in enumerate(scale_labels(data)) if name in _ONE_SCALE else ():
                 if place == nearest_scale(data):
-                    choices[label] = as_svg
+                    choices[label] = files["svg"]
                 elif draw_figure(data.isel(scale=[place]), figure) is not None:
                     choices[label] = svg(figure)
-        made[name] = Drawn(f"{name}{suffix}", as_svg, as_pdf, choices or {"": as_svg})
+        made[name] = Drawn(f"{name}{suffix}", files, choices or {"": files["svg"]})
     return made
 
 
@@ -115,7 +113,7 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
     missing, cells = study_tables.cells_not_run(dataset)
 
     def inline(drawn: Drawn, description: str) -> tuple[Drawing, ...]:
-        chosen = list(drawn.choices.values()).index(drawn.svg)
+        chosen = list(drawn.choices.values()).index(drawn.files["svg"])
         return drawings(drawn.choices, chosen, stem=drawn.stem, description=description, estimators=estimators)
 
     return render(
@@ -127,13 +125,9 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
         provenance=[(label, attributes[name]) for name, label in _PROVENANCE.items() if name in attributes],
         estimators=[(place, name, look.color) for place, (name, look) in enumerate(styles(estimators).items())],
         sections=[
-            {
-                "number": scenario.number,
-                "label": scenario.label,
-                "figures": drawn,
-                "tables": study_tables.scenario_tables(scenario.data),
-                "trouble": study_tables.troubled_flights(scenario.data),
-            }
+            scenario._asdict()
+            | {"figures": drawn, "tables": study_tables.scenario_tables(scenario.data)}
+            | {"trouble": study_tables.troubled_flights(scenario.data)}
             for scenario, drawn in sections
         ],
         level=study_tables.shown_level(dataset),

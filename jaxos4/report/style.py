@@ -94,7 +94,7 @@ def drawing() -> Iterator[None]:
 
 
 def styles(estimators: Sequence[str]) -> dict[str, Style]:
-    """A style for each estimator: always the same for those in `_KNOWN`, an unused one for each other name."""
+    """A style for each estimator. Those in `_KNOWN` have always the same style, the others have an unused one."""
     free = (place for place in itertools.count() if place >= len(_KNOWN) or _KNOWN[place] not in estimators)
     return {name: style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
 
@@ -195,7 +195,7 @@ def pdf(figure: Figure) -> bytes:
 
 
 def _printed(figure: Figure, write: Callable[..., None], metadata: dict[str, None]) -> bytes:
-    """The bytes that `write`, a method of a canvas, prints. `savefig` would draw twice, but restores the resolution."""
+    """The bytes that `write`, a method of a canvas, prints. `savefig` also restores the resolution, but draws twice."""
     buffer, resolution = io.BytesIO(), figure.dpi
     write(buffer, metadata=metadata)
     figure.set_dpi(resolution)

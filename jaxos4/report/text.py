@@ -15,7 +15,7 @@ _WORDS = 20  # columns of a terminal; a narrower column of words would be hard t
 
 
 def plain(value: float, digits: int = 3) -> str:
-    """`value` with so many significant digits, and a power of ten if it is very small or large; a dash if it is NaN."""
+    """A number with `digits` significant digits, and a power of ten if it is very small or large. NaN is a dash."""
     if not math.isfinite(value):
         return MISSING if math.isnan(value) else f"{value:g}"
     if value == 0:
@@ -28,7 +28,7 @@ def plain(value: float, digits: int = 3) -> str:
 
 
 def percent(share: float) -> str:
-    """A share in percent, without the sign %; a dash if it is NaN."""
+    """A share in percent, without the sign %. NaN is a dash."""
     return MISSING if math.isnan(share) else f"{100 * share:.1f}"
 
 
@@ -73,7 +73,7 @@ class Listing(NamedTuple):
 
 
 def print_whole(console: Console, table: RenderableType) -> None:
-    """Prints a table, wider than the terminal if it must be: the terminal then breaks its lines."""
+    """Prints a table without cutting a cell. If the table is wider than the terminal, the terminal breaks its lines."""
     size = console.size
     console.size = ConsoleDimensions(max(_needed_width(table), size.width), size.height)
     try:
