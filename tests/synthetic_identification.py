@@ -1,4 +1,4 @@
-"""Identifications that nobody computed: a flight's and a vehicle's, with everything that a page can show."""
+"""Identifications that nobody computed, of a flight and of a vehicle, with everything that a page can show."""
 
 import msgspec
 import numpy as np
@@ -25,16 +25,8 @@ WHITE = ChannelFit(0.01, "rad/s", 97.53, 1.0, 0.5, 0.02, 0.4, {"roll": 0.0, "pit
 COLOURED = msgspec.structs.replace(WHITE, percent=81.26, level=4.0, correlation=0.8, white_p=1e-9, input_p=1e-5)
 CONSTANTS = {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2"), "J_R": Constant(1e-8, 1e-7, "kg m^2")}
 NOTED = {"Ix": msgspec.structs.replace(CONSTANTS["Ix"], note="if arms and mass are right"), "J_R": CONSTANTS["J_R"]}
-COMMON = {
-    "estimator": "ibss",
-    "result": "successful",
-    "rollouts": 812,
-    "cost": 1234.5,
-    "seconds": 35.4,
-    "covariance": None,
-    "estimate": None,
-    "problem": None,
-}
+COMMON = {"estimator": "ibss", "result": "successful", "rollouts": 812, "cost": 1234.5, "seconds": 35.4}
+COMMON |= dict.fromkeys(("covariance", "estimate", "problem"))
 VERSIONS = {"airframe": "os4", "version": "0", "jax": "0", "device": "cpu", "precision": "float64"}
 
 
@@ -93,7 +85,7 @@ def synthetic_response() -> FrequencyResponse:
 
 
 def synthetic_predictions(starts=160) -> Predictions:
-    """Of two stretches; one measurement is missing."""
+    """Predictions in two stretches. One measurement is missing."""
     start = 5 + 12 * np.arange(starts)
     start[starts // 2 :] += 300
     horizons = np.array([0.1, 0.248, 0.5])

@@ -41,14 +41,11 @@ def test_simulate_writes_the_standard_flight(run, tmp_path):
     omega = [float(row[f"omega{i}"]) for row in rows for i in range(1, 5)]
     assert (math.floor(min(omega)), math.floor(max(omega))) == (134, 289)
     assert all(float(rows[0][name]) == 0 for name in ("x", "vz", "phi", "p"))
-
-
-def test_the_seed_determines_the_noise(run, tmp_path):
+    # The seed determines the noise.
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
         simulate(run, f"{name}.csv", "--noise", "1", "--seed", seed)
     a, b, c = ((tmp_path / f"{name}.csv").read_bytes() for name in "abc")
-    assert a == b
-    assert a != c
+    assert (a == b, a == c) == (True, False)
 
 
 def test_estimate_recovers_the_truth_within_its_intervals(run):
@@ -75,6 +72,10 @@ def test_estimate_recovers_the_truth_within_its_intervals(run):
     std = report["parameters"]["alpha3"]["std"]
     simulate(run, "flight.csv", "--noise", "10")
     assert estimate(run)[3]["parameters"]["alpha3"]["std"] / std == pytest.approx(10, rel=0.2)
+    simulate(run)
+    pathlib.Path("bracket.toml").write_text("alpha3 = [100, 140]\n")
+    code, out, err, _ = estimate(run, "--bracket", "bracket.toml", "--channels", "rates", "--initial-state", "known")
+    assert (code, "rates channels" in out) == (0, True), err
 
 
 def test_windows_and_validation(run):
@@ -129,15 +130,6 @@ def test_identifiability_names_the_parameters_that_are_not_excited(run, tmp_path
     assert "alpha3:" not in out
 
 
-def test_brackets_channels_and_initial_state(run, tmp_path):
-    simulate(run)
-    (tmp_path / "bracket.toml").write_text("alpha3 = [100, 140]\n")
-    options = ("--bracket", "bracket.toml", "--channels", "rates", "--initial-state", "known")
-    code, out, err, _ = estimate(run, *options)
-    assert code == 0, err
-    assert "rates channels" in out
-
-
 def test_a_flight_without_excitation_fails_with_a_message(run, tmp_path):
     simulate(run, "flight.csv", "--noise", "1")
     header, *rows = csv.reader((tmp_path / "flight.csv").read_text().splitlines())
@@ -150,7 +142,7 @@ def test_a_flight_without_excitation_fails_with_a_message(run, tmp_path):
 
 
 def samples(names, values, count, dt):
-    """A log: rotor speeds of `values[0]`, and constants in the columns `names`."""
+    """A log with rotor speeds of `values[0]`, and constants in the columns `names`."""
     lines = [",".join([f"{dt * i:g}", *[values[0]] * 4, *values[1:]]) for i in range(count)]
     return "\n".join([f"t,omega1,omega2,omega3,omega4,{names}", *lines, ""])
 
@@ -161,13 +153,9 @@ INPUTS = {
     "positions.csv": samples("x", "10", 2, 0.1),
     "short.csv": samples("p,q,r", "1000", 2, 0.1),
     "places.csv": samples("p,q,r,z", ("220", "0", "0", "0", "0"), 50, 0.01),
-    "empty.csv": "",
     "text.csv": "t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n0.1,1,abc,1,1,0\n",
-    "degrees.csv": "t,omega1,omega2,omega3,omega4,p\n0,1,1,1,1,0\n1,1,1,1,1,90\n",
     "bad.toml": "mass = = 3\n",
     "swapped.toml": "alpha3 = [140, 100]\n",
-    "unknown.toml": "alpha9 = [1, 2]\n",
-    "deep.toml": "x = " + "[" * 5000 + "]" * 5000 + "\n",
     "long.toml": "mass = 1" + "0" * 5000 + "\n",
     "huge.toml": "alpha1 = [0, 1" + "0" * 400 + "]\n",
     "tiny.toml": "mass = 0.65\ninertia = [1e-320, 1e-320, 1e-320]\narm = 0.23\nthrust_coefficient = 3e-5\n"
@@ -177,17 +165,13 @@ INPUTS = {
 REFUSED = {
     "estimate none.csv": ["none.csv"],
     "estimate .": ["."],
-    "estimate empty.csv": ["empty.csv", "empty"],
     "estimate text.csv": ["text.csv", "row 3", "omega2"],
-    "estimate degrees.csv": ["degrees.csv", "row 3", "p", "57.3"],
     "estimate positions.csv": ["positions.csv", "rates"],
     "estimate short.csv": ["short.csv", "6 measurements for 11 unknowns"],
     "estimate flight.csv --airframe none": ["none", "os4"],
     "estimate flight.csv --airframe long.toml": ["long.toml"],
     "estimate flight.csv --bracket bad.toml": ["bad.toml"],
     "estimate flight.csv --bracket swapped.toml": ["swapped.toml", "alpha3"],
-    "estimate flight.csv --bracket unknown.toml": ["unknown.toml", "alpha9"],
-    "estimate flight.csv --bracket deep.toml": ["deep.toml"],
     "estimate flight.csv --bracket huge.toml": ["huge.toml", "alpha1"],
     "estimate flight.csv --out none/e.json": ["none/e.json"],
     "estimate flight.csv --out .": ["."],
@@ -252,20 +236,15 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(run, inputs, mo
     assert {path: path.stat().st_mtime_ns for path in inputs.iterdir()} == before
 
 
-def test_without_arguments_the_help_is_shown(run):
+def test_the_help_shows_each_text_whole(run):
+    """Units stand in brackets, which are easily taken for markup. Without arguments the help is shown, too."""
     code, out, err = run()
-    assert code == 2
-    assert "identifiability" in out + err
-
-
-@pytest.mark.parametrize("command", ["simulate", "design", "estimate"])
-def test_the_help_shows_each_text_whole(run, command):
-    """Units stand in brackets, which are easily taken for markup."""
-    code, out, _ = run(command, "--help")
-    assert code == 0
-    texts = [vars(option)["help"] for option in typer.main.get_group(_app.app).commands[command].params]
-    assert len(texts) > 10
-    assert all("".join(text.split()) in "".join(out.split()) for text in texts)
+    assert (code, "identifiability" in out + err) == (2, True)
+    for command in ("simulate", "design", "estimate"):
+        code, out, _ = run(command, "--help")
+        texts = [vars(option)["help"] for option in typer.main.get_group(_app.app).commands[command].params]
+        assert (code, len(texts) > 10) == (0, True)
+        assert all("".join(text.split()) in "".join(out.split()) for text in texts)
 
 
 def test_a_flight_that_ends_in_a_singularity_is_not_written(run, tmp_path):
@@ -286,22 +265,17 @@ def test_a_real_flight_is_read_and_fitted(run, tmp_path, shared_flights):
     assert "are not white noise" in out or "No estimate" in out
 
 
-# Networks.
-
-
 @pytest.fixture(scope="module")
 def network_file(tmp_path_factory):
     """A small network for the standard flight, and that flight."""
     folder = tmp_path_factory.mktemp("network")
     small = functools.partial(NetworkEstimator, width=32, depth=2, batch=64, held_out=4000)
     flight, network = folder / "flight.csv", folder / "flight.net"
-    for arguments in (
-        ["simulate", "--noise", "1", "--out", str(flight)],
-        ["train", str(flight), "--steps", "1000", "--out", str(network)],
-    ):
+    lines = f"simulate --noise 1 --out {flight}", f"train {flight} --steps 1000 --out {network}"
+    for line in lines:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("jaxos4.networks.NetworkEstimator", small)
-            patch.setattr(sys, "argv", ["jaxos4", *arguments])
+            patch.setattr(sys, "argv", ["jaxos4", *line.split()])
             with pytest.raises(SystemExit) as stop:
                 main()
         assert not stop.value.code
@@ -312,8 +286,7 @@ def network_file(tmp_path_factory):
 def test_a_trained_network_identifies_other_flights_of_its_inputs(run, network_file, estimator):
     simulate(run, "flight.csv", "--noise", "2", "--seed", "5", "--duration", "5")
     code, out, err, report = estimate(run, "--estimator", estimator, "--network", str(network_file[0]))
-    assert code == 0, err
-    assert f"{estimator}, published model" in out
+    assert (code, f"{estimator}, published model" in out) == (0, True), err
     assert (report["estimator"], report["result"]) == (estimator, "successful")
     for name, row in report["parameters"].items():
         assert abs(row["estimate"] - TRUTH.get(name, 0.0)) < 4.5 * row["std"]

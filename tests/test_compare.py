@@ -5,18 +5,12 @@ import pytest
 import xarray as xr
 from helpers import compiled_programs, refused
 
-from jaxos4.cli import compare as command
+from jaxos4.cli import studies
 from jaxos4.report import write_report
 from jaxos4.study import OUTCOMES, Training
 
-SMALL = {
-    "durations": (0.5,),
-    "flights": 16,
-    "batch": 16,
-    "channels": ("rates",),
-    "estimators": ("ibss", "network", "hybrid"),
-    "network": Training(steps=20, held_out=1000),
-}
+SMALL = {"durations": (0.5,), "flights": 16, "batch": 16, "channels": ("rates",)}
+SMALL |= {"estimators": ("ibss", "network", "hybrid"), "network": Training(steps=20, held_out=1000)}
 
 
 def draw_few(dataset, directory, **options):
@@ -27,8 +21,8 @@ def draw_few(dataset, directory, **options):
 @pytest.fixture(autouse=True)
 def cut(monkeypatch):
     monkeypatch.setattr("jaxos4.report.write_report", draw_few)
-    whole = command.comparison
-    monkeypatch.setattr(command, "comparison", lambda *, quick: msgspec.structs.replace(whole(quick=quick), **SMALL))
+    whole = studies.comparison
+    monkeypatch.setattr(studies, "comparison", lambda *, quick: msgspec.structs.replace(whole(quick=quick), **SMALL))
 
 
 def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monkeypatch):
@@ -37,17 +31,8 @@ def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monke
     assert (code, err) == (0, "")
     # One program for the network, and one search for IBSS and the hybrid.
     assert [programs.count(f"jit({name})") for name in ("_identify", "_search")] == [1, 1]
-    for words in (
-        "noise x 0.1",
-        "noise x 10",
-        "bound, rates",
-        "ibss",
-        "network",
-        "hybrid",
-        "bracket centre",
-        "144 estimates",
-    ):
-        assert words in out
+    rows = ("noise x 0.1", "noise x 10", "bound, rates", "ibss", "network", "hybrid", "bracket centre")
+    assert all(words in out for words in (*rows, "144 estimates"))
     figures = {path.name for path in (tmp_path / "here/figures").iterdir()}
     assert figures >= {"error.svg", "efficiency.svg", "search.svg", "path.svg"}
     page = (tmp_path / "here/report.html").read_text(encoding="utf-8")

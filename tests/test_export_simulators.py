@@ -13,6 +13,7 @@ from synthetic_results import AIRFRAME, VALUES, os4_result, vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table, alpha_from_inertia
+from jaxos4.export import export_vehicle, read_result
 
 PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "into_your_simulator.md"
 # The simulators of the programs of the page, in their order.
@@ -33,12 +34,7 @@ def mujoco():
 def read(tmp_path, result):
     path = tmp_path / "found.json"
     path.write_text(json.dumps(result), encoding="utf-8")
-    return jaxos4.export.read_result(path)
-
-
-def exported(found, target):
-    """The text of the file for a simulator."""
-    return jaxos4.export.export_vehicle(found, target).text
+    return read_result(path)
 
 
 def random_states(slowest, fastest):
@@ -49,8 +45,8 @@ def random_states(slowest, fastest):
 
 
 def quaternions(states):
-    """w, x, y, z of R_z(psi) R_y(theta) R_x(phi) of each state."""
-    return np.roll(Rotation.from_euler("ZYX", states[:, [10, 8, 6]]).as_quat(), 1, axis=1)
+    """x, y, z, w of R_z(psi) R_y(theta) R_x(phi) of each state."""
+    return Rotation.from_euler("ZYX", states[:, [10, 8, 6]]).as_quat()
 
 
 def modelled(model, parameters, states, omega):
@@ -78,11 +74,11 @@ def vehicle_acceleration(values, states, omega):
 
 def mujoco_acceleration(found, states, omega):
     mujoco = pytest.importorskip("mujoco", reason="pip install mujoco")
-    model = mujoco.MjModel.from_xml_string(exported(found, "mujoco"))
+    model = mujoco.MjModel.from_xml_string(export_vehicle(found, "mujoco").text)
     data, accelerations = mujoco.MjData(model), []
     thrusts = found.vehicle.thrust_coefficient * omega**2
     for state, quaternion, thrust in zip(states, quaternions(states), thrusts, strict=True):
-        data.qpos[:] = np.append(state[[0, 2, 4]], quaternion)
+        data.qpos[:] = np.append(state[[0, 2, 4]], np.roll(quaternion, 1))
         data.qvel[:] = state[[1, 3, 5, 7, 9, 11]]
         data.ctrl[:4] = thrust
         if model.na:
@@ -95,21 +91,15 @@ def mujoco_acceleration(found, states, omega):
 def rotorpy_vehicle(found):
     multirotor = pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy").Multirotor
     defined = {}
-    exec(exported(found, "rotorpy"), defined)  # noqa: S102
+    exec(export_vehicle(found, "rotorpy").text, defined)  # noqa: S102
     return multirotor(defined["quad_params"])
 
 
 def rotorpy_acceleration(found, states, omega):
     vehicle, accelerations = rotorpy_vehicle(found), []
     for state, quaternion, speed in zip(states, quaternions(states), omega, strict=True):
-        now = {
-            "x": state[[0, 2, 4]],
-            "v": state[[1, 3, 5]],
-            "q": np.roll(quaternion, -1),
-            "w": state[[7, 9, 11]],
-            "wind": np.zeros(3),
-            "rotor_speeds": speed,
-        }
+        now = {"x": state[[0, 2, 4]], "v": state[[1, 3, 5]], "q": quaternion, "w": state[[7, 9, 11]]}
+        now |= {"wind": np.zeros(3), "rotor_speeds": speed}
         derivative = vehicle.statedot(now, {"cmd_motor_speeds": speed}, 0.01)
         accelerations.append(np.append(derivative["vdot"], derivative["wdot"]))
     return np.array(accelerations)
@@ -122,12 +112,6 @@ every_simulator = pytest.mark.parametrize("target", SIMULATORS)
 def agree(found, expected):
     """Whether each acceleration agrees to 1e-9 of the usual size of its component."""
     return bool((np.abs(found - expected) <= 1e-9 * np.sqrt(np.square(expected).mean(axis=0))).all())
-
-
-def effective(speeds, values):
-    """The rotor speeds that make the thrust of the curve."""
-    full, curve = AIRFRAME["max_rotor_speed"], values["thrust_curve"]
-    return np.sqrt(curve * speeds**2 + (1 - curve) * full * speeds)
 
 
 @every_simulator
@@ -150,7 +134,9 @@ def test_a_vehicle_accelerates_as_the_model(target, tmp_path):
         values = VALUES | dict.fromkeys((*NOT_ROTORPY, *DRAG), 0.0)
         values |= {f"{axis}_offset": 9.81 * VALUES[f"{axis}_thrust"] for axis in ("roll", "pitch")}
     states, omega = random_states(500, 2500)
-    simulated = SIMULATORS[target](read(tmp_path, vehicle_result(values)), states, effective(omega, values))
+    curve = values["thrust_curve"]
+    effective = np.sqrt(curve * omega**2 + (1 - curve) * AIRFRAME["max_rotor_speed"] * omega)  # they make the thrust
+    simulated = SIMULATORS[target](read(tmp_path, vehicle_result(values)), states, effective)
     assert agree(simulated, vehicle_acceleration(values, states, omega))
 
 
@@ -172,7 +158,7 @@ def test_the_drag_of_rotorpy_is_right_at_the_hover_speed(tmp_path):
 def test_the_rotors_of_mujoco_lag_and_are_late(mujoco, tmp_path, step, delay, error):
     """Also in a scene with another time step, and with a delay of 5.1 time steps."""
     found = read(tmp_path, vehicle_result(VALUES | {"rotor_delay": delay}))
-    model = mujoco.MjModel.from_xml_string(exported(found, "mujoco"))
+    model = mujoco.MjModel.from_xml_string(export_vehicle(found, "mujoco").text)
     model.opt.timestep = step
     data = mujoco.MjData(model)
     data.ctrl[:4] = 0.1
@@ -193,7 +179,7 @@ def test_the_rotors_of_rotorpy_lag(tmp_path):
 
 def test_the_vehicle_rests_in_the_hover_of_mujoco(mujoco, tmp_path):
     """The thrusts of the keyframe balance the weight and the constant torques."""
-    model = mujoco.MjModel.from_xml_string(exported(read(tmp_path, vehicle_result()), "mujoco"))
+    model = mujoco.MjModel.from_xml_string(export_vehicle(read(tmp_path, vehicle_result()), "mujoco").text)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)

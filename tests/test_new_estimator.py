@@ -42,7 +42,7 @@ class OneStep(AbstractEstimator):
 ESTIMATORS["toy"] = OneStep  # the line in the registry
 
 from jaxos4.cli import main
-from jaxos4.cli.compare import comparison
+from jaxos4.cli.studies import comparison
 
 assert comparison(quick=False).estimators[-1] == "toy"
 for line in open(sys.argv[1]):

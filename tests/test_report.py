@@ -80,15 +80,12 @@ def page(report):
     return tables(text)
 
 
-def test_the_files_are_those_that_it_says(report):
+def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_path, run):
     folder = report[0].parent
     names = {path.relative_to(folder).as_posix() for path in report}
     assert names == {"report.html"} | {f"figures/{n}.{s}" for n in OF_SCENARIO | OF_EXAMPLE for s in ("svg", "pdf")}
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == names
     assert all(p.read_bytes().startswith(b"%PDF") for p in report if p.suffix == ".pdf")
-
-
-def test_the_command_writes_the_same_bytes_from_the_file(study, report, tmp_path, run):
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     xr.testing.assert_equal(read_results(tmp_path), study)
     (tmp_path / "figures").mkdir()
@@ -96,10 +93,9 @@ def test_the_command_writes_the_same_bytes_from_the_file(study, report, tmp_path
         (tmp_path / "figures" / name).write_text("of before")
     code, out, err = run("report", str(tmp_path))
     assert (code, err) == (0, "")
-    assert "report.html" in out
     assert "11 figures" in out
     for path in report:
-        assert (tmp_path / path.relative_to(report[0].parent)).read_bytes() == path.read_bytes(), path.name
+        assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
     # A figure of an older report goes, what is not ours stays.
     left = {path.name for path in (tmp_path / "figures").iterdir()} - {path.name for path in report}
     assert left == {"notes.svg"}
@@ -175,9 +171,8 @@ def test_the_terminal_has_the_same_errors_in_80_columns():
     row = next(line for line in rows if line.startswith("ibss"))
     assert row.split()[1] == plain(error, 2)
     assert row.split()[2].endswith("‡")
-    assert "…" not in text
+    assert ("…" in text, "below the noise floor" in text) == (False, True)
     assert max(map(len, text.splitlines())) <= 80
-    assert "below the noise floor" in text
 
 
 def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypatch):
@@ -188,8 +183,8 @@ def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypa
     assert {path.stem for path in written[1:]} == {f"{name}-1" for name in OF_SCENARIO}
     text = written[0].read_text(encoding="utf-8")
     assert {"error-1", "error-2"} <= tables(text).keys()
-    assert "The first 1 scenarios have figures; all 2 have tables." in words(text)
-    assert "corrected model" in words(text)
+    for said in ("The first 1 scenarios have figures; all 2 have tables.", "corrected model"):
+        assert said in words(text)
 
 
 def test_names_cannot_break_out_of_the_page(tmp_path):
@@ -206,25 +201,17 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
     text = write_report(study, tmp_path, with_pdf=False)[0].read_text(encoding="utf-8")
     stands_alone(text)
     assert words(text).count("alert(1)") >= 6
-    assert "{{ 1 }}" in words(text)
-    assert "$\\frac{<b>}$" in words(text)
-
-
-def plain_hdf5(path):
-    with h5py.File(path, "w") as file:
-        file["truth"] = np.zeros(3)
+    assert all(name in words(text) for name in ("{{ 1 }}", "$\\frac{<b>}$"))
 
 
 NOT_A_STUDY = {
     "no folder": lambda path: path.parent.rmdir(),
     "no file": lambda path: None,
     "text": lambda path: path.write_text("not a netCDF file"),
-    "hdf5": plain_hdf5,
+    "hdf5": lambda path: h5py.File(path, "w").create_dataset("truth", data=np.zeros(3)).file.close(),
     "another netcdf": lambda path: xr.Dataset({"truth": ("flight", np.zeros(3))}).to_netcdf(path, engine="h5netcdf"),
-    "half": lambda path: (
-        synthetic_study(flights=2, spoiled=False).drop_vars("bound").to_netcdf(path, engine="h5netcdf")
-    ),
-    "shapes": lambda path: synthetic_study(flights=2, spoiled=False).isel(model=0).to_netcdf(path, engine="h5netcdf"),
+    "half": lambda path: synthetic_study(flights=9).drop_vars("bound").to_netcdf(path, engine="h5netcdf"),
+    "shapes": lambda path: synthetic_study(flights=9).isel(model=0).to_netcdf(path, engine="h5netcdf"),
 }
 
 
@@ -243,11 +230,11 @@ def test_what_is_not_a_study_is_refused_and_nothing_is_written(write, tmp_path, 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
     study = study[["search_half_width", "search_estimate"]]
-    before = study_page.draw(study_page.OF_EXAMPLE, study)
+    before = study_page.draw(study_page.EXAMPLE_FIGURES, study)
     assert list(before) == ["search"]
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):
         settings = dict(matplotlib.rcParams)
-        assert study_page.draw(study_page.OF_EXAMPLE, study) == before
+        assert study_page.draw(study_page.EXAMPLE_FIGURES, study) == before
         assert dict(matplotlib.rcParams) == settings
 
 

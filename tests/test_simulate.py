@@ -23,12 +23,6 @@ def name(flight):
     return jaxos4.result_names(flight.result).tolist()
 
 
-def hover(model):
-    return jnp.full((SAMPLES, 4), model.airframe.hover_speed)
-
-
-# Orders of convergence.
-
 COARSE, STEPS = 0.04, (1, 2, 4)
 
 
@@ -75,33 +69,20 @@ def test_diffrax_agrees_with_another_library_on_other_equations(refinements):
     np.testing.assert_allclose(exact, np.stack(states), rtol=0, atol=2e-9)
 
 
-# Zero-order hold.
-
-
-def square_wave(model):
-    """Rotor speeds that jump at every sample, in no regular pattern."""
-    jumps = np.random.default_rng(0).choice([-1.0, 1.0], (SAMPLES, 4))
-    return jnp.asarray(model.airframe.hover_speed + 40 * jumps)
-
-
 @every_method
 def test_each_row_is_held_until_the_next(method):
     """Without coupling the rates are sums of torques, and the vertical speed a sum of thrusts, whatever the method."""
     model = jaxos4.PublishedOS4()
-    omega, dt = square_wave(model), 0.05
+    # Rotor speeds that jump at every sample, in no regular pattern.
+    jumps = np.random.default_rng(0).choice([-1.0, 1.0], (SAMPLES, 4))
+    omega, dt = jnp.asarray(model.airframe.hover_speed + 40 * jumps), 0.05
     gains = jnp.array([0.0, 0.0, 120.0, 0.0, 0.0, 110.0, 0.0, 60.0])
     flight = jaxos4.simulate(model, gains, omega, dt=dt, method=method)
     assert name(flight) == SUCCESS
 
-    w = np.asarray(omega) ** 2
-    torque = np.stack(
-        [
-            120.0 * 0.23 * 3.13e-5 * (w[:, 3] - w[:, 1]),
-            110.0 * 0.23 * 3.13e-5 * (w[:, 2] - w[:, 0]),
-            60.0 * 7.5e-7 * (w[:, 3] + w[:, 1] - w[:, 2] - w[:, 0]),
-        ],
-        axis=-1,
-    )
+    w, arm = np.asarray(omega).T ** 2, 0.23 * 3.13e-5
+    yaw = 60.0 * 7.5e-7 * (w[3] + w[1] - w[2] - w[0])
+    torque = np.stack([120.0 * arm * (w[3] - w[1]), 110.0 * arm * (w[2] - w[0]), yaw], axis=-1)
     rates = np.asarray(flight.states)[:, [7, 9, 11]]
     held = np.concatenate([np.zeros((1, 3)), dt * np.cumsum(torque[:-1], axis=0)])
     np.testing.assert_allclose(rates, held, atol=1e-12)
@@ -114,22 +95,16 @@ def test_each_row_is_held_until_the_next(method):
     assert name(again) == SUCCESS
 
 
-# What a flight is.
-
-
 @every_method
 def test_begins_at_the_initial_state(method):
     model = jaxos4.PublishedOS4()
-    start = jnp.linspace(-0.3, 0.4, 12)
-    flight = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=start, method=method)
+    start, hover = jnp.linspace(-0.3, 0.4, 12), jnp.full((SAMPLES, 4), model.airframe.hover_speed)
+    flight = jaxos4.simulate(model, model.alpha, hover, dt=DT, initial_state=start, method=method)
     np.testing.assert_array_equal(flight.states[0], start)
     np.testing.assert_allclose(flight.time, DT * np.arange(SAMPLES))
     assert float(flight.dt) == pytest.approx(DT)
-    resumed = jaxos4.simulate(model, model.alpha, hover(model), dt=DT, initial_state=flight.states[5], method=method)
+    resumed = jaxos4.simulate(model, model.alpha, hover, dt=DT, initial_state=flight.states[5], method=method)
     np.testing.assert_allclose(resumed.states[:-5], flight.states[5:], rtol=1e-13, atol=1e-14)
-
-
-# One lane, many lanes.
 
 
 def batch(method, *arguments):
@@ -166,8 +141,6 @@ def test_vmaps_over_flights_models_and_sample_times_and_runs_without_jit(method)
     np.testing.assert_allclose(batched, alone, rtol=1e-12, atol=1e-14)
 
 
-# Failures are values, and stay in their lane.
-
 # Nose up without roll: pitch passes 90 degrees after 0.025 s. With any roll, Euler angles turn sharply before that.
 OVER = np.zeros(12)
 OVER[THETA], OVER[Q] = np.pi / 2 - 0.05, 2.0
@@ -177,8 +150,8 @@ PLANE = np.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 @every_method
 def test_a_failing_lane_ends_where_it_fails_and_leaves_its_neighbours_alone(method):
     """Over the top on both sides, a NaN in an input and in the start, an overflow; each beside a good flight."""
-    omega, start = np.tile(hover(jaxos4.PublishedOS4()), (LANES, 1, 1)), np.tile(OVER / 2, (LANES, 1))
-    alpha = np.tile(PLANE, (LANES, 1))
+    omega = np.full((LANES, SAMPLES, 4), jaxos4.OS4.hover_speed)
+    alpha, start = np.tile(PLANE, (LANES, 1)), np.tile(OVER / 2, (LANES, 1))
     valid = batch(method, alpha, omega, start)
     assert name(valid) == [SUCCESS] * LANES
     start[1], start[2], start[3] = OVER, -OVER, np.nan

@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from jaxos4.report import read_results
-from jaxos4.report.study_figures import error_unit
+from jaxos4.report.study_data import error_unit
 from jaxos4.report.style import INK, PAPER, grid
 from jaxos4.report.text import plain
 from jaxos4.study import metrics

@@ -10,15 +10,12 @@ import typer
 
 from ..errors import InputError, TrainingError
 from ._jax import NO_CACHE, prepare
-from .compare import compare
 from .design import design
 from .estimate import estimate
 from .export import export
-from .identifiability import identifiability
-from .inspect import inspect
-from .report import report
+from .information import identifiability, inspect
 from .simulate import simulate
-from .study import study
+from .studies import compare, report, study
 from .train import train
 
 _INTERRUPTED = 130
@@ -26,7 +23,7 @@ _EPILOG = f"Compiled programs are kept in your cache folder, at most 1 GB. {NO_C
 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, with JAX prepared first. Its arguments are parsed before that: help and mistakes need no JAX."""
+    """The command, which prepares JAX first. Its arguments are parsed before: help and mistakes need no JAX."""
 
     @functools.wraps(command)
     def run(*args, **kwargs) -> None:
@@ -78,7 +75,7 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # what all errors of the parser have, in every version of typer
             raise
-        typer.echo(_of_parser(error), err=True)
+        typer.echo(_parser_message(error), err=True)
         raise SystemExit(2) from None
     if code == _INTERRUPTED:
         sys.stdout.flush()
@@ -106,8 +103,8 @@ def console() -> None:
         os._exit(code)
 
 
-def _of_parser(error: Any) -> str:
-    """A mistake in the arguments in one line; or the help, if there are no arguments."""
+def _parser_message(error: Any) -> str:
+    """A mistake in the arguments in one line. If there are no arguments: the help."""
     message = error.format_message().removesuffix(".").replace("Value error, ", "")
     if "\n" in message:
         return message

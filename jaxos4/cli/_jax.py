@@ -37,7 +37,7 @@ def prepare() -> None:
 
 
 def rarely_collect_garbage() -> None:
-    """Tracing makes millions of small objects that stay."""
+    """Makes Python look for garbage rarely, because tracing makes millions of small objects that stay."""
     gc.set_threshold(100_000, 20, 100)
 
 

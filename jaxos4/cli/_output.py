@@ -44,7 +44,7 @@ def in_options(text: str, **files: Path | None) -> str:
 
 @contextlib.contextmanager
 def option_names(**files: Path | None) -> Iterator[None]:
-    """Raises an `InputError` of the library again, in the words of the command line; `files` as of `in_options`."""
+    """Raises an `InputError` of the library again, in the words of the command line. `files`: see `in_options`."""
     try:
         yield
     except InputError as error:
@@ -53,7 +53,7 @@ def option_names(**files: Path | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stages(first: str) -> Iterator[Callable[[str], None]]:
-    """Shows a stage and the time; gives a function that changes the stage. Shows nothing if stderr is no terminal."""
+    """Shows a stage and the time. Yields a function that changes the stage. Shows nothing if stderr is no terminal."""
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -64,20 +64,20 @@ def stages(first: str) -> Iterator[Callable[[str], None]]:
         yield lambda stage: bar.update(task, description=stage)
 
 
-def check_output(out: Path, *inputs: Path | None) -> None:
-    """Refuses an output that cannot be written, or that would overwrite an input."""
-    target = check_writable(out)
-    for source in inputs:
-        if source is not None and source.exists() and target.exists() and source.samefile(target):
-            raise InputError(f"{out}: would overwrite an input; give the output another name.")
+def check_outputs(*inputs: Path | str | None, **outputs: Path | None) -> None:
+    """Refuses outputs that cannot be written, that would overwrite an input, or that are one file.
 
-
-def check_different(**outputs: Path | None) -> None:
-    """Refuses two outputs that are one file. Takes options by their names in Python."""
+    `outputs`: by the names of their options in Python.
+    """
+    sources = [Path(source) for source in inputs if source is not None and Path(source).exists()]
     names: dict[Path, str] = {}
     for name, out in outputs.items():
-        option = f"--{name.replace('_', '-')}"
-        if out is not None and (other := names.setdefault(out.resolve(), option)) != option:
+        if out is None:
+            continue
+        target, option = check_writable(out), f"--{name.replace('_', '-')}"
+        if target.exists() and any(source.samefile(target) for source in sources):
+            raise InputError(f"{out}: would overwrite an input; give the output another name.")
+        if (other := names.setdefault(target, option)) != option:
             raise InputError(f"{out}: {other} and {option} name one file; give them two.")
 
 

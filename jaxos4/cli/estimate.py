@@ -3,64 +3,49 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from ..errors import InputError
-from ._options import (
-    BracketOption,
-    ChannelsOption,
-    Estimator,
-    InitialState,
-    InitialStateOption,
-    OutOption,
-    VehicleModel,
-    WindowOption,
-    chosen,
-    read_bracket,
-)
-from ._output import check_different, check_output, in_options, option_names, stages, write_json
+from . import _options as options
+from ._output import check_outputs, in_options, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from ..identification import Identification
-    from ..recording import Recording
 
 _OS4, _PUBLISHED = "os4", "published"
 
-FlightsArgument = Annotated[list[Path], typer.Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")]
+FlightsArgument = Annotated[list[Path], Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")]
 EstimatorOption = Annotated[
-    Estimator | None, typer.Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
+    options.Estimator | None, Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
 ]
 ModelOption = Annotated[
-    VehicleModel | None,
-    typer.Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
+    options.VehicleModel | None,
+    Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
 ]
 AirframeOption = Annotated[
-    str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
+    str | None, Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
 ]
 NetworkOption = Annotated[
-    Path | None, typer.Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
+    Path | None, Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
 ]
-ValidateOption = Annotated[
-    Path | None, typer.Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
-]
-TermsOption = Annotated[
-    str | None, typer.Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")
-]
+ValidateOption = Annotated[Path | None, Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")]
+TermsOption = Annotated[str | None, Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")]
 BeginOption = Annotated[
-    float | None, typer.Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on.")
+    float | None, Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on.")
 ]
 EndOption = Annotated[
-    float | None, typer.Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
+    float | None, Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
 ]
 AveragedTimeOption = Annotated[
-    float | None, typer.Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
+    float | None, Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
 ]
 HoldoutOption = Annotated[
-    float | None, typer.Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
+    float | None, Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
 ]
-ReportOption = Annotated[Path | None, typer.Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")]
+ReportOption = Annotated[Path | None, Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")]
 
 
 def estimate(
@@ -68,10 +53,10 @@ def estimate(
     estimator: EstimatorOption = None,
     model: ModelOption = None,
     airframe: AirframeOption = None,
-    bracket: BracketOption = None,
-    channels: ChannelsOption = None,
-    initial_state: InitialStateOption = InitialState["free"],
-    window: WindowOption = None,
+    bracket: options.BracketOption = None,
+    channels: options.ChannelsOption = None,
+    initial_state: options.InitialStateOption = options.InitialState["free"],
+    window: options.WindowOption = None,
     network: NetworkOption = None,
     validate: ValidateOption = None,
     terms: TermsOption = None,
@@ -80,37 +65,29 @@ def estimate(
     sample_time: AveragedTimeOption = None,
     holdout: HoldoutOption = None,
     report: ReportOption = None,
-    out: OutOption = None,
+    out: options.OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
-    for target in (out, report):
-        if target is not None:
-            check_output(target, *flights, None if airframe is None else Path(airframe), bracket, network, validate)
-    check_different(out=out, report=report)
+    check_outputs(*flights, airframe, bracket, network, validate, out=out, report=report)
     if report is not None and model not in (None, "flight"):
         raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
-    asked: dict[str, Any] = {
-        "channels": chosen(channels),
-        "initial_state": initial_state.value,
-        "window": window,
-        "terms": None if terms is None else [name.strip() for name in terms.split(",") if name.strip()],
-        "begin": begin,
-        "end": end,
-        "sample_time": sample_time,
-        "holdout": holdout,
-    }
+    listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
+    asked = {"channels": options.chosen(channels), "initial_state": initial_state.value, "window": window}
+    asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
     with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
         from ..airframe import load_airframe
         from ..identification import identify, settings_for
         from ..models import MODELS
-        from ..recording import read_recording
+        from ..recording import read_recording, vehicle_evidence
 
         progress("reading")
         vehicle = load_airframe(airframe or _OS4)
         # Without an airframe, commands are read only to find out that one is needed.
         full_scale = 1.0 if airframe is None and model in (None, "flight") else None
         recordings = [read_recording(path, vehicle, full_scale=full_scale) for path in flights]
-        evidence = "" if model is not None else _evidence(recordings)
+        # The first log that is evidently of a real vehicle, and why.
+        shown = (f"{each.name} {why}" for each in recordings if (why := vehicle_evidence(each)))
+        evidence = next(shown, "") if model is None else ""
         is_vehicle = model == "flight" or bool(evidence)
         if is_vehicle and airframe is None:
             why = evidence or "--model flight"
@@ -124,8 +101,8 @@ def estimate(
             recordings,
             subject,
             settings=settings_for(subject, asked),
-            estimator=chosen(estimator),
-            bracket=read_bracket(bracket),
+            estimator=options.chosen(estimator),
+            bracket=options.read_bracket(bracket),
             network=network,
             validate=other,
             progress=progress,
@@ -135,18 +112,9 @@ def estimate(
     _publish(_with_command(found, airframe or _OS4, notes), out, report, title=title)
 
 
-def _evidence(recordings: "list[Recording]") -> str:
-    """The first log that is evidently of a real vehicle, and why; empty if none is."""
-    from ..recording import vehicle_evidence
-
-    return next((f"{each.name} {why}" for each in recordings if (why := vehicle_evidence(each))), "")
-
-
 def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "Identification":
     """The identification with the command in its provenance, all notes and doubts in the words of the command line."""
     import msgspec
-
-    from ..identification.results import Doubt
 
     provenance = msgspec.structs.replace(
         found.provenance,
@@ -154,8 +122,8 @@ def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "
         notes=[*notes, *(in_options(note) for note in found.provenance.notes)],
         command=shlex.join(["jaxos4", *sys.argv[1:]]),
     )
-    doubts = tuple(Doubt(doubt.result, doubt.cause, in_options(doubt.remedy)) for doubt in found.doubts)
-    return msgspec.structs.replace(found, doubts=doubts, provenance=provenance)
+    doubts = (msgspec.structs.replace(doubt, remedy=in_options(doubt.remedy)) for doubt in found.doubts)
+    return msgspec.structs.replace(found, doubts=tuple(doubts), provenance=provenance)
 
 
 def _publish(found: "Identification", out: Path | None, report: Path | None, *, title: str) -> None:

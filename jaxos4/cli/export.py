@@ -4,22 +4,23 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from ..errors import InputError
-from ._options import Simulator
-from ._output import check_new_folder, check_output, option_names, stages, write_folder, write_text
+from . import _options as options
+from ._output import check_new_folder, check_outputs, option_names, stages, write_folder, write_text
 
 MOST_SAMPLES = 100_000
 
 
 def export(
-    result: Annotated[Path, typer.Argument(metavar="RESULT.json", help="A file of `jaxos4 estimate --out`.")],
-    to: Annotated[Simulator, typer.Option(help="MuJoCo (MJCF), RotorPy (Python) or SDF (Gazebo).")],
-    out: Annotated[Path | None, typer.Option(help="The file to write. Default: standard output.")] = None,
+    result: Annotated[Path, Argument(metavar="RESULT.json", help="A file of `jaxos4 estimate --out`.")],
+    to: Annotated[options.Simulator, Option(help="MuJoCo (MJCF), RotorPy (Python) or SDF (Gazebo).")],
+    out: Annotated[Path | None, Option(help="The file to write. Default: standard output.")] = None,
     samples: Annotated[
-        int, typer.Option(help="Also draw N vehicles from the covariance, into the folder OUT-samples.", metavar="N")
+        int, Option(help="Also draw N vehicles from the covariance, into the folder OUT-samples.", metavar="N")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Random seed of the samples.")] = 0,
+    seed: Annotated[int, Option(help="Random seed of the samples.")] = 0,
 ) -> None:
     """Write an identified vehicle as a model for a simulator, and vehicles drawn from its uncertainty."""
     if samples > MOST_SAMPLES:
@@ -28,7 +29,7 @@ def export(
         raise InputError("--samples: are written into a folder beside --out; give that too.")
     folder = None
     if out is not None:
-        check_output(out, result)
+        check_outputs(result, out=out)
         if samples:
             folder = out.with_name(f"{out.stem}-samples")
             check_new_folder(folder)

@@ -4,26 +4,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
 from ..errors import InputError
-from ._options import (
-    AirframeOption,
-    DelayOption,
-    DurationOption,
-    Excitation,
-    GustOption,
-    LagOption,
-    Method,
-    Model,
-    OpenLoopModelOption,
-    SampleTimeOption,
-    SensorsOption,
-    check_kind,
-    check_seed,
-    loop_of,
-    times_of,
-)
-from ._output import check_output, stages
+from . import _options as options
+from ._output import check_outputs, stages
 
 if TYPE_CHECKING:
     from ..airframe import Airframe
@@ -31,54 +16,54 @@ if TYPE_CHECKING:
     from ..flight import Flight
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
-ExcitationOption = Annotated[Excitation | None, typer.Option(help="Shape of the inputs. Default: multisine.")]
+ExcitationOption = Annotated[options.Excitation | None, Option(help="Shape of the inputs. Default: multisine.")]
 SpeedsOption = Annotated[
-    Path | None, typer.Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation.")
+    Path | None, Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation.")
 ]
-MethodOption = Annotated[Method | None, typer.Option(help="Integrator of the equations of motion. Default: euler.")]
+MethodOption = Annotated[options.Method | None, Option(help="Integrator of the equations of motion. Default: euler.")]
 NoiseOption = Annotated[
-    float | None, typer.Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
+    float | None, Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
 ]
 ReferencesOption = Annotated[
     Path | None,
-    typer.Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
+    Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
 ]
 
 
 def simulate(
-    out: Annotated[Path, typer.Option(help="The flight file to write (CSV).")],
-    airframe: AirframeOption = "os4",
-    duration: DurationOption = None,
-    dt: SampleTimeOption = None,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
-    model: OpenLoopModelOption = None,
+    out: Annotated[Path, Option(help="The flight file to write (CSV).")],
+    airframe: options.AirframeOption = "os4",
+    duration: options.DurationOption = None,
+    dt: options.SampleTimeOption = None,
+    seed: Annotated[int, Option(help="Random seed.")] = 0,
+    model: options.OpenLoopModelOption = None,
     excitation: ExcitationOption = None,
     speeds: SpeedsOption = None,
     method: MethodOption = None,
     noise: NoiseOption = None,
     closed_loop: Annotated[
-        bool, typer.Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
+        bool, Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
     ] = False,
-    gust: GustOption = None,
-    lag: LagOption = None,
-    delay: DelayOption = None,
-    sensors: SensorsOption = None,
+    gust: options.GustOption = None,
+    lag: options.LagOption = None,
+    delay: options.DelayOption = None,
+    sensors: options.SensorsOption = None,
     references: ReferencesOption = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
-    check_output(out, Path(airframe), references, speeds)
-    check_kind(
+    check_outputs(airframe, references, speeds, out=out)
+    options.check_kind(
         closed_loop,
-        of_open={"model": model, "excitation": excitation, "speeds": speeds, "method": method, "noise": noise},
-        of_closed={"gust": gust, "lag": lag, "delay": delay, "sensors": sensors, "references": references},
+        open_only={"model": model, "excitation": excitation, "speeds": speeds, "method": method, "noise": noise},
+        closed_only={"gust": gust, "lag": lag, "delay": delay, "sensors": sensors, "references": references},
     )
     _check_not_given(references, duration=duration, dt=dt)
     _check_not_given(speeds, duration=duration, excitation=excitation)
-    duration, dt = times_of(closed_loop, duration, dt)
+    duration, dt = options.flight_times(closed_loop, duration, dt)
     noise = 0.0 if noise is None else noise
     if not 0 <= noise <= 1e6:
         raise InputError(f"--noise: must lie in 0 to 1e+06, got {noise}.")
-    check_seed(seed)
+    options.check_seed(seed)
     if dt > 0 and duration / dt > MOST_SAMPLES:
         raise InputError(f"--duration {duration:g}: more than {MOST_SAMPLES} samples of {dt:g} s; ask for fewer.")
     with stages("loading the library") as progress:
@@ -90,13 +75,13 @@ def simulate(
         vehicle = load_airframe(airframe)
         if closed_loop:
             try:
-                loop = loop_of(airframe, gust, lag, delay, sensors)
+                loop = options.make_loop(airframe, gust, lag, delay, sensors)
                 flight, dt = _closed_loop(loop, references, duration, dt, seed)
             except ValueError as error:
                 raise InputError(f"--closed-loop: {error}") from None
             how = f"closed loop, {loop.logged}, gusts of {5.0 if gust is None else gust:g} rad/s^2"
         else:
-            model, method = model or Model["published"], method or Method["euler"]
+            model, method = model or options.Model["published"], method or options.Method["euler"]
             flight = _open_loop(vehicle, model, excitation, method, duration, dt, speeds)
             how = f"{model.value} model, {method.value}, noise {noise:g}"
         if flight.result != RESULTS.successful:
@@ -111,9 +96,9 @@ def simulate(
     typer.echo(f"{out}: {flight.time.shape[0]} samples of {dt:g} s, {how}")
 
 
-def _check_not_given(file: Path | None, **options: object) -> None:
-    """Refuses options whose values are in the file."""
-    for name, value in options.items():
+def _check_not_given(file: Path | None, **given: object) -> None:
+    """Refuses options if the file has their values."""
+    for name, value in given.items():
         if file is not None and value is not None:
             raise InputError(f"--{name}: {file} has its own; leave it out.")
 
@@ -121,7 +106,7 @@ def _check_not_given(file: Path | None, **options: object) -> None:
 def _closed_loop(
     loop: "ClosedLoop", references: Path | None, duration: float, dt: float, seed: int
 ) -> tuple["Flight", float]:
-    """A flight under the controller, with random references or those of a file, and its sample time."""
+    """A flight under the controller, with random references or those of a file. Returns its sample time [s] too."""
     from ..closed_loop import fly_standard
 
     flown = None
@@ -134,9 +119,9 @@ def _closed_loop(
 
 def _open_loop(
     airframe: "Airframe",
-    model: Model,
-    excitation: Excitation | None,
-    method: Method,
+    model: options.Model,
+    excitation: options.Excitation | None,
+    method: options.Method,
     duration: float,
     dt: float,
     speeds: Path | None,
@@ -147,7 +132,7 @@ def _open_loop(
     from ..models import MODELS
     from ..simulation import simulate as fly
 
-    vehicle, shape = MODELS[model](airframe), excitation or Excitation["multisine"]
+    vehicle, shape = MODELS[model](airframe), excitation or options.Excitation["multisine"]
     try:
         if speeds is None:
             omega = EXCITATIONS[shape](airframe, duration=duration, dt=dt)

@@ -5,51 +5,40 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from .._files import read_toml
 from ..errors import InputError
-from ._options import (
-    AirframeOption,
-    Approximator,
-    BracketOption,
-    Channels,
-    Features,
-    InitialState,
-    InitialStateOption,
-    Model,
-    ModelOption,
-    check_seed,
-)
-from ._output import check_output, option_names, stages
+from . import _options as options
+from ._output import check_outputs, option_names, stages
 
-# Of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
+# The defaults of `NetworkEstimator`, written out because its import takes seconds; a test compares them.
 NOISE, STEPS = (0.1, 10.0), 4000
 
 
 def train(
-    flight: Annotated[Path, typer.Argument(metavar="FLIGHT.csv", help="A flight with the inputs to train for.")],
-    out: Annotated[Path, typer.Option(help="The network file to write.")],
-    model: ModelOption = Model["published"],
-    airframe: AirframeOption = "os4",
-    bracket: BracketOption = None,
-    initial_state: InitialStateOption = InitialState["free"],
-    features: Annotated[Features, typer.Option(help="What the network sees.")] = Features["score"],
-    approximator: Annotated[Approximator, typer.Option(help="The kind of network.")] = Approximator["mlp"],
+    flight: Annotated[Path, Argument(metavar="FLIGHT.csv", help="A flight with the inputs to train for.")],
+    out: Annotated[Path, Option(help="The network file to write.")],
+    model: options.ModelOption = options.Model["published"],
+    airframe: options.AirframeOption = "os4",
+    bracket: options.BracketOption = None,
+    initial_state: options.InitialStateOption = options.InitialState["free"],
+    features: Annotated[options.Features, Option(help="What the network sees.")] = options.Features["score"],
+    approximator: Annotated[options.Approximator, Option(help="The kind of network.")] = options.Approximator["mlp"],
     noise: Annotated[
         tuple[float, float],
-        typer.Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
+        Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
     ] = NOISE,
     channels: Annotated[
-        Channels | None,
-        typer.Option(
+        options.Channels | None,
+        Option(
             help="The channels that the network sees. Default: the rates, and the attitude if a rate was not measured."
         ),
     ] = None,
-    steps: Annotated[int, typer.Option(help="Number of training steps.")] = STEPS,
-    seed: Annotated[int, typer.Option(help="Random seed for training.")] = 0,
+    steps: Annotated[int, Option(help="Number of training steps.")] = STEPS,
+    seed: Annotated[int, Option(help="Random seed for training.")] = 0,
 ) -> None:
     """Train a network that identifies any flight with the inputs of this one."""
-    check_seed(seed)
+    options.check_seed(seed)
     with stages("loading the library") as progress:
         from ..airframe import load_airframe
         from ..identification.network import train_network
@@ -63,7 +52,7 @@ def train(
             )
         except ValueError as error:
             raise InputError(f"options: {error}") from None
-        check_output(out, flight, Path(airframe), bracket)
+        check_outputs(flight, airframe, bracket, out=out)
         progress("reading")
         subject = MODELS[model](load_airframe(airframe))
         recording = read_recording(flight, subject.airframe)
@@ -75,8 +64,8 @@ def train(
             recording,
             subject,
             settings,
-            bracket=None if bracket is None else read_toml(bracket),
-            channels=None if channels is None else channels.value,
+            bracket=options.read_bracket(bracket),
+            channels=options.chosen(channels),
             initial_state=str(initial_state.value),
             seed=seed,
         )

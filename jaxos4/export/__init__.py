@@ -1,5 +1,5 @@
 """An identified vehicle as a model for simulators: MuJoCo, RotorPy and SDF (Gazebo)."""
 
+from .formats import TARGETS as TARGETS, Exported as Exported, Target as Target, export_vehicle as export_vehicle
 from .result import Identified as Identified, read_result as read_result
 from .vehicle import RigidVehicle as RigidVehicle
-from .writing import TARGETS as TARGETS, Exported as Exported, Target as Target, export_vehicle as export_vehicle

@@ -15,27 +15,25 @@ from ..errors import InputError
 from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES
 from ..results import NAMES, meaning
-from .vehicle import RigidVehicle, rigid_vehicle
+from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
 
 _VEHICLE = "flight"
-_SUCCESSFUL = "successful"
-# An inertia of the rotors counts if it differs from 0 by this many standard deviations, a thrust curve if from 1.
-_SURE = 3.0
-# Numbers that no vehicle has below 0, although an estimate can be.
+# An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
+# differs from 1 by as many.
+_SIGNIFICANT = 3.0
+# Parameters that no vehicle has below 0, although an estimate can be negative.
 _NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping", "x_drag", "y_drag")
 # Parameters without a place in a simulator's vehicle, and why.
-_APART = {
+_NOT_EXPORTED = {
     ("roll_velocity", "pitch_velocity"): "no simulator has a moment proportional to the body velocity",
     ("roll_flapping", "pitch_flapping"): "no simulator has a moment proportional to the lateral specific force",
     ("voltage_exponent",): "no simulator has the battery's voltage",
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
-# Simulators name these in their notes on the rotors' inertia.
+# Each simulator's note on the rotors' inertia names these parameters.
 _GYROSCOPIC = ("alpha2", "alpha5")
-# Inertias are `thrust_gain` divided by these alphas.
-_INVERSES = {"alpha3": "Ix", "alpha6": "Iy", "alpha8": "Iz"}
-# Draws for one sample before the uncertainty counts as too large.
+# The uncertainty is too large if so many draws for one sample are impossible.
 _MOST_DRAWS = 1000
 
 
@@ -96,7 +94,7 @@ class Identified(NamedTuple):
     @property
     def successful(self) -> bool:
         """True if the estimate can be trusted."""
-        return self.result == _SUCCESSFUL
+        return self.result == "successful"
 
     @property
     def reason(self) -> str:
@@ -167,9 +165,9 @@ def _identified(name: str, file: _File) -> Identified:
     if (np.diagonal(covariance) < 0).any():
         raise InputError("`covariance`: has a negative variance; run `jaxos4 estimate` again.")
     if file.model == _VEHICLE:
-        parts = _of_vehicle(file, covariance)
+        parts = _vehicle_parts(file, covariance)
     elif file.model in MODELS:
-        parts = _of_flight(file, airframe, covariance)
+        parts = _flight_parts(file, airframe, covariance)
     else:
         raise InputError(f"`model` {file.model[:40]}: must be one of {', '.join((*MODELS, _VEHICLE))}.")
     values, drawn, covariance, notes = parts
@@ -197,7 +195,7 @@ def _identified(name: str, file: _File) -> Identified:
 
 
 def _clipped(values: dict[str, float]) -> dict[str, float]:
-    """`values` with 0 for what is negative, and cannot be."""
+    """Replaces negative values by 0 if no vehicle has them."""
     return {name: max(value, 0.0) if name in _NOT_NEGATIVE else value for name, value in values.items()}
 
 
@@ -205,7 +203,7 @@ def _clipped(values: dict[str, float]) -> dict[str, float]:
 _Parts = tuple[dict[str, float], tuple[str, ...], np.ndarray, list[str]]
 
 
-def _of_flight(file: _File, airframe: Airframe, covariance: np.ndarray) -> _Parts:
+def _flight_parts(file: _File, airframe: Airframe, covariance: np.ndarray) -> _Parts:
     """Ix, Iy, Iz and J_R: the rigid body that explains the alphas of a flight best."""
     names = ("Ix", "Iy", "Iz", "J_R")
     if not file.constants.keys() >= set(names) or tuple(file.parameters) != PARAMETER_NAMES:
@@ -218,7 +216,7 @@ def _of_flight(file: _File, airframe: Airframe, covariance: np.ndarray) -> _Part
     spread = fit_inertia(model, alpha, covariance).covariance
     if not np.isfinite(spread).all():
         raise InputError("no moments of inertia explain the estimate; fly with more excitation.")
-    known = 4 if rotor > _SURE * np.sqrt(spread[3, 3]) else 3
+    known = 4 if rotor > _SIGNIFICANT * np.sqrt(spread[3, 3]) else 3
     notes = []
     if known == 3:
         del values["J_R"]
@@ -228,32 +226,32 @@ def _of_flight(file: _File, airframe: Airframe, covariance: np.ndarray) -> _Part
     return values, names[:known], spread[:known, :known], notes
 
 
-def _of_vehicle(file: _File, covariance: np.ndarray) -> _Parts:
+def _vehicle_parts(file: _File, covariance: np.ndarray) -> _Parts:
     """The parameters of a `FlightModel`."""
     rows, notes = file.parameters, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
-    if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SURE * found["rotor_reaction"][1]:
+    if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SIGNIFICANT * found["rotor_reaction"][1]:
         del found["rotor_reaction"]
         notes.append("rotor_reaction: below noise; the inertia of the rotors is the airframe's")
     curve, error = found.get("thrust_curve", (1.0, 0.0))
-    if abs(curve - 1) < _SURE * error:
+    if abs(curve - 1) < _SIGNIFICANT * error:
         del found["thrust_curve"]
     values = {name: value for name, (value, _) in found.items()}
     values = {name: held.value for name, held in file.held.items() if name != "rotor_reaction"} | values
-    for name, moment in _INVERSES.items():
+    for moment, name in INERTIAS.items():
         if name not in found:
             notes.append(f"{moment}: not identified; it follows from the airframe, or from the bracket")
-    for names, why in _APART.items():
+    for names, why in _NOT_EXPORTED.items():
         some = [name for name in found if name.startswith(names)]
         if some:
             notes.append(f"{', '.join(some)}: {why}")
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
-    apart = tuple(itertools.chain(_GYROSCOPIC, *_APART))
+    apart = tuple(itertools.chain(_GYROSCOPIC, *_NOT_EXPORTED))
     fixed = [name for name in values.keys() - found.keys() if not name.startswith(apart)]
     if fixed:
         notes.append(f"do not vary in samples, because the flights do not identify them: {', '.join(sorted(fixed))}")
-    zero = [name for name in (*_INVERSES, "thrust_gain") if values.get(name) == 0]
+    zero = [name for name in (*INERTIAS.values(), "thrust_gain") if values.get(name) == 0]
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")
     places = [place for place, name in enumerate(rows) if name in found]

@@ -10,17 +10,12 @@ from ..airframe import Airframe
 from ..analysis.inertia import center_of_mass
 
 AXES = ("roll", "pitch", "yaw")
-_INERTIAS = (("Ix", "alpha3"), ("Iy", "alpha6"), ("Iz", "alpha8"))
+# Moments of inertia, each with the parameter that is `thrust_gain` divided by it.
+INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
 # At this specific thrust, the term `center_of_mass` adds no torque (`FlightModel`) [m/s^2].
 _HOVER = 9.81
-# The full-scale rotor speed if nobody knows it, in hover speeds.
+# The full-scale rotor speed, in hover speeds, if the airframe does not have it.
 _FULL_SCALE = 2.0
-
-# Differences that several simulators have.
-NO_ROTOR_INERTIA = (
-    "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
-)
-DRAG_OF_ROTORS = "drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw"
 
 
 class RigidVehicle(NamedTuple):
@@ -67,6 +62,11 @@ class RigidVehicle(NamedTuple):
         return float(np.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient)))
 
     @property
+    def torque_ratio(self) -> float:
+        """The yaw torque of a rotor over its thrust [m]."""
+        return self.drag_coefficient / self.thrust_coefficient
+
+    @property
     def hover_thrust(self) -> Float[np.ndarray, "4"]:
         """The thrust of each rotor [N] that carries the weight and balances the constant torque."""
         x, y = self.rotor_positions.T
@@ -80,7 +80,7 @@ class RigidVehicle(NamedTuple):
 
     @property
     def thrust_share(self) -> str:
-        """The share of `full_thrust` that the command u of full scale makes, as a formula; empty if it is u^2."""
+        """Thrust over `full_thrust` as a formula of the command u (1: full scale). Empty if it is u^2."""
         curve = self.thrust_curve
         if curve > 1:
             return f"max(0, {curve:.4g} u^2 - {curve - 1:.4g} u)"
@@ -100,8 +100,8 @@ class RigidVehicle(NamedTuple):
 
     @property
     def impossible(self) -> str:
-        """Why no vehicle is like this; empty if nothing speaks against it."""
-        for (name, _), moment in zip(_INERTIAS, self.inertia, strict=True):
+        """The reason why no vehicle can be like this. Empty if there is none."""
+        for name, moment in zip(INERTIAS, self.inertia, strict=True):
             if not moment > 0:
                 return f"{name} = {moment:.3g} kg m^2 is not positive"
             if 2 * moment > self.inertia.sum():
@@ -118,11 +118,6 @@ class RigidVehicle(NamedTuple):
         return ""
 
 
-def differences(*lines: tuple[object, str]) -> tuple[str, ...]:
-    """The lines whose condition holds."""
-    return tuple(line for applies, line in lines if applies)
-
-
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
     """The vehicle with an airframe and the parameters that were identified.
 
@@ -131,13 +126,14 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     """
     mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)
-    for axis, (name, inverse) in enumerate(_INERTIAS):
+    for axis, (name, inverse) in enumerate(INERTIAS.items()):
         if name in values:
             inertia[axis] = values[name]
         elif inverse in values:
             # Torques exceed the airframe's by the same factor as thrust.
             inertia[axis] = gain / values[inverse]
-    offset = np.array([_mean([x for name, x in values.items() if name.startswith(f"{axis}_offset")]) for axis in AXES])
+    offsets = ([x for name, x in values.items() if name.startswith(f"{axis}_offset")] for axis in AXES)
+    offset = np.array([np.mean(of_axis or [0.0]) for of_axis in offsets])
     slopes = {name: values.get(name, 0.0) for name in ("roll_thrust", "pitch_thrust")}
     offset[:2] -= _HOVER * np.array(list(slopes.values()))
     # The centre of mass, x and y, in the frame of the airframe's rotor positions [m].
@@ -167,7 +163,3 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     )
     unknown = not np.isfinite(speed) and gain > 0
     return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed) if unknown else vehicle
-
-
-def _mean(values: list[float]) -> float:
-    return float(np.mean(values)) if values else 0.0

@@ -2,51 +2,32 @@
 
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import rich.box
 from rich.console import Console
-from rich.table import Table
 
 from .._files import write_atomically
 from ..design import Design
-from .text import plain
+from .text import Listing, plain
 
 _COLUMNS = 4
 _LONGEST_REPEATED = 1e4
 # The inputs are drawn for so many periods. Bounds that fall with the root of the duration are drawn up to this
 # multiple of the flight.
 _PERIODS, _LONGER = 2, 10
-
-
-class _Words(NamedTuple):
-    """Descriptions of a kind of design.
-
-    - `relative`: whether bounds of the targets are shown in percent of their scale.
-    - `panels`: titles of the panels of the inputs.
-    """
-
-    unexcited: str
-    targets: str
-    compared: str
-    relative: bool
-    panels: tuple[str, ...]
-
-
+# By the kind of design: what a missing bound means, what the geometric mean is taken of, what the other inputs share
+# with the design, and the titles of the panels of the inputs.
 _WORDS = {
-    "rotor speeds": _Words(
+    "rotor speeds": (
         "no better than the default bracket, not excited",
         "that both have",
         "in the same envelope and time",
-        False,
         tuple(f"rotor {i} [rad/s]" for i in range(1, 5)),
     ),
-    "references": _Words(
+    "references": (
         "the flight adds little to the bracket",
         "of Ix, Iy and Iz",
         "of the same length and largest angle",
-        True,
         ("roll [rad]", "pitch [rad]", "yaw [rad]", "vertical [m/s^2]"),
     ),
 }
@@ -57,25 +38,27 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
 
     `accuracy`: the wanted standard deviation of each target, as a share of its scale.
     """
-    task, words = found.task, _WORDS[found.task.kind]
+    task, rows = found.task, []
+    unexcited, targets, compared, _ = _WORDS[task.kind]
     every = {"designed": found.designed, **found.standard}
-    table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in ("parameter", "unit", *every):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
     for i, (name, unit) in enumerate(zip(task.names, task.units, strict=True)):
-        in_percent = words.relative and i < task.scale.size
+        in_percent = _in_percent(found) and i < task.scale.size
         factor = 100 / task.scale[i] if in_percent else 1.0
-        excited = [one.bounds[i] < task.unexcited[i] for one in every.values()]
-        cells = (plain(factor * one.bounds[i], 2) for one in every.values())
-        cells = (cell if known else "-" for cell, known in zip(cells, excited, strict=True))
-        table.add_row(name, "%" if in_percent else unit, *cells)
-    console.print(table, markup=False)
-    console.print(f"the smallest possible standard deviation; -: {words.unexcited}.")
+        bounds = [one.bounds[i] for one in every.values()]
+        cells = [plain(factor * bound, 2) if bound < task.unexcited[i] else "-" for bound in bounds]
+        rows.append((name, "%" if in_percent else unit, *cells))
+    Listing(("parameter", "unit", *every), rows, right=tuple(every)).print_on(console)
+    console.print(f"the smallest possible standard deviation; -: {unexcited}.")
     gains = "; ".join(_gain(found, name) for name in found.standard)
-    console.print(f"geometric mean of the bounds {words.targets}: {gains}; {words.compared}.")
+    console.print(f"geometric mean of the bounds {targets}: {gains}; {compared}.")
     uses = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.designed.uses.items())
     console.print(f"largest share of each limit, of {task.vehicles} vehicles from the bracket: {uses}.")
     console.print(_lengths(found, accuracy))
+
+
+def _in_percent(found: Design) -> bool:
+    """Whether bounds of the targets are shown in percent of their scale."""
+    return found.task.kind == "references"
 
 
 def _gain(found: Design, name: str) -> str:
@@ -91,7 +74,7 @@ def _lengths(found: Design, accuracy: float) -> str:
     task, designed = found.task, found.designed
     times = designed.shortest(accuracy * task.scale)
     longest = float(np.max(times))
-    if _WORDS[task.kind].relative:
+    if _in_percent(found):
         names = task.names[: times.size]
         after = ", ".join(f"{name} after {seconds:.3g} s" for name, seconds in zip(names, times, strict=True))
         return (
@@ -114,20 +97,20 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
     """
     from .style import INK, drawing, grid, label_edges, log_axis, styles, svg  # a second that the table does not need
 
-    task, words, designed = found.task, _WORDS[found.task.kind], found.designed
+    task, designed, in_percent = found.task, found.designed, _in_percent(found)
     every, targets = {"designed": designed, **found.standard}, task.scale.size
     with drawing():
         figure, panels = grid(_COLUMNS + targets, columns=_COLUMNS, height=1.9)
         looks, shown = styles(list(every)), round(_PERIODS * designed.period / designed.dt)
         time = designed.dt * np.arange(designed.inputs.shape[0])
-        for i, panel in enumerate(panels[:_COLUMNS]):
-            for name in ("designed",) if words.relative else ("multisine", "designed"):
+        for i, (panel, title) in enumerate(zip(panels, _WORDS[task.kind][-1], strict=False)):
+            for name in ("designed",) if in_percent else ("multisine", "designed"):
                 if name in every:
                     look = looks[name]
                     panel.plot(time[:shown], every[name].inputs[:shown, i], color=look.color, linestyle=look.dash)
-            panel.set_title(words.panels[i])
+            panel.set_title(title)
         for i, panel in enumerate(panels[_COLUMNS:]):
-            panel.axhline(100 * accuracy if words.relative else float(task.scale[i]), color=INK, linewidth=0.8)
+            panel.axhline(100 * accuracy if in_percent else float(task.scale[i]), color=INK, linewidth=0.8)
             for name, one in every.items():
                 if one.history is None:
                     seconds = np.geomspace(designed.period, _LONGER * designed.duration, 50)
@@ -137,11 +120,11 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
                     seconds, bound = time, one.history[:, i]
                     bound = np.where(bound < 3 * task.scale[i], bound, np.nan)
                 panel.plot(seconds, bound, color=looks[name].color, linestyle=looks[name].dash, label=name)
-            if words.relative:
+            if in_percent:
                 log_axis(panel, "x")
             log_axis(panel, "y")
-            panel.set_title(f"{task.names[i]}: bound [{'%' if words.relative else task.units[i]}]")
-        if words.relative:
+            panel.set_title(f"{task.names[i]}: bound [{'%' if in_percent else task.units[i]}]")
+        if in_percent:
             for i, panel in enumerate(panels):
                 panel.set_xlabel("time [s]" if i < _COLUMNS else "flight [s]")
         else:

@@ -22,36 +22,32 @@ class Drawing(NamedTuple):
     chosen: bool
 
 
-def render(template: str, *, filters: Mapping[str, Any] | None = None, **values: Any) -> str:
+def render(template: str, *, filters: Mapping[str, Any], **values: Any) -> str:
     """The page that a template in this folder makes of `values`. `filters`: functions for the template, by name."""
+    loader, undefined = jinja2.PackageLoader("jaxos4.report", "."), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("jaxos4.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, undefined=undefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= filters or {}
+    environment.filters |= filters
     return environment.get_template(template).render(**values)
 
 
 def drawings(
     choices: Mapping[str, bytes], chosen: int, *, stem: str, description: str, estimators: Sequence[str] = ()
 ) -> tuple[Drawing, ...]:
-    """SVG files by label, one of which the page shows at a time.
+    """Drawings from SVG files by label. The page shows one of them at a time.
 
     **Arguments:**
 
-    - `chosen`: the index of the first choice.
-    - `stem`: the ids in the elements begin with it.
+    - `chosen`: the index of the drawing that the page shows first.
+    - `stem`: the ids in the elements begin with this text.
     - `description`: what a screen reader says.
     - `estimators`: their names, for tooltips.
     """
     made = []
     for i, (label, file) in enumerate(choices.items()):
-        described = escape(f"{description}, {label}" if label else description)
-        element = Markup(_inline(file, f"{stem}-{i}", described, estimators))  # noqa: S704  # text in our SVG is outlines
-        made.append(Drawing(label, element, i == chosen))
+        element = _inline(file, f"{stem}-{i}", escape(f"{description}, {label}" if label else description), estimators)
+        made.append(Drawing(label, Markup(element), i == chosen))  # noqa: S704  # text in our SVG is outlines
     return tuple(made)
 
 

@@ -9,15 +9,15 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, NullLocator
+from matplotlib.ticker import MultipleLocator
 
 from .._files import check_writable, write_atomically
 from ..analysis.frequency_response import AxisResponse, FrequencyResponse
 from ..analysis.prediction import Predictions
 from ..identification.results import Identification
 from ..results import NINETY_FIVE
-from .html import Drawing, drawings, render
-from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg
+from .html import drawings, render
+from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg, ticks_at
 from .text import MISSING, plain
 
 BAND = 0.95
@@ -26,7 +26,7 @@ BAND = 0.95
 # The horizon that the page shows first [s], and the digits of its estimates.
 _SHOWN, _DIGITS = 0.25, 4
 # The page shows these entries of the provenance in a place of their own.
-_APART = ("command", "notes")
+_ELSEWHERE = ("command", "notes")
 # Width of the figure of predictions by the time that it shows [inch/s], and its limits [inch].
 _INCHES_A_SECOND, _NARROWEST, _WIDEST = 0.25, 9.0, 30.0
 # The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
@@ -39,13 +39,18 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     check_writable(path)
     look = styles([found.estimator])[found.estimator]
     predictions, responses = (), ()
-    if found.predictions is not None:
-        predictions = _predictions(found.predictions, found.provenance.sample_time, look)
-    if found.response is not None:
-        with drawing():
-            file = svg(frequency_responses(found.response, look))
-        description = "Frequency response of roll, pitch and yaw"
-        responses = drawings({"": file}, 0, stem="response", description=description)
+    with drawing():
+        if (predicted := found.predictions) is not None:
+            labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
+            rates = (predicted_rates(predicted, found.provenance.sample_time, at, look) for at in range(len(labels)))
+            files = dict(zip(labels, map(svg, rates), strict=True))
+            chosen = list(files).index(labels[int(np.argmin(np.abs(predicted.horizons - _SHOWN)))])
+            description = "Measured and predicted body rates p, q, r"
+            predictions = drawings(files, chosen, stem="predictions", description=description)
+        if found.response is not None:
+            files = {"": svg(frequency_responses(found.response, look))}
+            description = "Frequency response of roll, pitch and yaw"
+            responses = drawings(files, 0, stem="response", description=description)
     text = render(
         "identification.html.j2",
         filters={"number": _number, "interval": _interval, "share": _share, "plain": plain},
@@ -58,7 +63,9 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         command=found.provenance.command or "",
         notes=found.provenance.notes,
         provenance=[
-            (name.replace("_", " "), _text(x)) for name, x in found.provenance.to_dict().items() if name not in _APART
+            (name.replace("_", " "), _text(x))
+            for name, x in found.provenance.to_dict().items()
+            if name not in _ELSEWHERE
         ],
     )
     with write_atomically(path) as beside:
@@ -81,15 +88,6 @@ def _text(x: Any) -> str:
     if isinstance(x, str):
         return x
     return MISSING if x is None else json.dumps(x, ensure_ascii=False)
-
-
-def _predictions(predicted: Predictions, sample_time: float, look: Style) -> tuple[Drawing, ...]:
-    """A drawing for each horizon."""
-    labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
-    with drawing():
-        files = {label: svg(predicted_rates(predicted, sample_time, at, look)) for at, label in enumerate(labels)}
-    chosen = list(files).index(labels[int(np.argmin(np.abs(predicted.horizons - _SHOWN)))])
-    return drawings(files, chosen, stem="predictions", description="Measured and predicted body rates p, q, r")
 
 
 def predicted_rates(predicted: Predictions, sample_time: float, horizon: int, look: Style) -> Figure:
@@ -144,10 +142,10 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
         phase.axhline(0.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
         coherence.axhline(0.6, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[1])
         shown = [*drawn, model]
-        gain.set_title(f"{name}: {_said(axis)}")
+        gain.set_title(f"{name}: {_agreement(axis)}")
         gain.set_yscale("log")
         gain.set_ylim(_GAINS)
-        _ticks(gain, "y", _GAIN_TICKS)
+        ticks_at(gain.yaxis, _GAIN_TICKS)
         phase.set_ylim(-180, 180)
         phase.yaxis.set_major_locator(MultipleLocator(90))
         coherence.set_ylim(0, 1.03)
@@ -155,7 +153,7 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
         for panel in (gain, phase, coherence):
             panel.set_xscale("log")
             panel.set_xlim(1.0, top)
-            _ticks(panel, "x", _FREQUENCY_TICKS)
+            ticks_at(panel.xaxis, _FREQUENCY_TICKS)
             panel.tick_params(labelbottom=panel is coherence, labelleft=column == 0)
     for panel, label in zip(panels[::3], ("gain", "phase [degrees]", "coherence"), strict=True):
         panel.set_ylabel(label)
@@ -174,15 +172,8 @@ def _response(panel: Axes, axis: AxisResponse, values: np.ndarray, band: np.ndar
     return [line, filled, faint]
 
 
-def _said(axis: AxisResponse) -> str:
+def _agreement(axis: AxisResponse) -> str:
     agreement = axis.agreement()
     if math.isnan(agreement.ratio):
         return "no clear response"
     return "{:.2f} ({:.2f} to {:.2f}) times the model".format(agreement.ratio, *agreement.interval)
-
-
-def _ticks(panel: Axes, which: str, ticks: tuple[float, ...]) -> None:
-    axis = panel.xaxis if which == "x" else panel.yaxis
-    axis.set_major_locator(FixedLocator(list(ticks)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())

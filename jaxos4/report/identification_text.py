@@ -1,6 +1,6 @@
 """An identification as text, for a terminal."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from rich.console import Console
 
@@ -16,8 +16,9 @@ Section = Iterator[str | Listing]
 
 
 def print_identification(console: Console, found: Identification) -> None:
-    """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; without an answer, why."""
-    for section in _SECTIONS if found.has_answer else _WITHOUT_ANSWER:
+    """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; or why there is no answer."""
+    sections = (_notes, _parameters, _held, _fit, _inertias, _validation, _disturbances, _skill, _summary)
+    for section in sections if found.has_answer else (_notes, _failure):
         for part in section(found):
             if isinstance(part, Listing):
                 part.print_on(console)
@@ -172,10 +173,3 @@ def _share(value: float | None) -> str:
     if value is None:
         return "-"
     return f"{value:.2f}" if abs(value) < 100 else f"{value:.1e}"
-
-
-_WITHOUT_ANSWER: tuple[Callable[[Identification], Section], ...] = (_notes, _failure)
-_SECTIONS: tuple[Callable[[Identification], Section], ...] = (
-    *(_notes, _parameters, _held, _fit, _inertias, _validation),
-    *(_disturbances, _skill, _summary),
-)

@@ -60,7 +60,7 @@ def read_results(directory: Path) -> xr.Dataset:
 
 
 def _missing(dataset: xr.Dataset) -> str:
-    """Why a Dataset is not the results of a study, or an empty string."""
+    """The reason why a Dataset is not the results of a study. Empty if it is."""
     for name, dimensions in _VARIABLES.items():
         if name not in dataset.variables:
             return f"no variable `{name}`"
@@ -80,7 +80,7 @@ def _missing(dataset: xr.Dataset) -> str:
 
 
 class Scenario(NamedTuple):
-    """The data of one value on each axis except noise scale and estimator, which a table or figure compares."""
+    """The data that one table or figure compares: all noise scales and estimators, one value on each other axis."""
 
     number: int
     label: str
@@ -113,3 +113,29 @@ def bounds(data: xr.Dataset) -> dict[str, int]:
     for place in np.argsort(~known.values, kind="stable").tolist():  # first those that were run
         found.setdefault(str(data["seen"].isel(estimator=place).item()), place)
     return dict(sorted(found.items(), key=lambda item: item[1]))
+
+
+def positive_scales(data: xr.Dataset) -> xr.Dataset:
+    """The data without the noise scale 0, which a logarithmic axis cannot show."""
+    return data.isel(scale=np.flatnonzero(data["scale"].values > 0))
+
+
+def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
+    """The scale of a parameter's errors: "percent" or "absolute", the unit, and why not percent.
+
+    Absolute if the percentage of any point is meaningless, so that a panel has one scale.
+    """
+    reason = metrics.no_percentage(data).isel(parameter=parameter)
+    if not (reason > 0).any():
+        return "percent", "%", ""
+    worst = int(reason.where(reason > 0).min())
+    at = [f"{scale:g}" for scale in data["scale"].values[(reason > 0).any("estimator").values]]
+    where = f" at noise {', '.join(at)}" if len(at) < data.sizes["scale"] else ""
+    return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
+
+
+def nearest_scale(data: xr.Dataset) -> int:
+    """The index of the noise scale nearest 1 (by ratio). Figures of one scale show it."""
+    scales = data["scale"].values
+    positive = np.where(scales > 0, scales, np.finfo(float).tiny)
+    return int(np.argmin(np.abs(np.log(positive))))

@@ -1,16 +1,34 @@
-"""Figures of one scenario of a study: errors, efficiency and limits against noise; scatter, coverage and rollouts."""
+"""Figures of a study: of one scenario, of the example flight, and of the training.
 
+Each function returns `None` if its data are absent.
+"""
+
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from ..results import NINETY_FIVE
 from ..study import metrics
-from .study_data import bounds, names
-from .style import BOUND_DASHES, FAINT, INK, estimator_gid, grid, label_edges, legend, log_axis, scale_axis, styles
+from .study_data import bounds, error_unit, names, nearest_scale, positive_scales
+from .style import (
+    BOUND_DASHES,
+    FAINT,
+    INK,
+    Style,
+    estimator_gid,
+    grid,
+    label_edges,
+    legend,
+    log_axis,
+    scale_axis,
+    style,
+    styles,
+)
 from .text import plain
 
 _COLUMNS = 4
@@ -20,25 +38,6 @@ _DODGE = 0.3
 _QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 # The place on a logarithmic axis for an estimator without rollouts.
 _NO_ROLLOUTS = 0.5
-
-
-def positive_scales(data: xr.Dataset) -> xr.Dataset:
-    """The data without the noise scale 0, which a logarithmic axis cannot show."""
-    return data.isel(scale=np.flatnonzero(data["scale"].values > 0))
-
-
-def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
-    """The scale of a parameter's errors: "percent" or "absolute", the unit, and why not percent.
-
-    Absolute if the percentage of any point is meaningless, so that a panel has one scale.
-    """
-    reason = metrics.no_percentage(data).isel(parameter=parameter)
-    if not (reason > 0).any():
-        return "percent", "%", ""
-    worst = int(reason.where(reason > 0).min())
-    at = [f"{scale:g}" for scale in data["scale"].values[(reason > 0).any("estimator").values]]
-    where = f" at noise {', '.join(at)}" if len(at) < data.sizes["scale"] else ""
-    return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
 
 
 def errors(data: xr.Dataset) -> Figure | None:
@@ -55,7 +54,6 @@ def errors(data: xr.Dataset) -> Figure | None:
             y = best[kind].isel(parameter=place, estimator=estimator).values
             panel.plot(x, y, color=INK, linestyle=dash, linewidth=1.1, marker="_" if len(x) == 1 else None)
         _draw_estimators(panel, data, found[kind].isel(parameter=place))
-        scale_axis(panel, x)
         log_axis(panel, "y")
         panel.set_title(f"{name} [{unit}]")
         if why:
@@ -77,8 +75,7 @@ def efficiency(data: xr.Dataset) -> Figure | None:
     for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
         panel.axhline(1, color=INK, linewidth=1.1)
         one = found.isel(parameter=place)
-        _draw_estimators(panel, data, one["efficiency"], one)
-        scale_axis(panel, data["scale"].values)
+        _draw_estimators(panel, data, one["efficiency"], interval=one)
         panel.set_yscale("log")
         panel.set_title(name)
     label_edges(axes, _COLUMNS, x="noise scale", y="RMSE / bound")
@@ -103,12 +100,11 @@ def frontier(data: xr.Dataset) -> Figure | None:
     for scale in scales:
         panel.axvline(scale, color=FAINT, linewidth=0.8, linestyle="dashed", zorder=0)
     for row, (channels, estimator) in enumerate(seen.items()):
-        y = np.arange(len(parameters)) + 0.36 * (row - (len(seen) - 1) / 2)
         x = limits.isel(estimator=estimator).values
-        finite = x > 0
-        label = f"bound of channels: {channels}"
-        panel.plot(x[finite], y[finite], "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=label)
-        for a, b in zip(x[finite], y[finite], strict=True):
+        y = (np.arange(len(parameters)) + 0.36 * (row - (len(seen) - 1) / 2))[x > 0]
+        x, label = x[x > 0], f"bound of channels: {channels}"
+        panel.plot(x, y, "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=label)
+        for a, b in zip(x, y, strict=True):
             panel.annotate(plain(a, 2), (a, b), (6, 0), textcoords="offset points", va="center", fontsize=7)
     for y in np.flatnonzero((limits == 0).any("estimator").values):
         panel.text(least, float(y), "the truth is 0: no noise is small enough", va="center", fontsize=7.5)
@@ -124,13 +120,6 @@ def frontier(data: xr.Dataset) -> Figure | None:
     return figure
 
 
-def nearest_scale(data: xr.Dataset) -> int:
-    """The index of the noise scale nearest 1 (by ratio). Figures of one scale show it."""
-    scales = data["scale"].values
-    positive = np.where(scales > 0, scales, np.finfo(float).tiny)
-    return int(np.argmin(np.abs(np.log(positive))))
-
-
 def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None:
     """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1.
 
@@ -141,9 +130,9 @@ def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None
     if not some.any():
         return None
     found = every.where(some, 0.0).quantile(list(_QUANTILES), dim="flight").where(some)
-    style = styles(names(data, "estimator"))
+    estimators = names(data, "estimator")
     if drawn is None:
-        drawn, _ = grid(data.sizes["parameter"], columns=_COLUMNS, height=0.28 * len(style) + 0.75)
+        drawn, _ = grid(data.sizes["parameter"], columns=_COLUMNS, height=0.28 * len(estimators) + 0.75)
     # Wide enough for the boxes, but limited in case one estimator is very bad.
     reach = float(np.clip(1.08 * np.nanmax(np.abs(found.values), initial=0.0), 3.0, 12.0))
     for place, (panel, name) in enumerate(zip(drawn.axes, names(data, "parameter"), strict=True)):
@@ -152,7 +141,7 @@ def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None
         for x in (-NINETY_FIVE, NINETY_FIVE):
             panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
         panel.axvline(0, color=INK, linewidth=0.8)
-        for row, look in enumerate(style.values()):
+        for row, look in _looks(data):
             low, first, middle, third, high = found.isel(parameter=place, estimator=row).values
             if not np.isfinite(middle):
                 panel.text(0, row, "no estimates", va="center", ha="center", fontsize=7, gid=estimator_gid(row))
@@ -164,8 +153,8 @@ def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None
             panel.plot([middle], [row], marker=look.marker, markersize=4.5, **marks)
         panel.set_title(name)
         panel.set_xlim(-reach, reach)
-        panel.set_ylim(len(style) - 0.4, -0.6)
-        panel.set_yticks(range(len(style)), list(style) if place % _COLUMNS == 0 else [])
+        panel.set_ylim(len(estimators) - 0.4, -0.6)
+        panel.set_yticks(range(len(estimators)), estimators if place % _COLUMNS == 0 else [])
         panel.grid(axis="y", visible=False)
     label_edges(drawn.axes, _COLUMNS, x="error / bound")
     return drawn
@@ -176,17 +165,15 @@ def coverage(data: xr.Dataset) -> Figure | None:
     found = metrics.mean_coverage(data)
     if not found["coverage"].notnull().any():
         return None
-    style, levels = styles(names(data, "estimator")), data["level"].values
-    figure, axes = grid(
-        data.sizes["scale"], columns=_COLUMNS, width=2.25 * min(data.sizes["scale"], _COLUMNS) + 1.2, height=2.8
-    )
+    estimators, levels, count = names(data, "estimator"), data["level"].values, data.sizes["scale"]
+    figure, axes = grid(count, columns=_COLUMNS, width=2.25 * min(count, _COLUMNS) + 1.2, height=2.8)
     lowest = min(float(found["low"].min()), float(levels.min())) - 0.04
     for place, panel in enumerate(axes):
         one = found.isel(scale=place)
         for x, level in enumerate(levels):
             panel.hlines(level, x - 0.45, x + 0.45, color=INK, linewidth=1.4)
-        for row, look in enumerate(style.values()):
-            shift = 0.7 * (row / max(len(style) - 1, 1) - 0.5)
+        for row, look in _looks(data):
+            shift = 0.7 * (row / max(len(estimators) - 1, 1) - 0.5)
             at, part, gid = np.arange(len(levels)) + shift, one.isel(estimator=row), estimator_gid(row)
             panel.vlines(at, part["low"].values, part["high"].values, color=look.color, linewidth=1.0, gid=gid)
             shares = part["coverage"].values
@@ -197,9 +184,9 @@ def coverage(data: xr.Dataset) -> Figure | None:
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
         panel.grid(axis="x", visible=False)
         panel.set_xlabel("level claimed")
-        if place % _COLUMNS == 0:
-            panel.set_ylabel("intervals that hold the truth")
-    legend(figure, list(style), lines=False)
+    for panel in axes[::_COLUMNS]:
+        panel.set_ylabel("intervals that hold the truth")
+    legend(figure, estimators, lines=False)
     return figure
 
 
@@ -212,17 +199,22 @@ def rollouts(data: xr.Dataset) -> Figure | None:
         return None
     figure, (panel,) = grid(1, columns=1, width=7.0, height=3.6)
     panel.axhline(1, color=INK, linewidth=1.1)
-    for row, look in enumerate(styles(names(data, "estimator")).values()):
+    for row, look in _looks(data):
         at = known[:, row]
         across, up = np.maximum(x.isel(estimator=row).values[at], _NO_ROLLOUTS), y.isel(estimator=row).values[at]
         panel.plot(across, up, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(row))
+        marks = {"color": look.color, "marker": look.marker, "alpha": 0.8, "linewidths": 0}
         for place, a, b in zip(np.flatnonzero(at), across, up, strict=True):
             tip = f"noise x {data['scale'].values[place]:g}: {plain(float(x[place, row]))} rollouts, {plain(float(b))}"
-            marks = {"color": look.color, "marker": look.marker, "alpha": 0.8, "linewidths": 0}
             panel.scatter(a, b, s=26 + 30 * place, gid=estimator_gid(row, tip), **marks)
     log_axis(panel, "x")
     log_axis(panel, "y")
-    _rollout_ticks(panel, x.values[x.notnull().values])
+    spent = x.values[x.notnull().values]
+    top = int(np.ceil(np.log10(max(float(spent.max()), 10.0))))
+    ticks = {_NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
+    ticks |= {10.0**power: f"{10**power:,}" for power in range(top + 1)}
+    panel.set_xticks(list(ticks), list(ticks.values()))
+    panel.set_xlim(min(ticks) / 1.5 if 0 in np.floor(spent) else None, max(ticks) * 1.2)
     scales = ", ".join(f"{scale:g}" for scale in data["scale"].values)
     panel.set_xlabel(f"rollouts for one flight (larger markers: larger noise scale of {scales})")
     panel.set_ylabel("RMSE / least bound, mean of all parameters")
@@ -236,22 +228,114 @@ def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
     return scales * np.exp(_DODGE * gap * (place / max(count - 1, 1) - 0.5))
 
 
-def _draw_estimators(panel, data: xr.Dataset, values: xr.DataArray, interval: xr.Dataset | None = None) -> None:
-    style = styles(names(data, "estimator"))
-    for place, look in enumerate(style.values()):
-        y = values.isel(estimator=place).values
-        x = data["scale"].values if interval is None else dodged(data["scale"].values, place, len(style))
-        panel.plot(x, y, color=look.color, marker=look.marker, linestyle=look.dash, gid=estimator_gid(place))
+def _looks(data: xr.Dataset) -> Iterator[tuple[int, Style]]:
+    """The index and the style of each estimator."""
+    return enumerate(styles(names(data, "estimator")).values())
+
+
+def _draw_estimators(panel: Axes, data: xr.Dataset, values: xr.DataArray, interval: xr.Dataset | None = None) -> None:
+    """A line of each estimator against the noise scale, with its intervals if there are any."""
+    for place, look in _looks(data):
+        x, y = data["scale"].values, values.isel(estimator=place).values
+        x = x if interval is None else dodged(x, place, data.sizes["estimator"])
+        panel.plot(x, y, gid=estimator_gid(place), **look.line)
         if interval is not None:
             low, high = (interval[end].isel(estimator=place).values for end in ("low", "high"))
             panel.vlines(x, low, high, color=look.color, linewidth=1.0, gid=estimator_gid(place))
     if not np.isfinite(values.values).any():
         panel.text(0.5, 0.5, "no estimates", transform=panel.transAxes, ha="center")
+    scale_axis(panel, data["scale"].values)
 
 
-def _rollout_ticks(panel, spent: np.ndarray) -> None:
-    top = int(np.ceil(np.log10(max(float(spent.max()), 10.0))))
-    ticks = {_NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
-    ticks |= {10.0**power: f"{10**power:,}" for power in range(top + 1)}
-    panel.set_xticks(list(ticks), list(ticks.values()))
-    panel.set_xlim(min(ticks) / 1.5 if 0 in np.floor(spent) else None, max(ticks) * 1.2)
+def search(data: xr.Dataset) -> Figure | None:
+    """Half-widths and centres of the brackets of IBSS after each sweep, in units of the first half-widths."""
+    if "search_half_width" not in data:
+        return None
+    width = data["search_half_width"].transpose("sweep", "parameter")
+    first = width.isel(sweep=0)
+    moves = abs(data["search_estimate"] - data["search_estimate"].isel(sweep=-1)) / first
+    figure, axes = grid(2, columns=2, height=3.2)
+    titles = ("half-width of the bracket", "distance to the last estimate")
+    for panel, values, title in zip(axes, (width / first, moves.transpose("sweep", "parameter")), titles, strict=True):
+        for place, name in enumerate(names(data, "parameter")):
+            y = values.isel(parameter=place).values
+            panel.plot(data["sweep"].values, np.where(y > 0, y, np.nan), label=name, markersize=4, **style(place).line)
+        panel.set_title(title)
+        panel.set_xlabel("sweep")
+        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+        log_axis(panel, "y")
+    axes[0].set_ylabel("in first half-widths")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=8, handlelength=2.5)
+    return figure
+
+
+def trajectories(data: xr.Dataset, *, minus_truth: bool = False) -> Figure | None:
+    """The example flight: measured, true, and simulated with each estimate; or the simulations minus the truth.
+
+    A panel for each state that was measured.
+    """
+    if "example_measured" not in data:
+        return None
+    known = data["example_measured"].notnull() & data["example_true"].notnull()
+    shown = np.flatnonzero(known.any("sample").values).tolist()
+    if not shown:
+        return None
+    figure, axes = grid(len(shown), columns=3, height=1.75)
+    for panel, state in zip(axes, shown, strict=True):
+        one = data.isel(state=state)
+        simulated = one["example_simulated"]
+        if minus_truth:
+            simulated = simulated - one["example_true"]
+            panel.axhline(0, color=INK, linewidth=0.8)
+        else:
+            panel.plot(one["time"], one["example_measured"], ".", color=FAINT, markersize=2)
+            panel.plot(one["time"], one["example_true"], color=INK, linewidth=1.0)
+        for row, look in _looks(data):
+            y, gid = simulated.isel(estimator=row).values, estimator_gid(row)
+            if np.isfinite(y).any():
+                panel.plot(one["time"], y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=gid)
+        panel.set_title(f"{one['state'].item()} [{one['state_unit'].item()}]")
+    label_edges(axes, 3, x="time [s]")
+    legend(figure, names(data, "estimator"), markers=False)
+    return figure
+
+
+def path(data: xr.Dataset) -> Figure | None:
+    """The example flight in space."""
+    if "example_true" not in data:
+        return None
+    data = data.isel(state=[names(data, "state").index(axis) for axis in "xyz"])
+    if not np.isfinite(data["example_true"].values).any():
+        return None
+    figure = Figure(figsize=(6.5, 5.0), layout="constrained")
+    panel = figure.add_subplot(projection="3d")
+    panel.plot(*data["example_measured"].values.T, ".", color=FAINT, markersize=1.5, label="measured")
+    panel.plot(*data["example_true"].values.T, color=INK, linewidth=1.2)
+    for row, look in _looks(data):
+        line = data["example_simulated"].isel(estimator=row).values
+        if np.isfinite(line).any():
+            panel.plot(*line.T, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(row))
+    panel.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"})
+    legend(figure, names(data, "estimator"), markers=False)
+    return figure
+
+
+def training(data: xr.Dataset) -> Figure | None:
+    """The training loss and the validation loss of each network."""
+    if "training_loss" not in data:
+        return None
+    labels = names(data, "training")
+    figure, axes = grid(len(labels), columns=3, width=3.2 * min(len(labels), 3) + 0.6, height=2.6)
+    for place, (panel, label) in enumerate(zip(axes, labels, strict=True)):
+        one = data.isel(training=place)
+        losses = np.stack([one["training_loss"].values, one["validation_loss"].values])
+        for row, name in enumerate(("training", "validation")):
+            panel.plot(one["training_step"].values, losses[row], label=name, markersize=3.5, **style(row).line)
+        if not (losses <= 0).any() and np.isfinite(losses).any():
+            log_axis(panel, "y")
+        panel.set_title(label)
+        panel.set_xlabel("step")
+    for panel in axes[::3]:
+        panel.set_ylabel("loss")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure

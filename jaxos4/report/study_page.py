@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,9 +10,9 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from .._files import check_writable, write_atomically
-from . import example_figures, study_figures, study_tables
+from . import study_figures, study_tables
 from .html import Drawing, drawings, render
-from .study_data import Scenario, names, scale_labels, scenarios
+from .study_data import Scenario, names, nearest_scale, scale_labels, scenarios
 from .style import drawing, pdf, styles, svg
 
 MOST_DRAWN = 12
@@ -23,7 +24,7 @@ _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "dev
 
 # The figures of each scenario, and those of the example flight and of the networks. Each draws nothing if its data are
 # absent. `study.html.j2` has their titles and captions.
-OF_SCENARIO: dict[str, Callable[..., Figure | None]] = {
+SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "error": study_figures.errors,
     "efficiency": study_figures.efficiency,
     "distribution": study_figures.distribution,
@@ -31,60 +32,54 @@ OF_SCENARIO: dict[str, Callable[..., Figure | None]] = {
     "coverage": study_figures.coverage,
     "frontier": study_figures.frontier,
 }
-OF_EXAMPLE: dict[str, Callable[..., Figure | None]] = {
-    "trajectories": example_figures.trajectories,
-    "deviations": example_figures.deviations,
-    "path": example_figures.path,
-    "search": example_figures.search,
-    "training": example_figures.training,
+EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
+    "trajectories": study_figures.trajectories,
+    "deviations": partial(study_figures.trajectories, minus_truth=True),
+    "path": study_figures.path,
+    "search": study_figures.search,
+    "training": study_figures.training,
 }
-# These show one noise scale: the files the one nearest 1, the page the one that the reader chooses.
-_OF_ONE_SCALE = ("distribution",)
+# These figures show one noise scale: in the files, the scale nearest 1; on the page, the scale that the reader chooses.
+_ONE_SCALE = ("distribution",)
 
 
 class Drawn(NamedTuple):
-    """A figure of one study.
+    """A figure of a study.
 
-    - `stem`: of the names of its files.
-    - `svg`, `pdf`: the bytes of its files.
-    - `choices`: the figures among which the reader of the page chooses, by label; `svg` is one of them.
+    - `stem`: the name of its files, without the suffix.
+    - `files`: the bytes of its files, by suffix.
+    - `choices`: the SVG figures among which the reader of the page chooses, by label. The file is one of them.
     """
 
     stem: str
-    svg: bytes
-    pdf: bytes | None
+    files: dict[str, bytes]
     choices: dict[str, bytes]
 
 
 def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
     """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; returns their paths, the page first.
 
-    **Arguments:**
-
-    - `with_pdf`: if false, figures are SVG only, which takes half the time.
-
     All figures are drawn before the first file is written. Figures that only an older report has are removed.
+
+    **Arguments:** `with_pdf`: if false, figures are SVG only, which takes half the time.
     """
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
-    every = list(scenarios(dataset))
-    sections: list[tuple[Scenario, dict[str, Drawn]]] = []
+    every, sections = list(scenarios(dataset)), []
     for scenario in every:
-        shown = OF_SCENARIO if scenario.number <= MOST_DRAWN else {}
+        shown = SCENARIO_FIGURES if scenario.number <= MOST_DRAWN else {}
         suffix = f"-{scenario.number}" if len(every) > 1 else ""
         sections.append((scenario, draw(shown, scenario.data, suffix=suffix, with_pdf=with_pdf)))
-    example = draw(OF_EXAMPLE, dataset, with_pdf=with_pdf)
+    example = draw(EXAMPLE_FIGURES, dataset, with_pdf=with_pdf)
     page = _page(dataset, sections, example).encode()
     folder.mkdir(exist_ok=True)
     files: dict[Path, bytes] = {}
     for drawn in [drawn for figures in (*(of for _, of in sections), example) for drawn in figures.values()]:
-        files[folder / f"{drawn.stem}.svg"] = drawn.svg
-        if drawn.pdf is not None:
-            files[folder / f"{drawn.stem}.pdf"] = drawn.pdf
+        files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in drawn.files.items()}
     for path, content in (*files.items(), (target, page)):
         with write_atomically(path) as beside:
             beside.write_bytes(content)
-    ours = "|".join(OF_SCENARIO | OF_EXAMPLE)
+    ours = "|".join(SCENARIO_FIGURES | EXAMPLE_FIGURES)
     for path in folder.iterdir():
         if path not in files and re.fullmatch(rf"({ours})(-\d+)?\.(svg|pdf)", path.name):
             path.unlink()
@@ -94,20 +89,20 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
 def draw(
     figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, *, suffix: str = "", with_pdf: bool = True
 ) -> dict[str, Drawn]:
-    """The figures whose data are present. `suffix`: of the names of the files."""
+    """The figures whose data are present. `suffix`: the end of the names of the files."""
     made = {}
     for name, draw_figure in figures.items():
         with drawing():
             figure = draw_figure(data)
             if figure is None:
                 continue
-            as_svg, as_pdf, choices = svg(figure), pdf(figure) if with_pdf else None, {}
-            for place, label in enumerate(scale_labels(data)) if name in _OF_ONE_SCALE else ():
-                if place == study_figures.nearest_scale(data):
-                    choices[label] = as_svg
+            files, choices = {"svg": svg(figure)} | ({"pdf": pdf(figure)} if with_pdf else {}), {}
+            for place, label in enumerate(scale_labels(data)) if name in _ONE_SCALE else ():
+                if place == nearest_scale(data):
+                    choices[label] = files["svg"]
                 elif draw_figure(data.isel(scale=[place]), figure) is not None:
                     choices[label] = svg(figure)
-        made[name] = Drawn(f"{name}{suffix}", as_svg, as_pdf, choices or {"": as_svg})
+        made[name] = Drawn(f"{name}{suffix}", files, choices or {"": files["svg"]})
     return made
 
 
@@ -118,7 +113,7 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
     missing, cells = study_tables.cells_not_run(dataset)
 
     def inline(drawn: Drawn, description: str) -> tuple[Drawing, ...]:
-        chosen = list(drawn.choices.values()).index(drawn.svg)
+        chosen = list(drawn.choices.values()).index(drawn.files["svg"])
         return drawings(drawn.choices, chosen, stem=drawn.stem, description=description, estimators=estimators)
 
     return render(
@@ -130,13 +125,9 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
         provenance=[(label, attributes[name]) for name, label in _PROVENANCE.items() if name in attributes],
         estimators=[(place, name, look.color) for place, (name, look) in enumerate(styles(estimators).items())],
         sections=[
-            {
-                "number": scenario.number,
-                "label": scenario.label,
-                "figures": drawn,
-                "tables": study_tables.scenario_tables(scenario.data),
-                "trouble": study_tables.troubled_flights(scenario.data),
-            }
+            scenario._asdict()
+            | {"figures": drawn, "tables": study_tables.scenario_tables(scenario.data)}
+            | {"trouble": study_tables.troubled_flights(scenario.data)}
             for scenario, drawn in sections
         ],
         level=study_tables.shown_level(dataset),

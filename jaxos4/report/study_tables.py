@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -27,7 +27,7 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One row. `estimator`: the index of its estimator, if any; the page hides the row with the estimator."""
+    """One row. `estimator`: the index of its estimator, if it has one. The page hides the row with the estimator."""
 
     label: str
     cells: tuple[Cell, ...]
@@ -71,18 +71,12 @@ def shown_level(data: xr.Dataset) -> str:
 def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
     """RMS errors in percent of the truth, with rows for the bounds and for the centre of the bracket."""
     found, best, middle = metrics.estimator_error(data), metrics.bound_error(data), metrics.center_error(data)
-    used: set[int] = set()
 
     def cells(of: xr.Dataset) -> tuple[Cell, ...]:
-        made = []
-        for place in range(data.sizes["parameter"]):
-            one = of.isel(parameter=place)
-            reason = int(one["reason"])
-            value = float(one["absolute" if reason else "percent"])
-            mark = "" if np.isnan(value) else _MARKS[reason]
-            used.update({reason} if mark else ())
-            made.append(Cell(plain(value, digits), mark=mark))
-        return tuple(made)
+        reasons = of["reason"].values.astype(int)
+        values = np.where(reasons > 0, of["absolute"].values, of["percent"].values)
+        marks = ("" if np.isnan(value) else _MARKS[reason] for value, reason in zip(values, reasons, strict=True))
+        return tuple(Cell(plain(value, digits), mark=mark) for value, mark in zip(values, marks, strict=True))
 
     groups = []
     for place, label in enumerate(scale_labels(data)):
@@ -90,10 +84,11 @@ def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
         for at, name in enumerate(names(data, "estimator")):
             rows.append(Row(name, cells(found.isel(scale=place, estimator=at)), at))
         groups.append((label, [*rows, Row("bracket centre", cells(middle.isel(scale=place)))]))
+    used = {cell.mark for _, rows in groups for row in rows for cell in row.cells}
     notes = (
-        f"{_MARKS[code]} absolute error, in the parameter's unit: {metrics.NO_PERCENTAGE[code]}, so a percentage is "
-        "meaningless."
-        for code in sorted(used)
+        f"{mark} absolute error, in the parameter's unit: {reason}, so a percentage is meaningless."
+        for mark, reason in zip(_MARKS, metrics.NO_PERCENTAGE, strict=True)
+        if mark and mark in used
     )
     return Table(list(zip(names(data, "parameter"), names(data, "unit"), strict=True)), groups, tuple(notes))
 
@@ -122,23 +117,20 @@ class Trouble(NamedTuple):
 def troubled_flights(data: xr.Dataset) -> Trouble:
     """The flights that were run and did not converge."""
     order = ("scale", "estimator", "flight")
-    bad, results = (
-        (metrics.was_run(data) & ~metrics.converged(data)).transpose(*order),
-        data["result"].transpose(*order),
-    )
-    places = np.argwhere(bad.values).tolist()
+    bad = (metrics.was_run(data) & ~metrics.converged(data)).transpose(*order).values
+    results, places = data["result"].transpose(*order).values[bad], np.argwhere(bad)
     known = {code: name.replace("_", " ") for name, code in metrics.codes(data).items()}
-    labels = (scale_labels(data), names(data, "estimator"), names(data, "flight"))
-    listed = []
-    for place in places[:_MOST_LISTED]:
-        scale, estimator, flight = (label[i] for label, i in zip(labels, place, strict=True))
-        listed.append(f"{scale}, {estimator}, flight {flight}: {known.get(int(results[*place]), 'unknown result')}")
+    scales, estimators, flights = scale_labels(data), names(data, "estimator"), names(data, "flight")
+    listed = [
+        f"{scales[i]}, {estimators[j]}, flight {flights[k]}: {known.get(int(result), 'unknown result')}"
+        for (i, j, k), result in zip(places[:_MOST_LISTED], results[:_MOST_LISTED], strict=True)
+    ]
     return Trouble(listed, len(places))
 
 
 def failed_cells(dataset: xr.Dataset) -> Trouble:
     """The cells of a study that raised an error, with the error's message."""
-    failures: list[dict[str, Any]] = json.loads(dataset.attrs.get("failures", "[]"))
+    failures = json.loads(dataset.attrs.get("failures", "[]"))
     shown = [name for name in metrics.SCENARIO if dataset.sizes[name] > 1] or ["estimator"]
     listed = [
         f"cell {failure['cell']}, {', '.join(f'{name} {failure[name]}' for name in shown)}: {failure['message']}"
@@ -172,8 +164,5 @@ def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[s
 
 
 def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
-    made = []
-    for number, *ends in zip(*(one[part].values for part in (measure, "low", "high")), strict=True):
-        low, high = map(text, ends)
-        made.append(Cell(text(number), "" if MISSING in (low, high) else f"{low} to {high}"))
-    return tuple(made)
+    rows = (map(text, row) for row in zip(*(one[part].values for part in (measure, "low", "high")), strict=True))
+    return tuple(Cell(value, "" if MISSING in (low, high) else f"{low} to {high}") for value, low, high in rows)

@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 INK = "#1b1e23"
 GRID = "#d9dce1"
@@ -34,6 +35,11 @@ class Style(NamedTuple):
     marker: str
     dash: Dash
 
+    @property
+    def line(self) -> dict[str, Any]:
+        """The arguments of Matplotlib for a line with markers."""
+        return {"color": self.color, "marker": self.marker, "linestyle": self.dash}
+
 
 # After Okabe and Ito (2008), some darkened. The contrast is at least 3:1 on white and on dark paper.
 _STYLES = (
@@ -48,7 +54,7 @@ _STYLES = (
 )
 _KNOWN = ("ibss", "network", "hybrid", "output-error", "equation-error", "rls", "svsf", "kalman")
 BOUND_DASHES = (_SOLID, _DOTTED, _DASHED)
-_LEGEND_WIDTH = 1.4  # of an entry [inch]
+_LEGEND_WIDTH = 1.4  # the width of one entry [inch]
 
 _INKED = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color", "xtick.color", "ytick.color")
 _RC: dict[Any, Any] = {
@@ -88,7 +94,7 @@ def drawing() -> Iterator[None]:
 
 
 def styles(estimators: Sequence[str]) -> dict[str, Style]:
-    """A style for each estimator: always the same for those in `_KNOWN`, an unused one for each other name."""
+    """A style for each estimator. Those in `_KNOWN` have always the same style, the others have an unused one."""
     free = (place for place in itertools.count() if place >= len(_KNOWN) or _KNOWN[place] not in estimators)
     return {name: style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
 
@@ -105,7 +111,7 @@ def estimator_gid(place: int, tip: str = "") -> str:
 
 
 def grid(panels: int, *, columns: int, width: float = 9.0, height: float = 2.1) -> tuple[Figure, list[Axes]]:
-    """A figure with a grid of panels. `height`: of one row of panels [inch]."""
+    """A figure with a grid of panels. `height`: the height of one row of panels [inch]."""
     columns = min(columns, panels)
     rows = -(-panels // columns)
     figure = Figure(figsize=(width, height * rows + 0.5), layout="constrained")
@@ -136,9 +142,15 @@ def log_axis(axes: Axes, which: str) -> None:
 def scale_axis(axes: Axes, scales: np.ndarray) -> None:
     """A logarithmic x axis with a tick at each noise scale."""
     axes.set_xscale("log")
-    axes.set_xticks(list(scales), [f"{scale:g}" for scale in scales])
-    axes.xaxis.set_minor_locator(NullLocator())
+    ticks_at(axes.xaxis, scales)
     axes.set_xlim(scales.min() / 1.8, scales.max() * 1.8)
+
+
+def ticks_at(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
+    """Ticks with plain numbers at these values, and no others."""
+    axis.set_major_locator(FixedLocator(list(values)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def legend(
@@ -183,7 +195,7 @@ def pdf(figure: Figure) -> bytes:
 
 
 def _printed(figure: Figure, write: Callable[..., None], metadata: dict[str, None]) -> bytes:
-    """The bytes that `write`, a method of a canvas, prints. `savefig` would draw twice, but restores the resolution."""
+    """The bytes that `write`, a method of a canvas, prints. `savefig` also restores the resolution, but draws twice."""
     buffer, resolution = io.BytesIO(), figure.dpi
     write(buffer, metadata=metadata)
     figure.set_dpi(resolution)

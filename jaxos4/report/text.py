@@ -15,7 +15,7 @@ _WORDS = 20  # columns of a terminal; a narrower column of words would be hard t
 
 
 def plain(value: float, digits: int = 3) -> str:
-    """`value` with so many significant digits, and a power of ten if it is very small or large; a dash if it is NaN."""
+    """A number with `digits` significant digits, and a power of ten if it is very small or large. NaN is a dash."""
     if not math.isfinite(value):
         return MISSING if math.isnan(value) else f"{value:g}"
     if value == 0:
@@ -27,17 +27,17 @@ def plain(value: float, digits: int = 3) -> str:
     return f"{round(value, digits - 1 - exponent):.{max(digits - 1 - exponent, 0)}f}"
 
 
-def percent(share: float, digits: int = 1) -> str:
-    """A share in percent, without the sign %; a dash if it is NaN."""
-    return MISSING if math.isnan(share) else f"{100 * share:.{digits}f}"
+def percent(share: float) -> str:
+    """A share in percent, without the sign %. NaN is a dash."""
+    return MISSING if math.isnan(share) else f"{100 * share:.1f}"
 
 
 class Listing(NamedTuple):
     """A table as text.
 
     - `right`: the headings of the columns that are aligned to the right.
-    - `notes`: one for each row, about the item in its first cell; an empty string for none.
-    - `wraps`: the headings of columns of words, whose cells may have several lines.
+    - `notes`: a note for each row, about the item in its first cell; an empty string if there is none.
+    - `wraps`: the headings of the columns of words. Their cells can have several lines.
     """
 
     headings: Sequence[str]
@@ -50,35 +50,30 @@ class Listing(NamedTuple):
         """Prints the table. Notes are its last column, or lines below it if the terminal is too narrow."""
         if any(self.notes):
             rows = [[*row, note] for row, note in zip(self.rows, self.notes, strict=True)]
-            table = self._table(rows, last="note")
-            if _needed_width(table) <= console.width:
-                print_whole(console, table)
+            with_notes = Listing([*self.headings, "note"], rows, self.right, wraps=[*self.wraps, "note"])._table()
+            if _needed_width(with_notes) <= console.width:
+                print_whole(console, with_notes)
                 return
-        print_whole(console, self._table(self.rows))
+        print_whole(console, self._table())
         names: dict[str, list[str]] = {}
         for row, note in zip(self.rows, self.notes, strict=False):
             names.setdefault(note, []).append(row[0])
         for note in filter(None, names):
             console.print(f"{', '.join(names[note])}: {note}", markup=False, highlight=False)
 
-    def _table(self, rows: Sequence[Sequence[str]], *, last: str = "") -> Table:
+    def _table(self) -> Table:
         table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-        for i, heading in enumerate((*self.headings, *[last] * bool(last))):
-            widest = max(len(cell) for cell in (heading, *(row[i] for row in rows)))
-            wraps = heading in (last, *self.wraps)
-            table.add_column(
-                heading,
-                justify="right" if heading in self.right else "left",
-                no_wrap=not wraps,
-                min_width=min(widest, _WORDS) if wraps else widest,
-            )
-        for row in rows:
+        for i, heading in enumerate(self.headings):
+            widest, wraps = max(len(row[i]) for row in (self.headings, *self.rows)), heading in self.wraps
+            width, justify = min(widest, _WORDS) if wraps else widest, "right" if heading in self.right else "left"
+            table.add_column(heading, justify=justify, no_wrap=not wraps, min_width=width)
+        for row in self.rows:
             table.add_row(*row)
         return table
 
 
 def print_whole(console: Console, table: RenderableType) -> None:
-    """Prints a table, wider than the terminal if it must be: the terminal then breaks its lines."""
+    """Prints a table without cutting a cell. If the table is wider than the terminal, the terminal breaks its lines."""
     size = console.size
     console.size = ConsoleDimensions(max(_needed_width(table), size.width), size.height)
     try:

@@ -1,22 +1,23 @@
-"""`jaxos4 inspect`: the contents of a log, its usable parts, and the identifiable parameters."""
+"""`jaxos4 inspect` and `jaxos4 identifiability`: what a log contains, and which parameters it can identify."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from ..errors import InputError
-from ._options import OutOption
-from ._output import check_different, check_output, stages, write_json, write_text
+from . import _options as options
+from ._output import check_outputs, option_names, stages, write_json, write_text
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from ..identification import FlightInformation
     from ..recording.inspection import IdentifiableParameters, Inspection
 
-# At most so many parts are printed, the longest ones.
-MOST_PARTS = 14
-CHANNELS = (
+# If a log has more parts, only the longest are printed.
+_MOST_PARTS = 14
+_CHANNELS = (
     (("p", "q", "r"), "rad/s"),
     (("phi", "theta", "psi"), "rad"),
     (("x", "y", "z"), "m"),
@@ -24,24 +25,24 @@ CHANNELS = (
     (("ax", "ay", "az"), "m/s^2"),
     (("rotor1", "rotor2", "rotor3", "rotor4"), "rad/s"),
 )
+# Parameters with less than this share of the largest one are not shown in a direction.
+_SMALL = 0.1
+_MOST_HALF_WIDTHS = 1e3
 
 
 def inspect(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox or Crazyflie.")],
+    log: Annotated[Path, Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox or Crazyflie.")],
     airframe: Annotated[
-        str | None, typer.Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
+        str | None, Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
     ] = None,
     airframe_out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.toml", help="An airframe to write: what the log knows, and what must be measured."),
+        Option(metavar="FILE.toml", help="An airframe to write: what the log knows, and what must be measured."),
     ] = None,
-    out: OutOption = None,
+    out: options.OutOption = None,
 ) -> None:
     """Show what a log contains, which parts of it can be used, and which parameters they identify."""
-    for target in (out, airframe_out):
-        if target is not None:
-            check_output(target, log, None if airframe is None else Path(airframe))
-    check_different(out=out, airframe_out=airframe_out)
+    check_outputs(log, airframe, out=out, airframe_out=airframe_out)
     if airframe_out is not None and airframe_out.exists():
         raise InputError(
             f"{airframe_out}: exists, and may hold what you measured; give another name, and --airframe {airframe_out} "
@@ -92,7 +93,7 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
     )
     for finding in found.findings:
         console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
-    for names, unit in CHANNELS:
+    for names, unit in _CHANNELS:
         measured = {name: found.measured[name] for name in names if name in found.measured}
         if not measured:
             continue
@@ -111,7 +112,7 @@ def _print_parts(console: "Console", found: "Inspection") -> None:
     from ..report.text import Listing
 
     rows = []
-    shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:MOST_PARTS]
+    shown = sorted(found.parts, key=lambda part: part.begin - part.end)[:_MOST_PARTS]
     for part in sorted(shown, key=lambda part: part.begin):
         axes = [a.verdict if a.rate is None else f"{a.verdict} ({a.rate:.2g})" for a in part.excitation.values()]
         rows.append((f"{part.begin:.2f}", f"{part.end:.2f}", part.reason or "usable", *(axes or ["", "", ""])))
@@ -132,3 +133,75 @@ def _print_identifiable(console: "Console", found: "IdentifiableParameters") -> 
     for name, row in found.parameters.items():
         if row.note:
             console.print(f"  {name}: {row.note}")
+
+
+def identifiability(
+    flight: options.FlightFile,
+    model: options.ModelOption = options.Model["published"],
+    airframe: options.AirframeOption = "os4",
+    bracket: options.BracketOption = None,
+    channels: options.ChannelsOption = None,
+    initial_state: options.InitialStateOption = options.InitialState["free"],
+    window: options.WindowOption = None,
+    out: options.OutOption = None,
+) -> None:
+    """Find which of alpha_1..8 a flight can identify, and why not the others."""
+    check_outputs(flight, airframe, bracket, out=out)
+    with stages("loading the library") as progress, option_names(bracket=bracket):
+        from rich.console import Console
+
+        from ..airframe import load_airframe
+        from ..identification import assess
+        from ..models import MODELS
+        from ..recording import read_recording
+
+        progress("reading")
+        subject = MODELS[model](load_airframe(airframe))
+        recording = read_recording(flight, subject.airframe)
+        found = assess(
+            recording,
+            subject,
+            bracket=options.read_bracket(bracket),
+            channels=options.chosen(channels),
+            initial_state=str(initial_state.value),
+            window=window,
+            progress=progress,
+        )
+    if out is not None:
+        write_json(found.to_dict(), out)
+    console = Console(highlight=False, markup=False)
+    for note in recording.notes:
+        console.print(f"note: {note}")
+    _print_information(console, found)
+
+
+def _print_information(console: "Console", found: "FlightInformation") -> None:
+    from ..report.text import Listing
+
+    if not found.fitted:
+        console.print("note: no fit; all numbers below hold at the bracket's centre")
+    rows = []
+    for name, row in found.parameters.items():
+        bound, alone = (float("inf") if x is None else x for x in (row.bound, row.others_known))
+        limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
+        rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit))
+    numbers = ("bound", "others known", "of bracket", "noise limit")
+    Listing(("parameter", "unit", *numbers), rows, numbers).print_on(console)
+    console.print(
+        "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
+        "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
+        "identifiable; noise limit: the largest noise, in multiples of the noise that was found, at which the "
+        "airframe's value can be distinguished from 0."
+    )
+    for name, row in found.parameters.items():
+        if row.note:
+            console.print(f"{name}: {row.note}")
+    if found.eigenvalues is None or found.directions is None:
+        return
+    ordered = sorted(zip(found.parameters, found.directions[0], strict=True), key=lambda item: -abs(item[1]))
+    parts = " ".join(f"{part:+.2f} {name}" for name, part in ordered if abs(part) > _SMALL * abs(ordered[0][1]))
+    spread = max(found.eigenvalues[0], 1e-300) ** -0.5
+    size = f"{spread:.2g}" if spread < _MOST_HALF_WIDTHS else f"over {_MOST_HALF_WIDTHS:g}"
+    console.print(
+        f"weakest direction, in half-widths of the bracket: {parts}, known to {size} (1: no better than the bracket)."
+    )

@@ -1,0 +1,148 @@
+"""`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
+
+import time
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer import Argument, Option
+
+from ..errors import InputError
+from ._options import Estimator
+from ._output import stages
+
+if TYPE_CHECKING:
+    from ..study import Study
+
+Executor = StrEnum("Executor", ["local", "dask"])
+
+
+def study(
+    specification: Annotated[Path, Argument(metavar="SPEC.toml", help="The specification of the study.")],
+    out: Annotated[Path, Option(help="Folder of the study: a new one, or one to resume.")],
+    dry_run: Annotated[bool, Option("--dry-run", help="Only show the plan.")] = False,
+    executor: Annotated[Executor, Option(help="local: this machine; dask: a cluster.")] = Executor["local"],
+    scheduler: Annotated[str | None, Option(help="Address of the Dask scheduler, for dask.")] = None,
+) -> None:
+    """Run a noise study, or resume it: finished cells are kept."""
+    if (executor is Executor["dask"]) != (scheduler is not None):
+        raise InputError("--executor dask and --scheduler ADDRESS: give both, or neither.")
+    with stages("loading the library"):
+        from ..study import load_study, run_on_cluster, use_all_cores
+
+        use_all_cores()  # before anything is computed
+        wanted = load_study(specification)
+    if dry_run:
+        _print_plan(wanted, out)
+        return
+    from ..report.study_terminal import count_outcomes, run_with_bar
+
+    if scheduler is None:
+        dataset = run_with_bar(wanted, out)
+    else:
+        with _connected(scheduler) as client:
+            dataset = run_with_bar(wanted, out, device="Dask cluster", run=partial(run_on_cluster, client=client))
+    typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
+
+
+def _print_plan(wanted: "Study", out: Path) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..study import device_name, plan
+
+    rows = plan(wanted, out)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("estimator", "cells", "flights", "programs", "networks", "time [min]"):
+        table.add_column(heading, justify="left" if heading == "estimator" else "right")
+    for *counts, seconds in rows:
+        table.add_row(*map(str, counts), "-" if seconds is None else f"{seconds / 60:.1f}")
+    Console(highlight=False).print(table, markup=False)
+    cells, flights = sum(row.cells for row in rows), sum(row.flights for row in rows)
+    typer.echo(
+        f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}. The time "
+        "is known for estimators with finished cells. It does not include the training of networks."
+    )
+
+
+def _connected(address: str):
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--executor dask: the package distributed is missing; install jaxos4[dask].") from None
+    try:
+        return Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        what = " ".join(str(error).split())[:120]
+        raise InputError(f"--scheduler {address}: no Dask scheduler answers ({what}); give another address.") from None
+
+
+def report(
+    directory: Annotated[Path, Argument(metavar="DIR", help="The folder of a study, with its results.nc.")],
+) -> None:
+    """Write the report of a study: report.html and figures/ as SVG and PDF."""
+    with stages("loading the library") as progress:
+        from ..report import read_results, write_report
+
+        progress("reading")
+        dataset = read_results(directory)
+        progress("drawing")
+        page, *figures = write_report(dataset, directory)
+    typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
+    if figures:
+        count = len({path.stem for path in figures})
+        typer.echo(f"{figures[0].parent}: {count} figures, each as SVG and PDF")
+
+
+def compare(
+    out: Annotated[Path | None, Option(help="The folder to write. Default: comparison, or comparison-quick.")] = None,
+    quick: Annotated[
+        bool, Option("--quick", help="Only body rates, 128 flights, four estimators, and SVG figures.")
+    ] = False,
+) -> None:
+    """Compare all estimators on the standard flight at three noise levels: table, figures, report."""
+    begin = time.perf_counter()
+    with stages("loading the library"):
+        from rich.console import Console
+
+        from ..report import error_table, write_report
+        from ..report.study_terminal import count_outcomes, run_with_bar
+        from ..report.text import print_whole
+        from ..study import use_all_cores
+
+    use_all_cores()
+    directory = Path("comparison-quick" if quick else "comparison") if out is None else out
+    dataset = run_with_bar(comparison(quick=quick), directory)
+    print_whole(Console(highlight=False), error_table(dataset))
+    with stages("drawing"):
+        page, *_ = write_report(dataset, directory, with_pdf=not quick)
+    typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
+    typer.echo(f"{page}: the report, with figures/ and results.nc beside it")
+
+
+def comparison(*, quick: bool) -> "Study":
+    """The study that compares the estimators: the whole one, or a short one.
+
+    The training is shorter than the best one. The network loses accuracy, the hybrid does not: its search starts from a
+    network of the rates, and a short training is enough for that.
+    """
+    from ..study import Study, Training
+
+    if quick:
+        return Study(
+            title="IBSS, network, hybrid and a Kalman filter under sensor noise, body rates alone, in short",
+            channels=("rates",),
+            estimators=("ibss", "network", "hybrid", "kalman"),  # kalman: the baseline that compiles fastest
+            flights=128,
+            network=Training(steps=500, held_out=1000),
+        )
+    return Study(
+        title="IBSS, network, hybrid and baselines under sensor noise",
+        # The ant colony alone takes longer than all the others: `experiments/comparison` has it.
+        estimators=tuple(name.value for name in Estimator if name != "ant-colony"),
+        flights=256,
+        network=Training(steps=2000, held_out=5000, hybrid_channels="rates"),
+    )

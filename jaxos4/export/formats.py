@@ -1,0 +1,213 @@
+"""From a result to the texts of files for a simulator.
+
+A new simulator has a template in this folder, a function for what it does not have, and a line in `TARGETS`.
+"""
+
+import functools
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jinja2
+import numpy as np
+
+from .._version import __version__
+from ..errors import InputError
+from .result import Identified
+from .vehicle import AXES, RigidVehicle
+
+_FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. Rotor 1 is the airframe's first."
+# RotorPy and Gazebo need a lag: this one is too short to notice [s].
+_NO_LAG = 1e-3
+# Radius and thickness of a drawn rotor, in arms.
+_ROTOR, _FLAT = 0.5, 0.02
+# MuJoCo keeps enough past controls for the delay in scenes with time steps down to this [s].
+_SHORTEST_TIMESTEP = 0.0002
+# The gravity that RotorPy has [m/s^2].
+_GRAVITY = 9.81
+# Gazebo needs links with a mass: that of a rotor's link, as a share of the vehicle's.
+_ROTOR_MASS = 1e-3
+# Gazebo's links of rotors turn this many times slower than the rotors, so that long time steps can follow them.
+_SLOWDOWN = 10.0
+
+# Differences that several simulators have.
+_NO_ROTOR_INERTIA = (
+    "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
+)
+_DRAG_OF_ROTORS = "drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw"
+
+
+class Target(NamedTuple):
+    """A simulator's format.
+
+    - `label`: the name of the format. `suffix`: the suffix of its files.
+    - `text`: the file for a vehicle, with lines of comment at its top.
+    - `limits`: the effects that the simulator does not have, or has differently; one line each.
+    """
+
+    label: str
+    suffix: str
+    text: Callable[[RigidVehicle, Sequence[str]], str]
+    limits: Callable[[RigidVehicle], tuple[str, ...]]
+
+
+class Exported(NamedTuple):
+    """Files for a simulator, as texts.
+
+    - `text`: the estimated vehicle.
+    - `samples`: vehicles drawn from the uncertainty of the estimate.
+    - `impossible`: the number of impossible draws, which were repeated.
+    - `notes`: the effects that the simulator does not have, or has differently; one line each. They stand in the file
+      too, and each sample has its own.
+    """
+
+    text: str
+    samples: tuple[str, ...]
+    impossible: int
+    notes: tuple[str, ...]
+
+
+def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 0) -> Exported:
+    """Write the texts of files for a simulator.
+
+        found = jaxos4.export.read_result("found.json")
+        jaxos4.export.export_vehicle(found, "mujoco").text
+
+    **Arguments:**
+
+    - `found`: a result, from `read_result`.
+    - `to`: the simulator, a name in `TARGETS`.
+    - `samples`: the number of vehicles to draw from the covariance of the estimate. Constants that were not estimated,
+      such as the mass, do not change. `seed`: for the draws. Sample i does not depend on the number of samples.
+
+    **Raises:** `InputError` for an unknown simulator, if `samples` or `seed` is not an integer of at least 0, or if
+    hardly any draw is a possible vehicle.
+    """
+    if to not in TARGETS:
+        raise InputError(f"`to`: must be one of {', '.join(TARGETS)}, got {to!r}.")
+    for name, value in (("samples", samples), ("seed", seed)):
+        if not isinstance(value, int) or value < 0:
+            raise InputError(f"`{name}`: must be an integer of at least 0, got {value!r}.")
+    target = TARGETS[to]
+    warning = () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {found.reason}.", *found.doubts)
+
+    def text(vehicle: RigidVehicle, *lines: str) -> str:
+        made = f"Made by jaxos4 {__version__} from {found.source}."
+        notes = (f"Note: {note}" for note in (*found.notes, *target.limits(vehicle)))
+        # A file's name can have line breaks.
+        return target.text(vehicle, [" ".join(line.split()) for line in (made, *lines, *warning, _FRAME, *notes)])
+
+    draws = [found.draw(number, seed=seed) for number in range(samples)]
+    return Exported(
+        text=text(found.vehicle),
+        samples=tuple(text(vehicle, f"Sample {i}, seed {seed}.") for i, (vehicle, _) in enumerate(draws, start=1)),
+        impossible=sum(impossible for _, impossible in draws),
+        notes=(*found.notes, *target.limits(found.vehicle)),
+    )
+
+
+def _mujoco_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
+    return _that_apply(
+        (vehicle.rotor_inertia, _NO_ROTOR_INERTIA),
+        (vehicle.thrust_share, vehicle.curve("control = ctrlrange x ({})")),
+        (vehicle.lag, "rotor_lag: acts on the thrust and not on the rotor speed; the same for small changes"),
+        (
+            vehicle.delay,
+            f"rotor_delay: right for time steps of {_SHORTEST_TIMESTEP:g} s or longer; it needs MuJoCo 3.5 or newer: "
+            "older versions refuse `delay`, `nsample` and `interp`: remove them",
+        ),
+    )
+
+
+def _mujoco_text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
+    """The MJCF. Controls 1 to 4 are the thrusts of the rotors [N]; the others have no effect."""
+    names, directions = ("x_drag", "y_drag", *(f"{axis}_torque" for axis in AXES)), np.eye(6)[[0, 1, 3, 4, 5]]
+    constants, slopes = (0.0, 0.0, *vehicle.torque), (*vehicle.drag, *vehicle.damping)
+    rows = zip(names, directions, constants, slopes, strict=True)
+    passive = [row for row in rows if row[2] or row[3]]
+    delayed = math.ceil(vehicle.delay / _SHORTEST_TIMESTEP) + 1
+    return _render("mujoco.xml.j2", vehicle, comments, passive=passive, delayed=delayed)
+
+
+def _rotorpy_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
+    return _that_apply(
+        (vehicle.rotor_inertia, _NO_ROTOR_INERTIA),
+        (vehicle.thrust_share, vehicle.curve("rotor speed = rotor_speed_max x sqrt({})")),
+        (vehicle.torque.any(), "offsets: not carried: RotorPy has no constant torque"),
+        (vehicle.damping.any(), "damping: not carried: RotorPy has no torque against the body rates"),
+        (vehicle.drag.any(), _DRAG_OF_ROTORS),
+        (vehicle.delay, f"rotor_delay: not carried: give commands {vehicle.delay:.4g} s late"),
+        (not vehicle.lag, f"rotor_lag: none was identified; tau_m is {_NO_LAG:g} s, because RotorPy needs one"),
+        (vehicle.gravity != _GRAVITY, f"gravity: RotorPy has {_GRAVITY:g} m/s^2, the airframe {vehicle.gravity:g}"),
+    )
+
+
+def _sdf_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
+    return _that_apply(
+        (True, f"gravity: the world's; the vehicle was identified with {vehicle.gravity:g} m/s^2"),
+        (
+            vehicle.rotor_inertia,
+            f"rotor inertia: the links of the rotors have it, and turn {_SLOWDOWN:g} times slower than the rotors, so "
+            "that their gyroscopic torque (alpha2, alpha5) is too small by this factor",
+        ),
+        (vehicle.thrust_share, vehicle.curve("rotor speed = maxRotVelocity x sqrt({})")),
+        (vehicle.torque.any(), "offsets: not carried: SDF has no constant torque"),
+        (vehicle.damping.any(), "damping: not carried: SDF has no torque against the body rates of one axis"),
+        (vehicle.drag.any(), _DRAG_OF_ROTORS),
+        (vehicle.delay, f"rotor_delay: not carried: send commands {vehicle.delay:.4g} s late"),
+    )
+
+
+def _sdf_text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
+    """The SDF. Inertia and mass of all links together are the vehicle's."""
+
+    def steiner(place: np.ndarray) -> np.ndarray:
+        """The inertia of a unit mass at a place about the origin [m^2]."""
+        return place @ place * np.eye(3) - np.outer(place, place)
+
+    share = _ROTOR_MASS * vehicle.mass
+    # The link of a rotor is a thin disc.
+    about_axis = vehicle.rotor_inertia or share * (_ROTOR * vehicle.arm) ** 2 / 2
+    rotor = np.diag([about_axis / 2, about_axis / 2, about_axis])
+    places = np.column_stack([vehicle.rotor_positions, np.zeros(4)])
+    mass = vehicle.mass - 4 * share
+    center = -share * places.sum(axis=0) / mass
+    rest = np.diag(vehicle.inertia) - 4 * rotor - mass * steiner(center)
+    links = {
+        "body": (mass, center, rest - share * sum(steiner(place) for place in places)),
+        "rotor": (share, np.zeros(3), rotor),
+    }
+    return _render("sdf.xml.j2", vehicle, comments, slowdown=_SLOWDOWN, **links)
+
+
+def _that_apply(*lines: tuple[object, str]) -> tuple[str, ...]:
+    return tuple(line for applies, line in lines if applies)
+
+
+def _render(template: str, vehicle: RigidVehicle, comments: Sequence[str], **values: Any) -> str:
+    sizes = {"radius": _ROTOR * vehicle.arm, "thickness": _FLAT * vehicle.arm, "lag": vehicle.lag or _NO_LAG}
+    return _templates().get_template(template).render(vehicle=vehicle, comments=comments, **sizes, **values)
+
+
+@functools.cache
+def _templates() -> jinja2.Environment:
+    loader, undefined = jinja2.PackageLoader("jaxos4.export", "."), jinja2.StrictUndefined
+    made = jinja2.Environment(loader=loader, undefined=undefined, trim_blocks=True, lstrip_blocks=True)
+    made.keep_trailing_newline = True
+    # An XML comment must not contain two hyphens in a row.
+    made.filters["hyphens_apart"] = lambda line: re.sub("-(?=-)", "- ", line)
+    made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}
+    return made
+
+
+def _numbers(*values: float) -> str:
+    """Numbers with all their digits; 0 has no sign."""
+    return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
+
+
+TARGETS: dict[str, Target] = {
+    "mujoco": Target("MJCF for MuJoCo", ".xml", _mujoco_text, _mujoco_limits),
+    "rotorpy": Target("parameters for RotorPy", ".py", functools.partial(_render, "rotorpy.py.j2"), _rotorpy_limits),
+    "sdf": Target("SDF model for Gazebo", ".sdf", _sdf_text, _sdf_limits),
+}
