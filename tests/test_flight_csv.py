@@ -13,9 +13,9 @@ from helpers import CRAZYFLIE
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
+import jaxos4.logs.assemble as assemble_module
 import jaxos4.logs.csv as csv_module
 import jaxos4.logs.table as table_module
-import jaxos4.logs.units as units_module
 from jaxos4._files import write_atomically
 from jaxos4.airframe import OS4
 from jaxos4.errors import InputError
@@ -466,7 +466,7 @@ def test_noise_alone_is_no_degrees(save):
     path = save(csv("t,omega1,omega2,omega3,omega4,psi,r", rows))
     assert read_flight_and_notes(path)[1] == ()
     with pytest.MonkeyPatch.context() as patch:  # without the check that the two are similar
-        patch.setattr(units_module, "_SIMILARITY", -1.0)
+        patch.setattr(assemble_module, "_SIMILARITY", -1.0)
         assert "looks like degrees" in refusal(path)
 
 

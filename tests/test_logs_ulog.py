@@ -26,8 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
 from jaxos4.logs import Sampling, read_log, read_recording
-from jaxos4.logs.sampling import Series, at_rows, root_mean_square
-from jaxos4.logs.table import gyro_rows
+from jaxos4.logs.sampling import Series, at_rows, gyro_rows, root_mean_square
 
 T = 2500.0  # the test airframe's full scale [rad/s]
 ESC = b"esc_report:uint64_t timestamp;int32_t esc_rpm;uint8_t actuator_function;uint8_t[3] _padding0;"

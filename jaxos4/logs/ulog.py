@@ -35,8 +35,8 @@ import math
 
 import numpy as np
 
-from .sampling import Series, logged_rate
-from .table import LogFacts, LogFormat, Path, Sampling, Table, attitude_of, gyro_rows, needed, order_note, refuse
+from .sampling import Series, attitude_of, gyro_rows, logged_rate
+from .table import LogFacts, LogFormat, Path, Sampling, Table, needed, order_note, refuse
 from .ulog_file import HALF_TURN, MAGIC, Source, Topics, decoded
 from .ulog_rotors import TOPICS as ROTOR_TOPICS, rotors_of
 
