@@ -13,17 +13,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
-from .sampling import (
-    UNIFORM,
-    Series,
-    grid_size,
-    held_regularly,
-    integral,
-    logged_rate,
-    resample,
-    uniform_grid,
-    unwrap,
-)
+from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, uniform_grid, unwrap
 from .table import LIMITS, MAX_ROWS, LogFacts, Recording, Sampling, Table, counted, quoted
 
 SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")

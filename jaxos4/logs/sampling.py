@@ -120,12 +120,7 @@ def averaged_to(step: float, series: Series) -> Series:
 
 
 def gyro_rows(
-    path: Path,
-    rates: Series,
-    rotors: Series,
-    *,
-    measured: bool,
-    others: Mapping[tuple[str, ...], Series | None],
+    path: Path, rates: Series, rotors: Series, *, measured: bool, others: Mapping[tuple[str, ...], Series | None]
 ) -> tuple[Rows, dict[str, np.ndarray]]:
     """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
 
