@@ -240,6 +240,92 @@ def test_a_log_cut_by_a_loss_of_power_is_read_to_there(name, save):
     assert not any(words in note for note in read_log(save(content))[1])
 
 
+# Impossible samples
+
+
+def spoilt(truth, bad, column, value):
+    """Samples of a sensor, of which the rows `bad` of one column are impossible."""
+
+    def values(t):
+        out = truth(t)
+        out[bad, column] = value
+        return out
+
+    return values
+
+
+def csv_of(t, *sensors):
+    lines = np.column_stack([t, *(sensor(t) for sensor in sensors)]).tolist()
+    names = ["t", "p", "q", "r", "ax", "ay", "az", *(f"omega{i}" for i in range(1, 5))]
+    return "\n".join([",".join(names), *(",".join(map(str, line)) for line in lines)]).encode()
+
+
+def ulog_of(t, gyro, accelerometer, rotors):
+    return ulog.log(ulog.combined(t, gyro, accelerometer), ulog.escs(t, speeds=rotors))
+
+
+def crazyflie_of(t, gyro, accelerometer, rotors):
+    names = [*crazyflie.GYRO, *(f"rpm.m{i}(f)" for i in range(1, 5))]
+    values = [np.rad2deg(gyro(t)), accelerometer(t) / recorded_logs.GRAVITY, rotors(t) / RPM]
+    return recorded_logs.crazyflie([("e", names, t, np.column_stack(values))])
+
+
+def blackbox_of(t, gyro, accelerometer, rotors):
+    sensors = {"gyroADC": np.rad2deg(gyro(t)), "accSmooth": np.rint(accelerometer(t) / recorded_logs.GRAVITY * 2048)}
+    sensors["eRPM"] = np.rint(rotors(t) / RPM * 7 / 100)
+    columns = {f"{name}[{i}]": column for name, values in sensors.items() for i, column in enumerate(values.T)}
+    columns = {"loopIteration": np.arange(t.size), "time (us)": np.rint(1e6 * t)} | columns
+    return blackbox_csv(columns, settings=blackbox.SETTINGS | {"motor_poles": "14"}).encode()
+
+
+IMPOSSIBLE = {
+    csv_of: ("p", "az", "omega4"),
+    ulog_of: ("gyro_rad[0]", "accelerometer_m_s2[2]", "esc[3].esc_rpm"),
+    crazyflie_of: ("gyro.x", "acc.z", "rpm.m4"),
+    blackbox_of: ("gyroADC[0]", "accSmooth[2]", "eRPM[3]"),
+}
+
+
+@pytest.mark.parametrize("write", IMPOSSIBLE)
+def test_ten_impossible_samples_are_missing_and_the_rest_is_as_it_was(write, save):
+    t, bad = ulog.grid(0.004, 5.0), 7 + 120 * np.arange(10)
+
+    def log(gyro=bad, accelerometer=bad + 1, rotors=bad):
+        sensors = (rates, gyro, 0, 1e6), (recorded_logs.force, accelerometer, 2, -1e5), (speeds, rotors, 3, 104_720.0)
+        return save(write(t, *(spoilt(*each) for each in sensors)))
+
+    clean, found = read_recording(log([], [], [])), read_recording(log())
+    (note,) = set(found.notes) - set(clean.notes)
+    assert note.startswith("impossible values count as not measured, in ")
+    words = zip(
+        IMPOSSIBLE[write], ("1e+06 rad/s at 0.028 s", "-100000 m/s^2 at 0.032 s", "104720 rad/s at 0.028"), strict=True
+    )
+    for name, first in words:
+        assert f"{name}: 10 (first {first}" in note
+    p = STATE_NAMES.index("p")
+    expected = clean.states.copy()
+    expected[bad, p] = np.nan
+    np.testing.assert_array_equal(found.states, expected)
+    expected = clean.specific_force.copy()
+    expected[bad + 1, 2] = np.nan
+    np.testing.assert_array_equal(found.specific_force, expected)
+    elsewhere = np.delete(np.arange(t.size - 1), [bad - 1, bad])
+    np.testing.assert_allclose(found.omega[elsewhere], clean.omega[elsewhere], rtol=1e-12)
+    np.testing.assert_allclose(found.omega, clean.omega, atol=1.6)  # a step of eRPM is 1.5
+    many = np.arange(13) * 90  # of 1250
+    for kind, name in zip(("gyro", "accelerometer", "rotors"), IMPOSSIBLE[write], strict=True):
+        message = outcome(read_log, log(**{kind: many}))
+        assert f"{name}: " in message
+        assert " (13 of 1250 values, more than 1 %); " in message
+
+
+def test_an_impossible_first_value_of_a_rotor_is_the_next_one(save):
+    rows = [f"{0.01 * k:.2f},{2e5 if k in (0, 1, 9) else 100 + k},1,1,1,0.1" for k in range(400)]
+    found = read_recording(save("\n".join(["t,omega1,omega2,omega3,omega4,p", *rows])))
+    assert found.omega[[0, 1, 2, 8, 9, 10], 0].tolist() == [102, 102, 102, 108, 108, 110]
+    assert found.notes == ("impossible values count as not measured, in omega1: 3 (first 200000 rad/s at 0 s)",)
+
+
 COSTLY = {name: ulog.announced(formats) for name, formats in ulog.BOMBS.items()}
 COSTLY["empty events"] = crazyflie.EMPTY_EVENTS
 

@@ -25,7 +25,7 @@ from recorded_logs import (
 from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
-from jaxos4.logs import Sampling, read_log, read_recording
+from jaxos4.logs import Sampling, Table, read_log, read_recording
 from jaxos4.logs.sampling import Series, at_rows, gyro_rows, root_mean_square
 
 T = 2500.0  # the test airframe's full scale [rad/s]
@@ -43,8 +43,8 @@ def angular_velocity(t):
     return "vehicle_angular_velocity", fields, "QQfff", rows, t + 5e-4
 
 
-def combined(t):
-    rows = np.column_stack([rates(t) @ FRD, force(t) @ FRD]).tolist()
+def combined(t, gyro=rates, accelerometer=force):
+    rows = np.column_stack([gyro(t) @ FRD, accelerometer(t) @ FRD]).tolist()
     fields = "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;"
     return "sensor_combined", fields, "Qffffff", rows, t
 
@@ -61,7 +61,7 @@ def local_position(t, valid=True):
     return "vehicle_local_position", fields + "bool xy_valid;bool z_valid;", "Qffffff??", rows, t
 
 
-def escs(t, order=(0, 1, 2, 3)):
+def escs(t, order=(0, 1, 2, 3), speeds=speeds):
     """ESC number i turns motor order[i]; speeds are signed by the sense of rotation."""
     signed = speeds(t) / RPM * [1, -1, 1, -1]
     rows = []
@@ -378,9 +378,9 @@ def test_a_gyro_beyond_a_kilohertz_is_averaged_to_one():
     t = grid(0.00025, 2.0)
     noise = np.random.default_rng(0).normal(0, 0.1, (t.size, 3))
     motor = Series(grid(0.01, 2.2, offset=-0.1), np.full((220, 4), 0.5))
-    rows, columns = gyro_rows("", Series(t, rates(t) + noise), motor, measured=False, others={})
+    rows, table = gyro_rows(Table("", {}), Series(t, rates(t) + noise), motor, measured=False, others={})
     assert np.median(np.diff(rows)) == pytest.approx(0.001)
-    off = np.column_stack([columns[name] for name in "pqr"]) - rates(rows)
+    off = np.column_stack([table.columns[name] for name in "pqr"]) - rates(rows)
     assert np.std(off) == pytest.approx(0.1 / 2, rel=0.15)  # of four samples each
 
 

@@ -14,10 +14,21 @@ import numpy as np
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
 from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, uniform_grid, unwrap
-from .table import LIMITS, MAX_ROWS, LogFacts, Recording, Sampling, Table, counted, quoted
+from .table import (
+    COMMAND_NAMES as COMMAND_NAMES,
+    LIMITS,
+    MAX_ROWS,
+    PITCH,
+    ROLL,
+    SPEED_NAMES as SPEED_NAMES,
+    LogFacts,
+    Recording,
+    Sampling,
+    Table,
+    counted,
+    quoted,
+)
 
-SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
-COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
 
 _OTHER_NAMES = {  # names that other loggers use, for the question "should 'time' be t?"
@@ -47,7 +58,10 @@ def recording_of(
     _check_columns(table)
     facts = _facts(table)
     dt = _check_time(table)
-    _check_units(table)
+    table = _check_units(table.without_impossible())
+    if table.impossible:
+        what = [f"{table.names.get(n, n)}: {k} (first {first})" for n, (k, first) in table.impossible.items()]
+        found.append(f"impossible values count as not measured, in {', '.join(what)}")
     omega = _rotor_speeds(table, airframe, full_scale, found)
     if airframe is not None:
         thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient
@@ -147,36 +161,30 @@ def _check_time(table: Table) -> float:
     return dt
 
 
-def _check_units(table: Table) -> None:
-    """Refuse numbers beyond `LIMITS`, and angles that contradict their rates.
+def _check_units(table: Table) -> Table:
+    """Refuse angles that contradict their rates or jump by 360. Returns the table without impossible angles.
 
     Roll may pass 2 pi if its rate agrees: the vehicle made a flip.
     """
-    columns, limits = table.columns, LIMITS
+    columns, limits = table.columns, ROLL | PITCH
     for name, rate in _ANGLES:
         ratio = _scale_ratio(columns["t"], columns[name], columns[rate]) if table.holds(name, rate) else None
         if ratio is None:
             continue
         if name == "phi" and 1 / 3 < ratio < 3:
-            limits = LIMITS | {name: LIMITS["psi"]}
+            limits = PITCH
         if 1 / _SPREAD < ratio / _DEGREES < _SPREAD:
             what = table.remedy or "it looks like degrees, divide by 57.3"
             table.refuse(f"changes {ratio:.3g} times as fast as {rate}: {what}", column=name)
         if 1 / _SPREAD < ratio * _DEGREES < _SPREAD:
             what = table.remedy or "it looks like deg/s, divide by 57.3"
             table.refuse(f"is {1 / ratio:.3g} times as fast as {name} changes: {what}", column=rate)
-    for name, values in columns.items():
-        least, largest, unit, advice = limits[name]
-        what = f"is {{:g}} {unit}, beyond {largest:.4g} {unit}; {table.remedy or advice}"
-        _refuse_any(table, name, values > largest, what)
-        if least == 0 and name in SPEED_NAMES:
-            what = "is {:g} rad/s; drop the sign, because rotor_spins gives the direction"
-        _refuse_any(table, name, values < least, what)
     if table.holds("psi"):
         measured = np.flatnonzero(np.isfinite(columns["psi"]))
         jumps = np.zeros(columns["psi"].size, dtype=bool)
         jumps[measured[1:]] = np.abs(np.abs(np.diff(columns["psi"][measured])) - 360) < 20
         _refuse_any(table, "psi", jumps, "jumps by about 360: it looks like degrees, divide by 57.3")
+    return table.without_impossible(limits)
 
 
 def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
@@ -239,16 +247,18 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
 
 
 def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
-    """The column of a rotor. An empty cell gets the value before it."""
+    """The column of a rotor. An empty cell gets the value before it, and so does an impossible one, or after it."""
     column, t = table.columns[name], table.columns["t"]
     empty = np.isnan(column)
     if not empty.any():
         return column
-    if empty[0]:
+    impossible, _ = table.impossible.get(name, (0, ""))
+    if empty[0] and not impossible:
         table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
-    last = np.maximum.accumulate(np.where(empty, 0, np.arange(column.size)))
-    longest = (t - t[last]).max()
-    notes.append(f"{name}: {np.count_nonzero(empty)} empty cells hold the value before them, for up to {longest:.3g} s")
+    last = np.maximum.accumulate(np.where(empty, np.argmin(empty), np.arange(column.size)))
+    longest, cells = (t - t[last]).max(), np.count_nonzero(empty) - impossible
+    if cells:
+        notes.append(f"{name}: {cells} empty cells hold the value before them, for up to {longest:.3g} s")
     return column[last]
 
 

@@ -80,12 +80,12 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     rotors, first = needed(path, _rotors(variables, names), "rotor speeds or commands", remedy)
     others: dict[tuple[str, ...], Series | None] = {tuple(_ANGLES): _attitude(variables, names)}
     others |= {(name,): _series(variables, {name: source}, names) for name, source in _OTHERS.items()}
-    _, columns = gyro_rows(path, rates, rotors, measured=first == "omega1", others=others)
     if first == "command1":
         notes.append(f"commands are {names[first]}.., taken as fractions of full-scale rotor speed")
     motors, gyro = (Sampling(names[name], logged_rate(each.t)) for name, each in ((first, rotors), ("p", rates)))
     facts = LogFacts(motors, gyro, _OFTEN)
-    return Table(path, columns, first_row=None, names=names, remedy=_REMEDY, facts=facts), tuple(notes)
+    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=facts)
+    return gyro_rows(table, rates, rotors, measured=first == "omega1", others=others)[1], tuple(notes)
 
 
 CRAZYFLIE = LogFormat("Crazyflie", "Crazyflie micro-SD log", lambda begin: begin.startswith(_MAGIC), read_crazyflie)

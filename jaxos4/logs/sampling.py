@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .table import MAX_ROWS, Path, counted, refuse
+from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, Table, counted, refuse
 
 UNIFORM = 0.01  # of a step: rows this close to a grid keep their values
 REACH = 1.5  # times the step: measured samples further apart have a gap between them
@@ -120,35 +120,48 @@ def averaged_to(step: float, series: Series) -> Series:
 
 
 def gyro_rows(
-    path: Path, rates: Series, rotors: Series, *, measured: bool, others: Mapping[tuple[str, ...], Series | None]
-) -> tuple[Rows, dict[str, np.ndarray]]:
+    table: Table, rates: Series, rotors: Series, *, measured: bool, others: Mapping[tuple[str, ...], Series | None]
+) -> tuple[Rows, Table]:
     """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
 
-    A gyro that is faster than 1 kHz is averaged to 1 kHz.
+    Impossible samples are taken out before, so that no row takes a part of them. A gyro that is faster than 1 kHz is
+    averaged to 1 kHz.
 
     **Arguments:**
 
+    - `table`: without columns.
     - `rotors`: `measured` speeds [rad/s], or commands [0..1].
     - `others`: the other sensors, by the names of their columns; `None`: not logged.
 
-    **Returns:** the times of the rows [s], and the columns of a `Table`; `t` is 0 in the first row.
+    **Returns:** the times of the rows [s], and the table with columns; `t` is 0 in the first row.
 
-    **Raises:** `InputError` if rates and rotors do not overlap in time, or there are more than `MAX_ROWS` rows.
+    **Raises:** `InputError` if rates and rotors do not overlap in time, if there are more than `MAX_ROWS` rows, or for
+    too many impossible samples.
     """
-    rates = averaged_to(_FASTEST_ROWS, rates)
+    start, rotor_names = rates.t[rates.t < rotors.t[0]].size, SPEED_NAMES if measured else COMMAND_NAMES
+    begin = rates.t[min(start, rates.t.size - 1)]
+
+    def possible(names: tuple[str, ...], series: Series) -> Series:
+        nonlocal table
+        columns = {"t": series.t - begin} | dict(zip(names, series.values.T, strict=True))
+        table = table._replace(columns=columns).without_impossible()
+        return Series(series.t, np.column_stack([table.columns[name] for name in names]))
+
+    rates, rotors = averaged_to(_FASTEST_ROWS, possible(("p", "q", "r"), rates)), possible(rotor_names, rotors)
+    turning = np.isfinite(rotors.values).all(axis=1)
+    rotors = Series(rotors.t[turning], rotors.values[turning])
     inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + REACH * _step(rotors.t))
     if np.count_nonzero(inside) < 2:
-        refuse(path, "rates and motors were not logged at the same time; record both in one flight")
+        refuse(table.path, "rates and motors were not logged at the same time; record both in one flight")
     rows = rates.t[inside]
     if rows.size > MAX_ROWS:
-        refuse(path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
-    speeds, prefix = root_mean_square(rotors, rows, linear=measured), "omega" if measured else "command"
+        refuse(table.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
     columns = {"t": rows - rows[0]} | dict(zip("pqr", rates.values[inside].T, strict=True))
-    columns |= {f"{prefix}{i + 1}": column for i, column in enumerate(speeds.T)}
+    columns |= zip(rotor_names, root_mean_square(rotors, rows, linear=measured).T, strict=True)
     for names, series in others.items():
         if series is not None:
-            columns |= zip(names, at_rows(rows, series).T, strict=True)
-    return rows, columns
+            columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
+    return rows, table._replace(columns=columns)
 
 
 def uniform_grid(t: Times) -> Times | None:

@@ -28,6 +28,10 @@ large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 
 _JITTER = 0.95  # a log at a nominal rate may be this much slower
 _AT_ONCE = 1 << 20  # bytes
+_MOST_IMPOSSIBLE = 0.01  # share of the values of a column: more are a wrong unit, and not samples that went wrong
+
+SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
+COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 
 
 class Sampling(NamedTuple):
@@ -78,12 +82,13 @@ def fast_enough(rate: float) -> bool:
 
 
 class Limit(NamedTuple):
-    """The values that a column can have, their unit, and advice on the probable unit of other values."""
+    """The values that a column can have, their unit, and advice on larger values, and on smaller ones if it differs."""
 
     least: float
     largest: float
     unit: str
     advice: str
+    below: str = ""
 
 
 def _within(largest: float, unit: str, advice: str) -> Limit:
@@ -91,8 +96,9 @@ def _within(largest: float, unit: str, advice: str) -> Limit:
 
 
 _COMMAND = Limit(0, 1, "of full scale", "commands are fractions 0..1: divide by full scale (100, 65535)")
-_SPEED = Limit(0, 1e5, "rad/s", "rotor speeds are in rad/s: if these are rpm, divide by 9.549")
-_YAW = _within(1e4, "rad", "it looks like degrees: divide by 57.3")
+_RPM = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
+_SPEED = Limit(0, 1e5, "rad/s", _RPM, "drop the sign, because rotor_spins gives the direction")
+_ANGLE = _within(1e4, "rad", "it looks like degrees: divide by 57.3")
 _RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
 _PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
 _VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
@@ -100,16 +106,18 @@ _POSITION = "positions are in metres from a point near the flight; subtract an o
 _FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
 LIMITS = {
     "t": _within(1e11, "s", "t is in seconds: if these are milli-, micro- or nanoseconds, divide"),
-    **{f"omega{i}": _SPEED for i in range(1, 5)},
-    **{f"command{i}": _COMMAND for i in range(1, 5)},
+    **dict.fromkeys(SPEED_NAMES, _SPEED),
+    **dict.fromkeys(COMMAND_NAMES, _COMMAND),
     **dict.fromkeys("xyz", _within(1e6, "m", _POSITION)),
     **dict.fromkeys(("vx", "vy", "vz"), _within(1e3, "m/s", _VELOCITY)),
     **dict.fromkeys("pqr", _within(60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
-    **{"phi": _within(2 * math.pi, "rad", _YAW.advice), "theta": _within(_RIGHT_ANGLE, "rad", _PITCH), "psi": _YAW},
+    **dict.fromkeys(("phi", "theta", "psi"), _ANGLE),
     **dict.fromkeys(FORCE_NAMES, _within(1e3, "m/s^2", _FORCE)),
     "voltage": _within(200.0, "V", "the battery's voltage is in volts: if these are mV, divide by 1000"),
 }
-"""Each limit lies beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
+"""A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
+ROLL = {"phi": _within(2 * math.pi, "rad", _ANGLE.advice)}  # without a flip
+PITCH = {"theta": _within(_RIGHT_ANGLE, "rad", _PITCH)}
 
 
 class Table(NamedTuple):
@@ -122,6 +130,7 @@ class Table(NamedTuple):
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
     - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
+    - `impossible`: by column, how many values `without_impossible` took out, and the first of them.
     """
 
     path: Path
@@ -131,6 +140,7 @@ class Table(NamedTuple):
     names: Mapping[str, str] = MappingProxyType({})
     remedy: str = ""
     facts: LogFacts = LogFacts()
+    impossible: Mapping[str, tuple[int, str]] = MappingProxyType({})
 
     def refuse(self, what: str, *, index: int | None = None, column: str | None = None) -> NoReturn:
         """Raise an `InputError` about entry `index` of `column`."""
@@ -143,6 +153,30 @@ class Table(NamedTuple):
     def holds(self, *names: str) -> bool:
         """Whether all these columns are there."""
         return self.columns.keys() >= set(names)
+
+    def without_impossible(self, limits: Mapping[str, Limit] = LIMITS) -> "Table":
+        """The table without the values outside of `limits`: they count as not measured.
+
+        **Raises:** `InputError` if they are more than 1 % of the values of a column.
+        """
+        columns, impossible = dict(self.columns), dict(self.impossible)
+        for name, limit in limits.items():
+            values = columns.get(name, np.empty(0))
+            wrong = (values < limit.least) | (values > limit.largest)
+            if name == "t" or not wrong.any():
+                continue
+            index, count = int(np.argmax(wrong)), np.count_nonzero(wrong)
+            first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
+            if count > _MOST_IMPOSSIBLE * every:
+                low = values[index] < limit.least
+                share = f"{count} of {every} values, more than {100 * _MOST_IMPOSSIBLE:g} %"
+                what = f"is {first}, beyond {limit.least if low else limit.largest:.4g} {limit.unit} ({share}); "
+                advice = (low and limit.below) or self.remedy or limit.advice
+                self.refuse(what + advice, index=index, column=name)
+            columns[name] = np.where(wrong, np.nan, values)
+            before, begin = impossible.get(name, (0, f"{first} at {self.columns['t'][index]:.6g} s"))
+            impossible[name] = before + count, begin
+        return self._replace(columns=columns, impossible=impossible)
 
 
 class LogFormat(NamedTuple):

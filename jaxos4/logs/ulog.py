@@ -56,7 +56,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .sampling import Series, attitude_of, gyro_rows, logged_rate
-from .table import LogFacts, LogFormat, Path, Sampling, Table, fast_enough, needed, order_note, refuse
+from .table import LIMITS, LogFacts, LogFormat, Path, Sampling, Table, fast_enough, needed, order_note, refuse
 from .ulog_file import HALF_TURN, MAGIC, Source, Topics, decoded
 
 _RATES = (
@@ -92,7 +92,6 @@ _CA_AIRFRAMES = {
 }
 _VEHICLE_TYPES = {2: "a fixed wing", 3: "a rover", 4: "an airship"}  # of the topic vehicle_status
 _GROUND = ("landed", "maybe_landed", "ground_contact")
-_HIGHEST_VOLTAGE = 200.0  # [V]
 _FIRST_MOTOR = 101  # PX4's number of the output function "Motor 1"
 _RPM = 2 * math.pi / 60
 _OUTPUTS = 16  # of one driver
@@ -122,11 +121,12 @@ def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
         tuple(_FLAGS): _position(log),
         ("voltage",): _voltage(log),
     }
-    rows, columns = gyro_rows(path, rates, rotors.series, measured=rotors.measured, others=others)
+    table = Table(path, {}, first_row=None, names=log.names, remedy=_REMEDY)
+    rows, table = gyro_rows(table, rates, rotors.series, measured=rotors.measured, others=others)
     log.notes.extend(filter(None, (rotors.note, order_note(names[0]))))
     sampling = {"motors": Sampling(rotors.topic, rotors.rate), "gyro": Sampling(gyro, logged_rate(rates.t))}
     facts = _facts(log, rows)._replace(**sampling)
-    return Table(path, columns, first_row=None, names=log.names, remedy=_REMEDY, facts=facts), tuple(log.notes)
+    return table._replace(facts=facts), tuple(log.notes)
 
 
 ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(MAGIC[:4]), read_ulog)
@@ -182,7 +182,7 @@ def _voltage(log: Topics) -> Series | None:
         series = log.series("battery_status", (name,))
         if series is not None:
             log.names["voltage"] = f"battery_status.{name}"
-            possible = (series.values > 0) & (series.values < _HIGHEST_VOLTAGE)
+            possible = (series.values > 0) & (series.values < LIMITS["voltage"].largest)
             return Series(series.t, np.where(possible, series.values, np.nan))
     return None
 
