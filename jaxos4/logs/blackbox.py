@@ -17,13 +17,12 @@ estimators would attribute to the vehicle. Commands count as fractions of the ai
 
 **Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
 reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle`, `gyro_scale` and
-`blackbox_high_resolution` (rates are in tenths of a deg/s). `blackbox_decode` writes no settings: they are taken from
-the `.bbl` or `.BFL` file beside the CSV, if it is there (`LOG00001.02.csv`: second session of `LOG00001.BFL`). If not,
-the reader assumes 14 poles and rates in deg/s, takes 1 g from the median of the accelerometer and the protocol from the
-range of the commands, and notes each of these assumptions.
+`blackbox_high_resolution` (rates are in tenths of a deg/s). For the CSV of `blackbox_decode` they are taken from the
+`.bbl` or `.BFL` file beside it (`LOG00001.02.csv`: second session of `LOG00001.BFL`). Without settings, the reader
+assumes 14 poles, deg/s, 1 g from the accelerometer's median, the protocol from the commands' range, and notes it.
 
-**Sessions.** A vehicle writes one session each time that it is armed. The sessions of a `.bbl` or `.BFL` file follow
-each other in one flight, with an unmeasured second between them.
+**Sessions.** A vehicle writes one session each time that it is armed. The sessions of a file follow each other in one
+flight, with an unmeasured second between them.
 
 **Frames.** Gyro and accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose
 down, yaw counter-clockwise seen from above. (The firmware's own telemetry has the opposite signs of pitch and yaw.)
@@ -51,7 +50,7 @@ import numpy as np
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
 from .sampling import in_order
-from .table import LogFormat, Path, Table, counted, opened, order_note, read_bytes, refuse
+from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, opened, order_note, read_bytes, refuse
 
 _MAGIC = b"H Product:Blackbox"
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
@@ -67,9 +66,9 @@ _RATES = ("gyroUnfilt", "gyroADC")
 _RATE_UNITS = {"": _DEGREE, " (deg/s)": _DEGREE, " (rad/s)": 1.0}
 _FORCE_UNITS = {"": math.nan, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
+_TENTH = _DEGREE / 10
 _INAV = {  # column: column of the log, unit in our frame
-    **{"phi": ("attitude[0]", _DEGREE / 10), "theta": ("attitude[1]", _DEGREE / 10)},
-    **{"psi": ("attitude[2]", -_DEGREE / 10)},
+    **{"phi": ("attitude[0]", _TENTH), "theta": ("attitude[1]", _TENTH), "psi": ("attitude[2]", -_TENTH)},
     **{"x": ("navPos[0]", 0.01), "y": ("navPos[1]", -0.01), "z": ("navPos[2]", 0.01)},
     **{"vx": ("navVel[0]", 0.01), "vy": ("navVel[1]", -0.01), "vz": ("navVel[2]", 0.01)},
 }
@@ -130,8 +129,8 @@ class _Log(NamedTuple):
 
 def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
-    log, first_row = _csv(path) if not _is_raw(path) else (_Log(path, None, *_decoded(path)), None)
-    raw = log.raw
+    log = _decoded(path) if _is_raw(path) else _csv(path)
+    raw, first_row = log.raw, None if log.header is None else log.header + 1
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
         refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
@@ -140,8 +139,7 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     _add_rotors(log)
     _add_force(log)
     for column, (name, unit) in _INAV.items():
-        if name in raw:
-            log.add({column: name}, unit)
+        log.add({column: name} if name in raw else {}, unit)
     for name, firmware in _VOLTAGES.items():
         if name in raw and re.match(firmware, log.settings.get("Firmware revision", "")):
             log.add({"voltage": name}, 1.0)
@@ -158,7 +156,7 @@ def _recognises(begin: bytes) -> bool:
 BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
 
 
-def _csv(path: Path) -> tuple[_Log, int | None]:
+def _csv(path: Path) -> _Log:
     """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
     settings, skip = _settings_above(path)
     notes = []
@@ -167,7 +165,7 @@ def _csv(path: Path) -> tuple[_Log, int | None]:
         notes += [f"settings are taken from {beside} beside it"] * bool(settings)
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    return _Log(path, skip + 1, settings, raw, {}, {}, notes), table.first_row
+    return _Log(path, skip + 1, settings, raw, {}, {}, notes)
 
 
 def _is_header(line: str) -> bool:
@@ -192,17 +190,14 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
 
 
 def _settings_beside(path: Path) -> tuple[Settings, str]:
-    """The settings of the log that a CSV of `blackbox_decode` was made from, if it lies beside it, and its name.
-
-    `LOG00001.02.csv` was made from the second session of `LOG00001.BFL`, or of `.bbl` or `.TXT`.
-    """
+    """The settings of the log that a CSV of `blackbox_decode` was made from, if it lies beside it, and its name."""
     folder, name = os.path.split(os.fspath(path))
     match = re.fullmatch(r"(.+?)(?:\.(\d{2}))?\.csv", name, re.IGNORECASE)
-    for ending in ("bbl", "BBL", "bfl", "BFL", "txt", "TXT") if match else ():
+    if match is None:
+        return {}, ""
+    for ending in ("bbl", "BBL", "bfl", "BFL", "txt", "TXT"):
         beside = os.path.join(folder, f"{match[1]}.{ending}")
-        if not os.path.isfile(beside):
-            continue
-        every = _sessions(beside)
+        every = _sessions(beside) if os.path.isfile(beside) else []
         number = int(match[2]) if match[2] else 1 if len(every) == 1 else 0
         if 0 < number <= len(every):
             return every[number - 1][0], os.path.basename(beside)
@@ -221,7 +216,7 @@ def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
     A header ends at the first line that does not begin with `H `, or is not text.
     """
     content, found = read_bytes(path, _LARGEST) if _is_raw(path) else b"", []
-    places = [match.start() for match in re.finditer(re.escape(_MAGIC), content)]
+    places = [match.start() for match in re.finditer(_MAGIC, content)]
     for at, end in itertools.pairwise([*places, len(content)]):
         settings: Settings = {}
         while content.startswith(b"H ", at, end):
@@ -236,8 +231,8 @@ def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
     return found
 
 
-def _decoded(path: Path) -> tuple[Settings, Columns, Columns, dict[str, str], list[str]]:
-    """The settings and the columns of all sessions, one after the other; notes. Raises `InputError`."""
+def _decoded(path: Path) -> _Log:
+    """A `.bbl` or `.BFL` file: all sessions, one after the other. Raises `InputError`."""
     notes: list[str] = []
     found: list[tuple[Settings, Columns]] = []
     every = _sessions(path)
@@ -253,8 +248,8 @@ def _decoded(path: Path) -> tuple[Settings, Columns, Columns, dict[str, str], li
     longest = max(found, key=lambda each: each[1]["time"][-1])[0]
     same = [columns for settings, columns in found if all(settings.get(u) == longest.get(u) for u in _USED)]
     if len(same) < len(found):
-        what = f"{len(found) - len(same)} of {len(found)} sessions are ignored"
-        notes.append(f"{what}: their settings are not those of the longest one")
+        other = f"{len(found) - len(same)} of {len(found)}"
+        notes.append(f"{other} sessions are ignored: their settings are not those of the longest one")
     if len(same) > 1:
         lengths = ", ".join(f"{columns['time'][-1] / 1e6:.1f}" for columns in same)
         notes.append(f"{len(same)} sessions, of {lengths} s, follow each other with {_BETWEEN:g} s between them")
@@ -263,7 +258,7 @@ def _decoded(path: Path) -> tuple[Settings, Columns, Columns, dict[str, str], li
         columns["time"] += begin
         begin = columns["time"][-1] + 1e6 * _BETWEEN
     joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
-    return longest, joined, {}, {}, notes
+    return _Log(path, None, longest, joined, {}, {}, notes)
 
 
 def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
@@ -275,13 +270,10 @@ def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
     later = in_order(decoded.columns["time"])
     if later is None or later.size < 2:
         return None, "holds no frames that can be decoded: it is ignored"
-    remarks = []
-    if decoded.damaged:
-        places = counted(decoded.damaged, "place")
-        remarks.append(f"is damaged in {places}; what follows up to the next complete frame is ignored")
-    if not decoded.ended:
-        remarks.append("has no end: it was cut while it was written, or is corrupt")
-    return {name: column[later] for name, column in decoded.columns.items()}, "; ".join(remarks)
+    places = counted(decoded.damaged, "place")
+    damage = f"is damaged in {places}; what follows up to the next complete frame is ignored" if decoded.damaged else ""
+    end = "" if decoded.ended else "has no end: it was cut while it was written, or is corrupt"
+    return {name: column[later] for name, column in decoded.columns.items()}, "; ".join(filter(None, (damage, end)))
 
 
 def _add_rates(log: _Log) -> None:
@@ -292,11 +284,9 @@ def _add_rates(log: _Log) -> None:
     factor = _RATE_UNITS[unit]
     if unit == "":
         factor *= _gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-    if unit == "" and not log.settings:
-        log.notes.append(
-            f"{field} is taken as deg/s: with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or "
-            ".BFL file, or keep it beside this one"
-        )
+        fine = "with blackbox_high_resolution its unit is 0.1 deg/s"
+        remedy = "give the .bbl or .BFL file, or keep it beside this one"
+        log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}; {remedy}"])
     log.add(dict(zip("pqr", names, strict=True)), factor)
 
 
@@ -312,14 +302,13 @@ def _gyro_unit(settings: Settings) -> float:
 def _add_rotors(log: _Log) -> None:
     raw = log.raw
     speeds, commands, *others = [[f"{f}[{i}]" for i in r] for r in (range(4), range(4, 8)) for f in ("eRPM", "motor")]
-    if any(np.ptp(_finite(raw[name])) > 0 for names in others for name in names if name in raw):
+    if any(np.ptp(_finite(raw[name])) > 0 for name in itertools.chain(*others) if name in raw):
         refuse(log.path, "has more than four motors; give the log of a quadrotor", row=log.header)
     if raw.keys() >= set(speeds) and all((_finite(raw[name]) > 0).any() for name in speeds):
         poles = log.setting("motor_poles", 2, 100)
         if poles is None:
             log.notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle")
-        names = {f"omega{i}": name for i, name in enumerate(speeds, start=1)}
-        log.add(names, 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60)
+        log.add(dict(zip(SPEED_NAMES, speeds, strict=True)), 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60)
         return
     for name in commands:
         if name not in raw:
@@ -332,9 +321,8 @@ def _add_rotors(log: _Log) -> None:
     low, high = _DSHOT if dshot else _PWM
     what = f"commands are motor[0..3] from {low:g} to {high:g}, taken as fractions of full-scale rotor speed"
     log.notes.append(what + ("" if log.settings else "; the protocol is assumed from their range"))
-    for i, name in enumerate(commands, start=1):
-        log.add({f"command{i}": name}, 1.0)
-        log.columns[f"command{i}"] = np.clip((raw[name] - low) / (high - low), 0.0, 1.0)
+    log.add(dict(zip(COMMAND_NAMES, commands, strict=True)), 1.0)
+    log.columns.update((name, np.clip((log.columns[name] - low) / (high - low), 0.0, 1.0)) for name in COMMAND_NAMES)
 
 
 def _add_force(log: _Log) -> None:

@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
-from typing import IO, NamedTuple, NoReturn, TypeVar
+from typing import IO, Any, NamedTuple, NoReturn, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -165,7 +165,7 @@ class Table(NamedTuple):
             wrong = (values < limit.least) | (values > limit.largest)
             if name == "t" or not wrong.any():
                 continue
-            index, count = int(np.argmax(wrong)), np.count_nonzero(wrong)
+            index, count = int(np.argmax(wrong)), int(np.count_nonzero(wrong))
             first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
             if count > _MOST_IMPOSSIBLE * every:
                 low = values[index] < limit.least
@@ -226,15 +226,18 @@ class Recording(NamedTuple):
     @classmethod
     def of(cls, flight: Flight, name: str = "flight") -> "Recording":
         """A recording of a `Flight`."""
-        given = {field: getattr(flight, field) for field in _ARRAYS}
-        arrays = {f: None if x is None else np.asarray(x, int if f == "stretch" else float) for f, x in given.items()}
+        arrays: dict[str, Any] = {
+            field: np.asarray(value, int if field == "stretch" else float)
+            for field in _ARRAYS
+            if (value := getattr(flight, field)) is not None
+        }
         return cls(**arrays, commanded=flight.commanded, name=name)
 
     @property
     def flight(self) -> Flight:
         """The `Flight`, in the precision of JAX."""
-        stretch = None if self.stretch is None else jnp.asarray(self.stretch)
-        arrays = {field: getattr(self, field) for field in _ARRAYS} | {"stretch": stretch}
+        arrays: dict[str, Any] = {field: getattr(self, field) for field in _ARRAYS}
+        arrays["stretch"] = None if self.stretch is None else jnp.asarray(self.stretch)
         return Flight(**arrays, commanded=self.commanded)
 
     @property

@@ -94,14 +94,13 @@ _VEHICLE_TYPES = {2: "a fixed wing", 3: "a rover", 4: "an airship"}  # of the to
 _GROUND = ("landed", "maybe_landed", "ground_contact")
 _FIRST_MOTOR = 101  # PX4's number of the output function "Motor 1"
 _RPM = 2 * math.pi / 60
-_OUTPUTS = 16  # of one driver
+_OUTPUTS, _TIMERS = 16, 8  # of one driver
 _BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
 _OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other units
 _LEAST_PWM, _HIGHEST_PWM = 800.0, 2200.0  # [us]
 _PWM, _DSHOT, _UAVCAN = (1000.0, 2000.0), 1999.0, (1.0, 8191.0)
 _CAN, _DSHOT_LINK = 4, 5  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
 _DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TIM0 and so on
-_TIMERS = 8
 
 
 def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
@@ -113,7 +112,8 @@ def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
     remedy = "log esc_status, actuator_motors or actuator_outputs"
     rotors = needed(path, _rotors(log), "rotor speeds or commands", remedy)
     names = [f"{rotors.topic}.{field}" for field in rotors.fields]
-    log.names.update((f"{'omega' if rotors.measured else 'command'}{i + 1}", name) for i, name in enumerate(names))
+    prefix = "omega" if rotors.measured else "command"
+    log.names.update((f"{prefix}{i}", name) for i, name in enumerate(names, start=1))
     force = log.fastest(_FORCES, ("ax", "ay", "az"))
     others = {
         ("ax", "ay", "az"): None if force is None else force[0],
@@ -159,8 +159,7 @@ def _attitude(log: Topics) -> Series | None:
     if series is None:
         return None
     log.names.update(dict.fromkeys(_ANGLES, "vehicle_attitude.q"))
-    angles = attitude_of(series.t, series.values)
-    return Series(series.t, angles.values * HALF_TURN)
+    return Series(series.t, attitude_of(series.t, series.values).values * HALF_TURN)
 
 
 def _position(log: Topics) -> Series | None:
@@ -223,15 +222,12 @@ def _landed(log: Topics, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
 
 
 class _Rotors(NamedTuple):
-    """Measured speeds [rad/s] or commands [0..1] of the four rotors, and their topic and fields in the log.
-
-    `note`: what was assumed; empty for measured speeds.
-    """
+    """Measured speeds [rad/s] or commands [0..1] of the four rotors, and their topic and fields in the log."""
 
     series: Series
     topic: str
     fields: Sequence[str]
-    note: str = ""
+    note: str = ""  # what was assumed
 
     @property
     def measured(self) -> bool:
@@ -288,8 +284,7 @@ def _outputs(log: Topics) -> _Rotors | None:
     if place is None:
         return None
     names = [f"output[{i}]" for i in place[1]]
-    instances = range(len(log.topics.get("actuator_outputs", [])))
-    found = [log.series("actuator_outputs", names, i) for i in instances]
+    found = [log.series("actuator_outputs", names, i) for i in range(len(log.topics.get("actuator_outputs", [])))]
     found = [s for s in found if s is not None and s.t.size > 1 and np.isfinite(s.values).all()]
     if not found:
         return None
@@ -322,8 +317,8 @@ def _bank_of_motors(log: Topics) -> tuple[str, list[int]] | None:
         order = _motor_order([int(log.parameters.get(f"{bank}_FUNC{i + 1}", 0.0)) for i in range(_OUTPUTS)])
         if order is not None:
             return bank, order
-    known = any(f"{bank}_FUNC1" in log.parameters for bank in (*_BANKS, *_OTHER_BANKS))
-    return None if known else ("PWM_MAIN", [0, 1, 2, 3])
+    unknown = not any(f"{bank}_FUNC1" in log.parameters for bank in (*_BANKS, *_OTHER_BANKS))
+    return ("PWM_MAIN", [0, 1, 2, 3]) if unknown else None
 
 
 def _motor_order(functions: list[int]) -> list[int] | None:
@@ -335,16 +330,12 @@ def _motor_order(functions: list[int]) -> list[int] | None:
 def _limits(log: Topics, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
     """The protocol, and the values of each output at which its motor idles and is at full speed."""
     turning, get = values[values > 1], log.parameters.get
-    small, link = bool((turning < _LEAST_PWM).any()), log.latest("esc_status", "esc_connectiontype")
+    small, link = (turning < _LEAST_PWM).any(), log.latest("esc_status", "esc_connectiontype")
+    timers = {get(f"{bank}_TIM{i}") for i in range(_TIMERS)}
     kind, names, possible, default = "PWM", [f"{bank}_", "PWM_"], (_LEAST_PWM, _HIGHEST_PWM), _PWM
     if bank == "UAVCAN_EC" or (turning > _HIGHEST_PWM).any() or (small and link == _CAN):
         kind, names, possible, default = "UAVCAN", ["UAVCAN_EC_"], (0.0, 8191.0), _UAVCAN
-    elif (
-        small
-        or link == _DSHOT_LINK
-        or get("DSHOT_CONFIG", 0.0) > 0
-        or any(get(f"{bank}_TIM{i}") in _DSHOT_TIMERS for i in range(_TIMERS))
-    ):
+    elif small or link == _DSHOT_LINK or get("DSHOT_CONFIG", 0.0) > 0 or timers & set(_DSHOT_TIMERS):
         least = get("DSHOT_MIN", 0.0)
         kind, names, default = "DShot", [], (_DSHOT * least if 0 <= least < 0.5 else 0.0, _DSHOT)
 
