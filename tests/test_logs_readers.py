@@ -120,6 +120,10 @@ def good(rows, dt, start, wide):
     return lines
 
 
+def write(path, lines):
+    path.write_text("\n".join(map(",".join, lines)))
+
+
 @st.composite
 def mutated(draw):
     """A good flight, changed by a few accidents."""
@@ -170,10 +174,8 @@ def test_dropped_rows_never_refuse_a_flight(keep, seed, path):
     lines = good(25, 0.01, 0.0, True)
     for line, offset in zip(lines[1:], jitter.tolist(), strict=True):
         line[0] = repr(float(line[0]) + offset)
-    kept = [lines[0]] + [line for line, k in zip(lines[1:], keep, strict=True) if k]
-    path.write_text("\n".join(",".join(line) for line in kept))
-    flight = outcome(read, path)
-    assert isinstance(flight, Flight)
+    write(path, [lines[0]] + [line for line, k in zip(lines[1:], keep, strict=True) if k])
+    assert isinstance(outcome(read, path), Flight)
 
 
 def naive(path):
@@ -187,15 +189,13 @@ def naive(path):
     return Flight(array[:, 0], array[:, 1:5], states), ()
 
 
-@pytest.mark.parametrize(
-    ("row", "cell", "junk"), [(3, 5, "fast"), (3, 5, "inf"), (3, 0, "7"), (3, 1, ""), (3, 2, "-1")]
-)
+@pytest.mark.parametrize(("row", "cell", "junk"), [(3, 5, "fast"), (3, 5, "inf"), (3, 0, "7"), (3, 2, "-1")])
 def test_the_law_fails_a_naive_reader(row, cell, junk, path):
     lines = good(9, 0.01, 0.0, False)
-    path.write_text("\n".join(",".join(line) for line in lines))
+    write(path, lines)
     assert isinstance(outcome(naive, path), Flight)
     lines[row][cell] = junk
-    path.write_text("\n".join(",".join(line) for line in lines))
+    write(path, lines)
     with pytest.raises((AssertionError, ValueError)):
         outcome(naive, path)
     outcome(read, path)
@@ -254,10 +254,15 @@ def spoilt(truth, bad, column, value):
     return values
 
 
+def table_csv(names, *columns):
+    """A flight CSV; a NaN is an empty cell."""
+    lines = [",".join(map(str, row)).replace("nan", "") for row in np.column_stack(columns).tolist()]
+    return "\n".join([",".join(names), *lines]).encode()
+
+
 def csv_of(t, *sensors):
-    lines = np.column_stack([t, *(sensor(t) for sensor in sensors)]).tolist()
     names = ["t", "p", "q", "r", "ax", "ay", "az", *(f"omega{i}" for i in range(1, 5))]
-    return "\n".join([",".join(names), *(",".join(map(str, line)) for line in lines)]).encode()
+    return table_csv(names, t, *(sensor(t) for sensor in sensors))
 
 
 def ulog_of(t, gyro, accelerometer, rotors):
@@ -384,7 +389,7 @@ def test_a_new_format_is_read_and_inspected(log, save, run):
 
 # How often motors and gyro were logged
 
-ROWS = 1000
+ROWS, COMMANDS = 1000, [f"command{i}" for i in range(1, 5)]
 
 
 def repeating(tmp_path, held, *, stagger=0, lost=0.0):
@@ -393,10 +398,10 @@ def repeating(tmp_path, held, *, stagger=0, lost=0.0):
     commands = np.repeat(rng.uniform(0.4, 0.6, (ROWS // held + 9, 4)), held, axis=0)
     commands = np.stack([commands[stagger * i :, i][:ROWS] for i in range(4)], axis=1)
     commands[1:][rng.uniform(size=ROWS - 1) < lost] = np.nan
-    table = np.column_stack([0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3))])
     path = tmp_path / "log.csv"
-    np.savetxt(path, table, delimiter=",", header="t,command1,command2,command3,command4,p,q,r", comments="")
-    path.write_text(path.read_text().replace("nan", ""))
+    path.write_bytes(
+        table_csv(["t", *COMMANDS, "p", "q", "r"], 0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3)))
+    )
     return read_recording(path, full_scale=1.0)
 
 
@@ -453,12 +458,9 @@ def slow_ulog(step):
 
 def slow_csv(step):
     t = ulog.grid(0.004)
-    command = ulog.thrusts(t).astype(str)
-    command[np.arange(t.size) % round(step / 0.004) != 0] = ""
-    lines = [",".join(["t", *(f"command{i}" for i in range(1, 5)), "p", "q", "r"])]
-    for row in zip(t.tolist(), *command.T, *rates(t).T.tolist(), strict=True):
-        lines.append(",".join(map(str, row)))
-    return "\n".join(lines).encode()
+    commands = ulog.thrusts(t)
+    commands[np.arange(t.size) % round(step / 0.004) != 0] = np.nan
+    return table_csv(["t", *COMMANDS, "p", "q", "r"], t, commands, rates(t))
 
 
 def slow_crazyflie(step):
