@@ -409,7 +409,7 @@ OTHERS = {
     "vtol": (
         [states("vehicle_status", [0.0, 1.0], is_vtol=[0, 1])],
         {},
-        "field vehicle_status.is_vtol: this is a V",
+        "vehicle_status.is_vtol: this is a VTOL",
     ),
     "plane": ([states("vehicle_status", [0.0], vehicle_type=[2])], {}, "vehicle_status.vehicle_type: this is a fixed"),
     "hexarotor": ([states("vehicle_status", [0.0], system_type=[13])], {}, "system_type: this is a hexarotor"),
