@@ -5,20 +5,8 @@ import struct
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from recorded_logs import (
-    GRAVITY,
-    RPM,
-    attitude,
-    blackbox_csv,
-    check,
-    force,
-    position,
-    rates,
-    speeds,
-    velocity,
-)
+from recorded_logs import GRAVITY, RPM, attitude, blackbox_csv, check, force, position, rates, speeds, velocity
 
-from jaxos4.errors import InputError
 from jaxos4.logs import log_format, read_log
 from jaxos4.logs.blackbox_frames import Numbers
 from jaxos4.recording import usable_stretches
@@ -107,12 +95,12 @@ def test_commands_are_fractions_of_their_protocol(low, high, settings, save):
     assert any(f"from {low} to {high}" in note for note in notes)
 
 
-@pytest.mark.parametrize("how", ["setting", "zeros"])
-def test_an_accelerometer_that_is_off_is_none(how, save):
-    columns = (
-        recorded(T) if how == "setting" else recorded(T) | {f"accSmooth[{i}]": 0 * T.astype(int) for i in range(3)}
-    )
-    settings = SETTINGS | ({"acc_1G": "0"} if how == "setting" else {})
+ZEROS = {f"accSmooth[{i}]": 0 * T.astype(int) for i in range(3)}
+
+
+@pytest.mark.parametrize(("columns", "settings"), [(recorded(T), {"acc_1G": "0"}), (recorded(T) | ZEROS, {})])
+def test_an_accelerometer_that_is_off_is_none(columns, settings, save):
+    settings = SETTINGS | settings
     flight, notes = read_log(save(blackbox_csv(columns, settings=settings)))
     assert flight.specific_force is None
     assert any("the accelerometer is off" in note for note in notes)
@@ -220,10 +208,7 @@ def test_settings_are_read_from_the_log_beside_its_csv(save):
     np.testing.assert_allclose(flight.omega, speeds(np.asarray(flight.time)), atol=100 / 6 * RPM)
     assert any("from LOG1.BFL beside it" in note for note in notes)
     for name in ("LOG1.csv", "LOG1.03.csv", "LOG2.01.csv"):  # which session, none, none
-        assert not any(
-            "beside it" in note and "settings are taken" in note
-            for note in read_log(save(blackbox_csv(columns), name))[1]
-        )
+        assert "settings are taken" not in str(read_log(save(blackbox_csv(columns), name))[1])
 
 
 def test_the_gyros_scale_is_read(save):
@@ -232,14 +217,10 @@ def test_the_gyros_scale_is_read(save):
     check(flight, names=RATES, atol=5e-3)
 
 
-@pytest.mark.parametrize(
-    ("firmware", "name", "known"),
-    [
-        ("Betaflight 4.2.11 (948ba6339)", "vbatLatest", True),
-        ("Betaflight 3.0.1", "vbatLatest", False),
-        ("INAV 7.1", "vbat", True),
-    ],
-)
+FIRMWARES = [("Betaflight 4.2.11 (948)", "vbatLatest", True), ("Betaflight 3.0.1", "vbatLatest", False)]
+
+
+@pytest.mark.parametrize(("firmware", "name", "known"), [*FIRMWARES, ("INAV 7.1", "vbat", True)])
 def test_the_voltage_is_read_if_its_unit_is_known(firmware, name, known, save):
     columns = recorded(T) | {name: np.rint(1650 - 20 * T).astype(int)}
     flight, _ = read_log(save(bbl(columns, settings={"acc_1G": 2048, "Firmware revision": firmware})))
@@ -318,13 +299,11 @@ BAD = {
         "more than four motors",
     ),
     "settings above": ('"acc_1G","2048"\n' + "\n".join(LINES[:5]) + "\n1,2", "row 7"),
-    "too fast": (blackbox_csv(recorded(T[:50], scale=200)), "beyond 60 rad/s; its unit is not the one"),
+    "too fast": (
+        blackbox_csv(recorded(T[:50], scale=200)),
+        ["beyond 60 rad/s", "28 of 50 values", "its unit is not the one"],
+    ),
 }
-
-
-def test_commands_need_a_full_scale(save):
-    with pytest.raises(InputError, match=r"column motor\[0\]: the rotor speed of full command is not known"):
-        read_log(save(blackbox_csv(without(recorded(T), "eRPM"))))
 
 
 SMALL = blackbox_csv(recorded(T[:30]), settings=SETTINGS).encode()

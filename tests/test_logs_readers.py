@@ -120,6 +120,10 @@ def good(rows, dt, start, wide):
     return lines
 
 
+def write(path, lines):
+    path.write_text("\n".join(map(",".join, lines)))
+
+
 @st.composite
 def mutated(draw):
     """A good flight, changed by a few accidents."""
@@ -149,13 +153,13 @@ def mutated(draw):
     return draw(st.sampled_from(["\n", "\r\n", "\r"])).join(",".join(line) for line in lines)
 
 
-@given(text=mutated(), block=st.sampled_from([1, 50, 1 << 20]))
+@given(text=mutated(), block=st.sampled_from([1, 7]))
 @settings(max_examples=400)
 def test_good_flights_after_accidents(text, block, path):
     path.write_bytes(text.encode("utf-8", "surrogatepass"))
     whole = outcome(read, path)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(csv_module, "_BLOCK", block)
+        patch.setattr(csv_module, "_ROWS_AT_ONCE", block)
         parts = outcome(read, path)
     if isinstance(whole, str):
         assert isinstance(parts, str)  # of two faults, another may be found first
@@ -170,10 +174,8 @@ def test_dropped_rows_never_refuse_a_flight(keep, seed, path):
     lines = good(25, 0.01, 0.0, True)
     for line, offset in zip(lines[1:], jitter.tolist(), strict=True):
         line[0] = repr(float(line[0]) + offset)
-    kept = [lines[0]] + [line for line, k in zip(lines[1:], keep, strict=True) if k]
-    path.write_text("\n".join(",".join(line) for line in kept))
-    flight = outcome(read, path)
-    assert isinstance(flight, Flight)
+    write(path, [lines[0]] + [line for line, k in zip(lines[1:], keep, strict=True) if k])
+    assert isinstance(outcome(read, path), Flight)
 
 
 def naive(path):
@@ -187,15 +189,13 @@ def naive(path):
     return Flight(array[:, 0], array[:, 1:5], states), ()
 
 
-@pytest.mark.parametrize(
-    ("row", "cell", "junk"), [(3, 5, "fast"), (3, 5, "inf"), (3, 0, "7"), (3, 1, ""), (3, 2, "-1")]
-)
+@pytest.mark.parametrize(("row", "cell", "junk"), [(3, 5, "fast"), (3, 5, "inf"), (3, 0, "7"), (3, 2, "-1")])
 def test_the_law_fails_a_naive_reader(row, cell, junk, path):
     lines = good(9, 0.01, 0.0, False)
-    path.write_text("\n".join(",".join(line) for line in lines))
+    write(path, lines)
     assert isinstance(outcome(naive, path), Flight)
     lines[row][cell] = junk
-    path.write_text("\n".join(",".join(line) for line in lines))
+    write(path, lines)
     with pytest.raises((AssertionError, ValueError)):
         outcome(naive, path)
     outcome(read, path)
@@ -238,6 +238,97 @@ def test_a_log_cut_by_a_loss_of_power_is_read_to_there(name, save):
         assert any(words in note for note in notes)
         check(flight, start=start, seconds=1.9)
     assert not any(words in note for note in read_log(save(content))[1])
+
+
+# Impossible samples
+
+
+def spoilt(truth, bad, column, value):
+    """Samples of a sensor, of which the rows `bad` of one column are impossible."""
+
+    def values(t):
+        out = truth(t)
+        out[bad, column] = value
+        return out
+
+    return values
+
+
+def table_csv(names, *columns):
+    """A flight CSV; a NaN is an empty cell."""
+    lines = [",".join(map(str, row)).replace("nan", "") for row in np.column_stack(columns).tolist()]
+    return "\n".join([",".join(names), *lines]).encode()
+
+
+def csv_of(t, *sensors):
+    names = ["t", "p", "q", "r", "ax", "ay", "az", *(f"omega{i}" for i in range(1, 5))]
+    return table_csv(names, t, *(sensor(t) for sensor in sensors))
+
+
+def ulog_of(t, gyro, accelerometer, rotors):
+    return ulog.log(ulog.combined(t, gyro, accelerometer), ulog.escs(t, speeds=rotors))
+
+
+def crazyflie_of(t, gyro, accelerometer, rotors):
+    names = [*crazyflie.GYRO, *(f"rpm.m{i}(f)" for i in range(1, 5))]
+    values = [np.rad2deg(gyro(t)), accelerometer(t) / recorded_logs.GRAVITY, rotors(t) / RPM]
+    return recorded_logs.crazyflie([("e", names, t, np.column_stack(values))])
+
+
+def blackbox_of(t, gyro, accelerometer, rotors):
+    sensors = {"gyroADC": np.rad2deg(gyro(t)), "accSmooth": np.rint(accelerometer(t) / recorded_logs.GRAVITY * 2048)}
+    sensors["eRPM"] = np.rint(rotors(t) / RPM * 7 / 100)
+    columns = {f"{name}[{i}]": column for name, values in sensors.items() for i, column in enumerate(values.T)}
+    columns = {"loopIteration": np.arange(t.size), "time (us)": np.rint(1e6 * t)} | columns
+    return blackbox_csv(columns, settings=blackbox.SETTINGS | {"motor_poles": "14"}).encode()
+
+
+IMPOSSIBLE = {
+    csv_of: ("p", "az", "omega4"),
+    ulog_of: ("gyro_rad[0]", "accelerometer_m_s2[2]", "esc[3].esc_rpm"),
+    crazyflie_of: ("gyro.x", "acc.z", "rpm.m4"),
+    blackbox_of: ("gyroADC[0]", "accSmooth[2]", "eRPM[3]"),
+}
+
+
+@pytest.mark.parametrize("write", IMPOSSIBLE)
+def test_ten_impossible_samples_are_missing_and_the_rest_is_as_it_was(write, save):
+    t, bad = ulog.grid(0.004, 5.0), 7 + 120 * np.arange(10)
+
+    def log(gyro=bad, accelerometer=bad + 1, rotors=bad):
+        sensors = (rates, gyro, 0, 1e6), (recorded_logs.force, accelerometer, 2, -1e5), (speeds, rotors, 3, 104_720.0)
+        return save(write(t, *(spoilt(*each) for each in sensors)))
+
+    clean, found = read_recording(log([], [], [])), read_recording(log())
+    (note,) = set(found.notes) - set(clean.notes)
+    assert note.startswith("impossible values count as not measured, in ")
+    words = zip(
+        IMPOSSIBLE[write], ("1e+06 rad/s at 0.028 s", "-100000 m/s^2 at 0.032 s", "104720 rad/s at 0.028"), strict=True
+    )
+    for name, first in words:
+        assert f"{name}: 10 (first {first}" in note
+    p = STATE_NAMES.index("p")
+    expected = clean.states.copy()
+    expected[bad, p] = np.nan
+    np.testing.assert_array_equal(found.states, expected)
+    expected = clean.specific_force.copy()
+    expected[bad + 1, 2] = np.nan
+    np.testing.assert_array_equal(found.specific_force, expected)
+    elsewhere = np.delete(np.arange(t.size - 1), [bad - 1, bad])
+    np.testing.assert_allclose(found.omega[elsewhere], clean.omega[elsewhere], rtol=1e-12)
+    np.testing.assert_allclose(found.omega, clean.omega, atol=1.6)  # a step of eRPM is 1.5
+    many = np.arange(13) * 90  # of 1250
+    for kind, name in zip(("gyro", "accelerometer", "rotors"), IMPOSSIBLE[write], strict=True):
+        message = outcome(read_log, log(**{kind: many}))
+        assert f"{name}: " in message
+        assert " (13 of 1250 values, more than 1 %); " in message
+
+
+def test_an_impossible_first_value_of_a_rotor_is_the_next_one(save):
+    rows = [f"{0.01 * k:.2f},{2e5 if k in (0, 1, 9) else 100 + k},1,1,1,0.1" for k in range(400)]
+    found = read_recording(save("\n".join(["t,omega1,omega2,omega3,omega4,p", *rows])))
+    assert found.omega[[0, 1, 2, 8, 9, 10], 0].tolist() == [102, 102, 102, 108, 108, 110]
+    assert found.notes == ("impossible values count as not measured, in omega1: 3 (first 200000 rad/s at 0 s)",)
 
 
 COSTLY = {name: ulog.announced(formats) for name, formats in ulog.BOMBS.items()}
@@ -298,7 +389,7 @@ def test_a_new_format_is_read_and_inspected(log, save, run):
 
 # How often motors and gyro were logged
 
-ROWS = 1000
+ROWS, COMMANDS = 1000, [f"command{i}" for i in range(1, 5)]
 
 
 def repeating(tmp_path, held, *, stagger=0, lost=0.0):
@@ -307,10 +398,10 @@ def repeating(tmp_path, held, *, stagger=0, lost=0.0):
     commands = np.repeat(rng.uniform(0.4, 0.6, (ROWS // held + 9, 4)), held, axis=0)
     commands = np.stack([commands[stagger * i :, i][:ROWS] for i in range(4)], axis=1)
     commands[1:][rng.uniform(size=ROWS - 1) < lost] = np.nan
-    table = np.column_stack([0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3))])
     path = tmp_path / "log.csv"
-    np.savetxt(path, table, delimiter=",", header="t,command1,command2,command3,command4,p,q,r", comments="")
-    path.write_text(path.read_text().replace("nan", ""))
+    path.write_bytes(
+        table_csv(["t", *COMMANDS, "p", "q", "r"], 0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3)))
+    )
     return read_recording(path, full_scale=1.0)
 
 
@@ -367,12 +458,9 @@ def slow_ulog(step):
 
 def slow_csv(step):
     t = ulog.grid(0.004)
-    command = ulog.thrusts(t).astype(str)
-    command[np.arange(t.size) % round(step / 0.004) != 0] = ""
-    lines = [",".join(["t", *(f"command{i}" for i in range(1, 5)), "p", "q", "r"])]
-    for row in zip(t.tolist(), *command.T, *rates(t).T.tolist(), strict=True):
-        lines.append(",".join(map(str, row)))
-    return "\n".join(lines).encode()
+    commands = ulog.thrusts(t)
+    commands[np.arange(t.size) % round(step / 0.004) != 0] = np.nan
+    return table_csv(["t", *COMMANDS, "p", "q", "r"], t, commands, rates(t))
 
 
 def slow_crazyflie(step):

@@ -8,7 +8,7 @@ import warnings
 
 from ..airframe import Airframe
 from ..flight import Flight
-from .assemble import Recording as Recording, recording_of
+from .assemble import recording_of
 from .blackbox import BLACKBOX
 from .crazyflie import CRAZYFLIE
 from .csv import CSV, write_flight as write_flight
@@ -16,6 +16,7 @@ from .table import (
     LogFacts as LogFacts,
     LogFormat as LogFormat,
     Path,
+    Recording as Recording,
     Sampling as Sampling,
     Table as Table,
     opened,

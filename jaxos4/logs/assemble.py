@@ -1,21 +1,34 @@
-"""A `Recording`, which holds the samples of one flight as NumPy arrays, and how a log's columns become one."""
+"""Columns of a log become a `Recording`: checks of time and units, rotor speeds from commands, a uniform grid.
 
+A wrong unit can give numbers within `LIMITS`, so each angle is also compared with the integral of its rate, if both
+were measured.
+"""
+
+import math
 import os
 import re
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
 
 from ..airframe import Airframe
-from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES, Flight
-from .sampling import UNIFORM, grid_size, held_regularly, logged_rate, resample, uniform_grid, unwrap
-from .table import MAX_ROWS, LogFacts, Sampling, Table, quoted
-from .units import check_time, check_units, force_note, thrust_note
+from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
+from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, uniform_grid, unwrap
+from .table import (
+    COMMAND_NAMES as COMMAND_NAMES,
+    LIMITS,
+    MAX_ROWS,
+    PITCH,
+    ROLL,
+    SPEED_NAMES as SPEED_NAMES,
+    LogFacts,
+    Recording,
+    Sampling,
+    Table,
+    counted,
+    quoted,
+)
 
-SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
-COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
 
 _OTHER_NAMES = {  # names that other loggers use, for the question "should 'time' be t?"
@@ -26,87 +39,14 @@ _OTHER_NAMES = {  # names that other loggers use, for the question "should 'time
 }
 _MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
 _STILL = 100  # samples of an accelerometer that never change: it is off
-_NO_FACTS = LogFacts()
 _REPEATED = 0.9  # values that change at less than this share of the rate of their rows were repeated
-
-
-class Recording(NamedTuple):
-    """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
-
-    `time`, `omega`, `states`, `specific_force`, `voltage`, `body_velocity`, `stretch` and `commanded` are as in
-    `Flight`, in SI units. A recording is cleaned, cut and joined as it is, and becomes a `Flight` once, at the end.
-
-    - `name`: in messages and in the provenance. Usually the path of the file.
-    - `notes`: what the reader changed in the data, one line each.
-    - `facts`: what the log says beside the flight, such as how often motors and gyro were written.
-    """
-
-    time: Float[np.ndarray, " samples"]
-    omega: Float[np.ndarray, "samples 4"]
-    states: Float[np.ndarray, "samples 12"]
-    specific_force: Float[np.ndarray, "samples 3"] | None = None
-    voltage: Float[np.ndarray, " samples"] | None = None
-    body_velocity: Float[np.ndarray, "samples 3"] | None = None
-    stretch: Int[np.ndarray, " samples"] | None = None
-    commanded: bool = False
-    name: str = "flight"
-    notes: tuple[str, ...] = ()
-    facts: LogFacts = _NO_FACTS
-
-    @classmethod
-    def of(
-        cls, flight: Flight, name: str = "flight", notes: tuple[str, ...] = (), facts: LogFacts = _NO_FACTS
-    ) -> "Recording":
-        """A recording of a `Flight`."""
-        time, omega, states = (np.asarray(each, dtype=float) for each in (flight.time, flight.omega, flight.states))
-        optional = {field: np.asarray(value) for field in _OPTIONAL if (value := getattr(flight, field)) is not None}
-        optional = {field: value.astype(int if field == "stretch" else float) for field, value in optional.items()}
-        return cls(time, omega, states)._replace(
-            **optional, commanded=flight.commanded, name=name, notes=notes, facts=facts
-        )
-
-    @property
-    def flight(self) -> Flight:
-        """The `Flight`, in the precision of JAX."""
-        stretch = None if self.stretch is None else jnp.asarray(self.stretch)
-        return Flight(
-            self.time,
-            self.omega,
-            self.states,
-            self.specific_force,
-            body_velocity=self.body_velocity,
-            stretch=stretch,
-            commanded=self.commanded,
-            voltage=self.voltage,
-        )
-
-    @property
-    def dt(self) -> float:
-        """The sample time [s]."""
-        return float((self.time[-1] - self.time[0]) / (self.time.size - 1))
-
-    @property
-    def channels(self) -> Float[np.ndarray, "samples 15"]:
-        """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
-        nothing = np.full((self.time.size, len(FORCE_NAMES)), np.nan)
-        return np.column_stack([self.states, nothing if self.specific_force is None else self.specific_force])
-
-    def rows(self, part: slice) -> "Recording":
-        """Some samples of the recording; their time stays as recorded."""
-        fields = {field: getattr(self, field) for field in ("time", "omega", "states", *_OPTIONAL)}
-        return self._replace(**{field: value[part] for field, value in fields.items() if value is not None})
-
-    @property
-    def named_notes(self) -> tuple[str, ...]:
-        """The notes, each with the name in front."""
-        return tuple(f"{self.name}: {note}" for note in self.notes)
-
-    def same_data(self, other: "Recording") -> bool:
-        """Whether both hold the same samples: times, rotor speeds and states."""
-        return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(self[:3], other[:3], strict=True))
-
-
-_OPTIONAL = ("specific_force", "voltage", "body_velocity", "stretch")
+_SHORTEST_STEP, _LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
+_DEGREES = 180 / math.pi
+_ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
+_WINDOW = 0.2  # [s]: increments of an angle over this time are compared with the integral of its rate
+_FEWEST = 8  # windows that a comparison needs
+_SIMILARITY = 0.7  # smallest cosine between increments and integrals at which their ratio is used
+_SPREAD = 1.6  # a ratio within this factor of 57.3 counts as 57.3
 
 
 def recording_of(
@@ -114,20 +54,21 @@ def recording_of(
 ) -> Recording:
     """Make a recording from the columns of a log and the `notes` of its reader; see `read_log`."""
     found = [*notes, *([_unknown_note(table.unknown)] if table.unknown else [])]
-    columns = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    table = table._replace(columns=columns)
+    table = table._replace(columns={n: column for n, column in table.columns.items() if not np.isnan(column).all()})
     _check_columns(table)
     facts = _facts(table)
-    dt = check_time(table)
-    check_units(table)
+    dt = _check_time(table)
+    table = _check_units(table.without_impossible())
+    if table.impossible:
+        what = [f"{table.names.get(n, n)}: {k} (first {first})" for n, (k, first) in table.impossible.items()]
+        found.append(f"impossible values count as not measured, in {', '.join(what)}")
     omega = _rotor_speeds(table, airframe, full_scale, found)
-    commanded = not any(name in table.columns for name in SPEED_NAMES)
     if airframe is not None:
         thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient
-        found.extend(thrust_note(float(thrust / (airframe.mass * airframe.gravity))))
-    channels = _channels(table, found)
-    with_force = any(name in table.columns for name in FORCE_NAMES)
-    voltage = _voltage(table)
+        found += _thrust_note(float(thrust / (airframe.mass * airframe.gravity)))
+    channels, voltage = _channels(table, found), _voltage(table)
+    with_force = any(map(table.holds, FORCE_NAMES))
+    commanded = not any(map(table.holds, SPEED_NAMES))
     table = table._replace(columns={"t": table.columns["t"]})  # frees the memory of a long log
     time, omega, channels, voltage = _evenly(table, dt, omega, channels, voltage, found)
     dt = float(time[-1] - time[0]) / (time.size - 1)
@@ -148,39 +89,11 @@ def recording_of(
     )
 
 
-def _facts(table: Table) -> LogFacts:
-    """The facts beside the columns. Cells that hold no value were not logged, also those of a rotor."""
-    facts = table.facts
-    speeds = any(name in table.columns for name in SPEED_NAMES)
-    motors = facts.motors or _slowest(table, SPEED_NAMES if speeds else COMMAND_NAMES)
-    return facts._replace(motors=motors, gyro=facts.gyro or _slowest(table, ("p", "q", "r")))
-
-
-def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
-    """The column that was logged most rarely, of those that were logged at all.
-
-    Rows that repeat the values of the row before were not logged: programs that join topics fill them in.
-    """
-    t, found = table.columns["t"], []
-    for name in names:
-        logged = np.isfinite(table.columns.get(name, np.full(t.size, np.nan)))
-        if not logged.any():
-            continue
-        source, at = table.names.get(name, name), t[logged]
-        changes = at[1:][np.diff(table.columns[name][logged]) != 0]
-        rate, of_changes = logged_rate(at), logged_rate(changes)
-        if held_regularly(changes) and of_changes < _REPEATED * rate:
-            source, rate = f"the values of {source} change so often", of_changes
-        found.append(Sampling(source, rate))
-    return min(found, key=lambda each: each.rate, default=None)
-
-
 def _check_columns(table: Table) -> None:
     """Refuse a log without time or without any state."""
-    columns = table.columns
-    if "t" not in columns:
+    if not table.holds("t"):
         table.refuse(_missing("there is no time", ("t",), table) + "; each row needs its time [s]", column="t")
-    if not any(name in columns for name in STATE_NAMES):
+    if not any(map(table.holds, STATE_NAMES)):
         what = _missing("no state was measured", STATE_NAMES, table)
         table.refuse(f"{what}; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
 
@@ -202,8 +115,117 @@ def _unknown_note(unknown: tuple[str, ...]) -> str:
     return f"unknown columns are ignored: {', '.join(shown)}{more}"
 
 
+def _facts(table: Table) -> LogFacts:
+    """The facts beside the columns. Cells that hold no value were not logged, also those of a rotor."""
+    motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
+    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
+    return table.facts._replace(**{name: getattr(table.facts, name) or found for name, found in rarest.items()})
+
+
+def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
+    """The column that was logged most rarely, of those that were logged at all.
+
+    Rows that repeat the values of the row before were not logged: programs that join topics fill them in.
+    """
+    found = []
+    for name in filter(table.holds, names):
+        logged = np.isfinite(table.columns[name])
+        source, at = table.names.get(name, name), table.columns["t"][logged]
+        changes = at[1:][np.diff(table.columns[name][logged]) != 0]
+        rate, of_changes = logged_rate(at), logged_rate(changes)
+        if held_regularly(changes) and of_changes < _REPEATED * rate:
+            source, rate = f"the values of {source} change so often", of_changes
+        found.append(Sampling(source, rate))
+    return min(found, key=lambda each: each.rate, default=None)
+
+
+def _check_time(table: Table) -> float:
+    """The median time between rows [s]. Refuses a time that is missing, does not increase, or is not in seconds."""
+    t = table.columns["t"]
+    _refuse_any(table, "t", np.isnan(t), "is empty; each row needs its time")
+    _refuse_any(table, "t", np.abs(t) > LIMITS["t"].largest, f"is {{:g}} s; {LIMITS['t'].advice}")
+    step = np.diff(t)
+    if (step <= 0).any():
+        index = int(np.argmax(step <= 0))
+        what = f"runs backward, from {t[index]:.9g} s to {t[index + 1]:.9g} s; sort the rows, or cut the file there"
+        if step[index] == 0:
+            row = index + (table.first_row or 0)
+            what = f"repeats {t[index]:.9g} s of row {row}; time must increase: delete one of the two rows"
+        table.refuse(what, index=index + 1, column="t")
+    dt = float(np.median(step))
+    if dt < _SHORTEST_STEP:
+        table.refuse(f"has rows {dt:.3g} s apart, less than a microsecond; t is in seconds: multiply", column="t")
+    if dt > _LONGEST_STEP:
+        what = f"has rows {dt:.4g} s apart, too far for a flight; t is in seconds: if these are ms or us, divide"
+        table.refuse(what, column="t")
+    return dt
+
+
+def _check_units(table: Table) -> Table:
+    """Refuse angles that contradict their rates or jump by 360. Returns the table without impossible angles.
+
+    Roll may pass 2 pi if its rate agrees: the vehicle made a flip.
+    """
+    columns, limits = table.columns, ROLL | PITCH
+    for name, rate in _ANGLES:
+        ratio = _scale_ratio(columns["t"], columns[name], columns[rate]) if table.holds(name, rate) else None
+        if ratio is None:
+            continue
+        if name == "phi" and 1 / 3 < ratio < 3:
+            limits = PITCH
+        if 1 / _SPREAD < ratio / _DEGREES < _SPREAD:
+            what = table.remedy or "it looks like degrees, divide by 57.3"
+            table.refuse(f"changes {ratio:.3g} times as fast as {rate}: {what}", column=name)
+        if 1 / _SPREAD < ratio * _DEGREES < _SPREAD:
+            what = table.remedy or "it looks like deg/s, divide by 57.3"
+            table.refuse(f"is {1 / ratio:.3g} times as fast as {name} changes: {what}", column=rate)
+    if table.holds("psi"):
+        measured = np.flatnonzero(np.isfinite(columns["psi"]))
+        jumps = np.zeros(columns["psi"].size, dtype=bool)
+        jumps[measured[1:]] = np.abs(np.abs(np.diff(columns["psi"][measured])) - 360) < 20
+        _refuse_any(table, "psi", jumps, "jumps by about 360: it looks like degrees, divide by 57.3")
+    return table.without_impossible(limits)
+
+
+def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
+    """Refuse the first value of a column that is `wrong`; `what` may hold a place for the value."""
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        table.refuse(what.format(table.columns[name][index]), index=index, column=name)
+
+
+def _scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | None:
+    """How much faster an angle changes than its rate, or None if the flight does not show it.
+
+    Increments of the angle over 0.2 s are compared with the integral of the rate, so that noise averages out. In a
+    steep attitude the axes are coupled, and the increments no longer resemble the integral: the result is then None.
+    """
+    with_rate = np.isfinite(rate)
+    if np.count_nonzero(with_rate) < 2:
+        return None
+    rates = Series(t[with_rate], rate[with_rate, None])
+    with_angle = np.isfinite(angle) & (t >= rates.t[0]) & (t <= rates.t[-1])
+    instants, angle = t[with_angle], angle[with_angle]
+    if instants.size <= _FEWEST:
+        return None
+    windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
+    knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
+    knots = knots[knots < instants.size]
+    if knots.size <= _FEWEST:
+        return None
+    steps = np.diff(angle)
+    turn = 360.0 if np.abs(steps).max() > 3 * math.pi else 2 * math.pi
+    increments = np.diff(np.concatenate([[0.0], np.cumsum(steps - turn * np.rint(steps / turn))])[knots])
+    expected = np.diff(integral(rates, instants[knots], linear=True)[:, 0])
+    sizes = float(np.linalg.norm(increments)), float(np.linalg.norm(expected))
+    if min(sizes) == 0 or increments @ expected < _SIMILARITY * sizes[0] * sizes[1]:
+        return None
+    return sizes[0] / sizes[1]
+
+
 def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | None, notes: list[str]) -> np.ndarray:
-    speeds, commands = ([name for name in names if name in table.columns] for names in (SPEED_NAMES, COMMAND_NAMES))
+    """Measured speeds, or commands times the speed of full command [rad/s], shape (rows, 4)."""
+    speeds, commands = (list(filter(table.holds, names)) for names in (SPEED_NAMES, COMMAND_NAMES))
     names = speeds or commands
     if len(names) < 4:
         wanted = COMMAND_NAMES if commands and not speeds else SPEED_NAMES
@@ -225,48 +247,61 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
 
 
 def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
-    """The column of a rotor. An empty cell gets the value before it."""
-    column = table.columns[name]
+    """The column of a rotor. An empty cell gets the value before it, and so does an impossible one, or after it."""
+    column, t = table.columns[name], table.columns["t"]
     empty = np.isnan(column)
     if not empty.any():
         return column
-    if empty[0]:
+    impossible, _ = table.impossible.get(name, (0, ""))
+    if empty[0] and not impossible:
         table.refuse("is empty, with no earlier value to hold; delete the row", index=0, column=name)
-    last = np.maximum.accumulate(np.where(empty, 0, np.arange(column.size)))
-    t = table.columns["t"]
-    longest = (t - t[last]).max()
-    notes.append(f"{name}: {np.count_nonzero(empty)} empty cells hold the value before them, for up to {longest:.3g} s")
+    last = np.maximum.accumulate(np.where(empty, np.argmin(empty), np.arange(column.size)))
+    longest, cells = (t - t[last]).max(), np.count_nonzero(empty) - impossible
+    if cells:
+        notes.append(f"{name}: {cells} empty cells hold the value before them, for up to {longest:.3g} s")
     return column[last]
 
 
-def _voltage(table: Table) -> np.ndarray | None:
-    """The battery's voltage at every row [V], interpolated linearly between measured cells; 0 is not measured."""
-    if "voltage" not in table.columns:
-        return None
-    t, voltage = table.columns["t"], table.columns["voltage"]
-    measured = voltage > 0
-    return np.interp(t, t[measured], voltage[measured]) if measured.any() else None
+def _thrust_note(ratio: float) -> list[str]:
+    """A note, if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
+    if 1 / 25 < ratio < 25:
+        return []
+    if ratio == 0:
+        return ["the rotors do not turn for at least half of the flight: keep only the part in the air"]
+    unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
+    what = f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight"
+    return [f"{what}: check the airframe, and whether rotor speeds are in {unit}"]
 
 
 def _channels(table: Table, notes: list[str]) -> np.ndarray:
     """States and specific force, shape (rows, 15), with unwrapped angles."""
-    channels = np.full((table.columns["t"].size, len(CHANNEL_NAMES)), np.nan)
-    for i, name in enumerate(CHANNEL_NAMES):
-        if name not in table.columns:
-            continue
-        channels[:, i] = table.columns[name]
-        if name in ("phi", "psi"):
-            channels[:, i], jumps = unwrap(table.columns[name])
-            if jumps:
-                notes.append(f"{name}: {jumps} {'jump' if jumps == 1 else 'jumps'} of 2 pi removed")
+    nothing = np.full(table.columns["t"].size, np.nan)
+    channels = np.column_stack([table.columns.get(name, nothing) for name in CHANNEL_NAMES])
+    for name in ("phi", "psi"):
+        i = CHANNEL_NAMES.index(name)
+        channels[:, i], jumps = unwrap(channels[:, i])
+        if jumps:
+            notes.append(f"{name}: {counted(jumps, 'jump')} of 2 pi removed")
     force = channels[:, len(STATE_NAMES) :]
     measured = force[:, np.isfinite(force).any(axis=0)]
     # No accelerometer lies still to the last bit.
     if len(measured) >= _STILL and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
         notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
         force[:] = np.nan
-    notes.extend(force_note(force))
+    size = np.sqrt((force**2).sum(axis=1))
+    size = size[np.isfinite(size)]
+    if size.size and 0.5 < (median := np.median(size)) < 2:
+        notes.append(f"ax, ay, az have a median magnitude of {median:.2g} m/s^2: if they are in g, multiply by 9.80665")
     return channels
+
+
+def _voltage(table: Table) -> np.ndarray | None:
+    """The battery's voltage at every row [V], interpolated linearly between measured cells; 0 is not measured."""
+    if not table.holds("voltage"):
+        return None
+    t, voltage = table.columns["t"], table.columns["voltage"]
+    measured = voltage > 0
+    return np.interp(t, t[measured], voltage[measured]) if measured.any() else None
 
 
 def _evenly(

@@ -17,13 +17,12 @@ estimators would attribute to the vehicle. Commands count as fractions of the ai
 
 **Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
 reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle`, `gyro_scale` and
-`blackbox_high_resolution` (rates are in tenths of a deg/s). `blackbox_decode` writes no settings: they are taken from
-the `.bbl` or `.BFL` file beside the CSV, if it is there (`LOG00001.02.csv`: second session of `LOG00001.BFL`). If not,
-the reader assumes 14 poles and rates in deg/s, takes 1 g from the median of the accelerometer and the protocol from the
-range of the commands, and notes each of these assumptions.
+`blackbox_high_resolution` (rates are in tenths of a deg/s). For the CSV of `blackbox_decode` they are taken from the
+`.bbl` or `.BFL` file beside it (`LOG00001.02.csv`: second session of `LOG00001.BFL`). Without settings, the reader
+assumes 14 poles, deg/s, 1 g from the accelerometer's median, the protocol from the commands' range, and notes it.
 
-**Sessions.** A vehicle writes one session each time that it is armed. The sessions of a `.bbl` or `.BFL` file follow
-each other in one flight, with an unmeasured second between them.
+**Sessions.** A vehicle writes one session each time that it is armed. The sessions of a file follow each other in one
+flight, with an unmeasured second between them.
 
 **Frames.** Gyro and accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose
 down, yaw counter-clockwise seen from above. (The firmware's own telemetry has the opposite signs of pitch and yaw.)
@@ -36,44 +35,60 @@ The airframe's `rotor_positions` and `rotor_spins` must have the same order.
 Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight and INAV.
 """
 
+import contextlib
 import csv
+import itertools
 import math
+import os
 import re
+import struct
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from .blackbox_raw import MAGIC, gyro_unit, is_raw, read_sessions, settings_beside
+from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
-from .table import LogFormat, Path, Table, opened, order_note, refuse
+from .sampling import in_order
+from .table import COMMAND_NAMES, SPEED_NAMES, LogFormat, Path, Table, counted, opened, order_note, read_bytes, refuse
 
+_MAGIC = b"H Product:Blackbox"
 _HEADER_MARKS = ("loopIteration", "gyroADC[0]", "motor[0]")
 _MOST_SETTINGS = 5000  # lines above the header
 _LONGEST_LINE = 1 << 16
+_LARGEST = 1 << 29  # bytes of a file: more than an hour of flight
+_BETWEEN = 1.0  # [s], put between sessions
 _DEGREE, _GRAVITY = math.pi / 180, 9.80665
 _POLES = 14
 _COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
 _TIMES = {"time (us)": 1e-6, "time (ms)": 1e-3, "time (s)": 1.0, "time": 1e-6}
+_RATES = ("gyroUnfilt", "gyroADC")
 _RATE_UNITS = {"": _DEGREE, " (deg/s)": _DEGREE, " (rad/s)": 1.0}
-_FORCE_UNITS = {"": None, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
+_FORCE_UNITS = {"": math.nan, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
-_ANGLES = {"phi": _DEGREE / 10, "theta": _DEGREE / 10, "psi": -_DEGREE / 10}
+_TENTH = _DEGREE / 10
 _INAV = {  # column: column of the log, unit in our frame
-    **{axis: (f"attitude[{i}]", unit) for i, (axis, unit) in enumerate(_ANGLES.items())},
+    **{"phi": ("attitude[0]", _TENTH), "theta": ("attitude[1]", _TENTH), "psi": ("attitude[2]", -_TENTH)},
     **{"x": ("navPos[0]", 0.01), "y": ("navPos[1]", -0.01), "z": ("navPos[2]", 0.01)},
     **{"vx": ("navVel[0]", 0.01), "vy": ("navVel[1]", -0.01), "vz": ("navVel[2]", 0.01)},
 }
 _VOLTAGES = {"vbatLatest": r"Betaflight ([4-9]|\d{2,})\.", "vbat": "INAV"}  # the firmware whose unit is known
 _EXPORT = "export it as CSV by Blackbox Explorer"
+_DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _KNOWN = (
     *_TIMES,
-    *(f"{name}[{i}]{unit}" for name in ("gyroUnfilt", "gyroADC") for i in range(3) for unit in _RATE_UNITS),
+    *(f"{name}[{i}]{unit}" for name in _RATES for i in range(3) for unit in _RATE_UNITS),
     *(f"accSmooth[{i}]{unit}" for i in range(3) for unit in _FORCE_UNITS),
     *(name for name, _ in _INAV.values()),
     *_VOLTAGES,
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
+# A session is read with the longest one only if they agree in these settings.
+_USED = ("acc_1G", "gyro_scale", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
+
+Settings = dict[str, str]
+Columns = dict[str, np.ndarray]
 
 
 class _Log(NamedTuple):
@@ -84,17 +99,24 @@ class _Log(NamedTuple):
 
     path: Path
     header: int | None
-    settings: dict[str, str]
-    raw: dict[str, np.ndarray]
-    columns: dict[str, np.ndarray]
+    settings: Settings
+    raw: Columns
+    columns: Columns
     names: dict[str, str]
     notes: list[str]
 
-    def add(self, column: str, name: str, values: np.ndarray) -> None:
-        self.columns[column], self.names[column] = values, name
+    def add(self, names: dict[str, str], factor: float) -> None:
+        """Add columns, by the log's names of them."""
+        self.names.update(names)
+        self.columns.update((column, self.raw[name] * factor) for column, name in names.items())
 
-    def has(self, names: list[str]) -> bool:
-        return all(name in self.raw for name in names)
+    def vector(self, fields: Iterable[str], units: Iterable[str]) -> tuple[str, str, list[str]] | None:
+        """The first field with three columns in one of the units, the unit, and the columns."""
+        for field, unit in itertools.product(fields, units):
+            names = [f"{field}[{i}]{unit}" for i in range(3)]
+            if self.raw.keys() >= set(names):
+                return field, unit, names
+        return None
 
     def setting(self, name: str, least: float, most: float) -> float | None:
         """A setting, or the last of several, if it is a number within these limits."""
@@ -107,58 +129,52 @@ class _Log(NamedTuple):
 
 def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
-    log, first_row = _decoded(path) if is_raw(path) else _csv(path)
-    raw = log.raw
+    log = _decoded(path) if _is_raw(path) else _csv(path)
+    raw, first_row = log.raw, None if log.header is None else log.header + 1
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
         refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
-    log.add("t", time, (raw[time] - np.nan_to_num(raw[time][0])) * _TIMES[time])
+    log.names["t"], log.columns["t"] = time, (raw[time] - np.nan_to_num(raw[time][0])) * _TIMES[time]
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
     for column, (name, unit) in _INAV.items():
-        if name in raw:
-            log.add(column, name, raw[name] * unit)
+        log.add({column: name} if name in raw else {}, unit)
     for name, firmware in _VOLTAGES.items():
         if name in raw and re.match(firmware, log.settings.get("Firmware revision", "")):
-            log.add("voltage", name, raw[name] / 100)
+            log.add({"voltage": name}, 1.0)
+            log.columns["voltage"] /= 100
     log.notes.append(order_note(log.names.get("omega1", log.names.get("command1", ""))))
     return Table(path, log.columns, first_row=first_row, names=log.names, remedy=_REMEDY), tuple(log.notes)
 
 
-def _decoded(path: Path) -> tuple[_Log, None]:
-    """A `.bbl` or `.BFL` file."""
-    raw, settings, notes = read_sessions(path, _KNOWN)
-    return _Log(path, None, settings, raw, {}, {}, notes), None
-
-
-def _csv(path: Path) -> tuple[_Log, int | None]:
-    """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
-    settings, skip = _settings(path)
-    notes = []
-    if not settings:
-        settings, beside = settings_beside(path)
-        notes += [f"settings are taken from {beside} beside it"] * bool(settings)
-    table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
-    raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    return _Log(path, skip + 1, settings, raw, {}, {}, notes), table.first_row
-
-
 def _recognises(begin: bytes) -> bool:
     lines = begin.decode("utf-8-sig", errors="replace").splitlines()
-    return begin.startswith(MAGIC) or any(_is_header(line) for line in lines[:_MOST_SETTINGS])
+    return begin.startswith(_MAGIC) or any(_is_header(line) for line in lines[:_MOST_SETTINGS])
 
 
 BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
+
+
+def _csv(path: Path) -> _Log:
+    """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
+    settings, skip = _settings_above(path)
+    notes = []
+    if not settings:
+        settings, beside = _settings_beside(path)
+        notes += [f"settings are taken from {beside} beside it"] * bool(settings)
+    table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
+    raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
+    return _Log(path, skip + 1, settings, raw, {}, {}, notes)
 
 
 def _is_header(line: str) -> bool:
     return any(mark in line for mark in _HEADER_MARKS) and line.count(",") > 2
 
 
-def _settings(path: Path) -> tuple[dict[str, str], int]:
+def _settings_above(path: Path) -> tuple[Settings, int]:
     """The settings above the header, and the number of their lines."""
-    settings: dict[str, str] = {}
+    settings: Settings = {}
     with opened(path) as file:
         for number in range(_MOST_SETTINGS):
             line = file.readline(_LONGEST_LINE)
@@ -166,84 +182,166 @@ def _settings(path: Path) -> tuple[dict[str, str], int]:
                 return settings, number
             if not line:
                 break
-            try:
-                cells = next(csv.reader([line.rstrip("\n")]), [])
-            except csv.Error:
-                continue
-            if len(cells) > 1:
-                settings.setdefault(cells[0].strip(), ",".join(cells[1:]).strip())
+            with contextlib.suppress(csv.Error):
+                name, *values = next(csv.reader([line.rstrip("\n")]), [""])
+                if values:
+                    settings.setdefault(name.strip(), ",".join(values).strip())
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
+def _settings_beside(path: Path) -> tuple[Settings, str]:
+    """The settings of the log that a CSV of `blackbox_decode` was made from, if it lies beside it, and its name."""
+    folder, name = os.path.split(os.fspath(path))
+    match = re.fullmatch(r"(.+?)(?:\.(\d{2}))?\.csv", name, re.IGNORECASE)
+    if match is None:
+        return {}, ""
+    for ending in ("bbl", "BBL", "bfl", "BFL", "txt", "TXT"):
+        beside = os.path.join(folder, f"{match[1]}.{ending}")
+        every = _sessions(beside) if os.path.isfile(beside) else []
+        number = int(match[2]) if match[2] else 1 if len(every) == 1 else 0
+        if 0 < number <= len(every):
+            return every[number - 1][0], os.path.basename(beside)
+    return {}, ""
+
+
+def _is_raw(path: Path) -> bool:
+    """Whether a file is a blackbox log that was not decoded."""
+    with opened(path, "rb") as file:
+        return file.seekable() and file.read(len(_MAGIC)) == _MAGIC
+
+
+def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
+    """The settings and the frames of the sessions of a file, in order; none if it is no blackbox log.
+
+    A header ends at the first line that does not begin with `H `, or is not text.
+    """
+    content, found = read_bytes(path, _LARGEST) if _is_raw(path) else b"", []
+    places = [match.start() for match in re.finditer(_MAGIC, content)]
+    for at, end in itertools.pairwise([*places, len(content)]):
+        settings: Settings = {}
+        while content.startswith(b"H ", at, end):
+            stop = content.find(b"\n", at, min(at + _LONGEST_LINE, end))
+            line = content[at:stop]
+            if stop < 0 or not line.isascii():
+                break
+            name, _, value = line[2:].decode().partition(":")
+            settings.setdefault(name.strip(), value.strip())
+            at = stop + 1
+        found.append((settings, content[at:end]))
+    return found
+
+
+def _decoded(path: Path) -> _Log:
+    """A `.bbl` or `.BFL` file: all sessions, one after the other. Raises `InputError`."""
+    notes: list[str] = []
+    found: list[tuple[Settings, Columns]] = []
+    every = _sessions(path)
+    for number, (settings, frames) in enumerate(every, start=1):
+        columns, remark = _session(settings, frames)
+        if remark:
+            notes.append((f"session {number}: " if len(every) > 1 else "") + remark)
+        if columns is not None:
+            found.append((settings, columns))
+    if not found:
+        why = f" ({notes[0]})" if notes else ""
+        refuse(path, f"no frame of it can be decoded{why}: it is corrupt, or of another kind; {_DECODE}")
+    longest = max(found, key=lambda each: each[1]["time"][-1])[0]
+    same = [columns for settings, columns in found if all(settings.get(u) == longest.get(u) for u in _USED)]
+    if len(same) < len(found):
+        other = f"{len(found) - len(same)} of {len(found)}"
+        notes.append(f"{other} sessions are ignored: their settings are not those of the longest one")
+    if len(same) > 1:
+        lengths = ", ".join(f"{columns['time'][-1] / 1e6:.1f}" for columns in same)
+        notes.append(f"{len(same)} sessions, of {lengths} s, follow each other with {_BETWEEN:g} s between them")
+    begin = 0.0
+    for columns in same:
+        columns["time"] += begin
+        begin = columns["time"][-1] + 1e6 * _BETWEEN
+    joined = {name: np.concatenate([columns[name] for columns in same]) for name in set.intersection(*map(set, same))}
+    return _Log(path, None, longest, joined, {}, {}, notes)
+
+
+def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
+    """The columns of one session with the time from 0, or `None`, and a remark on what is lost."""
+    try:
+        decoded = decode_frames(settings, frames, _KNOWN)
+    except BadHeader as error:
+        return None, f"{error}: it is ignored"
+    later = in_order(decoded.columns["time"])
+    if later is None or later.size < 2:
+        return None, "holds no frames that can be decoded: it is ignored"
+    places = counted(decoded.damaged, "place")
+    damage = f"is damaged in {places}; what follows up to the next complete frame is ignored" if decoded.damaged else ""
+    end = "" if decoded.ended else "has no end: it was cut while it was written, or is corrupt"
+    return {name: column[later] for name, column in decoded.columns.items()}, "; ".join(filter(None, (damage, end)))
+
+
 def _add_rates(log: _Log) -> None:
-    for field in ("gyroUnfilt", "gyroADC"):
-        for unit, factor in _RATE_UNITS.items():
-            names = [f"{field}[{i}]{unit}" for i in range(3)]
-            if not log.has(names):
-                continue
-            if unit == "":
-                factor *= gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-            if unit == "" and not log.settings:
-                log.notes.append(
-                    f"{field} is taken as deg/s: with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or "
-                    ".BFL file, or keep it beside this one"
-                )
-            for column, name in zip("pqr", names, strict=True):
-                log.add(column, name, log.raw[name] * factor)
-            return
-    refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
+    found = log.vector(_RATES, _RATE_UNITS)
+    if found is None:
+        refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
+    field, unit, names = found
+    factor = _RATE_UNITS[unit]
+    if unit == "":
+        factor *= _gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
+        fine = "with blackbox_high_resolution its unit is 0.1 deg/s"
+        remedy = "give the .bbl or .BFL file, or keep it beside this one"
+        log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}; {remedy}"])
+    log.add(dict(zip("pqr", names, strict=True)), factor)
+
+
+def _gyro_unit(settings: Settings) -> float:
+    """The unit of the gyro [deg/s], by the setting `gyro_scale`, as `0x3f800000`; 1 if there is none."""
+    text = settings.get("gyro_scale", "")
+    if not re.fullmatch("0x[0-9a-fA-F]{1,8}", text):
+        return 1.0
+    (value,) = struct.unpack("<f", int(text, 16).to_bytes(4, "little"))
+    return value if 1e-3 <= value <= 1 else 1.0
 
 
 def _add_rotors(log: _Log) -> None:
-    raw, others = log.raw, [f"{field}[{i}]" for field in ("eRPM", "motor") for i in range(4, 8)]
-    if any(name in raw and np.ptp(_finite(raw[name])) > 0 for name in others):
+    raw = log.raw
+    speeds, commands, *others = [[f"{f}[{i}]" for i in r] for r in (range(4), range(4, 8)) for f in ("eRPM", "motor")]
+    if any(np.ptp(_finite(raw[name])) > 0 for name in itertools.chain(*others) if name in raw):
         refuse(log.path, "has more than four motors; give the log of a quadrotor", row=log.header)
-    speeds, commands = ([f"{field}[{i}]" for i in range(4)] for field in ("eRPM", "motor"))
-    if log.has(speeds) and all((_finite(raw[name]) > 0).any() for name in speeds):
+    if raw.keys() >= set(speeds) and all((_finite(raw[name]) > 0).any() for name in speeds):
         poles = log.setting("motor_poles", 2, 100)
         if poles is None:
             log.notes.append(f"eRPM is turned into speeds with {_POLES} motor poles, the default: check the vehicle")
-        for i, name in enumerate(speeds):
-            log.add(f"omega{i + 1}", name, raw[name] * (100 / ((poles or _POLES) / 2) * 2 * math.pi / 60))
+        log.add(dict(zip(SPEED_NAMES, speeds, strict=True)), 100 / ((poles or _POLES) / 2) * 2 * math.pi / 60)
         return
     for name in commands:
         if name not in raw:
             what = "is missing; log the motors, or eRPM (bidirectional DShot)"
             refuse(log.path, what, row=log.header, column=name)
-    low, high = _ends(np.column_stack([raw[name] for name in commands]), log)
+    # The ends of the protocol, and not the idle command.
+    values = _finite(np.concatenate([raw[name] for name in commands]))
+    full = log.setting("motorOutput", 1, 65535) or log.setting("maxthrottle", 1, 65535) or 0.0
+    dshot = (values[values > 0] < _PWM[0]).any() or max(values.max(), full) > _PWM[1]
+    low, high = _DSHOT if dshot else _PWM
     what = f"commands are motor[0..3] from {low:g} to {high:g}, taken as fractions of full-scale rotor speed"
     log.notes.append(what + ("" if log.settings else "; the protocol is assumed from their range"))
-    for i, name in enumerate(commands):
-        log.add(f"command{i + 1}", name, np.clip((raw[name] - low) / (high - low), 0.0, 1.0))
-
-
-def _ends(values: np.ndarray, log: _Log) -> tuple[float, float]:
-    """The commands at rest and at full speed: the ends of the protocol, and not the idle command."""
-    finite = _finite(values)
-    full = log.setting("motorOutput", 1, 65535) or log.setting("maxthrottle", 1, 65535) or 0.0
-    dshot = (finite[finite > 0] < _PWM[0]).any() or max(finite.max(initial=0), full) > _PWM[1]
-    return _DSHOT if dshot else _PWM
+    log.add(dict(zip(COMMAND_NAMES, commands, strict=True)), 1.0)
+    log.columns.update((name, np.clip((log.columns[name] - low) / (high - low), 0.0, 1.0)) for name in COMMAND_NAMES)
 
 
 def _add_force(log: _Log) -> None:
-    for unit, factor in _FORCE_UNITS.items():
-        names = [f"accSmooth[{i}]{unit}" for i in range(3)]
-        if not log.has(names):
-            continue
-        if log.setting("acc_1G", 0, 0) is not None or not any(np.ptp(_finite(log.raw[name])) for name in names):
-            what = "the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked"
-            log.notes.append(what)
-            return
-        if factor is None:
-            one = log.setting("acc_1G", 1, 65535)
-            if one is None:
-                median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
-                one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
-                log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
-            factor = _GRAVITY / one
-        for column, name in zip(("ax", "ay", "az"), names, strict=True):
-            log.add(column, name, log.raw[name] * factor)
+    found = log.vector(("accSmooth",), _FORCE_UNITS)
+    if found is None:
         return
+    _, unit, names = found
+    if log.setting("acc_1G", 0, 0) is not None or not any(np.ptp(_finite(log.raw[name])) for name in names):
+        log.notes.append("the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked")
+        return
+    factor = _FORCE_UNITS[unit]
+    if unit == "":
+        one = log.setting("acc_1G", 1, 65535)
+        if one is None:
+            median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
+            one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
+            log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
+        factor = _GRAVITY / one
+    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), factor)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

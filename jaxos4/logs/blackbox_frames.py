@@ -1,13 +1,14 @@
 """The frames of a blackbox session: numbers of few bits, most of them as differences from a prediction.
 
 A frame begins with a letter: "I" (complete), "P" (differences from the frames before), "S", "G", "H" (slow values, GPS,
-home) or "E" (an event). The header gives the fields of each kind with their encodings and predictors. If a frame is
+home) or "E" (an event). The settings give the fields of each kind with their encodings and predictors. If a frame is
 damaged, all differences after it are wrong up to the next complete frame: they are left out.
 
 Reference: the description of the format by Nicholas Sherlock ("Blackbox internals", Cleanflight), and the sources of
 Betaflight and INAV for the encodings that came later.
 """
 
+import array
 import itertools
 import re
 from collections.abc import Collection, Iterator
@@ -21,7 +22,6 @@ _MARKER = re.compile(rb"[IPSGHE]")
 _LONGEST_FRAME = 1024  # bytes
 _MOST_FIELDS = 512
 _FARTHEST, _MOST_ITERATIONS = 10_000_000, 5000  # [us], from one frame to the next: more is damage
-_AT_ONCE = 4096  # rows
 _END = b"End of log"
 _I, _P, _E = b"IPE"
 _EVENTS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}  # event: how many numbers it has
@@ -29,21 +29,26 @@ _EVENTS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}  # event: how many numbers it has
 _SIGNED, _UNSIGNED, _NEGATIVE_14, _TAG8, _TAG2_3, _TAG8_4, _NULL, _TAG2_3_V = 0, 1, 3, 6, 7, 8, 9, 10
 # How many fields of an encoding are read together.
 _TOGETHER = {_TAG8: 8, _TAG2_3: 3, _TAG8_4: 4, _TAG2_3_V: 3}
-_TOGETHER |= dict.fromkeys((_SIGNED, _UNSIGNED, _NEGATIVE_14, _NULL), 512)
+_TOGETHER |= dict.fromkeys((_SIGNED, _UNSIGNED, _NEGATIVE_14, _NULL), _MOST_FIELDS)
 # Three numbers in 14 or 22 bits: (place, width) of each.
 _IN_14_OR_22 = {
     _TAG2_3: (((8, 4), (4, 4), (0, 4)), ((16, 6), (8, 6), (0, 6))),
     _TAG2_3_V: (((9, 5), (4, 5), (0, 4)), ((14, 8), (7, 7), (0, 7))),
 }
-
 _PREVIOUS, _LINE, _AVERAGE, _MINTHROTTLE, _MOTOR0, _INCREMENT, _1500, _VBATREF, _MINMOTOR = *range(1, 7), 8, 9, 11
+_CONSTANTS = {_MINTHROTTLE: "minthrottle", _VBATREF: "vbatref", _MINMOTOR: "motorOutput"}
+
+
+class _Kind(NamedTuple):
+    """The fields of one kind of frame: `groups` are (encoding, number of fields)."""
+
+    names: list[str]
+    groups: list[tuple[int, int]]
+    predictors: list[int]
 
 
 class BadHeader(Exception):
     """A header that does not describe frames which can be decoded; the text says why."""
-
-    def __init__(self, why: str = "its header is damaged"):
-        super().__init__(why)
 
 
 class Decoded(NamedTuple):
@@ -59,106 +64,54 @@ class Decoded(NamedTuple):
     ended: bool
 
 
-class _Kind(NamedTuple):
-    """The fields of one kind of frame: `groups` are (encoding, number of fields)."""
-
-    names: list[str]
-    groups: list[tuple[int, int]]
-    predictors: list[int]
-
-
 def decode_frames(settings: dict[str, str], data: bytes, wanted: Collection[str]) -> Decoded:
     """Decode the columns `wanted`, as far as there are, from the bytes after the header. Raises `BadHeader`."""
-    kinds = {letter: kind for letter in "IPSGH" if (kind := _kind(settings, letter)) is not None}
-    if not {_TIME, _ITERATION} <= set(kinds["I"].names if "I" in kinds else ()):
-        raise BadHeader("its header does not describe the frames")
-    names = kinds["I"].names
-    if "P" in kinds and len(kinds["P"].predictors) != len(names):
-        raise BadHeader
-    places = [i for i, name in enumerate(names) if name in wanted]
-    stream = _Stream(data, kinds, _Predictor(settings, names))
-    rows = map(itemgetter(names.index(_TIME), names.index(_ITERATION), *places), stream.frames())
-    times, blocks = [np.empty(0)], [np.empty((0, len(places)), dtype=np.float32)]
-    while block := list(itertools.islice(rows, _AT_ONCE)):
-        table = np.array(block, dtype=float)
-        times.append(table[:, 0])
-        blocks.append(table[:, 2:].astype(np.float32))
-    table, time = np.concatenate(blocks), np.concatenate(times)
-    columns = {names[place]: table[:, i].astype(float) for i, place in enumerate(places)}
+    stream, values = _Stream(settings, data), array.array("d")
+    names = stream.kinds[_I].names
+    places = [stream.time, *(i for i, name in enumerate(names) if name in wanted)]
+    for row in map(itemgetter(*places, stream.time), stream.frames()):
+        values.extend(row)
+    columns = dict(zip((names[i] for i in places), np.asarray(values).reshape(-1, len(places) + 1).T, strict=False))
+    time = columns[_TIME]
     # The vehicle counts the time in 32 bits, so it wraps after 72 minutes.
-    columns[_TIME] = np.concatenate([np.zeros(min(time.size, 1)), np.cumsum(np.diff(time) % 2.0**32)])
+    columns[_TIME] = np.cumsum(np.diff(time, prepend=time[:1]) % 2.0**32)
     return Decoded(columns, stream.damaged, stream.ended)
 
 
-def _kind(settings: dict[str, str], letter: str) -> _Kind | None:
-    encodings, predictors = (_numbers(settings.get(f"Field {letter} {what}", "")) for what in ("encoding", "predictor"))
-    if not encodings:
-        return None
-    names = [name.strip() for name in settings.get(f"Field {letter} name", "").split(",")]
-    if not len(predictors) == len(encodings) <= _MOST_FIELDS or (letter != "P" and len(names) != len(encodings)):
-        raise BadHeader
-    groups: list[tuple[int, int]] = []
-    for encoding, run in itertools.groupby(encodings):
-        if encoding not in _TOGETHER:
-            raise BadHeader(f"its frames have an encoding that is not known, {encoding}")
-        count, most = len(list(run)), _TOGETHER[encoding]
-        groups += [(encoding, min(most, count - done)) for done in range(0, count, most)]
-    if _TAG8_4 in encodings and settings.get("Data version", "2") != "2":
-        raise BadHeader("its frames are of version 1")
-    return _Kind(names, groups, predictors)
+def _kinds(settings: dict[str, str]) -> dict[int, _Kind]:
+    """The kinds of frames by their letters. Raises `BadHeader`."""
+    kinds: dict[int, _Kind] = {}
+    for letter in "IPSGH":
+        encodings, predictors = (_numbers(settings.get(f"Field {letter} {what}")) for what in ("encoding", "predictor"))
+        if not encodings:
+            continue
+        names = [name.strip() for name in settings.get(f"Field {letter} name", "").split(",")]
+        if not len(predictors) == len(encodings) <= _MOST_FIELDS or (letter != "P" and len(names) != len(encodings)):
+            raise BadHeader("its header is damaged")
+        groups: list[tuple[int, int]] = []
+        for encoding, run in itertools.groupby(encodings):
+            if encoding not in _TOGETHER:
+                raise BadHeader(f"its frames have an encoding that is not known, {encoding}")
+            count, most = len(list(run)), _TOGETHER[encoding]
+            groups += [(encoding, min(most, count - done)) for done in range(0, count, most)]
+        if _TAG8_4 in encodings and settings.get("Data version", "2") != "2":
+            raise BadHeader("its frames are of version 1")
+        kinds[ord(letter)] = _Kind(names, groups, predictors)
+    if _I not in kinds or not {_TIME, _ITERATION} <= set(kinds[_I].names):
+        raise BadHeader("its header does not describe the frames")
+    if _P in kinds and len(kinds[_P].predictors) != len(kinds[_I].names):
+        raise BadHeader("its header is damaged")
+    return kinds
 
 
-def _numbers(text: str) -> list[int]:
-    return [int(cell) for cell in text.split(",")] if re.fullmatch(r"\d{1,3}(,\d{1,3})*", text) else []
+def _numbers(text: str | None) -> list[int]:
+    return [int(cell) for cell in text.split(",")] if text and re.fullmatch(r"\d{1,3}(,\d{1,3})*", text) else []
 
 
-def _whole(text: str, default: int) -> int:
+def _whole(text: str | None, default: int) -> int:
     """The number at the beginning of a setting. If there is none, or it is 0, the default."""
-    match = re.match(r"\d{1,9}", text)
+    match = re.match(r"\d{1,9}", text or "")
     return int(match[0]) or default if match else default
-
-
-class _Predictor:
-    """Adds predictions to the values of main frames."""
-
-    def __init__(self, settings: dict[str, str], names: list[str]):
-        names_of = {_MINTHROTTLE: "minthrottle", _VBATREF: "vbatref", _MINMOTOR: "motorOutput"}
-        self.constants = {key: _whole(settings.get(name, ""), 0) for key, name in names_of.items()} | {_1500: 1500}
-        self.motor0 = names.index("motor[0]") if "motor[0]" in names else 0
-        first, _, last = settings.get("P interval", "").partition("/")
-        self.interval = _whole(settings.get("I interval", ""), 1)
-        self.share, self.apart = (_whole(first, 1), _whole(last, 1)) if last else (1, _whole(first, 1))
-        if self.interval > 1 << 16 or not 0 < self.share <= self.apart:
-            raise BadHeader
-        self.steps: dict[int, int] = {}
-
-    def step(self, iteration: int) -> int:
-        """The iterations from a frame to the next one that the vehicle logs."""
-        phase = iteration % self.interval
-        if phase not in self.steps:
-            step = 1
-            while ((phase + step) % self.interval + self.share - 1) % self.apart >= self.share:
-                step += 1
-            self.steps[phase] = step
-        return self.steps[phase]
-
-    def complete(self, values: list[int], kind: _Kind, before: list[int], earlier: list[int]) -> None:
-        """Add the predictions from the two frames before, in place."""
-        constants = self.constants
-        for i, predictor in enumerate(kind.predictors):
-            if predictor == _PREVIOUS:
-                values[i] += before[i]
-            elif predictor == _AVERAGE:
-                total = before[i] + earlier[i]
-                values[i] += total // 2 if total >= 0 else -(-total // 2)
-            elif predictor == _LINE:
-                values[i] += 2 * before[i] - earlier[i]
-            elif predictor == _MOTOR0:
-                values[i] += values[self.motor0]
-            elif predictor == _INCREMENT:
-                values[i] += before[i] + self.step(before[i])
-            elif predictor in constants:
-                values[i] += constants[predictor]
 
 
 class Numbers:
@@ -230,15 +183,8 @@ class Numbers:
             for _ in range(size):
                 bits = bits << 8 | self.byte()
             return [_extended(bits >> place, width) for place, width in _IN_14_OR_22[encoding][size - 1]]
-        values = []
-        for shift in (0, 2, 4):
-            length = (lead >> shift & 3) + 1
-            number = self.data[self.at : self.at + length]
-            if len(number) < length:
-                raise IndexError
-            values.append(_extended(int.from_bytes(number, "little"), 8 * length))
-            self.at += length
-        return values
+        lengths = [(lead >> shift & 3) + 1 for shift in (0, 2, 4)]
+        return [_extended(sum(self.byte() << 8 * i for i in range(length)), 8 * length) for length in lengths]
 
     def _tag8_4(self) -> list[int]:
         """Four numbers of 0, 4, 8 or 16 bits, in a row of half bytes."""
@@ -261,14 +207,22 @@ def _extended(value: int, bits: int) -> int:
 
 
 class _Stream:
-    """The frames of a session in order."""
+    """The frames of a session in order. Raises `BadHeader`."""
 
-    def __init__(self, data: bytes, kinds: dict[str, _Kind], predictor: _Predictor):
-        self.data, self.kinds, self.predictor = data, {ord(letter): kind for letter, kind in kinds.items()}, predictor
-        self.numbers = Numbers(data)
+    def __init__(self, settings: dict[str, str], data: bytes):
+        self.data, self.kinds, self.numbers = data, _kinds(settings), Numbers(data)
         self.damaged, self.ended = 0, False
-        self.time, self.iteration = kinds["I"].names.index(_TIME), kinds["I"].names.index(_ITERATION)
         self.last: tuple[int, int] | None = None  # iteration and time of the last frame
+        names = self.kinds[_I].names
+        self.time, self.iteration = names.index(_TIME), names.index(_ITERATION)
+        self.motor0 = names.index("motor[0]") if "motor[0]" in names else 0
+        self.constants = {key: _whole(settings.get(name), 0) for key, name in _CONSTANTS.items()} | {_1500: 1500}
+        first, _, last = settings.get("P interval", "").partition("/")
+        self.interval = _whole(settings.get("I interval"), 1)
+        self.share, self.apart = (_whole(first, 1), _whole(last, 1)) if last else (1, _whole(first, 1))
+        if self.interval > 1 << 16 or not 0 < self.share <= self.apart:
+            raise BadHeader("its header is damaged")
+        self.steps: dict[int, int] = {}
 
     def frames(self) -> Iterator[list[int]]:
         """The values of each main frame that can be trusted.
@@ -292,31 +246,57 @@ class _Stream:
                 self.damaged += intact or not block
                 intact = False
             elif letter == _I:
-                self.predictor.complete(values, self.kinds[_I], values, values)
-                follows = self._follows(values)
+                self._complete(values, _I, values, values)
                 last = self.last
-                if intact and last is not None and values[self.iteration] != last[0] + self.predictor.step(last[0]):
+                if intact and last is not None and values[self.iteration] != last[0] + self._step(last[0]):
                     self.damaged += 1  # a frame is missing between the last one and this one
                     del block[1:]
                 yield from block
-                block = [values] if follows else []
-                intact = follows
-                self.last = (values[self.iteration], values[self.time]) if follows else self.last
+                intact = self._follows(values)
+                block = [values] if intact else []
             elif letter == _P and intact:
-                self.predictor.complete(values, self.kinds[_P], block[-1], block[max(len(block) - 2, 0)])
+                self._complete(values, _P, block[-1], block[max(len(block) - 2, 0)])
                 intact = self._follows(values)
                 self.damaged += not intact
-                if intact:
-                    block.append(values)
-                    self.last = values[self.iteration], values[self.time]
+                block += [values] * intact
         yield from block
 
     def _follows(self, values: list[int]) -> bool:
-        """Whether a frame comes a moment after the last one."""
-        if self.last is None:
-            return True
+        """Whether a frame comes a moment after the last one; it is then the last one."""
         iteration, time = values[self.iteration], values[self.time]
-        return 0 < (time - self.last[1]) % (1 << 32) < _FARTHEST and 0 < iteration - self.last[0] < _MOST_ITERATIONS
+        if self.last is not None:
+            apart = (time - self.last[1]) % (1 << 32)
+            if not (0 < apart < _FARTHEST and 0 < iteration - self.last[0] < _MOST_ITERATIONS):
+                return False
+        self.last = iteration, time
+        return True
+
+    def _complete(self, values: list[int], kind: int, before: list[int], earlier: list[int]) -> None:
+        """Add the predictions from the two frames before, in place."""
+        constants = self.constants
+        for i, predictor in enumerate(self.kinds[kind].predictors):
+            if predictor == _PREVIOUS:
+                values[i] += before[i]
+            elif predictor == _AVERAGE:
+                total = before[i] + earlier[i]
+                values[i] += total // 2 if total >= 0 else -(-total // 2)
+            elif predictor == _LINE:
+                values[i] += 2 * before[i] - earlier[i]
+            elif predictor == _MOTOR0:
+                values[i] += values[self.motor0]
+            elif predictor == _INCREMENT:
+                values[i] += before[i] + self._step(before[i])
+            elif predictor in constants:
+                values[i] += constants[predictor]
+
+    def _step(self, iteration: int) -> int:
+        """The iterations from a frame to the next one that the vehicle logs."""
+        phase, step = iteration % self.interval, 1
+        if phase not in self.steps:
+            while ((phase + step) % self.interval + self.share - 1) % self.apart >= self.share:
+                step += 1
+            self.steps[phase] = step
+        return self.steps[phase]
 
     def _values(self, letter: int) -> list[int] | None:
         """The encoded numbers of a frame; `None` if it is none. Raises `IndexError` at the end of the data."""

@@ -33,29 +33,18 @@ import array
 import math
 import re
 import zlib
-from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from .sampling import Series, in_order, logged_rate
-from .table import (
-    LogFacts,
-    LogFormat,
-    Path,
-    Sampling,
-    Table,
-    attitude_of,
-    gyro_rows,
-    needed,
-    quoted,
-    read_bytes,
-    refuse,
-    unwrapped,
-)
+from .sampling import Series, attitude_of, gyro_rows, in_order, logged_rate, unwrapped
+from .table import LogFacts, LogFormat, Path, Sampling, Table, needed, quoted, read_bytes, refuse
 
 _MAGIC = b"\xbc"
 _MOST_TYPES, _MOST_VARIABLES = 64, 256
 _LARGEST = 1 << 28  # bytes of a file: an hour at 1 kHz
+_PAIR = re.compile(rb"(..)(..)", re.DOTALL)
+_TYPE = re.compile(rb"(..)[^\0]{0,255}\0(..)", re.DOTALL)
+_NAME = re.compile(rb"([^\0]{0,255})\0")
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
 _DEGREE, _GRAVITY, _RPM, _FULL = math.pi / 180, 9.80665, 2 * math.pi / 60, 65535.0
 _RATES = {"p": ("gyro.x", _DEGREE), "q": ("gyro.y", _DEGREE), "r": ("gyro.z", _DEGREE)}
@@ -77,134 +66,101 @@ _OFTEN = "raise the frequency of these variables in the deck's config.txt, and f
 _DAMAGED = f"it is corrupt; {_AGAIN}"
 
 Variables = dict[str, tuple[np.ndarray, np.ndarray]]
-
-
-class _Type(NamedTuple):
-    """A type of events: its variables, and the layout of an event."""
-
-    variables: list[str]
-    layout: np.dtype
+Types = dict[int, np.dtype]
 
 
 def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a Crazyflie's log, and notes on what was assumed. Raises `InputError`."""
-    content = read_bytes(path, _LARGEST)
     notes: list[str] = []
     names: dict[str, str] = {}
-    variables = _variables(path, content, notes)
+    variables = _variables(path, notes)
     remedy = "add gyro.x, gyro.y and gyro.z to the deck's config.txt"
     rates = needed(path, _series(variables, _RATES, names), "body rates", remedy)
     remedy = "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt"
-    rotors, measured = needed(path, _rotors(variables, names), "rotor speeds or commands", remedy)
+    rotors, first = needed(path, _rotors(variables, names), "rotor speeds or commands", remedy)
     others: dict[tuple[str, ...], Series | None] = {tuple(_ANGLES): _attitude(variables, names)}
     others |= {(name,): _series(variables, {name: source}, names) for name, source in _OTHERS.items()}
-    _, columns = gyro_rows(path, rates, rotors, measured=measured, others=others)
-    if not measured:
-        notes.append(f"commands are {names['command1']}.., taken as fractions of full-scale rotor speed")
-    motors = Sampling(names["omega1" if measured else "command1"], logged_rate(rotors.t))
-    facts = LogFacts(motors, Sampling(names["p"], logged_rate(rates.t)), _OFTEN)
-    return Table(path, columns, first_row=None, names=names, remedy=_REMEDY, facts=facts), tuple(notes)
+    if first == "command1":
+        notes.append(f"commands are {names[first]}.., taken as fractions of full-scale rotor speed")
+    motors, gyro = (Sampling(names[name], logged_rate(each.t)) for name, each in ((first, rotors), ("p", rates)))
+    facts = LogFacts(motors, gyro, _OFTEN)
+    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=facts)
+    return gyro_rows(table, rates, rotors, measured=first == "omega1", others=others)[1], tuple(notes)
 
 
 CRAZYFLIE = LogFormat("Crazyflie", "Crazyflie micro-SD log", lambda begin: begin.startswith(_MAGIC), read_crazyflie)
 
 
-def _variables(path: Path, content: bytes, notes: list[str]) -> Variables:
+def _variables(path: Path, notes: list[str]) -> Variables:
     """Times [s] and values of each variable, from the event that holds the most of its samples."""
-    header = _Header(path, content)
-    types, version = header.types()
-    valid = len(content) >= header.at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
-    places, ignored = _places(path, content[: -4 if valid else None], types, header.at, valid=valid)
+    content = read_bytes(path, _LARGEST)
+    types, version, at = _types(path, content)
+    valid = len(content) >= at + 4 and zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
+    places, ignored = _places(path, content[: -4 if valid else None], types, at, valid=valid)
     if not valid:
         cut = f"and its last {ignored} bytes are not a complete event" if ignored else "but ends with a complete event"
         notes.append(f"the log has no valid checksum, {cut}: it was cut while it was written, or is corrupt")
     data, found = np.frombuffer(content, dtype=np.uint8), []
-    for number, (names, layout) in types.items():
+    for number, layout in types.items():
         at = np.asarray(places[number], dtype=np.int64)
         if at.size < 2:
             continue
         records = data[at[:, None] + np.arange(layout.itemsize)].reshape(-1).view(layout)
-        t = records["t"].astype(float) * (1e-3 if version == 1 else 1e-6)
+        t = records[" t"].astype(float) * (1e-3 if version == 1 else 1e-6)
         kept = in_order(t)
         if kept is None:
             refuse(path, f"time runs backward from one event to the next: {_DAMAGED}")
         if not kept.all():
             notes.append(f"{np.count_nonzero(~kept)} late events are ignored")
-        with np.errstate(all="ignore"):
-            values = [records[f"v{i}"][kept].astype(float) for i in range(len(names))]
-        found.append((t[kept], zip(names, [np.where(np.isfinite(v), v, np.nan) for v in values], strict=True)))
+        t = t[kept]
+        for name in (layout.names or ())[2:]:
+            with np.errstate(all="ignore"):
+                values = records[name][kept].astype(float)
+            found.append((name, t, np.where(np.isfinite(values), values, np.nan)))
     if not found:
         refuse(path, "holds no events; a flight needs at least two")
-    return {
-        name: (t, values) for t, columns in sorted(found, key=lambda event: event[0].size) for name, values in columns
-    }
+    return {name: (t, values) for name, t, values in sorted(found, key=lambda each: each[1].size)}
 
 
-class _Header:
-    """Reads the header of a file. `at` is the number of bytes read."""
+def _types(path: Path, content: bytes) -> tuple[Types, int, int]:
+    """The layout of each type of events by its number, the version, and the number of bytes of the header."""
+    at = 1
 
-    def __init__(self, path: Path, content: bytes):
-        self.path, self.content, self.at = path, content, 1
+    def take(pattern: re.Pattern[bytes]) -> tuple[bytes, ...]:
+        nonlocal at
+        match = pattern.match(content, at)
+        if match is None:
+            refuse(path, f"ends within its header, or is corrupt; {_AGAIN}")
+        at = match.end()
+        return match.groups()
 
-    def types(self) -> tuple[dict[int, _Type], int]:
-        """The event types by their numbers, and the version."""
-        version, count = self._short(), self._short()
-        if version not in (1, 2):
-            refuse(self.path, f"is of version {version}, not 1 or 2; update jaxos4, or give another log")
-        if not 0 < count <= _MOST_TYPES:
-            self._corrupt(f"announces {count} event types")
-        types: dict[int, _Type] = {}
-        for _ in range(count):
-            number = self._short()
-            self._text()
-            names, kinds = self._variables()
-            if number in types or len(set(names)) < len(names):
-                self._corrupt("names an event type or a variable twice")
-            stamp = "<u4" if version == 1 else "<u8"
-            fields = [("number", "<u2"), ("t", stamp), *((f"v{i}", f"<{kind}") for i, kind in enumerate(kinds))]
-            types[number] = _Type(names, np.dtype(fields))
-        return types, version
-
-    def _variables(self) -> tuple[list[str], list[str]]:
-        """The names of an event's variables, and their types in numpy's words."""
-        count = self._short()
-        if count > _MOST_VARIABLES:
-            self._corrupt(f"announces {count} variables in an event")
-        names, kinds = [], []
-        for _ in range(count):
-            text = self._text()
+    version, count = (int.from_bytes(each, "little") for each in take(_PAIR))
+    if version not in (1, 2):
+        refuse(path, f"is of version {version}, not 1 or 2; update jaxos4, or give another log")
+    if not 0 < count <= _MOST_TYPES:
+        refuse(path, f"announces {count} event types: {_DAMAGED}")
+    types: Types = {}
+    for _ in range(count):
+        number, size = (int.from_bytes(each, "little") for each in take(_TYPE))
+        if size > _MOST_VARIABLES:
+            refuse(path, f"announces {size} variables in an event: {_DAMAGED}")
+        fields = [(" number", "<u2"), (" t", "<u4" if version == 1 else "<u8")]  # no variable begins with a blank
+        for _ in range(size):
+            (text,) = take(_NAME)
             parts = _VARIABLE.fullmatch(text)
             if parts is None:
-                self._corrupt(f"has a variable {quoted(text.decode(errors='replace'))} without a known type")
-            names.append(parts[1].decode())
-            kinds.append("f2" if parts[2] == b"e" else np.dtype(parts[2].decode()).str[1:])
-        return names, kinds
-
-    def _short(self) -> int:
-        self.at += 2
-        if self.at > len(self.content):
-            self._cut()
-        return int.from_bytes(self.content[self.at - 2 : self.at], "little")
-
-    def _text(self) -> bytes:
-        text, zero, _ = self.content[self.at : self.at + 256].partition(b"\0")
-        if not zero:
-            self._cut()
-        self.at += len(text) + 1
-        return text
-
-    def _cut(self) -> NoReturn:
-        refuse(self.path, f"ends within its header, or is corrupt; {_AGAIN}")
-
-    def _corrupt(self, what: str) -> NoReturn:
-        refuse(self.path, f"{what}: {_DAMAGED}")
+                shown = quoted(text.decode(errors="replace"))
+                refuse(path, f"has a variable {shown} without a known type: {_DAMAGED}")
+            fields.append((parts[1].decode(), "<f2" if parts[2] == b"e" else f"<{parts[2].decode()}"))
+        if number in types or len(dict(fields)) < len(fields):
+            refuse(path, f"names an event type or a variable twice: {_DAMAGED}")
+        types[number] = np.dtype(fields)
+    return types, version, at
 
 
-def _places(
-    path: Path, content: bytes, types: dict[int, _Type], at: int, *, valid: bool
-) -> tuple[dict[int, array.array], int]:
+def _places(path: Path, content: bytes, types: Types, at: int, *, valid: bool) -> tuple[dict[int, array.array], int]:
     """The position of each event by its type, and the number of bytes after the last complete event."""
-    sizes = {number: each.layout.itemsize for number, each in types.items()}
+    sizes = {number: layout.itemsize for number, layout in types.items()}
     places = {number: array.array("q") for number in sizes}
     end = len(content)
     while at + 2 <= end:
@@ -223,16 +179,15 @@ def _places(
 
 def _series(variables: Variables, wanted: dict[str, tuple[str, float]], names: dict[str, str]) -> Series | None:
     """The columns `wanted` (variable and factor), if one event holds them all."""
-    found = [variables.get(variable) for variable, _ in wanted.values()]
-    times = [each[0] for each in found if each is not None]
-    if len(times) < len(found) or any(t is not times[0] for t in times):
+    found = [variables[variable] for variable, _ in wanted.values() if variable in variables]
+    if len(found) < len(wanted) or any(t is not found[0][0] for t, _ in found):
         return None
     names |= {column: variable for column, (variable, _) in wanted.items()}
-    return Series(times[0], np.column_stack([variables[name][1] * factor for name, factor in wanted.values()]))
+    return Series(found[0][0], np.column_stack([variables[name][1] * factor for name, factor in wanted.values()]))
 
 
-def _rotors(variables: Variables, names: dict[str, str]) -> tuple[Series, bool] | None:
-    """Rotor speeds [rad/s] or commands [0..1], and whether they are measured speeds."""
+def _rotors(variables: Variables, names: dict[str, str]) -> tuple[Series, str] | None:
+    """Rotor speeds [rad/s] or commands [0..1], and the name of the first column."""
     for prefix, variable, factor in _ROTORS:
         found: dict[str, str] = {}
         series = _series(variables, {f"{prefix}{i}": (variable.format(i), factor) for i in range(1, 5)}, found)
@@ -243,7 +198,7 @@ def _rotors(variables: Variables, names: dict[str, str]) -> tuple[Series, bool] 
         if np.count_nonzero(finite) > 1:
             names |= found
             values = series.values[finite]
-            return Series(series.t[finite], values if measured else np.clip(values, 0.0, 1.0)), measured
+            return Series(series.t[finite], values if measured else np.clip(values, 0.0, 1.0)), f"{prefix}1"
     return None
 
 

@@ -21,12 +21,13 @@ The parser is our own: `numpy.loadtxt` takes no empty cells and accepts `nan` an
 as NaN, and neither gives the row of the file and the name of the column.
 """
 
+import contextlib
 import csv
+import itertools
 import math
 import os
 import re
-from collections.abc import Collection, Iterator
-from operator import itemgetter
+from collections.abc import Collection, Iterator, Sequence
 from typing import IO
 
 import numpy as np
@@ -36,11 +37,10 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
 from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES
-from .table import MAX_ROWS, LogFormat, Path, Table, opened, printable, quoted, refuse
+from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, printable, quoted, refuse
 
-_ROWS_AT_ONCE = 8192
+_ROWS_AT_ONCE = 8192  # the whole text never has to fit in memory
 _LONGEST_LINE = 1 << 20
-_BLOCK = 1 << 20  # characters parsed at once: the whole text never has to fit in memory
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _EMPTY = "leave the cell empty if it was not measured"
@@ -61,11 +61,25 @@ def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Co
 
     **Raises:** `InputError`, one line with file, row and column, whatever the file contains.
     """
+    first_row = skip + 2
     with opened(path) as file:
         for _ in range(skip):
             file.readline(_LONGEST_LINE)
         header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
-        return _parse(path, file, header, known, skip + 2, missing)
+        parts: dict[str, list[np.ndarray]] = {name: [] for name in header if name in known}
+        rows, row = _rows(path, file, len(header), first_row), first_row
+        while block := list(itertools.islice(rows, _ROWS_AT_ONCE)):
+            for name, cells in zip(header, zip(*block, strict=True), strict=True):
+                if name in parts:
+                    given = ["" if cell.strip() in missing else cell for cell in cells] if missing else cells
+                    parts[name].append(_numbers(path, name, given, row))
+            row += len(block)
+            if row - first_row > MAX_ROWS:
+                refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
+    if row - first_row < 2:
+        refuse(path, f"has a header and {['no data', 'one row of data'][row - first_row]}; a flight needs two rows")
+    columns = {name: np.concatenate(parts.pop(name)) for name in list(parts)}
+    return Table(path, columns, tuple(name for name in header if name not in known), first_row)
 
 
 def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
@@ -113,89 +127,64 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
 
 def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str]:
     """The names of the columns."""
-    if not line:
-        refuse(path, "is empty; a flight needs a header row and at least two rows of data")
     if not _readable(line):
         refuse(path, _NOT_UTF8, row=row)
-    if len(line) >= _LONGEST_LINE:
-        refuse(path, "is longer than a million characters; export the log as CSV with a header row", row=row)
     names = [name.strip() for name in _cells(path, line.rstrip("\n"), row)]
-    if not any(names):
-        refuse(path, "is empty; the first row must be the header", row=row)
-    if len(names) == 1:
-        for separator, shown in ((";", "';'"), ("\t", "tabs"), ("|", "'|'"), (" ", "blanks")):
-            if separator in line.strip():
-                refuse(path, f"is separated by {shown}; separate by commas, with points in the numbers", row=row)
-    if all(_NUMBER.fullmatch(name) for name in names if name):
-        refuse(path, "contains numbers instead of the header; write the names of the columns in a first row", row=row)
+    separators = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
+    wrong = next((shown for each, shown in separators.items() if len(names) == 1 and each in line.strip()), None)
+    for fault, what in (
+        (not line, "is empty; a flight needs a header row and at least two rows of data"),
+        (not any(names), "is empty; the first row must be the header"),
+        (wrong, f"is separated by {wrong}; separate by commas, with points in the numbers"),
+        (
+            all(_NUMBER.fullmatch(name) for name in names if name),
+            "contains numbers instead of the header; write the names of the columns in a first row",
+        ),
+    ):
+        if fault:
+            refuse(path, what, row=row if line else None)
     for name in known:
         if names.count(name) > 1:
             refuse(path, f"occurs {names.count(name)} times in the header; keep one of them", row=row, column=name)
     return names
 
 
-def _parse(
-    path: Path, file: IO[str], header: list[str], known: Collection[str], first_row: int, missing: Collection[str]
-) -> Table:
-    wanted = [(name, itemgetter(i)) for i, name in enumerate(header) if name in known]
-    parts: dict[str, list[np.ndarray]] = {name: [np.empty(0)] for name, _ in wanted}
-    row = first_row
-    for lines in _blocks(path, file, first_row):
-        rows = [_cells(path, line, row + i) for i, line in enumerate(lines)]
-        widths = list(map(len, rows))
-        if widths.count(len(header)) != len(rows):
-            i = next(i for i, width in enumerate(widths) if width != len(header))
-            if not lines[i].strip():
-                refuse(path, "is blank; delete it", row=row + i)
-            count = "1 cell" if widths[i] == 1 else f"{widths[i]} cells"
-            refuse(path, f"has {count}, but the header has {len(header)}; repair or delete the row", row=row + i)
-        for name, cell in wanted:
-            cells = list(map(cell, rows))
-            cells = ["" if text.strip() in missing else text for text in cells] if missing else cells
-            parts[name].append(_numbers(path, name, cells, row))
-        row += len(rows)
-        if row - first_row > MAX_ROWS:
-            refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
-    if row - first_row < 2:
-        refuse(path, f"has a header and {['no data', 'one row of data'][row - first_row]}; a flight needs two rows")
-    columns = {name: np.concatenate(parts.pop(name)) for name, _ in wanted}
-    return Table(path, columns, tuple(name for name in header if name not in known), first_row)
-
-
-def _blocks(path: Path, file: IO[str], row: int) -> Iterator[list[str]]:
-    """Some lines at a time, without the blank lines at the end of the file."""
-    blank: list[str] = []  # at the end of the last block: allowed only if no other line follows
-    while text := file.read(_BLOCK):
-        rest = file.readline(_LONGEST_LINE)
-        lines = blank + (text + rest).removesuffix("\n").split("\n")
-        if len(rest) >= _LONGEST_LINE:
-            refuse(path, "is longer than a million characters; give a CSV file", row=row + len(lines) - 1)
-        end = len(lines)
-        while end and not lines[end - 1].strip():
-            end -= 1
-        blank = lines[end:]
-        if len(blank) > _LONGEST_LINE:
-            refuse(path, "and a million rows after it are blank; delete them", row=row + end)
-        if end:
-            yield lines[:end]
-            row += end
+def _rows(path: Path, file: IO[str], width: int, first_row: int) -> Iterator[list[str]]:
+    """The cells of each line, without the blank lines at the end of the file."""
+    blank = 0
+    for row in itertools.count(first_row):
+        line = file.readline(_LONGEST_LINE)
+        if not line:
+            return
+        if line.isspace():
+            blank += 1
+            if blank > _LONGEST_LINE:
+                refuse(path, "and a million rows before it are blank; delete them", row=row)
+            continue
+        if blank:
+            refuse(path, "is blank; delete it", row=row - blank)
+        cells = _cells(path, line.rstrip("\n"), row)
+        if len(cells) != width:
+            what = f"has {counted(len(cells), 'cell')}, but the header has {width}; repair or delete the row"
+            refuse(path, what, row=row)
+        yield cells
 
 
 def _cells(path: Path, line: str, row: int) -> list[str]:
+    """The cells of one line: an open quote ends with its line."""
+    if len(line) >= _LONGEST_LINE - 1:
+        refuse(path, "is longer than a million characters; export the log as CSV with a header row", row=row)
     try:
-        return next(csv.reader([line]), [])  # line by line, so that an open quote ends with its line
+        return next(csv.reader([line]), [])
     except csv.Error:
         refuse(path, "contains a cell that is too long; repair or delete the row", row=row)
 
 
-def _numbers(path: Path, column: str, cells: list[str], row: int) -> np.ndarray:
+def _numbers(path: Path, column: str, cells: Sequence[str], row: int) -> np.ndarray:
     text = "".join(cells)
     if text.isascii() and "_" not in text:  # float() also reads "1_0" and the digits of other scripts
-        try:
+        with contextlib.suppress(ValueError):
             values = np.array([float(cell) if cell else math.nan for cell in cells])
-        except ValueError:
-            pass
-        else:
             if np.count_nonzero(np.isfinite(values)) + cells.count("") == len(cells):
                 return values
     values = np.empty(len(cells))
@@ -208,11 +197,12 @@ def _numbers(path: Path, column: str, cells: list[str], row: int) -> np.ndarray:
 
 def _complaint(cell: str) -> str:
     """The fault of a cell that is no finite number, and the remedy."""
+    if not _readable(cell):
+        return _NOT_UTF8
     if cell.lower().lstrip("+-") in _NO_NUMBER:
         return f"contains {quoted(cell)}; {_EMPTY}"
-    if _NUMBER.fullmatch(cell):
-        return f"contains {quoted(cell)}, which is too large for a number; {_EMPTY}"
-    return f"contains {quoted(cell)}, which is not a number; correct it, or {_EMPTY}" if _readable(cell) else _NOT_UTF8
+    fault = "too large for a number;" if _NUMBER.fullmatch(cell) else "not a number; correct it, or"
+    return f"contains {quoted(cell)}, which is {fault} {_EMPTY}"
 
 
 def _readable(text: str) -> bool:

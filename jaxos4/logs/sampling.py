@@ -1,10 +1,13 @@
 """Samples at any times, brought to other times: integrals, means, interpolation. Gaps stay unmeasured (NaN)."""
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, Table, counted, refuse
 
 UNIFORM = 0.01  # of a step: rows this close to a grid keep their values
 REACH = 1.5  # times the step: measured samples further apart have a gap between them
@@ -12,6 +15,7 @@ _ROUNDING = 1e-6  # of a step: a smaller difference from a grid is a rounding er
 _FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
 _MEASURED = 0.45  # of a longer sample must be measured: below one half, because the ends have half of their rows
 _DISORDER = 0.01  # share of samples that may be late or repeated in an intact log
+_FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
 _PAUSE = 1.0  # [s]; a longer time between samples is a pause of the log, and not its rate
 _FEWEST_CHANGES, _REGULAR = 20, 0.6  # so many steps, of which most are equal up to this share, are a rate
 
@@ -19,8 +23,8 @@ Times = Float[np.ndarray, " samples"]
 Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]
 Rows = Float[np.ndarray, " rows"]
-# Time, rotor speeds and channels on another grid.
 Resampled = tuple[Rows, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
+"""Time, rotor speeds and channels on another grid."""
 
 
 class Series(NamedTuple):
@@ -92,12 +96,12 @@ def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[n
     `step`: the rows are a uniform grid of this step [s]. Every row between neighbours within 1.5 steps then gets a
     value, and nothing is averaged.
     """
-    own = step or (float(np.median(np.diff(rows))) if rows.size > 1 else 0.0)
+    own = step or _step(rows)
     out = np.full((rows.size, series.values.shape[1]), np.nan)
     for column, values in enumerate(series.values.T):
         measured = np.isfinite(values)
         t, values = series.t[measured], values[measured]
-        if step is None and t.size > 1 and np.median(np.diff(t)) < _FASTER * own:
+        if step is None and t.size > 1 and _step(t) < _FASTER * own:
             out[:, column] = _means(rows, own, Series(t, values[:, None]))[:, 0]
         elif t.size:
             out[:, column] = _interpolated(rows, own, t, values, every=step is not None)
@@ -106,15 +110,58 @@ def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[n
 
 def averaged_to(step: float, series: Series) -> Series:
     """The series, averaged to one sample each `step` [s] if it is faster. Gaps stay gaps."""
-    if series.t.size < 2 or np.median(np.diff(series.t)) >= _FASTER * step:
+    kept = np.isfinite(series.values).all(axis=1)
+    if series.t.size < 2 or _step(series.t) >= _FASTER * step or np.count_nonzero(kept) < 2:
         return series
     grid = series.t[0] + step * (np.unique(np.floor((series.t - series.t[0]) / step)) + 0.5)
-    kept = np.isfinite(series.values).all(axis=1)
-    if np.count_nonzero(kept) < 2:
-        return series
     means = _means(grid, step, Series(series.t[kept], series.values[kept]))
     measured = np.isfinite(means).all(axis=1)
     return Series(grid[measured], means[measured]) if np.count_nonzero(measured) > 1 else series
+
+
+def gyro_rows(
+    table: Table, rates: Series, rotors: Series, *, measured: bool, others: Mapping[tuple[str, ...], Series | None]
+) -> tuple[Rows, Table]:
+    """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
+
+    Impossible samples are taken out before, so that no row takes a part of them. A gyro that is faster than 1 kHz is
+    averaged to 1 kHz.
+
+    **Arguments:**
+
+    - `table`: without columns.
+    - `rotors`: `measured` speeds [rad/s], or commands [0..1].
+    - `others`: the other sensors, by the names of their columns; `None`: not logged.
+
+    **Returns:** the times of the rows [s], and the table with columns; `t` is 0 in the first row.
+
+    **Raises:** `InputError` if rates and rotors do not overlap in time, if there are more than `MAX_ROWS` rows, or for
+    too many impossible samples.
+    """
+    start, rotor_names = rates.t[rates.t < rotors.t[0]].size, SPEED_NAMES if measured else COMMAND_NAMES
+    begin = rates.t[min(start, rates.t.size - 1)]
+
+    def possible(names: tuple[str, ...], series: Series) -> Series:
+        nonlocal table
+        columns = {"t": series.t - begin} | dict(zip(names, series.values.T, strict=True))
+        table = table._replace(columns=columns).without_impossible()
+        return Series(series.t, np.column_stack([table.columns[name] for name in names]))
+
+    rates, rotors = averaged_to(_FASTEST_ROWS, possible(("p", "q", "r"), rates)), possible(rotor_names, rotors)
+    turning = np.isfinite(rotors.values).all(axis=1)
+    rotors = Series(rotors.t[turning], rotors.values[turning])
+    inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + REACH * _step(rotors.t))
+    if np.count_nonzero(inside) < 2:
+        refuse(table.path, "rates and motors were not logged at the same time; record both in one flight")
+    rows = rates.t[inside]
+    if rows.size > MAX_ROWS:
+        refuse(table.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
+    columns = {"t": rows - rows[0]} | dict(zip("pqr", rates.values[inside].T, strict=True))
+    columns |= zip(rotor_names, root_mean_square(rotors, rows, linear=measured).T, strict=True)
+    for names, series in others.items():
+        if series is not None:
+            columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
+    return rows, table._replace(columns=columns)
 
 
 def uniform_grid(t: Times) -> Times | None:
@@ -136,14 +183,12 @@ def grid_size(t: Times, dt: float) -> float:
 
 
 def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Resampled, str]:
-    """Resample rows at uneven times to the grid t_0, t_0 + dt, ...
+    """Resample rows at uneven times [s] to the grid t_0, t_0 + dt, ...
 
-    **Arguments:** times [s], rotor speeds [rad/s], each held until the next row, measurements with unwrapped angles
-    (NaN means not measured), and the step of the grid [s].
+    `omega` is held until the next row (`root_mean_square`), `channels` are interpolated linearly (`at_rows`), with an
+    error of second order in dt. A gap is NaN, except for samples within 1 % of dt of a time of the grid.
 
-    **Returns:** time, rotor speeds (`root_mean_square`) and channels (`at_rows`); a note with the figures of the
-    resampling. Linear interpolation has an error of second order in dt. A gap is NaN, except for samples within 1 % of
-    dt of a time of the grid.
+    **Returns:** time, rotor speeds and channels; a note with the figures of the resampling.
     """
     grid = _grid(t, dt)
     even = at_rows(grid, Series(t, channels), step=dt)
@@ -162,6 +207,20 @@ def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"
     return angle, int(np.count_nonzero(turns))
 
 
+def unwrapped(t: Times, angles: Float[np.ndarray, "samples 3"]) -> Series:
+    """Roll, pitch, yaw [rad] as a series, with the jumps of 2 pi removed from roll and yaw."""
+    return Series(t, np.column_stack([unwrap(angles[:, 0])[0], angles[:, 1], unwrap(angles[:, 2])[0]]))
+
+
+def attitude_of(t: Times, quaternion: Float[np.ndarray, "samples 4"]) -> Series:
+    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z), which need not be normalised. NaN if one is zero."""
+    with np.errstate(all="ignore"):
+        w, x, y, z = (quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))).T
+    phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    return unwrapped(t, np.column_stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))]))
+
+
 def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:
     """Which samples are later than all samples before them. None if more than 1 % are not: the log is corrupt."""
     if not np.isfinite(t).all():
@@ -174,8 +233,7 @@ def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:
 def logged_rate(t: Times) -> float:
     """How often samples at the times `t` [s] were written [Hz]. For half of the time, samples come at least this often.
 
-    A burst of samples does not count as a high rate. Pauses of more than a second do not count, unless there is nothing
-    else.
+    A burst is no high rate. Pauses of more than a second do not count, unless there is nothing else.
     """
     steps = np.diff(t)
     steps = np.sort(steps[(steps > 0) & (steps <= _PAUSE)] if (steps <= _PAUSE).any() else steps)
@@ -192,6 +250,11 @@ def held_regularly(t: Times) -> bool:
         return False
     low, middle, high = np.quantile(steps, [0.1, 0.5, 0.9])
     return bool(high - low <= _REGULAR * middle)
+
+
+def _step(t: np.ndarray) -> float:
+    """The median time between samples [s]; 0 for one sample."""
+    return float(np.median(np.diff(t))) if t.size > 1 else 0.0
 
 
 def _grid(t: np.ndarray, dt: float) -> np.ndarray:
@@ -216,10 +279,8 @@ def _interpolated(rows: np.ndarray, step: float, t: np.ndarray, values: np.ndarr
     near[row[np.abs(rows[row] - t) <= (step / 2 if every else step)]] = True
     right = np.clip(np.searchsorted(t, rows), min(1, t.size - 1), t.size - 1)
     left = np.maximum(right - 1, 0)
-    own_step = max(float(np.median(np.diff(t))) if t.size > 1 else 0.0, step)
-    apart = t[right] - t[left]
-    between = (t[left] <= rows) & (rows <= t[right])
-    joined = between & ((near & (apart <= REACH * own_step)) | (every & (apart <= REACH * step)))
+    apart, between = t[right] - t[left], (t[left] <= rows) & (rows <= t[right])
+    joined = between & ((near & (apart <= REACH * max(_step(t), step))) | (every & (apart <= REACH * step)))
     exact = near & ~joined & (np.abs(t[sample] - rows) <= UNIFORM * step)
     out = np.where(joined, np.interp(rows, t, values), np.nan)
     out[exact] = values[sample[exact]]
@@ -248,8 +309,7 @@ def _note(t: np.ndarray, grid: np.ndarray, dt: float) -> str:
         return text
     starts = np.flatnonzero(gap)
     inside = np.searchsorted(grid, t[starts + 1] - UNIFORM * dt) - np.searchsorted(grid, t[starts] + UNIFORM * dt)
-    gaps = "1 gap" if starts.size == 1 else f"{starts.size} gaps"
     return (
-        f"{text}; {gaps} of up to {1e3 * step.max():.4g} ms: the {int(inside.sum())} samples in gaps hold the rotor "
-        "speeds and count as not measured"
+        f"{text}; {counted(starts.size, 'gap')} of up to {1e3 * step.max():.4g} ms: the {int(inside.sum())} samples in "
+        "gaps hold the rotor speeds and count as not measured"
     )

@@ -1,16 +1,18 @@
-"""Shared by all log formats: columns as a `Table`, facts beside them, the description of a format, refusing a file."""
+"""Shared by all log formats: columns as a `Table`, facts beside them, a flight as a `Recording`, refusing a file."""
 
 import contextlib
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
-from typing import IO, NamedTuple, NoReturn, TypeVar
+from typing import IO, Any, NamedTuple, NoReturn, TypeVar
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..errors import InputError
-from .sampling import REACH, Series, at_rows, averaged_to, root_mean_square, unwrap
+from ..flight import FORCE_NAMES, Flight
 
 Path = str | os.PathLike[str]
 Found = TypeVar("Found")
@@ -26,7 +28,10 @@ large, commands at 20 Hz 1.1 to 1.2 times; at 40 Hz the error is below 6 %.
 
 _JITTER = 0.95  # a log at a nominal rate may be this much slower
 _AT_ONCE = 1 << 20  # bytes
-_FASTEST_ROWS = 0.001  # [s]; a faster gyro is averaged to this step, because no vehicle's motion needs more
+_MOST_IMPOSSIBLE = 0.01  # share of the values of a column: more are a wrong unit, and not samples that went wrong
+
+SPEED_NAMES = ("omega1", "omega2", "omega3", "omega4")
+COMMAND_NAMES = ("command1", "command2", "command3", "command4")
 
 
 class Sampling(NamedTuple):
@@ -58,10 +63,9 @@ class LogFacts(NamedTuple):
     @property
     def too_slow(self) -> str:
         """Why the log was written too rarely to identify a vehicle, and what to do; empty if it was not."""
-        every = (("the motors were", self.motors), ("the gyro was", self.gyro))
         slow = [
             f"{what} logged at {sampling.rate:.2g} Hz ({sampling.source})"
-            for what, sampling in every
+            for what, sampling in (("the motors were", self.motors), ("the gyro was", self.gyro))
             if sampling is not None and not fast_enough(sampling.rate)
         ]
         if not slow:
@@ -77,6 +81,45 @@ def fast_enough(rate: float) -> bool:
     return rate >= _JITTER * SLOWEST_RATE
 
 
+class Limit(NamedTuple):
+    """The values that a column can have, their unit, and advice on larger values, and on smaller ones if it differs."""
+
+    least: float
+    largest: float
+    unit: str
+    advice: str
+    below: str = ""
+
+
+def _within(largest: float, unit: str, advice: str) -> Limit:
+    return Limit(-largest, largest, unit, advice)
+
+
+_COMMAND = Limit(0, 1, "of full scale", "commands are fractions 0..1: divide by full scale (100, 65535)")
+_RPM = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
+_SPEED = Limit(0, 1e5, "rad/s", _RPM, "drop the sign, because rotor_spins gives the direction")
+_ANGLE = _within(1e4, "rad", "it looks like degrees: divide by 57.3")
+_RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
+_PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
+_VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
+_POSITION = "positions are in metres from a point near the flight; subtract an offset"
+_FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
+LIMITS = {
+    "t": _within(1e11, "s", "t is in seconds: if these are milli-, micro- or nanoseconds, divide"),
+    **dict.fromkeys(SPEED_NAMES, _SPEED),
+    **dict.fromkeys(COMMAND_NAMES, _COMMAND),
+    **dict.fromkeys("xyz", _within(1e6, "m", _POSITION)),
+    **dict.fromkeys(("vx", "vy", "vz"), _within(1e3, "m/s", _VELOCITY)),
+    **dict.fromkeys("pqr", _within(60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
+    **dict.fromkeys(("phi", "theta", "psi"), _ANGLE),
+    **dict.fromkeys(FORCE_NAMES, _within(1e3, "m/s^2", _FORCE)),
+    "voltage": _within(200.0, "V", "the battery's voltage is in volts: if these are mV, divide by 1000"),
+}
+"""A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
+ROLL = {"phi": _within(2 * math.pi, "rad", _ANGLE.advice)}  # without a flip
+PITCH = {"theta": _within(_RIGHT_ANGLE, "rad", _PITCH)}
+
+
 class Table(NamedTuple):
     """Columns of a log. NaN means not measured; all other values are finite.
 
@@ -87,6 +130,7 @@ class Table(NamedTuple):
     - `remedy`: advice for an impossible number, if the user cannot choose the units of the format.
     - `facts`: see `LogFacts`. How often motors and gyro were written follows from the cells, if
       `facts` does not say it.
+    - `impossible`: by column, how many values `without_impossible` took out, and the first of them.
     """
 
     path: Path
@@ -96,6 +140,7 @@ class Table(NamedTuple):
     names: Mapping[str, str] = MappingProxyType({})
     remedy: str = ""
     facts: LogFacts = LogFacts()
+    impossible: Mapping[str, tuple[int, str]] = MappingProxyType({})
 
     def refuse(self, what: str, *, index: int | None = None, column: str | None = None) -> NoReturn:
         """Raise an `InputError` about entry `index` of `column`."""
@@ -104,6 +149,34 @@ class Table(NamedTuple):
         row = None if index is None or self.first_row is None else index + self.first_row
         name = None if column is None else self.names.get(column, column)
         refuse(self.path, what, row=row, column=name, kind="column" if self.first_row is not None else "field")
+
+    def holds(self, *names: str) -> bool:
+        """Whether all these columns are there."""
+        return self.columns.keys() >= set(names)
+
+    def without_impossible(self, limits: Mapping[str, Limit] = LIMITS) -> "Table":
+        """The table without the values outside of `limits`: they count as not measured.
+
+        **Raises:** `InputError` if they are more than 1 % of the values of a column.
+        """
+        columns, impossible = dict(self.columns), dict(self.impossible)
+        for name, limit in limits.items():
+            values = columns.get(name, np.empty(0))
+            wrong = (values < limit.least) | (values > limit.largest)
+            if name == "t" or not wrong.any():
+                continue
+            index, count = int(np.argmax(wrong)), int(np.count_nonzero(wrong))
+            first, every = f"{values[index]:g} {limit.unit}", np.count_nonzero(~np.isnan(values))
+            if count > _MOST_IMPOSSIBLE * every:
+                low = values[index] < limit.least
+                share = f"{count} of {every} values, more than {100 * _MOST_IMPOSSIBLE:g} %"
+                what = f"is {first}, beyond {limit.least if low else limit.largest:.4g} {limit.unit} ({share}); "
+                advice = (low and limit.below) or self.remedy or limit.advice
+                self.refuse(what + advice, index=index, column=name)
+            columns[name] = np.where(wrong, np.nan, values)
+            before, begin = impossible.get(name, (0, f"{first} at {self.columns['t'][index]:.6g} s"))
+            impossible[name] = before + count, begin
+        return self._replace(columns=columns, impossible=impossible)
 
 
 class LogFormat(NamedTuple):
@@ -124,42 +197,72 @@ class LogFormat(NamedTuple):
     read: Callable[[Path], tuple[Table, tuple[str, ...]]]
 
 
-def gyro_rows(
-    path: Path,
-    rates: Series,
-    rotors: Series,
-    *,
-    measured: bool,
-    others: Mapping[tuple[str, ...], Series | None],
-) -> tuple[Float[np.ndarray, " rows"], dict[str, np.ndarray]]:
-    """Use the gyro's samples as rows, and bring rotors and `others` to them. Series are in our units and frame.
+_ARRAYS = ("time", "omega", "states", "specific_force", "voltage", "body_velocity", "stretch")
 
-    A gyro that is faster than 1 kHz is averaged to 1 kHz.
 
-    **Arguments:**
+class Recording(NamedTuple):
+    """A recorded flight as NumPy arrays in double precision, its name, and what its log says beside it.
 
-    - `rotors`: `measured` speeds [rad/s], or commands [0..1].
-    - `others`: the other sensors, by the names of their columns; `None`: not logged.
+    The arrays and `commanded` are as in `Flight`, in SI units. A recording is cleaned, cut and joined as it is, and
+    becomes a `Flight` once, at the end.
 
-    **Returns:** the times of the rows [s], and the columns of a `Table`; `t` is 0 in the first row.
-
-    **Raises:** `InputError` if rates and rotors do not overlap in time, or there are more than `MAX_ROWS` rows.
+    - `name`: in messages and in the provenance. Usually the path of the file.
+    - `notes`: what the reader changed in the data, one line each.
+    - `facts`: what the log says beside the flight, such as how often motors and gyro were written.
     """
-    rates = averaged_to(_FASTEST_ROWS, rates)
-    step = float(np.median(np.diff(rotors.t))) if rotors.t.size > 1 else 0.0
-    inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + REACH * step)
-    if np.count_nonzero(inside) < 2:
-        refuse(path, "rates and motors were not logged at the same time; record both in one flight")
-    rows = rates.t[inside]
-    if rows.size > MAX_ROWS:
-        refuse(path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
-    columns = {"t": rows - rows[0], **dict(zip("pqr", rates.values[inside].T, strict=True))}
-    speeds, prefix = root_mean_square(rotors, rows, linear=measured), "omega" if measured else "command"
-    columns |= {f"{prefix}{i + 1}": column for i, column in enumerate(speeds.T)}
-    for names, series in others.items():
-        if series is not None:
-            columns |= zip(names, at_rows(rows, series).T, strict=True)
-    return rows, columns
+
+    time: Float[np.ndarray, " samples"]
+    omega: Float[np.ndarray, "samples 4"]
+    states: Float[np.ndarray, "samples 12"]
+    specific_force: Float[np.ndarray, "samples 3"] | None = None
+    voltage: Float[np.ndarray, " samples"] | None = None
+    body_velocity: Float[np.ndarray, "samples 3"] | None = None
+    stretch: Int[np.ndarray, " samples"] | None = None
+    commanded: bool = False
+    name: str = "flight"
+    notes: tuple[str, ...] = ()
+    facts: LogFacts = LogFacts()
+
+    @classmethod
+    def of(cls, flight: Flight, name: str = "flight") -> "Recording":
+        """A recording of a `Flight`."""
+        arrays: dict[str, Any] = {
+            field: np.asarray(value, int if field == "stretch" else float)
+            for field in _ARRAYS
+            if (value := getattr(flight, field)) is not None
+        }
+        return cls(**arrays, commanded=flight.commanded, name=name)
+
+    @property
+    def flight(self) -> Flight:
+        """The `Flight`, in the precision of JAX."""
+        arrays: dict[str, Any] = {field: getattr(self, field) for field in _ARRAYS}
+        arrays["stretch"] = None if self.stretch is None else jnp.asarray(self.stretch)
+        return Flight(**arrays, commanded=self.commanded)
+
+    @property
+    def dt(self) -> float:
+        """The sample time [s]."""
+        return float((self.time[-1] - self.time[0]) / (self.time.size - 1))
+
+    @property
+    def channels(self) -> Float[np.ndarray, "samples 15"]:
+        """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
+        nothing = np.full((self.time.size, len(FORCE_NAMES)), np.nan)
+        return np.column_stack([self.states, nothing if self.specific_force is None else self.specific_force])
+
+    def rows(self, part: slice) -> "Recording":
+        """Some samples of the recording; their time stays as recorded."""
+        return self._replace(**{f: x[part] for f in _ARRAYS if (x := getattr(self, f)) is not None})
+
+    @property
+    def named_notes(self) -> tuple[str, ...]:
+        """The notes, each with the name in front."""
+        return tuple(f"{self.name}: {note}" for note in self.notes)
+
+    def same_data(self, other: "Recording") -> bool:
+        """Whether both hold the same samples: times, rotor speeds and states."""
+        return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(self[:3], other[:3], strict=True))
 
 
 def needed(path: Path, found: Found | None, what: str, remedy: str) -> Found:
@@ -169,25 +272,18 @@ def needed(path: Path, found: Found | None, what: str, remedy: str) -> Found:
     return found
 
 
-def attitude_of(t: np.ndarray, quaternion: Float[np.ndarray, "samples 4"]) -> Series:
-    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z), which need not be normalised. NaN if one is zero."""
-    with np.errstate(all="ignore"):
-        w, x, y, z = (quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))).T
-    phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return unwrapped(t, np.column_stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))]))
-
-
-def unwrapped(t: np.ndarray, angles: Float[np.ndarray, "samples 3"]) -> Series:
-    """Roll, pitch, yaw [rad] as a series, with the jumps of 2 pi removed from roll and yaw."""
-    return Series(t, np.column_stack([unwrap(angles[:, 0])[0], angles[:, 1], unwrap(angles[:, 2])[0]]))
-
-
 def order_note(first: str) -> str:
     """The note on the order of the rotors; `first`: what the log calls rotor 1."""
     return (
         f"rotors keep the log's order ({first} is rotor 1): rotor_positions and rotor_spins must be in the same order"
     )
+
+
+_UNREADABLE = {
+    FileNotFoundError: "there is no such file; give the path of a log",
+    IsADirectoryError: "is a folder, not a file; give the path of a log",
+    PermissionError: "cannot be opened (permission denied); change its permissions or copy it",
+}
 
 
 @contextlib.contextmanager
@@ -199,15 +295,9 @@ def opened(path: Path, mode: str = "r") -> Iterator[IO]:
     try:
         with open(path, mode, encoding=encoding, errors=errors) as file:
             yield file
-    except FileNotFoundError:
-        refuse(path, "there is no such file; give the path of a log")
-    except IsADirectoryError:
-        refuse(path, "is a folder, not a file; give the path of a log")
-    except PermissionError:
-        refuse(path, "cannot be opened (permission denied); change its permissions or copy it")
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "its name or content cannot be decoded"
-        refuse(path, f"cannot be read ({reason}); give the path of a log")
+        refuse(path, _UNREADABLE.get(type(error), f"cannot be read ({reason}); give the path of a log"))
 
 
 def read_bytes(path: Path, most: int) -> bytes:
@@ -237,3 +327,8 @@ def printable(text: str) -> str:
 def quoted(text: str) -> str:
     """`text` in quotes, on one line, with at most 40 characters."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 gap`, or `2 gaps`."""
+    return f"{number} {noun}{'s' * (number != 1)}"

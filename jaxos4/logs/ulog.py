@@ -12,8 +12,7 @@
 | `command1..4` | `actuator_outputs.output[0..3]`, if `actuator_motors` is missing or slow | PWM, DShot or UAVCAN |
 | `voltage` | `battery_status.voltage_v` | V |
 
-A command is held until the next one, and counts as a fraction of the airframe's `max_rotor_speed`. How commands become
-such fractions: `jaxos4.logs.ulog_rotors`.
+A command is held until the next one, and counts as a fraction of the airframe's `max_rotor_speed`.
 
 **Vehicles.** A vehicle that is not a quadrotor is refused. The log's facts (`jaxos4.logs.LogFacts`) are: the rates of
 logging; the rotors' positions and spins, from `CA_ROTOR0_PX` and so on; when the land detector says "on the ground".
@@ -29,16 +28,36 @@ and psi change their signs; x, p and phi do not.
 **Rotors.** They keep PX4's numbers (quad X: 1 front right, 2 rear left, 3 front left, 4 rear right). The airframe's
 `rotor_positions` and `rotor_spins` must have the same order. If `actuator_function`, or a parameter such as
 `PWM_MAIN_FUNC1`, says which motor an output drives, the outputs are put in the order of the motors.
+
+**Commands.** A command becomes a fraction of full rotor speed in two steps.
+
+1. The fraction u of the motor's signal. u is 0 at the smallest value of `actuator_outputs` with a turning motor, and 1
+   at the largest.
+2. The thrust of that signal. PX4's model is: fraction of thrust = f u^2 + (1 - f) u, with the parameter
+   f = THR_MDL_FAC. Speed is the square root of thrust.
+
+`actuator_motors` holds the fraction of thrust; `actuator_outputs` holds the signal. If f is 0, its default, nobody
+measured the thrust, and both topics hold u. Speed then counts as proportional to u, and the term `curve` of a vehicle's
+model fits the thrust.
+
+| protocol | smallest | largest |
+| --- | --- | --- |
+| PWM | `PWM_MAIN_MIN1`, ..., or `PWM_MIN`; 1000 us if the log does not say it | the same with `MAX`; 2000 us |
+| DShot | 1999 times `DSHOT_MIN`; 0 if the log does not say it | 1999 |
+| UAVCAN | `UAVCAN_EC_MIN1`, ...; 1 | `UAVCAN_EC_MAX1`, ...; 8191 |
+
+Reference: `FunctionMotors::updateValues`, `MixingOutput` and `logged_topics.cpp` of PX4.
 """
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from .sampling import Series, logged_rate
-from .table import LogFacts, LogFormat, Path, Sampling, Table, attitude_of, gyro_rows, needed, order_note, refuse
+from .sampling import Series, attitude_of, gyro_rows, logged_rate
+from .table import LIMITS, LogFacts, LogFormat, Path, Sampling, Table, fast_enough, needed, order_note, refuse
 from .ulog_file import HALF_TURN, MAGIC, Source, Topics, decoded
-from .ulog_rotors import TOPICS as ROTOR_TOPICS, rotors_of
 
 _RATES = (
     Source("vehicle_angular_velocity", ("xyz[0]", "xyz[1]", "xyz[2]")),
@@ -52,15 +71,13 @@ _FORCES = (
 )
 _TOPICS = (
     *(source.topic for source in (*_RATES, *_FORCES)),
-    *ROTOR_TOPICS,
+    *("esc_status", "actuator_motors", "actuator_outputs"),
     *("vehicle_attitude", "vehicle_local_position", "vehicle_status", "vehicle_land_detected", "battery_status"),
 )
 _ANGLES = ("phi", "theta", "psi")
 _FLAGS = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
 _REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 _MOTORS = 12  # the most that PX4 can drive
-
-_ONLY = "only a quadrotor can be identified: give the log of one"
 _VTOL = "a VTOL"
 # Types of MAVLink (MAV_TYPE), and of PX4's control allocation (CA_AIRFRAME). Types that are missing here can be quads.
 _MAV_TYPES = {
@@ -75,7 +92,15 @@ _CA_AIRFRAMES = {
 }
 _VEHICLE_TYPES = {2: "a fixed wing", 3: "a rover", 4: "an airship"}  # of the topic vehicle_status
 _GROUND = ("landed", "maybe_landed", "ground_contact")
-_HIGHEST_VOLTAGE = 200.0  # [V]
+_FIRST_MOTOR = 101  # PX4's number of the output function "Motor 1"
+_RPM = 2 * math.pi / 60
+_OUTPUTS, _TIMERS = 16, 8  # of one driver
+_BANKS = ("PWM_MAIN", "PWM_AUX", "PWM_EXTRA", "UAVCAN_EC")
+_OTHER_BANKS = ("SIM_GZ_EC", "HIL_ACT")  # simulators, whose outputs have other units
+_LEAST_PWM, _HIGHEST_PWM = 800.0, 2200.0  # [us]
+_PWM, _DSHOT, _UAVCAN = (1000.0, 2000.0), 1999.0, (1.0, 8191.0)
+_CAN, _DSHOT_LINK = 4, 5  # ESC_CONNECTION_TYPE_CAN, ESC_CONNECTION_TYPE_DSHOT
+_DSHOT_TIMERS = range(-5, -1)  # DShot150 to DShot1200, as values of PWM_MAIN_TIM0 and so on
 
 
 def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
@@ -85,9 +110,10 @@ def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
     remedy = "log vehicle_angular_velocity or sensor_combined (SDLOG_PROFILE)"
     rates, gyro = needed(path, log.fastest(_RATES, ("p", "q", "r")), "body rates", remedy)
     remedy = "log esc_status, actuator_motors or actuator_outputs"
-    rotors = needed(path, rotors_of(log), "rotor speeds or commands", remedy)
+    rotors = needed(path, _rotors(log), "rotor speeds or commands", remedy)
+    names = [f"{rotors.topic}.{field}" for field in rotors.fields]
     prefix = "omega" if rotors.measured else "command"
-    log.names.update((f"{prefix}{i + 1}", name) for i, name in enumerate(rotors.names))
+    log.names.update((f"{prefix}{i}", name) for i, name in enumerate(names, start=1))
     force = log.fastest(_FORCES, ("ax", "ay", "az"))
     others = {
         ("ax", "ay", "az"): None if force is None else force[0],
@@ -95,85 +121,58 @@ def read_ulog(path: Path) -> tuple[Table, tuple[str, ...]]:
         tuple(_FLAGS): _position(log),
         ("voltage",): _voltage(log),
     }
-    rows, columns = gyro_rows(path, rates, rotors.series, measured=rotors.measured, others=others)
-    log.notes.extend([rotors.note] if rotors.note else [])
-    log.notes.append(order_note(rotors.names[0]))
-    facts = _facts(log, rows, Sampling(rotors.topic, rotors.rate), Sampling(gyro, logged_rate(rates.t)))
-    return Table(path, columns, first_row=None, names=log.names, remedy=_REMEDY, facts=facts), tuple(log.notes)
+    table = Table(path, {}, first_row=None, names=log.names, remedy=_REMEDY)
+    rows, table = gyro_rows(table, rates, rotors.series, measured=rotors.measured, others=others)
+    log.notes.extend(filter(None, (rotors.note, order_note(names[0]))))
+    sampling = {"motors": Sampling(rotors.topic, rotors.rate), "gyro": Sampling(gyro, logged_rate(rates.t))}
+    facts = _facts(log, rows)._replace(**sampling)
+    return table._replace(facts=facts), tuple(log.notes)
 
 
 ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(MAGIC[:4]), read_ulog)
 
 
+def _check_vehicle(log: Topics) -> None:
+    """Refuse a vehicle that is not a quadrotor: servos and more motors would be read as rotors. Raises `InputError`."""
+    status, parameter = "vehicle_status", log.parameters.get
+    motors, rotors = log.fields("actuator_motors"), int(parameter("CA_ROTOR_COUNT", 0.0))
+    others = [i for i in range(4, _MOTORS) if np.nan_to_num(motors.get(f"control[{i}]", np.zeros(1))).any()]
+    is_vtol = float(log.fields(status).get("is_vtol", np.zeros(1)).any())
+    counts = {} if rotors in (0, 4) else {rotors: f"a vehicle with {rotors} rotors"}
+    for value, kinds, name in (
+        (is_vtol, {1: _VTOL}, f"{status}.is_vtol"),
+        (log.latest(status, "system_type"), _MAV_TYPES, f"{status}.system_type"),
+        (parameter("MAV_TYPE"), _MAV_TYPES, "MAV_TYPE"),
+        (log.latest(status, "vehicle_type"), _VEHICLE_TYPES, f"{status}.vehicle_type"),
+        (parameter("CA_AIRFRAME"), _CA_AIRFRAMES, "CA_AIRFRAME"),
+        (rotors, counts, "CA_ROTOR_COUNT"),
+        (len(others), {n: f"a vehicle that drives {4 + n} motors" for n in range(1, _MOTORS)}, "actuator_motors"),
+    ):
+        if value is not None and int(value) in kinds:
+            what = f"this is {kinds[int(value)]}; only a quadrotor can be identified: give the log of one"
+            name += f".control[{others[0]}]" if name == "actuator_motors" else ""
+            refuse(log.path, what, column=name, kind="parameter" if name.isupper() else "field")
+
+
 def _attitude(log: Topics) -> Series | None:
-    series = log.series("vehicle_attitude", tuple(f"q[{i}]" for i in range(4)))
+    series = log.series("vehicle_attitude", [f"q[{i}]" for i in range(4)])
     if series is None:
         return None
     log.names.update(dict.fromkeys(_ANGLES, "vehicle_attitude.q"))
-    angles = attitude_of(series.t, series.values)
-    return Series(series.t, angles.values * HALF_TURN)
+    return Series(series.t, attitude_of(series.t, series.values).values * HALF_TURN)
 
 
 def _position(log: Topics) -> Series | None:
-    columns = tuple(_FLAGS)
-    logged = log.fields("vehicle_local_position")
-    flags = {column: flag for column, flag in _FLAGS.items() if flag in logged}
-    series = log.series("vehicle_local_position", (*columns, *flags.values()))
+    topic = "vehicle_local_position"
+    flags = {column: flag for column, flag in _FLAGS.items() if flag in log.fields(topic)}
+    series = log.series(topic, (*_FLAGS, *flags.values()))
     if series is None:
         return None
     values = series.values[:, :6] * np.tile(HALF_TURN, 2)
     for i, column in enumerate(flags):
-        values[series.values[:, 6 + i] == 0, columns.index(column)] = np.nan
-    log.names.update((name, f"vehicle_local_position.{name}") for name in columns)
+        values[series.values[:, 6 + i] == 0, list(_FLAGS).index(column)] = np.nan
+    log.names.update((name, f"{topic}.{name}") for name in _FLAGS)
     return Series(series.t, values)
-
-
-def _check_vehicle(log: Topics) -> None:
-    """Refuse a vehicle that is not a quadrotor: servos and more motors would be read as rotors. Raises `InputError`."""
-    status, parameter = "vehicle_status", log.parameters.get
-    if log.fields(status).get("is_vtol", np.zeros(1)).any():
-        _refuse(log, _VTOL, f"{status}.is_vtol")
-    system = log.latest(status, "system_type")
-    for value, kinds, name, place in (
-        (system, _MAV_TYPES, f"{status}.system_type", "field"),
-        (parameter("MAV_TYPE"), _MAV_TYPES, "MAV_TYPE", "parameter"),
-        (log.latest(status, "vehicle_type"), _VEHICLE_TYPES, f"{status}.vehicle_type", "field"),
-        (parameter("CA_AIRFRAME"), _CA_AIRFRAMES, "CA_AIRFRAME", "parameter"),
-    ):
-        if value is not None and int(value) in kinds:
-            _refuse(log, kinds[int(value)], name, place)
-    rotors = int(parameter("CA_ROTOR_COUNT", 0.0))
-    if rotors not in (0, 4):
-        _refuse(log, f"a vehicle with {rotors} rotors", "CA_ROTOR_COUNT", "parameter")
-    motors = log.fields("actuator_motors")
-    others = [i for i in range(4, _MOTORS) if np.nan_to_num(motors.get(f"control[{i}]", np.zeros(1))).any()]
-    if others:
-        _refuse(log, f"a vehicle that drives {4 + len(others)} motors", f"actuator_motors.control[{others[0]}]")
-
-
-def _refuse(log: Topics, what: str, name: str, kind: str = "field") -> None:
-    refuse(log.path, f"this is {what}; {_ONLY}", column=name, kind=kind)
-
-
-def _facts(log: Topics, rows: np.ndarray, motors: Sampling, gyro: Sampling) -> LogFacts:
-    """The facts of the log; `rows`: the times of the flight's samples [s], in the log's time."""
-    positions = [[log.parameters.get(f"CA_ROTOR{i}_P{axis}", math.nan) for axis in "XY"] for i in range(4)]
-    moments = [log.parameters.get(f"CA_ROTOR{i}_KM", math.nan) for i in range(4)]
-    known = log.parameters.get("CA_ROTOR_COUNT") == 4
-    # PX4's y points to the right. Generic airframes say 1 m, because only the directions of the rotors matter to PX4.
-    placed = known and np.isfinite(positions).all() and not np.isin(np.abs(positions), (0.0, 1.0)).all()
-    spun = known and all(moment != 0 and math.isfinite(moment) for moment in moments)
-    cells = (log.latest("battery_status", "cell_count"), log.parameters.get("BAT1_N_CELLS"))
-    cells = next((int(each) for each in (*cells, log.parameters.get("BAT_N_CELLS")) if each and each > 0), None)
-    return LogFacts(
-        motors,
-        gyro,
-        faster=_faster(log),
-        landed=_landed(log, rows),
-        rotor_positions=tuple((float(x), -float(y)) for x, y in positions) if placed else None,
-        rotor_spins=tuple(math.copysign(1.0, moment) for moment in moments) if spun else None,
-        cells=cells,
-    )
 
 
 def _voltage(log: Topics) -> Series | None:
@@ -182,9 +181,32 @@ def _voltage(log: Topics) -> Series | None:
         series = log.series("battery_status", (name,))
         if series is not None:
             log.names["voltage"] = f"battery_status.{name}"
-            possible = (series.values > 0) & (series.values < _HIGHEST_VOLTAGE)
+            possible = (series.values > 0) & (series.values < LIMITS["voltage"].largest)
             return Series(series.t, np.where(possible, series.values, np.nan))
     return None
+
+
+def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
+    """The facts of the log; `rows`: the times of the flight's samples [s], in the log's time."""
+    get = log.parameters.get
+    positions = [[get(f"CA_ROTOR{i}_P{axis}", math.nan) for axis in "XY"] for i in range(4)]
+    moments = [get(f"CA_ROTOR{i}_KM", math.nan) for i in range(4)]
+    known = get("CA_ROTOR_COUNT") == 4
+    # PX4's y points to the right. Generic airframes say 1 m, because only the directions of the rotors matter to PX4.
+    placed = known and np.isfinite(positions).all() and not np.isin(np.abs(positions), (0.0, 1.0)).all()
+    spun = known and all(moment != 0 and math.isfinite(moment) for moment in moments)
+    cells = (log.latest("battery_status", "cell_count"), get("BAT1_N_CELLS"), get("BAT_N_CELLS"))
+    profile, high_rate = int(get("SDLOG_PROFILE", 1.0)), 16  # `add_high_rate_topics`
+    faster = f"set SDLOG_PROFILE to {profile | high_rate} (which includes {high_rate}, 'high rate'), and fly again"
+    if profile & high_rate:
+        faster = "log esc_status or actuator_motors at full rate (logger_topics.txt on the card), and fly again"
+    return LogFacts(
+        faster=faster,
+        landed=_landed(log, rows),
+        rotor_positions=tuple((float(x), -float(y)) for x, y in positions) if placed else None,
+        rotor_spins=tuple(math.copysign(1.0, moment) for moment in moments) if spun else None,
+        cells=next((int(each) for each in cells if each and each > 0), None),
+    )
 
 
 def _landed(log: Topics, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
@@ -193,22 +215,135 @@ def _landed(log: Topics, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
     series = log.series("vehicle_land_detected", names) if names else None
     if series is None:
         return ()
-    on_ground = (series.values > 0).any(axis=1)
-    begins, ends = series.t, np.append(series.t[1:], np.inf)  # a state holds until the next one
-    begins, ends = np.maximum(begins, rows[0])[on_ground], np.minimum(ends, rows[-1])[on_ground]
-    found: list[tuple[float, float]] = []
-    for begin, end in zip((begins - rows[0]).tolist(), (ends - rows[0]).tolist(), strict=True):
-        if end < begin:
-            continue
-        if found and begin <= found[-1][1]:
-            begin = found.pop()[0]
-        found.append((begin, end))
-    return tuple(found)
+    changes = np.flatnonzero(np.diff((series.values > 0).any(axis=1), prepend=False, append=False))
+    times = np.append(series.t, np.inf)[changes]  # a state holds until the next one
+    begins, ends = np.maximum(times[::2], rows[0]) - rows[0], np.minimum(times[1::2], rows[-1]) - rows[0]
+    return tuple((a, b) for a, b in zip(begins.tolist(), ends.tolist(), strict=True) if a <= b)
 
 
-def _faster(log: Topics) -> str:
-    """Advice to make PX4 log faster. Reference: `logged_topics.cpp` of PX4, `add_high_rate_topics`."""
-    profile, high_rate = int(log.parameters.get("SDLOG_PROFILE", 1.0)), 16
-    if profile & high_rate:
-        return "log esc_status or actuator_motors at full rate (logger_topics.txt on the card), and fly again"
-    return f"set SDLOG_PROFILE to {profile | high_rate} (which includes {high_rate}, 'high rate'), and fly again"
+class _Rotors(NamedTuple):
+    """Measured speeds [rad/s] or commands [0..1] of the four rotors, and their topic and fields in the log."""
+
+    series: Series
+    topic: str
+    fields: Sequence[str]
+    note: str = ""  # what was assumed
+
+    @property
+    def measured(self) -> bool:
+        return self.topic == "esc_status"
+
+    @property
+    def rate(self) -> float:
+        return logged_rate(self.series.t)
+
+
+def _rotors(log: Topics) -> _Rotors | None:
+    """Measured speeds, or the motors' commands, or the outputs: the first that was logged often enough.
+
+    If none was, the one that was logged most often.
+    """
+    every = [found for find in (_speeds, _motors, _outputs) if (found := find(log)) is not None]
+    rarely = max(every, key=lambda each: each.rate, default=None)
+    chosen = next((each for each in every if fast_enough(each.rate)), rarely)
+    if chosen is not None and every[0].measured and not chosen.measured:
+        log.notes.append(f"measured speeds (esc_status) were logged at {every[0].rate:.2g} Hz only: commands are used")
+    return chosen
+
+
+def _speeds(log: Topics) -> _Rotors | None:
+    names = [f"esc[{i}].esc_rpm" for i in range(4)]
+    series = log.series("esc_status", names)
+    if series is None or series.t.size < 2:
+        return None
+    if not (np.abs(series.values) > 0).any(axis=0).all():
+        log.notes.append("esc_status holds no speed of at least one rotor: commands are used")
+        return None
+    functions = [int(log.latest("esc_status", f"esc[{i}].actuator_function") or 0) for i in range(4)]
+    order = _motor_order(functions) or range(4)
+    measured = np.isfinite(series.values).all(axis=1)
+    if np.count_nonzero(measured) < 2:
+        return None
+    speeds = Series(series.t[measured], np.abs(series.values[measured])[:, order] * _RPM)
+    return _Rotors(speeds, "esc_status", [names[i] for i in order])
+
+
+def _motors(log: Topics) -> _Rotors | None:
+    names = [f"control[{i}]" for i in range(4)]
+    series = log.series("actuator_motors", names)
+    if series is None or series.t.size < 2 or not np.isfinite(series.values).any():
+        return None
+    shares = np.clip(np.nan_to_num(series.values), 0.0, 1.0)  # NaN means not armed
+    curve, what = _thrust_curve(log)
+    note = f"commands are actuator_motors.control, {what}"
+    return _Rotors(Series(series.t, np.sqrt(shares) if curve else shares), "actuator_motors", names, note)
+
+
+def _outputs(log: Topics) -> _Rotors | None:
+    place = _bank_of_motors(log)
+    if place is None:
+        return None
+    names = [f"output[{i}]" for i in place[1]]
+    found = [log.series("actuator_outputs", names, i) for i in range(len(log.topics.get("actuator_outputs", [])))]
+    found = [s for s in found if s is not None and s.t.size > 1 and np.isfinite(s.values).all()]
+    if not found:
+        return None
+    series = max(found, key=lambda each: float(each.values.std(axis=0).min()))
+    kind, low, high = _limits(log, series.values, *place)
+    shares = np.clip((series.values - low) / (high - low), 0.0, 1.0)
+    curve, what = _thrust_curve(log)
+    speeds = np.sqrt(curve * shares**2 + (1 - curve) * shares) if curve else shares
+    note = f"commands are actuator_outputs.output, {kind} {low.min():g}..{high.max():g}, {what}"
+    return _Rotors(Series(series.t, speeds), "actuator_outputs", names, note)
+
+
+def _thrust_curve(log: Topics) -> tuple[float, str]:
+    """THR_MDL_FAC, 0 if it is not known, and what follows for the speeds."""
+    curve = log.parameters.get("THR_MDL_FAC", 0.0)
+    if 0 < curve <= 1:
+        return curve, f"taken as fractions of full-scale rotor speed by THR_MDL_FAC = {curve:.3g}"
+    return 0.0, (
+        "taken as fractions of full-scale rotor speed, because THR_MDL_FAC is 0: the thrust curve was not measured "
+        "(the term curve of a vehicle fits it, if the accelerometer was logged)"
+    )
+
+
+def _bank_of_motors(log: Topics) -> tuple[str, list[int]] | None:
+    """The beginning of the parameters' names of the outputs of motors 1 to 4, and these outputs.
+
+    None if the log says which motor an output drives, but no driver has all four motors. Old PX4: the first of MAIN.
+    """
+    for bank in _BANKS:
+        order = _motor_order([int(log.parameters.get(f"{bank}_FUNC{i + 1}", 0.0)) for i in range(_OUTPUTS)])
+        if order is not None:
+            return bank, order
+    unknown = not any(f"{bank}_FUNC1" in log.parameters for bank in (*_BANKS, *_OTHER_BANKS))
+    return ("PWM_MAIN", [0, 1, 2, 3]) if unknown else None
+
+
+def _motor_order(functions: list[int]) -> list[int] | None:
+    """Where motors 1 to 4 are among the outputs with these functions; None if one of them is not."""
+    motors = range(_FIRST_MOTOR, _FIRST_MOTOR + 4)
+    return [functions.index(motor) for motor in motors] if set(motors) <= set(functions) else None
+
+
+def _limits(log: Topics, values: np.ndarray, bank: str, channels: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
+    """The protocol, and the values of each output at which its motor idles and is at full speed."""
+    turning, get = values[values > 1], log.parameters.get
+    small, link = (turning < _LEAST_PWM).any(), log.latest("esc_status", "esc_connectiontype")
+    timers = {get(f"{bank}_TIM{i}") for i in range(_TIMERS)}
+    kind, names, possible, default = "PWM", [f"{bank}_", "PWM_"], (_LEAST_PWM, _HIGHEST_PWM), _PWM
+    if bank == "UAVCAN_EC" or (turning > _HIGHEST_PWM).any() or (small and link == _CAN):
+        kind, names, possible, default = "UAVCAN", ["UAVCAN_EC_"], (0.0, 8191.0), _UAVCAN
+    elif small or link == _DSHOT_LINK or get("DSHOT_CONFIG", 0.0) > 0 or timers & set(_DSHOT_TIMERS):
+        least = get("DSHOT_MIN", 0.0)
+        kind, names, default = "DShot", [], (_DSHOT * least if 0 <= least < 0.5 else 0.0, _DSHOT)
+
+    def known(end: int, channel: int) -> float:
+        """By the output's number, else of the bank, else the default."""
+        every = [get(f"{name}{('MIN', 'MAX')[end]}{number}") for name in names for number in (channel + 1, "")]
+        return next((each for each in every if each is not None and possible[0] <= each <= possible[1]), default[end])
+
+    low, high = (np.array([known(end, channel) for channel in channels]) for end in (0, 1))
+    right = low < high
+    return kind, np.where(right, low, default[0]), np.where(right, high, default[1])

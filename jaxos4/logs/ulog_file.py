@@ -24,21 +24,15 @@ from .sampling import Series, in_order, logged_rate
 from .table import Path, opened, printable, refuse
 
 MAGIC = b"ULog\x01\x12\x35"
+HALF_TURN = np.array([1.0, -1.0, -1.0])  # about x: from forward, right, down to forward, left, up
+
+_FASTER = 1.1  # a topic that is this much faster than another is preferred to it
 _MOST_FIELDS = 1024  # of one message, with those of arrays and nested messages; the largest of PX4 have about 200
 _DEEPEST = 3  # levels of messages inside messages
 _HEADER = struct.Struct("<HB")
 _FIELD = re.compile(rb"([A-Za-z0-9_]+)(?:\[(\d{1,5})\])? ([A-Za-z0-9_]+)")
+_BASIC = re.compile(rb"u?int(8|16|32|64)_t|float|double|bool|char")
 _PARAMETER = re.compile(rb"(int32_t|float) ([A-Za-z0-9_]{1,32})")
-_BASIC = {
-    b"int8_t", b"uint8_t", b"int16_t", b"uint16_t", b"int32_t", b"uint32_t", b"int64_t", b"uint64_t",
-    b"float", b"double", b"bool", b"char",
-}  # fmt: skip
-
-
-HALF_TURN = np.array([1.0, -1.0, -1.0])  # about x: from forward, right, down to forward, left, up
-
-# A topic that is this much faster than another is preferred to it.
-_FASTER = 1.1
 
 Fields = dict[str, np.ndarray]
 
@@ -70,13 +64,13 @@ class Topics(NamedTuple):
 
     def fields(self, topic: str, instance: int = 0) -> Fields:
         """The fields of a topic; none if it was not logged."""
-        found = self.topics.get(topic, [])[instance : instance + 1]
-        return found[0] if found else {}
+        found = self.topics.get(topic, [])
+        return found[instance] if instance < len(found) else {}
 
     def series(self, topic: str, fields: Sequence[str], instance: int = 0) -> Series | None:
         """Samples of the fields of a topic, or None if one of them was not logged."""
         raw = self.fields(topic, instance)
-        if not raw or not all(name in raw for name in fields):
+        if not raw or not raw.keys() >= set(fields):
             return None
         stamp = raw.get("timestamp_sample", raw["timestamp"])
         stamp = np.asarray(stamp if np.all(stamp > 0) else raw["timestamp"], dtype=float)
@@ -116,14 +110,13 @@ class Topics(NamedTuple):
 
         Reference: `calibration::Gyroscope::Correct` and `calibration::Accelerometer::Correct` of PX4.
         """
-        get, device = self.parameters.get, self.fields(source.topic, instance).get("device_id")
-        turned = get("SENS_BOARD_ROT", 0.0) or any(get(f"SENS_BOARD_{axis}_OFF", 0.0) for axis in "XYZ")
-        if turned or device is None or not device.size:
+        get, device = self.parameters.get, self.fields(source.topic, instance).get("device_id", np.empty(0))
+        if get("SENS_BOARD_ROT", 0.0) or any(get(f"SENS_BOARD_{axis}_OFF", 0.0) for axis in "XYZ"):
             return None
-        for number in range(4):
-            name = f"{source.calibration}{number}_"
+        for name in (f"{source.calibration}{number}_" for number in range(4)):
             # A parameter is a signed number of 32 bits, the identity of a sensor an unsigned one.
-            if int(get(f"{name}ID", 0.0)) % (1 << 32) == int(device[0]) != 0 and not get(f"{name}ROT", -1.0) > 0:
+            known = device.size and int(get(f"{name}ID", 0.0)) % (1 << 32) == int(device[0]) != 0
+            if known and not get(f"{name}ROT", -1.0) > 0:
                 offset = np.array([get(f"{name}{axis}OFF", 0.0) for axis in "XYZ"])
                 scale = np.array([get(f"{name}{axis}SCALE", 1.0) for axis in "XYZ"])
                 return Series(series.t, (series.values - offset) * scale)
@@ -135,7 +128,6 @@ def decoded(path: Path, topics: Sequence[str]) -> Topics:
     walk = _Walk(path, {name.encode() for name in topics})
     with opened(path, "rb") as file:
         content, cut = walk.through(file)
-    notes = [f"the log ends abruptly: its last {cut} bytes are ignored"] if cut else []
     try:
         from pyulog.core import ULog
         from pyulog.exceptions import ULogException
@@ -153,6 +145,7 @@ def decoded(path: Path, topics: Sequence[str]) -> Topics:
     for data in sorted(log.data_list, key=lambda data: data.multi_id):
         if "timestamp" in data.data:
             found.setdefault(data.name, []).append(data.data)
+    notes = [f"the log ends abruptly: its last {cut} bytes are ignored"] * (cut > 0)
     return Topics(path, found, walk.parameters, {}, notes)
 
 
@@ -164,15 +157,13 @@ class _Walk:
     """
 
     def __init__(self, path: Path, topics: set[bytes]):
-        self.path, self.topics = path, topics
-        self.position = 0
+        self.path, self.topics, self.position = path, topics, 0
         self.formats: dict[bytes, bytes] = {}
-        self.used: set[bytes] = set()
-        self.definitions, self.data = bytearray(), bytearray()
+        self.definitions: dict[bytes, bytes] = {}
+        self.data = bytearray()
         self.appended: tuple[int, ...] = ()
         self.parameters: dict[str, float] = {}
-        self.wanted: set[int] = set()
-        self.others: set[int] = set()
+        self.wanted: dict[int, bool] = {}  # of the topics' numbers
 
     def through(self, file: IO[bytes]) -> tuple[bytes, int]:
         """A smaller file, and the number of bytes that were cut off its end. Raises `InputError`."""
@@ -181,97 +172,76 @@ class _Walk:
             refuse(self.path, "is not a ULog file of version 1; give a .ulg file")
         if len(start) < 16:
             refuse(self.path, "ends within its header; copy the log again from the vehicle")
-        self.position = len(start)
-        cut = 0
+        self.position, cut = len(start), 0
         while header := file.read(3):
             length, kind = _HEADER.unpack(header) if len(header) == 3 else (0, 0)
             appended = min((each for each in self.appended if each > self.position), default=math.inf)
             if self.position + 3 + length > appended:  # the message was cut by a crash; the log goes on after it
                 self.position = file.seek(int(appended))
                 continue
-            body = file.read(length)
-            if len(header) < 3 or len(body) < length:
-                cut = len(header) + len(body)
+            message = header + (body := file.read(length))
+            if len(message) < 3 + length:
+                cut = len(message)
                 break
             if kind == 0:
-                cut = len(header) + len(body) + self._zeros(file, header + body)
+                while message:
+                    if message.strip(b"\0"):
+                        self._corrupt("no message begins there")
+                    cut += len(message)
+                    message = file.read(1 << 20)
                 break
-            self._take(kind, header, body)
-            self.position += len(header) + length
-        return bytes(start + self.definitions + self.data), cut
+            self._take(chr(kind), message, body)
+            self.position += len(message)
+        return start + b"".join(self.definitions.values()) + bytes(self.data), cut
 
-    def _take(self, kind: int, header: bytes, body: bytes) -> None:
-        if kind == ord("D"):
-            number = int.from_bytes(body[:2], "little")
-            if number in self.wanted:
-                self.data += header + body
-            elif number not in self.others or len(body) < 2:
+    def _take(self, kind: str, message: bytes, body: bytes) -> None:
+        if kind == "D":
+            wanted = self.wanted.get(int.from_bytes(body[:2], "little")) if len(body) > 1 else None
+            if wanted is None:
                 self._corrupt("data of a topic that was never announced")
-        elif kind == ord("F"):
-            self.formats[body.partition(b":")[0]] = body
-        elif kind == ord("A"):
-            self._announce(header, body)
-        elif kind == ord("P"):
-            self._set_parameter(body)
-        elif kind == ord("B"):
+            if wanted:
+                self.data += message
+        elif kind == "F":
+            self.formats[body.partition(b":")[0]] = message
+        elif kind == "A":
+            if len(body) < 4:
+                self._corrupt("a topic without a name")
+            wanted = self.wanted[int.from_bytes(body[1:3], "little")] = body[3:] in self.topics
+            if wanted:
+                self._define(body[3:], 0)
+                self.data += message
+        elif kind == "P":
+            # A damaged parameter is ignored: the flight does not depend on most of them.
+            parts = _PARAMETER.fullmatch(body[1:-4])
+            if parts is not None and body[0] == len(parts[0]):
+                (value,) = struct.unpack("<i" if parts[1] == b"int32_t" else "<f", body[-4:])
+                self.parameters |= {parts[2].decode(): float(value)} if math.isfinite(value) else {}
+        elif kind == "B":
             if len(body) >= 16 and (body[8] & 0xFE or any(body[9:16])):
                 refuse(self.path, "has a newer ULog format than this reader knows; update jaxos4")
             if len(body) >= 40 and body[8] & 1:
                 self.appended = struct.unpack_from("<QQQ", body, 16)
-        elif not ord("A") <= kind <= ord("Z"):
+        elif not "A" <= kind <= "Z":
             self._corrupt("no message begins there")
-
-    def _set_parameter(self, body: bytes) -> None:
-        """A damaged parameter is ignored: the flight does not depend on most of them."""
-        parts = _PARAMETER.fullmatch(body[1 : 1 + body[0]]) if body else None
-        if parts is None or len(body) != 1 + body[0] + 4:
-            return
-        value = float(struct.unpack("<i" if parts[1] == b"int32_t" else "<f", body[-4:])[0])
-        if math.isfinite(value):
-            self.parameters[parts[2].decode()] = value
-
-    def _announce(self, header: bytes, body: bytes) -> None:
-        if len(body) < 4:
-            self._corrupt("a topic without a name")
-        number, name = int.from_bytes(body[1:3], "little"), body[3:]
-        if name not in self.topics:
-            self.others.add(number)
-            return
-        self._define(name, 0)
-        self.wanted.add(number)
-        self.others.discard(number)
-        self.data += header + body
 
     def _define(self, name: bytes, depth: int) -> int:
         """Keep the format of a message and the formats inside it. Returns the number of its fields."""
-        body = self.formats.get(name)
-        if body is None:
+        message = self.formats.get(name)
+        if message is None:
             self._corrupt(f"topic {printable(name[:40].decode(errors='replace'))} has no format")
         if depth > _DEEPEST:
             self._corrupt("messages are nested too deeply")
         total = 0
-        for field in filter(None, body.partition(b":")[2].split(b";")):
+        for field in filter(None, message[3:].partition(b":")[2].split(b";")):
             parts = _FIELD.fullmatch(field)
             if parts is None:
                 self._corrupt("a field cannot be read")
             count = int(parts[2] or 1)
-            total += count * (1 if parts[1] in _BASIC else self._define(parts[1], depth + 1) if count else 0)
+            total += count * (1 if _BASIC.fullmatch(parts[1]) else self._define(parts[1], depth + 1) if count else 0)
             if total > _MOST_FIELDS:
                 self._corrupt(f"a message has more than {_MOST_FIELDS} fields")
-        if name not in self.used:
-            self.used.add(name)
-            self.definitions += _HEADER.pack(len(body), ord("F")) + body
+        self.definitions.setdefault(name, message)
         return total
-
-    def _zeros(self, file: IO[bytes], rest: bytes) -> int:
-        """Check that `rest` and all that follows is zero. Returns the number of bytes that follow."""
-        size = 0
-        while rest:
-            if rest.strip(b"\0"):
-                self._corrupt("no message begins there")
-            rest = file.read(1 << 20)
-            size += len(rest)
-        return size
 
     def _corrupt(self, why: str) -> NoReturn:
         refuse(self.path, f"is corrupt at byte {self.position}: {why}; copy it again from the vehicle, or repair it")
