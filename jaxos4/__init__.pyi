@@ -52,7 +52,9 @@ from .analysis.prediction import Predictions as Predictions, Skill as Skill, pre
 from .analysis.sandwich import robust_covariance as robust_covariance
 from .bracket import Bracket as Bracket
 from .closed_loop import (
+    Air as Air,
     ClosedLoop as ClosedLoop,
+    Sensors as Sensors,
     fly_closed_loop as fly_closed_loop,
     random_references as random_references,
 )
