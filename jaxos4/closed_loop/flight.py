@@ -281,7 +281,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     hover, _ = _speeds(mixer, jnp.zeros(3), weight, airframe.max_rotor_speed)
     velocity = None if loop.air is None else (zero, zero, zero)
     motion = Motion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
-    signals = None if sense is None else Signals.hovering(airframe.gravity)
+    signals = None if sense is None else Signals.hovering(vehicle.gravity)
     first = _Carry(motion, hover, jnp.zeros(3), jnp.broadcast_to(hover, (runs + 1, 4)), signals)
     draws = _Draws.of(loop, key, runs, steps, h)
     inputs = (jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), draws)

@@ -32,8 +32,7 @@ def _setting(
     """
 
     def convert(value: ArrayLike | Sequence[float] | None) -> Array:
-        if optional and value is None:
-            return as_float(np.nan)
+        value = np.nan if value is None else value
         array = as_float(np.asarray(value) if isinstance(value, Sequence) else value)
         if array.shape not in ((), (len(axes),) if axes else ()):
             several = f" or {len(axes)} ({', '.join(axes)})" if axes else ""
