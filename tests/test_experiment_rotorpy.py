@@ -8,10 +8,10 @@ import jaxos4
 
 
 @pytest.mark.usefixtures("quickly_compiled")
-def test_rotorpy(tmp_path, capsys):
+def test_rotorpy(tmp_path):
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     cases = {"flights": 1, "kinds": ["calm"], "duration": 8.0, "estimators": ["filter-error"]}
-    report = report_of("rotorpy", tmp_path, folder=tmp_path / "flights", **cases)
+    report = report_of("rotorpy", tmp_path, recordings=tmp_path / "flights", **cases)
     (path,) = (tmp_path / "flights").iterdir()
     flight = jaxos4.read_flight(path)
     assert np.isfinite(flight.omega).all()
@@ -28,5 +28,5 @@ def test_rotorpy(tmp_path, capsys):
     assert all(abs(case["summary"][name]["mean"]) < 0.05 for name in ("Ix", "Iy", "Iz", "thrust"))
     # The flights that are there are not flown again, and those that were identified are not identified again.
     recorded = path.stat().st_mtime_ns
-    assert report_of("rotorpy", tmp_path, folder=tmp_path / "flights", **cases) == report
+    assert report_of("rotorpy", tmp_path, recordings=tmp_path / "flights", **cases) == report
     assert path.stat().st_mtime_ns == recorded

@@ -24,13 +24,13 @@ from flights import VEHICLE, recorded
 jax.config.update("jax_enable_x64", True)
 
 GUSTS = {"calm": 0.0, "gusty": 1.5}  # [m/s]
-ESTIMATORS = ("filter-error", "ibss", "hybrid")
+KINDS, ESTIMATORS = tuple(GUSTS), ("filter-error", "ibss", "hybrid")
 
 
 def main(
-    folder: Annotated[Path, typer.Argument(help="Folder of the flights. Those that are missing are flown.")],
+    recordings: Annotated[Path, typer.Argument(help="Folder of the flights. Those that are missing are flown.")],
     flights: Annotated[int, typer.Option(help="Number of flights of each kind.")] = 20,
-    kinds: Annotated[list[str], typer.Option(help="calm, gusty")] = list(GUSTS),
+    kinds: Annotated[list[str], typer.Option(help="calm, gusty")] = KINDS,
     duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
     seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 21,
     estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = (
@@ -43,7 +43,7 @@ def main(
     """Fly and identify RotorPy's Hummingbird."""
 
     def flights_of(kind: str) -> list[jaxos4.Flight]:
-        return [jaxos4.read_flight(recorded(folder, GUSTS[kind], i, duration, seed)) for i in range(flights)]
+        return [jaxos4.read_flight(recorded(recordings, GUSTS[kind], i, duration, seed)) for i in range(flights)]
 
     settings = {"flights": flights, "duration": duration, "seed": seed}
     report = run_cases(out, settings, list(itertools.product(kinds, estimators)), VEHICLE, flights_of)
