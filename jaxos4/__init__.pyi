@@ -59,7 +59,9 @@ from .analysis.inertia import (
 from .analysis.prediction import Predictions as Predictions, Skill as Skill, predictions as predictions, skill as skill
 from .bracket import Bracket as Bracket
 from .closed_loop import (
+    Air as Air,
     ClosedLoop as ClosedLoop,
+    Sensors as Sensors,
     fly_closed_loop as fly_closed_loop,
     random_references as random_references,
 )

@@ -1,6 +1,7 @@
 """Simulation of a flight from rotor speeds: forward Euler, Runge-Kutta 4, or diffrax's adaptive Tsit5."""
 
 from collections.abc import Callable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,18 @@ from .models.abstract import AbstractModel
 from .models.state import CASCADE_ORDER, Forcing, State, stack, unstack
 from .results import RESULTS
 
+S = TypeVar("S")
+
+
+@runtime_checkable
+class Cascade(Protocol[S]):
+    """Whatever has a derivative: a model, or the true vehicle of a simulation."""
+
+    def cascade(self, state: S, forcing: Any, parameters: Any) -> S:
+        """The time derivative of a state, which is any tree of numbers."""
+        ...
+
+
 Stepper = Callable[[AbstractModel, State, Forcing, Parameters | tuple[Scalar, ...], Scalar], State]
 
 
@@ -23,7 +36,7 @@ def euler_step(model: AbstractModel, state: State, forcing: Forcing, parameters,
     return _advance(state, model.cascade(state, forcing, parameters), dt)
 
 
-def rk4_step(model: AbstractModel, state: State, forcing: Forcing, parameters, dt: Scalar) -> State:
+def rk4_step(model: Cascade[S], state: S, forcing: Any, parameters: Any, dt: Scalar) -> S:
     """The classical Runge-Kutta step, of order 4. The forcing is constant over the step."""
     k1 = model.cascade(state, forcing, parameters)
     k2 = model.cascade(_advance(state, k1, dt / 2), forcing, parameters)
@@ -33,7 +46,7 @@ def rk4_step(model: AbstractModel, state: State, forcing: Forcing, parameters, d
     return _advance(state, mean, dt)
 
 
-def _advance(state: State, derivative: State, dt: Scalar) -> State:
+def _advance(state: S, derivative: S, dt: Scalar) -> S:
     return jax.tree.map(lambda x, dx: x + dt * dx, state, derivative)
 
 

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, CRAZYFLIE_TOML, FULL_SPEED, refused
+from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.closed_loop import fly_standard, ornstein_uhlenbeck
 
 DT, SECONDS = 0.004, 20.0
 SAMPLES = round(SECONDS / DT) + 1
-RATES, ANGLES = [7, 9, 11], [6, 8, 10]
+RATES, ANGLES, VELOCITY = [7, 9, 11], [6, 8, 10], [1, 3, 5]
 SUCCESS = jaxos4.RESULTS.successful
 QUIET = {"gyro_noise": 0.0, "attitude_noise": 0.0, "force_noise": 0.0}
 NO_GAINS = {"attitude_gain": 0.0, "rate_gain": 0.0, "integral_gain": 0.0}
@@ -41,27 +42,35 @@ def fly(loop, wanted=LEVEL, *, seed=1):
 
 
 def fall_and_turn(motion, speeds, change, v):
-    """The derivative of rates and attitude from Newton and Euler, with one force for each rotor."""
+    """The derivative of rates, attitude and velocity from Newton and Euler, with one force for each rotor.
+
+    The velocity is along the axes of the earth.
+    """
     airframe = v.airframe
     (x, y), spin = np.asarray(airframe.rotor_positions).T, np.asarray(airframe.rotor_spins)
     inertia, rotor = np.asarray(airframe.inertia), float(airframe.rotor_inertia)
     force = float(airframe.thrust_coefficient) * speeds**2
     yaw = -float(airframe.drag_coefficient) * spin @ speeds**2 - rotor * spin @ change
-    rate, (phi, theta, _) = motion[:3], motion[3:]
+    rate, (phi, theta, psi) = motion[:3], motion[3:6]
     momentum = inertia * rate + [0, 0, rotor * spin @ speeds]
     turning = (np.array([y @ force, -x @ force, yaw]) - np.cross(rate, momentum)) / inertia
     turning += np.asarray(v.offset) - np.asarray(v.damping) * rate
+    to_earth = Rotation.from_euler("ZYX", [psi, theta, phi])
+    along = to_earth.inv().apply(motion[6:])
+    turning += np.array([*np.asarray(v.air.flapping) * along[[1, 0]], 0])
+    specific = [0, 0, force.sum() / float(airframe.mass)] - np.array([*v.air.drag, v.air.inflow]) * along
+    moving = to_earth.apply(specific) - [0, 0, float(airframe.gravity)]
     across = rate[1] * np.sin(phi) + rate[2] * np.cos(phi)
-    along = rate[1] * np.cos(phi) - rate[2] * np.sin(phi)
-    return np.array([*turning, rate[0] + np.tan(theta) * across, along, across / np.cos(theta)])
+    forward = rate[1] * np.cos(phi) - rate[2] * np.sin(phi)
+    return np.array([*turning, rate[0] + np.tan(theta) * across, forward, across / np.cos(theta), *moving])
 
 
 def reference_motion(v, omega, samples, fine=10):
-    """Rates and attitude at each sample, and mean rotor speeds over it, from the commands: small midpoint steps."""
+    """Rates, attitude and velocity at each sample, mean rotor speeds over it, from commands: small midpoint steps."""
     h, lag, delay = DT / fine, float(v.rotor_lag), float(v.rotor_delay)
     weight = float(v.airframe.mass * v.airframe.gravity)
     hover = np.sqrt(np.linalg.solve(np.asarray(v.airframe.mixer), [0, 0, 0, weight]))
-    motion, speeds, motions, means = np.zeros(6), hover, [], []
+    motion, speeds, motions, means = np.zeros(9), hover, [], []
     for k in range(samples):
         motions.append(motion)
         sums = np.zeros(4)
@@ -100,6 +109,8 @@ def rough():
     inertia = 1.25 * np.asarray(CRAZYFLIE.inertia)
     return loop_of(
         **{"rotor_lag": 0.04, "rotor_delay": 2.7 * DT, "offset": (3.0, -2.0, 1.0), "damping": (1.5, 0.8, 0.4)},
+        **{"air": jaxos4.Air(drag=(0.4, 0.2), inflow=0.7, flapping=(-2.0, 1.5))},
+        sensors=jaxos4.Sensors(velocity_noise=0.0),
         controller_inertia=inertia,
     )
 
@@ -107,19 +118,25 @@ def rough():
 def test_the_motion_follows_from_the_commands(rough):
     flight, samples = fly(rough, references()), 400
     motion, _ = reference_motion(rough, np.asarray(flight.omega), samples)
-    measured = np.asarray(flight.states)[:samples, RATES + ANGLES]
+    measured = np.asarray(flight.states)[:samples, RATES + ANGLES + VELOCITY]
     assert np.abs(measured).max(axis=0).min() > 0.03
     np.testing.assert_allclose(measured, motion, rtol=0, atol=2e-4)
-    # The reference sees a delay that is wrong by half a millisecond.
-    wrong = eqx.tree_at(lambda v: v.rotor_delay, rough, rough.rotor_delay + 5e-4)
-    assert np.abs(measured - reference_motion(wrong, np.asarray(flight.omega), samples)[0]).max() > 5e-3
+    # The reference sees a delay that is wrong by half a millisecond, and each effect of the air.
+    for part, change, seen in (
+        (lambda v: v.rotor_delay, 5e-4, 5e-3),
+        (lambda v: v.air.drag, 0.1, 2e-3),
+        (lambda v: v.air.inflow, 0.1, 2e-3),
+        (lambda v: v.air.flapping, 0.5, 5e-3),
+    ):
+        wrong = eqx.tree_at(part, rough, part(rough) + change)
+        assert np.abs(measured - reference_motion(wrong, np.asarray(flight.omega), samples)[0]).max() > seen
 
 
 def test_measured_speeds_are_means_over_the_samples(rough):
     commanded, samples = fly(rough, references()), 350
     speeds = fly(loop_of(rotor_lag=0.04, logged="speeds"), references())
     assert (commanded.commanded, speeds.commanded) == (True, False)
-    same = loop_of(rotor_lag=0.04)
+    same = loop_of(rotor_lag=0.04, air=jaxos4.Air())
     _, means = reference_motion(same, np.asarray(fly(same, references()).omega), samples)
     np.testing.assert_allclose(np.asarray(speeds.omega)[:samples], means, rtol=1e-5)
 

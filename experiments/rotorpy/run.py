@@ -1,0 +1,54 @@
+"""Are the intervals right if the truth is RotorPy's, not ours?
+
+Each flight: AscTec's Hummingbird as RotorPy simulates it, under RotorPy's SE3 controller, which knows the true state.
+The references are sums of sines and steps. The airframe that is given has a thrust coefficient that is 20 % wrong and
+moments of inertia that are 25 % wrong; its mass and arms are right. The log has a gyro, an accelerometer, the attitude
+and measured rotor speeds. RotorPy's vehicle has effects that the model has otherwise or not at all: see `flights.py`.
+"""
+
+import itertools
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import typer
+
+import jaxos4
+
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
+
+from fits import print_table, run_cases
+from flights import VEHICLE, recorded
+
+jax.config.update("jax_enable_x64", True)
+
+GUSTS = {"calm": 0.0, "gusty": 1.5}  # [m/s]
+KINDS, ESTIMATORS = tuple(GUSTS), ("filter-error", "ibss", "hybrid")
+
+
+def main(
+    recordings: Annotated[Path, typer.Argument(help="Folder of the flights. Those that are missing are flown.")],
+    flights: Annotated[int, typer.Option(help="Number of flights of each kind.")] = 20,
+    kinds: Annotated[list[str], typer.Option(help="calm, gusty")] = KINDS,
+    duration: Annotated[float, typer.Option(help="Length of a flight [s].")] = 20.0,
+    seed: Annotated[int, typer.Option(help="Random seed of references, gusts and noise.")] = 21,
+    estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = (
+        "filter-error",
+        "ibss",
+        "hybrid",
+    ),
+    out: Annotated[Path | None, typer.Option(help="JSON file for the results; continued if it exists.")] = None,
+) -> None:
+    """Fly and identify RotorPy's Hummingbird."""
+
+    def flights_of(kind: str) -> list[jaxos4.Flight]:
+        return [jaxos4.read_flight(recorded(recordings, GUSTS[kind], i, duration, seed)) for i in range(flights)]
+
+    settings = {"flights": flights, "duration": duration, "seed": seed}
+    report = run_cases(out, settings, list(itertools.product(kinds, estimators)), VEHICLE, flights_of)
+    print_table(f"RotorPy's Hummingbird, flights of {duration:g} s", report)
+
+
+if __name__ == "__main__":
+    typer.run(main)

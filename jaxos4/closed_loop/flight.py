@@ -1,0 +1,327 @@
+"""A flight in closed loop: references, the true vehicle, its controller, and what its sensors log."""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from .._custom_types import Key, Numeric, Scalar, as_float
+from .._xla import quick_jit
+from ..airframe import alpha_scalars
+from ..flight import Flight
+from ..models.rotation import attitude_rates
+from ..models.state import Attitude, Rates, Vector
+from ..simulation import rk4_step
+from ..trigonometry import sincos
+from .sensors import Logged, Motion, Sense, Signals, log
+from .settings import ClosedLoop, PerAxis
+
+References = Float[Array, "samples 4"]
+
+# The controller tilts the thrust no further than this to carry the weight: the cosine of 60 degrees.
+_STEEPEST = 0.5
+
+
+def random_references(
+    *,
+    duration: float = 20.0,
+    dt: float = 0.004,
+    hold: float = 0.5,
+    amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5),
+    key: Key,
+) -> References:
+    """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
+
+    **Arguments:**
+
+    - `duration`, `dt`: length and sample time [s].
+    - `hold`: the time between two steps of one reference [s]. The references do not step at the same time.
+    - `amplitude`: levels are uniform between -amplitude and amplitude: roll, pitch, yaw [rad], acceleration [m/s^2].
+
+    **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
+
+    **Raises:** `ValueError` that names the argument.
+    """
+    for name, value in (("duration", duration), ("dt", dt), ("hold", hold)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"`{name}` must be positive and finite [s], got {value}.")
+    if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
+        raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
+    time = dt * np.arange(round(duration / dt) + 1)
+    steps = (time[:, None] / hold + np.arange(4) / 4).astype(int)
+    flown = (time >= 1) & (time <= duration - 1)
+    return _levels(key, steps, int(steps[-1, -1]) + 1, flown[:, None] * np.asarray(amplitude, dtype=float))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _levels(key: Key, steps: Int[Array, "samples 4"], count: int, amplitude: References) -> References:
+    """The level of each reference in each of its steps, of which there are at most `count`."""
+    levels = jax.random.uniform(key, (count, 4), minval=-1, maxval=1)
+    return amplitude * jnp.take_along_axis(levels, steps, axis=0)
+
+
+def fly_closed_loop(
+    loop: ClosedLoop,
+    references: References,
+    *,
+    dt: Float[ArrayLike, ""] = 0.004,
+    key: Key,
+    substeps: int = 4,
+) -> Flight:
+    """Fly a vehicle in closed loop from hovering, and return what its autopilot logs.
+
+    The flight is one `lax.scan`. `vmap` it over keys, gust strengths or airframes.
+
+    **Arguments:**
+
+    - `references`: roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, of shape
+      (samples, 4); `random_references` makes some.
+    - `dt`: the sample time of the log [s]. The controller runs `loop.log_every` times in it.
+    - `key`: for the gusts and the noise.
+    - `substeps`: Runge-Kutta steps of the physics in each sample, a multiple of `loop.log_every`.
+
+    **Returns:** a `Flight` with noisy body rates, attitude and specific force. Row k of `omega` holds the commands at
+    sample k, or the mean speed of each rotor until sample k + 1. Its `result` is that of `simulate`. After a failure
+    the measurements are NaN and the rotor speeds are 0.
+
+    **Raises:** `ValueError` that names the argument.
+    """
+    shape = jnp.shape(references)
+    if len(shape) != 2 or shape[0] < 2 or shape[1] != 4:
+        raise ValueError(f"`references` must have shape (samples, 4), at least two samples, got {shape}.")
+    if not isinstance(dt, Tracer) and not np.asarray(dt) > 0:
+        raise ValueError(f"`dt` must be positive, got {dt}.")
+    if substeps < 1 or substeps % loop.log_every:
+        several = "" if loop.log_every == 1 else f" and a multiple of `log_every` = {loop.log_every}"
+        raise ValueError(f"`substeps` must be at least 1{several}, got {substeps}.")
+    return _fly(loop, as_float(references), as_float(dt), key, substeps)
+
+
+def fly_standard(
+    loop: ClosedLoop,
+    *,
+    references: Float[Numeric, "samples 4"] | None = None,
+    duration: float = 20.0,
+    dt: float = 0.004,
+    seed: int,
+) -> Flight:
+    """Fly references, by default random ones, with all random numbers from `seed`: `jaxos4 simulate --closed-loop`."""
+    first, flight = jax.random.split(jax.random.key(seed))
+    if references is None:
+        references = random_references(duration=duration, dt=dt, key=first)
+    return fly_closed_loop(loop, as_float(references), dt=dt, key=flight)
+
+
+class _Acting(NamedTuple):
+    """What acts on the vehicle for a step.
+
+    - `torque`: [N m]. `thrust`: over the mass [m/s^2]. `gust`: of p', q', r' [rad/s^2] and the vertical force [m/s^2].
+    - `wind`: along the body's axes [m/s].
+    """
+
+    torque: Vector
+    thrust: Scalar
+    residual_speed: Scalar
+    spin_up: Scalar
+    gust: tuple[Scalar, ...]
+    wind: Vector | None
+
+
+class _Vehicle(NamedTuple):
+    """The true vehicle. Its constants are scalars, because a batch of scalars vectorises."""
+
+    alpha: tuple[Scalar, ...]
+    reaction: Scalar
+    gravity: Scalar
+    damping: tuple[Scalar, ...]
+    drag: tuple[Scalar, ...]
+    flapping: tuple[Scalar, ...]
+
+    @classmethod
+    def of(cls, loop: ClosedLoop) -> "_Vehicle":
+        """Drag along x and y, and inflow along z."""
+        airframe, air = loop.airframe, loop.air
+        ix, iy, iz = jnp.asarray(airframe.inertia)
+        rotor, gravity = jnp.asarray(airframe.rotor_inertia), jnp.asarray(airframe.gravity)
+        drag, flapping = ((), ()) if air is None else ((*air.drag, air.inflow), tuple(air.flapping))
+        return cls(alpha_scalars(ix, iy, iz, rotor), rotor / iz, gravity, tuple(loop.damping), drag, flapping)
+
+    def cascade(self, state: Motion, forcing: _Acting, parameters: None) -> Motion:
+        """The derivative of the motion: Newton and Euler in the body's axes."""
+        (p, q, r), (a1, a2, a3, a4, a5, a6, a7, a8) = state.rates, self.alpha
+        (roll, pitch, yaw), spinning, gust = forcing.torque, forcing.residual_speed, forcing.gust
+        turning = Rates(
+            q * r * a1 - a2 * spinning * q + a3 * roll + gust[0] - self.damping[0] * p,
+            p * r * a4 + a5 * spinning * p + a6 * pitch + gust[1] - self.damping[1] * q,
+            p * q * a7 + a8 * yaw + gust[2] - self.damping[2] * r - self.reaction * forcing.spin_up,
+        )
+        attitude = attitude_rates(state.rates, state.attitude)
+        if state.velocity is None or forcing.wind is None:
+            return Motion(turning, attitude, None)
+        (u, v, w), (wind_x, wind_y, _) = state.velocity, forcing.wind
+        along = Rates(self.flapping[0] * (v - wind_y), self.flapping[1] * (u - wind_x), jnp.zeros_like(u))
+        turning = jax.tree.map(jnp.add, turning, along)
+        (sin_phi, cos_phi), (sin_theta, cos_theta) = sincos(state.attitude.phi), sincos(state.attitude.theta)
+        x, y, z = self.specific_force(state.velocity, forcing)
+        moving = (
+            x + self.gravity * sin_theta - q * w + r * v,
+            y - self.gravity * cos_theta * sin_phi - r * u + p * w,
+            z - self.gravity * cos_theta * cos_phi - p * v + q * u,
+        )
+        return Motion(turning, attitude, moving)
+
+    def specific_force(self, velocity: Vector | None, forcing: _Acting) -> Vector:
+        """The specific force along the body's axes [m/s^2]: thrust, gust, and drag through the air."""
+        thrust = forcing.thrust + forcing.gust[3]
+        if velocity is None or forcing.wind is None:
+            return jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust
+        x, y, z = (drag * (wind - v) for drag, v, wind in zip(self.drag, velocity, forcing.wind, strict=True))
+        return x, y, thrust + z
+
+
+class _Carry(NamedTuple):
+    """The state from one run of the controller to the next.
+
+    `commands`: row k + 1 is the command of run k, row 0 the one before.
+    """
+
+    motion: Motion
+    speeds: Float[Array, "4"]
+    integral: PerAxis
+    commands: Float[Array, "runs 4"]
+    signals: Signals | None
+
+
+class _Draws(NamedTuple):
+    """The random numbers of a flight, each row for one run of the controller.
+
+    - `gusts`, `winds`: at the begin and the end of each step of the physics; gusts with the constant torque.
+    - `noise`: of gyro, attitude, accelerometer.
+    """
+
+    gusts: Float[Array, "runs ends 4"]
+    winds: Float[Array, "runs ends 3"] | None
+    noise: Float[Array, "runs 9"]
+    own_noise: Float[Array, "runs 3"] | None
+
+    @classmethod
+    def of(cls, loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> "_Draws":
+        """`steps` of length `h` in each run."""
+        (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
+        count, rows = runs * steps + 1, steps * np.arange(runs)[:, None] + np.arange(steps + 1)
+        gusts = jnp.append(loop.gust, loop.thrust_gust) * ornstein_uhlenbeck(gust_key, count, h / loop.gust_time)
+        gusts = jnp.append(loop.offset, 0.0) + gusts
+        spread = jnp.repeat(jnp.stack([loop.gyro_noise, loop.attitude_noise, loop.force_noise]), 3)
+        winds = own = None
+        if loop.air is not None:
+            winds = loop.air.wind * ornstein_uhlenbeck(wind_key, count, h / loop.air.wind_time)[:, :3]
+            winds = winds[rows]
+        if loop.sensors is not None:
+            own = jnp.nan_to_num(loop.sensors.controller_gyro_noise) * jax.random.normal(own_key, (runs, 3))
+        return cls(gusts[rows], winds, spread * jax.random.normal(noise_key, (runs, 9)), own)
+
+
+@quick_jit
+def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substeps: int) -> Flight:
+    samples, steps = references.shape[0], substeps // loop.log_every
+    runs, period = samples * loop.log_every, dt / loop.log_every
+    h, vehicle, airframe = period / steps, _Vehicle.of(loop), loop.airframe
+    sense_key, log_key = jax.random.split(jax.random.fold_in(key, 1))
+    sense = None if loop.sensors is None else Sense.of(loop.sensors, airframe.hover_speed, period, sense_key)
+    mixer, spins = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins)
+    # A command acts `late` runs after its own, and in the first `part` of a run the one before it still acts.
+    late = jnp.floor(loop.rotor_delay / period).astype(int)
+    part = loop.rotor_delay / period - late
+
+    def acting(weak, squares, residual, spin_up, gust, wind) -> _Acting:
+        *torque, thrust = weak * (mixer @ squares)
+        wind = None if wind is None else tuple(wind)
+        return _Acting(tuple(torque), thrust / airframe.mass, residual, spin_up, tuple(gust), wind)
+
+    def run(carry: _Carry, row):
+        k, reference, draw = row
+        weak, nothing, error = 1 - loop.sag * k / (runs - 1), jnp.zeros(()), draw.noise
+        at_once = jax.tree.map(lambda ends: ends[0], (draw.gusts, draw.winds))
+        now = acting(weak, jnp.square(carry.speeds), nothing, nothing, *at_once)
+        specific = jnp.stack(vehicle.specific_force(carry.motion.velocity, now)) + error[6:]
+        rates, attitude = jnp.stack(carry.motion.rates), jnp.stack(carry.motion.attitude) + error[3:6]
+        signals, seen, gyro = carry.signals, rates + error[:3], rates + error[:3]
+        if sense is not None and signals is not None:
+            signals, seen = sense(signals, carry.speeds, gyro, rates + draw.own_noise, specific)
+            gyro, specific = signals.filtered[:3], signals.filtered[6:]
+        command, integral = _control(loop, mixer, reference, seen, attitude, carry.integral, period)
+        commands = carry.commands.at[k + 1].set(command)
+        before, now = (commands[jnp.maximum(k + 1 - late - i, 0)] for i in (1, 0))
+
+        def step(moving, row):
+            motion, speeds = moving
+            j, *gust_and_wind = row
+            share = jnp.clip(steps * part - j, 0, 1)
+            wanted = now + share * (before - now)
+            after = wanted + (speeds - wanted) * jnp.exp(-h / loop.rotor_lag)
+            squares = (speeds * speeds + speeds * after + after * after) / 3
+            residual, spin_up = (speeds + after) @ spins / 2, (after - speeds) @ spins / h
+            forcing = acting(weak, squares, residual, spin_up, *gust_and_wind)
+            return (rk4_step(vehicle, motion, forcing, None, h), after), (speeds + after) / 2
+
+        middle = jax.tree.map(lambda ends: (ends[:-1] + ends[1:]) / 2, (draw.gusts, draw.winds))
+        (motion, speeds), means = jax.lax.scan(step, (carry.motion, carry.speeds), (jnp.arange(steps), *middle))
+        mean = means.mean(axis=0)
+        signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)
+        omega = command if loop.logged == "commands" else mean
+        logged = Logged(omega, carry.motion, gyro, attitude, specific)
+        return _Carry(motion, speeds, integral, commands, signals), logged
+
+    weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())
+    hover, _ = _speeds(mixer, jnp.zeros(3), weight, airframe.max_rotor_speed)
+    velocity = None if loop.air is None else (zero, zero, zero)
+    motion = Motion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
+    signals = None if sense is None else Signals.hovering(vehicle.gravity)
+    first = _Carry(motion, hover, jnp.zeros(3), jnp.broadcast_to(hover, (runs + 1, 4)), signals)
+    draws = _Draws.of(loop, key, runs, steps, h)
+    inputs = (jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), draws)
+    return log(loop, dt, jax.lax.scan(run, first, inputs)[1], log_key)
+
+
+def _control(
+    loop: ClosedLoop,
+    mixer: Array,
+    reference: Array,
+    rates: PerAxis,
+    attitude: PerAxis,
+    integral: PerAxis,
+    period: Scalar,
+) -> tuple[Float[Array, "4"], PerAxis]:
+    """The commands [rad/s] of one run, and the integrators after it."""
+    airframe = loop.airframe
+    error = loop.attitude_gain * (reference[:3] - attitude) - rates
+    demand = loop.rate_gain * error + integral
+    upright = jnp.maximum(jnp.cos(attitude[0]) * jnp.cos(attitude[1]), _STEEPEST)
+    thrust = as_float(airframe.mass * (reference[3] + airframe.gravity) / upright)
+    inertia = as_float(airframe.inertia) if loop.controller_inertia is None else loop.controller_inertia
+    command, saturated = _speeds(mixer, inertia * demand, thrust, airframe.max_rotor_speed)
+    return command, jnp.where(saturated, integral, integral + period * loop.integral_gain * error)
+
+
+def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> tuple[Float[Array, "4"], Array]:
+    """The rotor speeds [rad/s] that make torque [N m] and thrust [N], and whether one of them saturates."""
+    wanted = jnp.linalg.solve(mixer, jnp.append(torque, thrust))
+    squares = jnp.clip(wanted, 0.0, jnp.asarray(fastest) ** 2)
+    return jnp.sqrt(squares), jnp.any(squares != wanted)
+
+
+def ornstein_uhlenbeck(key: Key, count: int, step: Scalar) -> Float[Array, "count 4"]:
+    """Four independent Ornstein-Uhlenbeck processes of unit variance; `step`: time step / correlation time."""
+    decay, fresh = jnp.exp(-step), jnp.sqrt(-jnp.expm1(-2 * step))
+    draws = jax.random.normal(key, (count, 4))
+
+    def advance(value, draw):
+        value = decay * value + fresh * draw
+        return value, value
+
+    return jnp.concatenate([draws[:1], jax.lax.scan(advance, draws[0], draws[1:])[1]])

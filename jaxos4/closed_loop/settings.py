@@ -1,0 +1,175 @@
+"""The settings of a flight in closed loop: vehicle, air, controller and sensors.
+
+Flights share one program if they have the same `log_every` and `logged`, and all or none of them have `air` and
+`sensors`: all other settings are data.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from .._custom_types import Scalar, as_float
+from ..airframe import Airframe
+from ..noise import FORCE_SIGMA
+
+PerAxis = Float[Array, "3"]
+Pair = Float[Array, "2"]
+
+LOGGED = ("commands", "speeds")
+_BODY, _XYZ, _XY, _TILT = ("roll", "pitch", "yaw"), ("x", "y", "z"), ("x", "y"), ("roll", "pitch")
+
+
+def _setting(
+    name: str, axes: tuple[str, ...] = (), *, low: float = 0.0, high: float = np.inf, optional: bool = False
+) -> Callable[[ArrayLike | Sequence[float] | None], Array]:
+    """A field's converter: accepts one number, or one for each of `axes`, in a range unless traced.
+
+    An optional setting can be `None`, which is stored as NaN, so that all flights share one program.
+    """
+
+    def convert(value: ArrayLike | Sequence[float] | None) -> Array:
+        value = np.nan if value is None else value
+        array = as_float(np.asarray(value) if isinstance(value, Sequence) else value)
+        if array.shape not in ((), (len(axes),) if axes else ()):
+            several = f" or {len(axes)} ({', '.join(axes)})" if axes else ""
+            remedy = "" if axes else "; use `vmap` for a batch"
+            raise ValueError(f"`{name}` must be one number{several}, got shape {array.shape}{remedy}.")
+        if not isinstance(array, Tracer):
+            numbers = np.asarray(array)
+            allowed = (numbers >= low) & (numbers <= high) & np.isfinite(numbers)
+            if not np.all(allowed | (np.isnan(numbers) if optional else False)):
+                least = "" if low == -np.inf else f" and at least {low:g}"
+                most = "" if high == np.inf else f" and at most {high:g}"
+                raise ValueError(f"`{name}` must be finite{least}{most}, got {numbers.tolist()}.")
+        return jnp.broadcast_to(array, (len(axes),)) if axes else array
+
+    return convert
+
+
+class Air(eqx.Module):
+    """The forces and moments of the air on a vehicle in closed loop. With these defaults it exerts none.
+
+    The wind is a vector of Ornstein-Uhlenbeck processes along the axes of the body. The airspeed v is the velocity
+    minus the wind. It adds -drag_x v_x, -drag_y v_y, -inflow v_z to the specific force, flapping_roll v_y to the roll
+    acceleration, and flapping_pitch v_x to the pitch acceleration.
+
+    - `wind`: standard deviation along x, y, z [m/s]. `wind_time`: the correlation time [s].
+    - `drag`: of the rotors along x and y [1/s].
+    - `inflow`: the thrust that rotors lose as they climb through the air [1/s].
+    - `flapping`: moment over inertia and airspeed, in roll and pitch [1/(m s)], of either sign.
+
+    **Raises:** `ValueError` that names the setting.
+    """
+
+    wind: PerAxis = eqx.field(converter=_setting("wind", _XYZ), default=0.0)
+    wind_time: Scalar = eqx.field(converter=_setting("wind_time"), default=0.5)
+    drag: Pair = eqx.field(converter=_setting("drag", _XY), default=0.0)
+    inflow: Scalar = eqx.field(converter=_setting("inflow"), default=0.0)
+    flapping: Pair = eqx.field(converter=_setting("flapping", _TILT, low=-np.inf), default=0.0)
+
+
+class Sensors(eqx.Module):
+    """What gyro, accelerometer and recorder do to a flight besides white noise. With these defaults nothing.
+
+    - `gyro_vibration` [rad/s], `force_vibration` [m/s^2]: amplitude of the sine that each rotor in hover adds to each
+      axis, once for each revolution. The amplitude is proportional to the squared speed. Sampling causes aliasing.
+    - `gyro_filter`, `force_filter`: time constants of the first-order low-pass filters before logging [s]. They filter
+      the noise too.
+    - `speed_noise`, `speed_step`: standard deviation and step of rounding of what is logged of the rotors [rad/s].
+    - `clock_offset`: the rotors are logged so much later than the gyro, earlier if negative [s].
+    - `dropouts`: the shares of samples that gyro and accelerometer lose (NaN), independently.
+    - `bad_samples`: the number of impossible values, 1e6, at random places of gyro and accelerometer.
+    - `velocity_noise`: standard deviation of the measured velocity [m/s]. `None`: not measured. Needs `ClosedLoop.air`.
+    - `controller_gyro_noise`: `None`: the controller answers the body rates of the log. A number: it answers the true
+      rates with white noise of its own with this standard deviation [rad/s], behind a filter with the time constant
+      `controller_gyro_filter` [s].
+
+    **Raises:** `ValueError` that names the setting.
+    """
+
+    gyro_vibration: Scalar = eqx.field(converter=_setting("gyro_vibration"), default=0.0)
+    force_vibration: Scalar = eqx.field(converter=_setting("force_vibration"), default=0.0)
+    gyro_filter: Scalar = eqx.field(converter=_setting("gyro_filter"), default=0.0)
+    force_filter: Scalar = eqx.field(converter=_setting("force_filter"), default=0.0)
+    speed_noise: Scalar = eqx.field(converter=_setting("speed_noise"), default=0.0)
+    speed_step: Scalar = eqx.field(converter=_setting("speed_step"), default=0.0)
+    clock_offset: Scalar = eqx.field(converter=_setting("clock_offset", low=-np.inf), default=0.0)
+    dropouts: Pair = eqx.field(converter=_setting("dropouts", ("gyro", "accelerometer"), high=1.0), default=0.0)
+    bad_samples: Scalar = eqx.field(converter=_setting("bad_samples"), default=0.0)
+    velocity_noise: Scalar = eqx.field(converter=_setting("velocity_noise", optional=True), default=None)
+    controller_gyro_noise: Scalar = eqx.field(converter=_setting("controller_gyro_noise", optional=True), default=None)
+    controller_gyro_filter: Scalar = eqx.field(converter=_setting("controller_gyro_filter"), default=0.0)
+
+
+class ClosedLoop(eqx.Module):
+    """A vehicle with its controller, its disturbances and its sensors. `fly_closed_loop` flies it.
+
+    A setting "for each axis" is one number for all axes, or three for roll, pitch and yaw.
+
+    The vehicle. Its equations are those of `FlightModel` with the terms offset, damping, reaction, lag and delay, and
+    what `air` adds:
+
+    - `airframe`: the true constants. Rotor speeds lie between 0 and its `max_rotor_speed`. Its `rotor_inertia` makes
+      the gyroscopic torque and the yaw moment of rotors that accelerate.
+    - `rotor_lag`, `rotor_delay`: lag and delay of the rotors behind their commands [s], not only whole samples.
+    - `offset`: a constant torque over the inertia, for each axis [rad/s^2].
+    - `damping`: a moment against the body rate, for each axis [1/s].
+    - `sag`: the share of their thrust and drag that the rotors lose during the flight, linearly in time.
+    - `air`: wind, drag, inflow and flapping. `None`: the air exerts nothing, and the velocity is not simulated.
+
+    The gusts, which are Ornstein-Uhlenbeck processes:
+
+    - `gust`: standard deviation of the disturbance torque over the inertia, for each axis [rad/s^2].
+    - `thrust_gust`: standard deviation of the disturbance of the vertical specific force [m/s^2].
+    - `gust_time`: their correlation time [s].
+
+    The sensors have white noise:
+
+    - `gyro_noise` [rad/s], `attitude_noise` [rad], `force_noise` (accelerometer) [m/s^2]: standard deviations.
+    - `sensors`: vibration, filters, clocks, losses, and a gyro of the controller's own. `None`: white noise is all.
+
+    The controller: attitude error x `attitude_gain` is the wanted body rate. A PI controller of the body rate makes the
+    wanted angular acceleration. Torque is that x `controller_inertia`. The thrust carries the weight. A rotor that
+    would have to be slower than 0 or faster than its maximum saturates, and the integrators then stop.
+
+    - `attitude_gain` [1/s], `rate_gain` [1/s], `integral_gain` [1/s^2]: for each axis.
+    - `controller_inertia`: Ix, Iy, Iz that the controller knows [kg m^2]; the true ones by default.
+    - `log_every`: the controller runs so many times in each sample of the log.
+
+    - `logged`: `"commands"`, or `"speeds"` for measured rotor speeds.
+
+    **Raises:** `ValueError` that names the setting.
+    """
+
+    airframe: Airframe
+    rotor_lag: Scalar = eqx.field(converter=_setting("rotor_lag"), default=0.05)
+    rotor_delay: Scalar = eqx.field(converter=_setting("rotor_delay"), default=0.01)
+    offset: PerAxis = eqx.field(converter=_setting("offset", _BODY, low=-np.inf), default=0.0)
+    damping: PerAxis = eqx.field(converter=_setting("damping", _BODY, low=-np.inf), default=0.0)
+    sag: Scalar = eqx.field(converter=_setting("sag", high=1.0), default=0.0)
+    air: Air | None = None
+    gust: PerAxis = eqx.field(converter=_setting("gust", _BODY), default=0.0)
+    thrust_gust: Scalar = eqx.field(converter=_setting("thrust_gust"), default=0.0)
+    gust_time: Scalar = eqx.field(converter=_setting("gust_time"), default=0.25)
+    gyro_noise: Scalar = eqx.field(converter=_setting("gyro_noise"), default=0.02)
+    attitude_noise: Scalar = eqx.field(converter=_setting("attitude_noise"), default=0.002)
+    force_noise: Scalar = eqx.field(converter=_setting("force_noise"), default=FORCE_SIGMA)
+    sensors: Sensors | None = None
+    attitude_gain: PerAxis = eqx.field(converter=_setting("attitude_gain", _BODY), default=(4.0, 4.0, 2.0))
+    rate_gain: PerAxis = eqx.field(converter=_setting("rate_gain", _BODY), default=(12.0, 12.0, 6.0))
+    integral_gain: PerAxis = eqx.field(converter=_setting("integral_gain", _BODY), default=(10.0, 10.0, 5.0))
+    controller_inertia: PerAxis | None = eqx.field(
+        converter=lambda x: None if x is None else _setting("controller_inertia", _BODY)(x), default=None
+    )
+    log_every: int = eqx.field(static=True, default=1)
+    logged: str = eqx.field(static=True, default="commands")
+
+    def __check_init__(self):
+        if self.logged not in LOGGED:
+            raise ValueError(f"`logged` must be one of {', '.join(LOGGED)}, got {self.logged!r}.")
+        if self.log_every < 1:
+            raise ValueError(f"`log_every` must be at least 1, got {self.log_every}.")

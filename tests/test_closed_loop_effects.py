@@ -1,0 +1,264 @@
+"""The effects of `Air` and `Sensors` in a flight in closed loop, each against a law in closed form or SciPy.
+
+Unless a test says otherwise: no gusts, no noise, and a controller that knows the true rates.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import CRAZYFLIE
+from scipy.signal import lsim
+from scipy.spatial.transform import Rotation
+
+import jaxos4
+
+DT, SAMPLES = 0.004, 4001
+TIME = DT * np.arange(SAMPLES)
+RATES, ANGLES, VELOCITY = [7, 9, 11], [6, 8, 10], [1, 3, 5]
+GRAVITY, HOVER = float(CRAZYFLIE.gravity), float(CRAZYFLIE.hover_speed)
+QUIET = {"gyro_noise": 0.0, "attitude_noise": 0.0, "force_noise": 0.0}
+LEVEL = np.zeros((SAMPLES, 4))
+CLIMB = LEVEL + [0, 0, 0, 2.0]
+RANDOM = np.asarray(jaxos4.random_references(duration=16.0, dt=DT, key=jax.random.key(0)))
+SUCCESS = jaxos4.RESULTS.successful
+
+
+def loop_of(*, air=None, loop=None, **sensors):
+    sensors = {"velocity_noise": 0.0, "controller_gyro_noise": 0.0, **sensors}
+    return jaxos4.ClosedLoop(
+        CRAZYFLIE, air=jaxos4.Air(**(air or {})), sensors=jaxos4.Sensors(**sensors), **{**QUIET, **(loop or {})}
+    )
+
+
+def fly(references=RANDOM, *, seed=1, **settings):
+    """All flights have one length, and share one program. Returns rotor speeds, states and specific force."""
+    flight = jaxos4.fly_closed_loop(loop_of(**settings), jnp.asarray(references), dt=DT, key=jax.random.key(seed))
+    assert flight.result == SUCCESS
+    return np.asarray(flight.omega), np.asarray(flight.states), np.asarray(flight.specific_force)
+
+
+def test_still_air_and_perfect_sensors_change_nothing():
+    flight = jaxos4.fly_closed_loop(
+        jaxos4.ClosedLoop(CRAZYFLIE, gust=5.0), jnp.asarray(RANDOM), dt=DT, key=jax.random.key(1)
+    )
+    noise = {"gyro_noise": 0.02, "attitude_noise": 0.002, "force_noise": 0.3}
+    omega, states, force = fly(loop={"gust": 5.0, **noise}, controller_gyro_noise=None, velocity_noise=None)
+    np.testing.assert_allclose(omega, flight.omega, rtol=1e-9)
+    np.testing.assert_allclose(states, flight.states, atol=1e-9)
+    np.testing.assert_allclose(force, flight.specific_force, atol=1e-9)
+
+
+# The air.
+
+
+def test_a_climb_ends_at_the_speed_at_which_inflow_takes_the_thrust():
+    """Commands that accelerate by 2 m/s^2 in still air: v = 2 / k_z (1 - exp(-k_z t)), and the force falls to g."""
+    inflow = 0.8
+    _, states, force = fly(CLIMB, air={"inflow": inflow})
+    late = TIME > 1
+    expected = 2 / inflow * (1 - np.exp(-inflow * (TIME - 0.06)))  # the rotors follow after lag and delay
+    np.testing.assert_allclose(states[late, 5], expected[late], rtol=5e-3)
+    np.testing.assert_allclose(force[late, 2], GRAVITY + 2 - inflow * states[late, 5], rtol=1e-9)
+
+
+def test_wind_has_its_strength_and_its_correlation_time():
+    """Drag shows the airspeed, and the log shows the velocity: the difference is the wind."""
+    drag, inflow, wind, duration = (0.5, 0.3), 0.6, np.array([1.0, 0.5, 0.8]), 0.1
+    omega, states, force = fly(LEVEL, air={"drag": drag, "inflow": inflow, "wind": wind, "wind_time": duration})
+    body = Rotation.from_euler("ZYX", states[:, ANGLES[::-1]]).inv().apply(states[:, VELOCITY])
+    np.testing.assert_allclose(omega, HOVER, rtol=1e-9)
+    found = body + (force - [0, 0, GRAVITY]) / [*drag, inflow]
+    # 16 s are 160 correlation times: the variance has a standard error of 11 %.
+    np.testing.assert_allclose(found.std(axis=0) / wind, 1, atol=0.2)
+    shifted = (found[25:] * found[:-25]).mean(axis=0) / found.var(axis=0)
+    np.testing.assert_allclose(shifted, np.exp(-25 * DT / duration), atol=0.2)
+    assert np.abs(np.corrcoef(found.T) - np.eye(3)).max() < 0.4
+
+
+# Vibration and filters.
+
+
+def line(values, speed):
+    """The complex amplitudes of the sine with this angular speed, and what it does not explain."""
+    waves = np.exp(1j * speed * TIME)
+    design = np.stack([waves.real, waves.imag], axis=1)
+    coefficients, *_ = np.linalg.lstsq(design, values, rcond=None)
+    return np.hypot(*coefficients), np.abs(values - design @ coefficients).max()
+
+
+def test_vibration_is_a_line_at_the_speed_of_the_rotors():
+    """Its amplitude is proportional to the squared speed. The line lies beyond half the rate of the log."""
+    assert HOVER > np.pi / DT
+    sizes = {"gyro_vibration": 0.05, "force_vibration": 0.4}
+    for climb, share in ((0.0, 1.0), (2.0, 1 + 2 / GRAVITY)):
+        _, states, force = fly(LEVEL + [0, 0, 0, climb], **sizes)
+        late = slice(1000, None)
+        shaken = np.concatenate([states[late, RATES], force[late] - [0, 0, GRAVITY + climb]], axis=1)
+        waves = np.exp(1j * HOVER * np.sqrt(share) * TIME[late])
+        design = np.stack([waves.real, waves.imag], axis=1)
+        fitted = np.linalg.lstsq(design, shaken, rcond=None)[0]
+        np.testing.assert_allclose(design @ fitted, shaken, atol=1e-5)
+        amplitude = np.hypot(*fitted) / np.repeat(list(sizes.values()), 3) / share
+        if climb == 0:
+            still = amplitude
+            # Four rotors with random phases.
+            assert 1 < np.sqrt(np.mean(still**2)) < 3
+    np.testing.assert_allclose(amplitude, still, rtol=1e-4)
+
+
+def test_filters_are_of_first_order():
+    """SciPy's simulation of 1 / (T s + 1) takes signals as linear between samples, too."""
+    _, raw, raw_force = fly()
+    _, states, force = fly(gyro_filter=0.008, force_filter=0.03)
+    for T, before, after in ((0.008, raw[:, RATES], states[:, RATES]), (0.03, raw_force - GRAVITY, force - GRAVITY)):
+        for axis in range(3):
+            start = 0 if axis == 2 or T == 0.008 else -GRAVITY
+            expected = lsim(([1], [T, 1]), before[:, axis] - start, TIME)[1] + start
+            np.testing.assert_allclose(after[:, axis], expected, atol=1e-9)
+            assert np.abs(after - before)[:, axis].max() > (1e-3 if T == 0.008 or axis == 2 else -1)
+
+
+# The gyro of the controller.
+
+
+def test_the_controller_can_know_the_true_rates():
+    quiet, noisy = fly(), fly(loop={"gyro_noise": 0.1}, gyro_filter=0.01, gyro_vibration=0.1)
+    np.testing.assert_allclose(noisy[0], quiet[0], rtol=1e-12)
+    assert np.std(noisy[1][:, RATES] - quiet[1][:, RATES]) > 0.05
+    answering, _, _ = fly(loop={"gyro_noise": 0.1}, controller_gyro_noise=None)
+    assert np.std(answering - quiet[0]) > 1
+
+
+def test_the_controller_can_have_a_gyro_of_its_own():
+    """A controller with little gain answers its noise with the proportional gain. A filter makes the noise smaller."""
+    gains = {"attitude_gain": 0.0, "rate_gain": 1.0, "integral_gain": 0.0, "gyro_noise": 0.02}
+    sizes = []
+    for own in (0.0, 0.05):
+        for T in (0.0, 0.02):
+            omega, states, _ = fly(LEVEL, loop=gains, controller_gyro_noise=own, controller_gyro_filter=T)
+            torque = np.asarray(CRAZYFLIE.mixer)[:3] @ np.square(omega).T
+            sizes.append((torque.T / np.asarray(CRAZYFLIE.inertia)).std(axis=0))
+            # The noise of the log is another one.
+            assert np.abs(np.corrcoef(states[1000:, RATES[0]], torque[0, 1000:])[0, 1]) < 0.1 or own == 0.0
+    none, also_none, white, filtered = sizes
+    np.testing.assert_allclose([none, also_none], 0, atol=1e-9)
+    np.testing.assert_allclose(white, 0.05, rtol=0.05)
+    np.testing.assert_allclose(filtered / white, np.sqrt(filtered_share(0.02)), rtol=0.1)
+
+
+def filtered_share(T):
+    """The variance of filtered white noise of unit variance: the sum of the squared impulse response."""
+    impulse = np.zeros(500)
+    impulse[1] = 1
+    return np.square(lsim(([1], [T, 1]), impulse, DT * np.arange(500))[1]).sum()
+
+
+@pytest.mark.parametrize("logged", ["commands", "speeds"])
+def test_a_fast_controller_is_a_fast_log_of_which_some_rows_are_kept(logged):
+    sensors = {"gyro_vibration": 0.05, "gyro_filter": 0.002, "clock_offset": 0.0023, "controller_gyro_noise": None}
+    air = {"wind": 1.0, "drag": 0.3, "flapping": 2.0}
+    settings = {"gust": 5.0, "gyro_noise": 0.02, "force_noise": 0.3, "logged": logged}
+    rows = RANDOM[:500]
+    slow, fast = (loop_of(air=air, loop={**settings, "log_every": n}, **sensors) for n in (4, 1))
+    key = jax.random.key(3)
+    kept = jaxos4.fly_closed_loop(slow, jnp.asarray(rows), dt=DT, key=key, substeps=8)
+    every = jaxos4.fly_closed_loop(fast, jnp.repeat(jnp.asarray(rows), 4, axis=0), dt=DT / 4, key=key, substeps=2)
+    np.testing.assert_allclose(kept.states[:, RATES + ANGLES], every.states[::4, RATES + ANGLES], atol=1e-9)
+    np.testing.assert_allclose(kept.specific_force, every.specific_force[::4], atol=1e-9)
+    omega = np.asarray(every.omega)
+    expected = omega[::4] if logged == "commands" else omega.reshape(-1, 4, 4).mean(axis=1)
+    np.testing.assert_allclose(kept.omega, expected, rtol=1e-9)
+    assert np.std(np.diff(omega, axis=0)) > 0.5
+
+
+# The recorder.
+
+
+@pytest.mark.parametrize("offset", [0.0031, -0.0067, 0.008])
+def test_a_clock_offset_moves_the_rotors_against_the_gyro(offset):
+    (exact, states, _), (late, same, _) = fly(), fly(clock_offset=offset)
+    np.testing.assert_array_equal(same, states)
+    expected = np.stack([np.interp(TIME - offset, TIME, column) for column in exact.T], axis=1)
+    np.testing.assert_allclose(late, expected, rtol=1e-9)
+    assert np.abs(late - exact).max() > 10
+
+
+def test_rotor_speeds_are_noisy_and_rounded():
+    exact, noisy, rounded = (fly(speed_noise=noise, speed_step=step)[0] for noise, step in ((0, 0), (3, 0), (0, 25)))
+    # 16004 draws: the standard deviation has an error of 0.6 %.
+    np.testing.assert_allclose(np.std(noisy - exact), 3, rtol=0.025)
+    np.testing.assert_array_equal(rounded, 25 * np.round(exact / 25))
+
+
+def test_samples_are_lost_and_impossible():
+    shares, count = np.array([0.05, 0.2]), 7
+    _, exact, exact_force = fly()
+    _, states, force = fly(bad_samples=count)
+    bad = np.concatenate([states != exact, force != exact_force], axis=1) & ~np.isnan(np.c_[exact, exact_force])
+    assert bad[:, [*RATES, 12, 13, 14]].sum() == bad.sum() == count
+    assert (np.c_[states, force][bad] == 1e6).all()
+    _, states, force = fly(dropouts=shares)
+    lost = np.isnan(np.c_[states[:, RATES], force])
+    np.testing.assert_array_equal(lost, lost[:, [0, 0, 0, 3, 3, 3]])
+    np.testing.assert_allclose(lost.mean(axis=0)[[0, 3]], shares, atol=4 * np.sqrt(0.25 * 0.2 / SAMPLES * 4))
+    # Which samples are lost is independent.
+    assert abs(np.corrcoef(lost[:, 0], lost[:, 3])[0, 1]) < 4 / np.sqrt(SAMPLES)
+    np.testing.assert_array_equal(states[:, ANGLES], exact[:, ANGLES])
+
+
+def test_a_battery_sags_linearly():
+    sag = 0.2
+    omega, _, force = fly(LEVEL, loop={"sag": sag})
+    np.testing.assert_allclose(omega, HOVER, rtol=1e-9)
+    np.testing.assert_allclose(force[:, 2], GRAVITY * (1 - sag * TIME / TIME[-1]), rtol=1e-9)
+
+
+def test_the_velocity_has_noise():
+    exact, noisy = (fly(velocity_noise=noise)[1][:, VELOCITY] for noise in (0.0, 0.1))
+    np.testing.assert_allclose((noisy - exact).std(axis=0), 0.1, rtol=4 / np.sqrt(2 * SAMPLES))
+
+
+def test_flights_with_all_effects_and_with_none_are_one_batch():
+    every = loop_of(
+        air={"wind": 1.0, "drag": 0.3, "inflow": 0.4, "flapping": (-3.0, 3.0)},
+        loop={"gyro_noise": 0.02, "sag": 0.1, "gust": 5.0},
+        **{"gyro_vibration": 0.1, "force_vibration": 0.3, "gyro_filter": 0.005, "force_filter": 0.01},
+        **{"speed_noise": 3.0, "speed_step": 1.0, "clock_offset": 0.003, "dropouts": 0.05, "bad_samples": 3},
+        **{"controller_gyro_noise": None, "velocity_noise": None},
+    )
+    loops = [loop_of(), every]
+    batch = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *loops)
+    key = jax.random.key(4)
+    together = eqx.filter_vmap(lambda loop: jaxos4.fly_closed_loop(loop, jnp.asarray(RANDOM), dt=DT, key=key))(batch)
+    for i, loop in enumerate(loops):
+        alone = jaxos4.fly_closed_loop(loop, jnp.asarray(RANDOM), dt=DT, key=key)
+        assert alone.result == SUCCESS
+        for field in ("states", "specific_force"):
+            found, expected = np.asarray(getattr(together, field))[i], np.asarray(getattr(alone, field))
+            np.testing.assert_allclose(found[:500], expected[:500], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "settings", "fragment"),
+    [
+        (jaxos4.Air, {"wind": -1.0}, "`wind`.*at least 0"),
+        (jaxos4.Air, {"drag": (1.0, 2.0, 3.0)}, r"`drag`.*2 \(x, y\).*\(3,\)"),
+        (jaxos4.Air, {"inflow": None}, "`inflow`"),
+        (jaxos4.Sensors, {"dropouts": 1.5}, "`dropouts`.*at most 1"),
+        (jaxos4.Sensors, {"clock_offset": np.inf}, "`clock_offset`"),
+        (jaxos4.Sensors, {"controller_gyro_noise": -1.0}, "`controller_gyro_noise`"),
+        (jaxos4.ClosedLoop, {"airframe": CRAZYFLIE, "sag": 2.0}, "`sag`"),
+        (jaxos4.ClosedLoop, {"airframe": CRAZYFLIE, "log_every": 0}, "`log_every`"),
+    ],
+)
+def test_wrong_settings_are_named(make, settings, fragment):
+    with pytest.raises(ValueError, match=fragment):
+        make(**settings)
+
+
+def test_each_run_of_the_controller_has_the_same_steps():
+    loop = jaxos4.ClosedLoop(CRAZYFLIE, log_every=3)
+    with pytest.raises(ValueError, match=r"`substeps`.*multiple of `log_every` = 3, got 4"):
+        jaxos4.fly_closed_loop(loop, jnp.zeros((5, 4)), key=jax.random.key(0))
