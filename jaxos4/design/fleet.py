@@ -115,7 +115,8 @@ class Fleet(eqx.Module):
             raise InputError("`bracket`: alpha3, alpha6 and alpha8 must be positive.")
         loops = batch_of(loop, np.arange(LANES) >= _STILL, inertia=inertia, force_noise=np.zeros(LANES))
         model, prior = model_of(loop), jnp.asarray(1 / np.square(np.asarray(bracket.half_width)))
-        known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": loop.rotor_delay if loop.logged == "commands" else 0.0}
+        delay = loop.rotor_delay if loop.logged == "commands" else 0.0
+        known: dict[str, Any] = {"rotor_lag": loop.rotor_lag, "rotor_delay": delay}
         for i, axis in enumerate(("roll", "pitch", "yaw")):
             known |= {f"{axis}_offset": loop.offset[i], f"{axis}_damping": loop.damping[i]}
         names, alpha = model.parameter_names, np.asarray(model.alpha)
