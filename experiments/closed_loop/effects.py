@@ -56,7 +56,7 @@ EFFECTS = {
     "dropouts": Effect(sensors={"dropouts": 0.03}),
     "bad samples": Effect(sensors={"bad_samples": 5.0}),
     "sag": Effect(loop={"sag": 0.1}),
-    "saturation": Effect(fastest=0.72),
+    "saturation": Effect(fastest=0.78),
 }
 ALL = "all"
 _SIGNED = ("clock_offset", "flapping")
