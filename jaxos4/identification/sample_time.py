@@ -16,8 +16,9 @@ from .fit import Fit, fit_innovations
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
 
-# Innovations that correlate by less count as white. Two answers agree within so many standard deviations.
-WHITE, AGREE = 0.3, 2.0
+# Innovations that correlate by less count as white. Two answers agree within so many standard deviations and this share:
+# longer samples have errors of discretisation.
+WHITE, AGREE, _DISCRETE = 0.3, 2.0, 0.03
 _RATES = ("p", "q", "r")
 
 
@@ -32,7 +33,7 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
         progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
         if fits and fits[0].answered:
             problem = problem.starting_from(np.asarray(fits[0].estimate.parameters))
-        fits.insert(0, fit_innovations(case, problem))
+        fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
     answers = tuple(_answer(case, fit) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
@@ -48,7 +49,7 @@ def moved(answer: SampleTime, other: SampleTime) -> list[str]:
     """The moments of inertia that another sample time contradicts."""
 
     def differs(one: Constant, two: Constant) -> bool:
-        return abs(one.estimate - two.estimate) > AGREE * max(one.std, two.std)
+        return abs(one.estimate - two.estimate) > AGREE * max(one.std, two.std) + _DISCRETE * one.estimate
 
     both = [name for name in answer.constants if name in other.constants]
     return [name for name in both if differs(answer.constants[name], other.constants[name])]
