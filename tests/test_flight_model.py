@@ -15,11 +15,19 @@ import jaxos4
 from jaxos4.flight import Inputs
 from jaxos4.models import Term, TermParameter, default_terms
 from jaxos4.models.state import Rates
-from jaxos4.models.terms import BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE
+from jaxos4.models.terms import (
+    AXIAL_VELOCITY,
+    BODY_VELOCITY,
+    COMMANDS,
+    FULL_SCALE,
+    LATERAL_FORCE,
+    VERTICAL_FORCE,
+    VOLTAGE,
+)
 from jaxos4.models.vehicle import DEFAULT_TERMS
 
 ALL = tuple(jaxos4.TERMS)
-RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "flapping", "drag"))
+RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "flapping", "inflow", "drag"))
 FULL = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, np.asarray(500.0))
 VOLTS = 11.1
 NAMES = {
@@ -34,6 +42,7 @@ NAMES = {
     "reaction": ["rotor_reaction"],
     "curve": ["thrust_curve"],
     "accelerometer": ["thrust_gain", "az_bias"],
+    "inflow": ["z_drag"],
     "drag": ["x_drag", "y_drag"],
     "gyro_bias": ["p_bias", "q_bias", "r_bias"],
 }
@@ -41,7 +50,9 @@ NAMES = {
 VALUES = {
     **dict(roll_offset=0.3, pitch_offset=-0.2, yaw_offset=0.1, roll_damping=1.5, pitch_damping=0.8, yaw_damping=0.4),
     **dict(roll_velocity=0.3, pitch_velocity=-0.4, roll_flapping=0.2, pitch_flapping=-0.1, rotor_lag=0.06),
-    **dict(rotor_delay=0.02, rotor_reaction=0.02, thrust_curve=0.6, thrust_gain=1.2, x_drag=0.4, y_drag=0.3),
+    **dict(
+        rotor_delay=0.02, rotor_reaction=0.02, thrust_curve=0.6, thrust_gain=1.2, x_drag=0.4, y_drag=0.3, z_drag=0.6
+    ),
     **dict(ax_bias=0.5, ay_bias=-0.4, az_bias=0.2, p_bias=0.03, q_bias=-0.02, r_bias=0.01),
     **dict(roll_thrust=-0.5, pitch_thrust=0.9, voltage_exponent=0.7),
 }
@@ -90,8 +101,10 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
         cx, sx, cy, sy, cz, sz = (f(angle) for angle in (phi, theta, psi) for f in (np.cos, np.sin))
         turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]
         turn = turn @ [[1, 0, 0], [0, cx, -sx], [0, sx, cx]]
-        vx, vy, _ = turn.T @ state[[7, 9, 11]]
-        specific = np.array([-v["x_drag"] * vx, -v["y_drag"] * vy, v["thrust_gain"] * force.sum() / m])
+        vx, vy, vz = turn.T @ state[[7, 9, 11]]
+        specific = np.array(
+            [-v["x_drag"] * vx, -v["y_drag"] * vy, v["thrust_gain"] * force.sum() / m - v["z_drag"] * vz]
+        )
         rates_dot = [
             a1 * q * r - a2 * (spin @ w) * q + a3 * (y @ force) + v["roll_offset"] - v["roll_damping"] * p
             + v["roll_velocity"] * vy - a3 * y_c * (force.sum() - 9.81 * m),
@@ -167,7 +180,7 @@ def test_without_terms_it_is_the_corrected_model():
         (("offset", "center_of_mass"), 1e-7),
         (("voltage", "accelerometer"), 1e-7),
         (("curve", "accelerometer"), 1e-7),
-        (("accelerometer", "drag"), 1e-7),
+        (("accelerometer", "drag", "inflow"), 1e-7),
         (("lag", "delay", "reaction"), 2e-3),
         (tuple(term for term in ALL if term != "flapping"), 2e-3),
     ],
@@ -297,7 +310,7 @@ def test_a_new_term_is_one_object(monkeypatch):
 
 
 def test_an_estimate_uses_the_terms_that_the_logs_allow():
-    basic = ("offset", "center_of_mass", "damping", "reaction")
+    basic = ("offset", "center_of_mass", "damping", "delay", "reaction")
     rotors = ("offset", "center_of_mass", "damping", "lag", "delay", "reaction")
     assert default_terms(frozenset()) == default_terms(frozenset({FULL_SCALE})) == basic
     assert default_terms(frozenset({COMMANDS, FULL_SCALE})) == rotors == DEFAULT_TERMS
@@ -305,7 +318,8 @@ def test_an_estimate_uses_the_terms_that_the_logs_allow():
     for available, terms in (
         (force, (*basic, "flapping", "accelerometer")),
         (force | {BODY_VELOCITY, FULL_SCALE}, (*basic, "velocity", "accelerometer")),
-        (frozenset({VOLTAGE}), basic),
+        (force | {AXIAL_VELOCITY}, (*basic, "flapping", "accelerometer", "inflow")),
+        (frozenset({AXIAL_VELOCITY, VOLTAGE}), basic),
         (frozenset({COMMANDS, VOLTAGE}), (*rotors, "voltage")),
         (force | {COMMANDS}, (*rotors, "flapping", "accelerometer")),
         (force | {COMMANDS, FULL_SCALE}, (*rotors, "flapping", "curve", "accelerometer")),

@@ -25,7 +25,7 @@ KEYS = {
         {"estimate", "std", "bound", "ci95", "unit", "note", "noise_limit"},
     ),
     "vehicle": (
-        {*COMMON, "held", "noise", "doubts", "disturbances", "widened", "skill"},
+        {*COMMON, "held", "noise", "doubts", "disturbances", "widened", "skill", "sample_times"},
         {*SETTINGS, "flights", "validate", "terms", "fitted_seconds", "tested_seconds"},
         {"estimate", "std", "bound", "ci95", "unit", "note"},
     ),
@@ -71,11 +71,14 @@ def test_a_vehicle_has_the_numbers_of_the_command(run, tmp_path, vehicle):  # no
     paths, airframe = [vehicle / f"flight{i}.csv" for i in (1, 2)], str(vehicle / "airframe.toml")
     code, _, err = run(
         *("estimate", *map(str, paths), "--model", "flight", "--airframe", airframe),
-        *("--terms", ",".join(TERMS), "--out", str(tmp_path / "found.json")),
+        *("--terms", ",".join(TERMS), "--sample-time", "0.01", "--out", str(tmp_path / "found.json")),
     )
     assert code == 0, err
     constants = jaxos4.load_airframe(airframe)
-    recordings, settings = [read_recording(path, constants) for path in paths], jaxos4.VehicleSettings(terms=TERMS)
+    recordings, settings = (
+        [read_recording(path, constants) for path in paths],
+        jaxos4.VehicleSettings(terms=TERMS, sample_time=0.01),
+    )
     found = jaxos4.identify(recordings, constants, settings=settings)
     assert_same_as_written(found, tmp_path / "found.json")
     assert found.predictions is not None

@@ -6,13 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import Stretches, fill_gaps
 from jaxos4.logs.sampling import average
-from jaxos4.recording import Recording
-from jaxos4.recording.pieces import averaged, cut, with_body_velocity
+from jaxos4.recording.pieces import averaged, cut
 from jaxos4.recording.usable import Stretch
 from jaxos4.shooting.padding import padded
 
@@ -195,18 +193,3 @@ def test_gaps_are_filled_from_their_own_stretch():
     found = fill_gaps(values, Stretches.of(number))[:, 0]
     np.testing.assert_array_equal(found, [1, 1, 1, 2, 0, 0, 5, 5, 5, 5])
     np.testing.assert_array_equal(fill_gaps(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])
-
-
-def test_the_bodys_velocity_is_that_of_the_earth_turned_by_the_attitude():
-    flight = Recording.of(stretch(50, 0))
-    flight = flight._replace(states=flight.states.copy())
-    flight.states[[0, 20], 6] = np.nan
-    states = flight.states.copy()
-    for column in states.T:  # the value before a gap, or the first one
-        measured = np.flatnonzero(np.isfinite(column))
-        column[:] = column[measured[np.maximum(np.searchsorted(measured, np.arange(50), side="right") - 1, 0)]]
-    angles, velocity = states[:, [10, 8, 6]], states[:, [1, 3, 5]]
-    expected = Rotation.from_euler("ZYX", angles).apply(velocity, inverse=True)
-    np.testing.assert_allclose(with_body_velocity(flight).body_velocity, expected, atol=1e-12)
-    flight.states[:, 1] = np.nan
-    assert with_body_velocity(flight) is flight

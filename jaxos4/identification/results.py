@@ -296,7 +296,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 # Fields that are written of one kind of identification only.
 _OF_FLIGHTS = ("fit", "validation")
-_OF_VEHICLES = ("held", "noise", "doubts", "disturbances", "widened", "skill")
+_OF_VEHICLES = ("held", "noise", "doubts", "disturbances", "widened", "skill", "sample_times")
 
 
 class ParameterInformation(msgspec.Struct, frozen=True):

@@ -1,0 +1,66 @@
+"""The rule that chooses the sample time of a vehicle, and what the fits at several sample times share."""
+
+import jax
+import numpy as np
+import pytest
+from helpers import CRAZYFLIE, compiled_programs
+
+import jaxos4
+from jaxos4.identification.results import Constant, SampleTime
+from jaxos4.identification.sample_time import moved, shortest
+
+
+def table(*rows):
+    """Answers at 4, 8, 16 ms and so on. A row: Ix and Iy with a standard deviation of 1, and the correlation."""
+    return [
+        SampleTime(
+            0.004 * 2**i,
+            {name: Constant(value, 1.0, "kg m^2") for name, value in zip(("Ix", "Iy"), values, strict=False)},
+            correlation,
+        )
+        for i, (values, correlation) in enumerate(rows)
+    ]
+
+
+A, B, C = (10.0, 20.0), (13.0, 20.0), (10.0, 25.0)
+
+
+@pytest.mark.parametrize(
+    ("answers", "place"),
+    [
+        (table((A, 0.0)), 0),
+        (table((A, 0.1), (A, 0.0), (A, 0.0)), 0),
+        (table((A, 0.1), (B, 0.0), (B, 0.0)), 1),
+        (table((A, 0.1), (C, 0.0), (C, -0.2)), 1),
+        (table((A, 0.5), (A, 0.1), (A, 0.1)), 1),
+        (table((A, -0.5), (A, 0.1), (A, 0.1)), 1),
+        (table((A, 0.9), (A, 0.8), (A, 0.7)), 0),
+        (table((A, 0.9), (A, 0.8), (A, 0.1)), 2),
+        (table((A, 0.1), (B, 0.1), (A, 0.1)), 0),
+        (table(((), 0.1), (A, 0.1), (A, 0.1)), 1),
+    ],
+    ids=["one", "plateau", "later plateau", "plateau of Iy", "white later", "negative", "none white", "last alone",
+         "no plateau", "no answer"],
+)  # fmt: skip
+def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(answers, place):
+    assert shortest(answers) == place
+
+
+def test_answers_agree_within_two_standard_deviations():
+    near, far = table(((11.9, 20.0), 0.0))[0], table(((12.1, 20.0), 0.0))[0]
+    own = table((A, 0.0))[0]
+    assert moved(own, near) == []
+    assert moved(own, far) == moved(far, own) == ["Ix"]
+
+
+def test_four_sample_times_need_two_programs():
+    """The shortest has its own; the others are padded to one length."""
+    keys = jax.random.split(jax.random.key(0))
+    references = jaxos4.random_references(duration=16.0, dt=0.004, key=keys[0])
+    flight = jaxos4.fly_closed_loop(jaxos4.ClosedLoop(CRAZYFLIE, gust=2.0), references, dt=0.004, key=keys[1])
+    with compiled_programs() as programs:
+        settings = jaxos4.VehicleSettings(terms=("offset", "lag", "delay"))
+        found = jaxos4.identify(flight, CRAZYFLIE, settings=settings)
+    np.testing.assert_allclose([each.sample_time for each in found.sample_times], [0.004, 0.008, 0.016, 0.032])
+    searches = [name for name in programs if name is not None and "call" in name.lower()]
+    assert len(searches) == 2, programs

@@ -1,0 +1,116 @@
+"""The velocity of a recording, measured or by dead reckoning, against a trajectory that SciPy integrates."""
+
+import functools
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from jaxos4.recording import Recording
+from jaxos4.recording.velocity import motion_of
+
+G, FORGETS, SECONDS = 9.81, 2.0, 20.0
+ANGLES, VELOCITY, RATES = [6, 8, 10], [1, 3, 5], [7, 9, 11]
+
+
+def tones(t, *parts):
+    """A sum of sines, and its derivative. `parts`: amplitude, frequency [Hz], phase."""
+    turns = [(a, 2 * np.pi * f, 2 * np.pi * f * t + phase) for a, f, phase in parts]
+    return sum(a * np.sin(x) for a, _, x in turns), sum(a * w * np.cos(x) for a, w, x in turns)
+
+
+def flown_at(t):
+    """Euler angles, body rates, and the specific force of a thrust along z. The climb has whole periods."""
+    (phi, phi_), (theta, theta_), (psi, psi_) = (
+        tones(t, (0.2, 0.7, 0.0)), tones(t, (0.15, 0.9, 1.0)), tones(t, (0.4, 0.3, 0.0)),
+    )  # fmt: skip
+    p = phi_ - psi_ * np.sin(theta)
+    q = theta_ * np.cos(phi) + psi_ * np.sin(phi) * np.cos(theta)
+    r = -theta_ * np.sin(phi) + psi_ * np.cos(phi) * np.cos(theta)
+    climb, _ = tones(t, (3.0, 0.8, 0.0), (2.0, 1.5, 1.0))
+    thrust = (G + climb) / (np.cos(phi) * np.cos(theta))
+    return np.stack([phi, theta, psi], -1), np.stack([p, q, r], -1), np.stack([0 * thrust, 0 * thrust, thrust], -1)
+
+
+def to_earth(angles):
+    return Rotation.from_euler("ZYX", angles[..., ::-1])
+
+
+@functools.cache
+def trajectory(dt):
+    """A recording, its velocity in the body, and the same after the slow part of it is forgotten."""
+    time = dt * np.arange(round(SECONDS / dt))
+
+    def follow(t, state):
+        angles, _, force = flown_at(t)
+        push = to_earth(angles).apply(force) - [0.0, 0.0, G]
+        return np.concatenate([push, push - state[3:] / FORGETS])
+
+    exact = solve_ivp(follow, (0.0, time[-1]), np.zeros(6), t_eval=time, rtol=1e-9, atol=1e-9, max_step=0.02).y.T
+    angles, rates, force = flown_at(time)
+    states = np.full((time.size, 12), np.nan)
+    states[:, ANGLES], states[:, RATES], states[:, VELOCITY] = angles, rates, exact[:, :3]
+    turn = to_earth(angles)
+    true, forgetful = (turn.apply(part, inverse=True) for part in (exact[:, :3], exact[:, 3:]))
+    return Recording(time, np.full((time.size, 4), 100.0), states, force), true, forgetful
+
+
+def without(recording, *columns):
+    states = recording.states.copy()
+    states[:, sum(columns, [])] = np.nan
+    return recording._replace(states=states)
+
+
+def test_a_measured_velocity_is_turned_by_the_attitude():
+    recording, true, _ = trajectory(0.004)
+    found = motion_of(recording)
+    assert found.measured
+    np.testing.assert_allclose(found.velocity, true, atol=1e-9)
+    upright = to_earth(recording.states[:, ANGLES]).apply([0.0, 0.0, 1.0], inverse=True)
+    np.testing.assert_allclose(found.up, upright, atol=1e-12)
+    gaps = recording._replace(states=recording.states.copy())
+    gaps.states[20:24] = np.nan  # a gap has the value before it
+    np.testing.assert_allclose(motion_of(gaps).velocity[20:24], true[[19] * 4], atol=1e-9)
+
+
+def test_dead_reckoning_converges_to_the_integral_that_forgets():
+    errors = []
+    for dt in (0.008, 0.004):
+        recording, _, forgetful = trajectory(dt)
+        found = motion_of(without(recording, VELOCITY))
+        assert not found.measured
+        errors.append(np.abs(found.velocity - forgetful).max())
+    assert errors[1] < 0.05
+    assert errors[1] < 0.7 * errors[0]
+
+
+@pytest.mark.parametrize("known", ["attitude", "nothing"])
+def test_the_velocity_along_z_is_found(known):
+    recording, true, _ = trajectory(0.004)
+    found = motion_of(without(recording, VELOCITY, *([ANGLES] if known == "nothing" else [])))
+    late = recording.time > 5
+    error, size = (found.velocity - true)[late, 2].std(), true[late, 2].std()
+    assert error < 0.3 * size
+    assert (
+        np.abs(found.up[late, 2] - np.cos(recording.states[late, 6]) * np.cos(recording.states[late, 8])).max() < 0.03
+    )
+
+
+def test_a_constant_error_of_the_accelerometer_is_left_out():
+    recording = without(trajectory(0.004)[0], VELOCITY)
+    up = motion_of(recording).up
+    biased = recording._replace(specific_force=recording.specific_force + 0.5 * up)
+    np.testing.assert_allclose(motion_of(biased).velocity, motion_of(recording).velocity, atol=1e-9)
+
+
+def test_a_log_without_gyro_or_accelerometer_has_no_velocity():
+    recording = without(trajectory(0.004)[0], VELOCITY)
+    force = recording.specific_force.copy()
+    force[:, 1] = np.nan
+    for lacking in (
+        without(recording, RATES),
+        recording._replace(specific_force=None),
+        recording._replace(specific_force=force),
+    ):
+        assert motion_of(lacking) is None
