@@ -134,8 +134,8 @@ def yaw_doubt(axes: Sequence[Opposite]) -> tuple[str, str] | None:
             return (
                 "yaw answers the rotors with the opposite sign (torque and angular acceleration correlate by "
                 f"{-each.wrong:.2f})",
-                "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change all "
-                "four signs",
+                "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
+                "all four signs",
             )
     return None
 
