@@ -292,7 +292,10 @@ class InnovationsProblem(AbstractProblem):
         positions = np.asarray(model.forcing_parameters, dtype=int)
 
         def excess(parameters: Parameters, thrust: Array, forcing: Forcing) -> Scalar:
-            force = model.specific_force(thrust, forcing, tuple(parameters))[2]
+            def along_z(thrust: Array, forcing: Forcing) -> Scalar:
+                return model.specific_force(thrust, forcing, tuple(parameters))[2]
+
+            force = jax.vmap(jax.vmap(along_z))(thrust, forcing)
             return ((weight * force).sum() - balance.gravity) / balance.sigma
 
         def lift(parameters: Parameters, forcing: Forcing, tangents: Forcing | None) -> tuple[Scalar, Parameters]:
