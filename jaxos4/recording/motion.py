@@ -24,7 +24,9 @@ _ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi
 _STEP = 0.008  # [s]
 _SMOOTH, _SLOW = 3, 63  # samples: differences of these means are the motion between about 2 and 20 Hz
 # Motors against gyro [s]: lag and delay of rotors; and the same with clocks that may be shifted either way.
-_CAUSAL, _SHIFTED = (0.0, 0.048), (-0.04, 0.06)
+_CAUSAL, _SHIFTED, _WIDE = (0.0, 0.048), (-0.04, 0.06), (-0.08, 0.08)
+# Motors are late or early beyond these delays [s]; rotors that were measured act at once.
+_LATE, _EARLY, _SEEN = -0.005, 0.02, 0.6
 _LEAST_SECONDS = 3.0
 _OPPOSITE, _CLEAR = 0.4, 1.5  # correlation, and by how much it exceeds that of another sign or pair of rotors
 # The same before a sign of the airframe is called wrong, by axis. A controller turns the sign at negative shifts.
@@ -106,7 +108,7 @@ def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> list[Oppos
 
     **Arguments:** usable stretches of flights, each of one vehicle.
     """
-    _, found = _torque_correlations(pieces, airframe)
+    _, found = _torque_correlations(pieces, airframe, _SHIFTED)
     every = [Opposite(axis, -float(row.min()), float(row.max())) for axis, row in zip(AXES, found.T, strict=True)]
     limits = _WRONG.values()
     return [
@@ -178,12 +180,37 @@ def _excitation(recording: Recording, axis: str, torque: float) -> Excitation:
     return Excitation(axis, torque, size, noise, verdict)
 
 
+def motor_clock_note(pieces: Sequence[Recording], airframe: Airframe) -> str:
+    """By how much motors are recorded late or early against the gyro, if roll and pitch show it clearly; else empty.
+
+    Commands precede the motion by an unknown lag of the rotors: they are never called early, and late by at least the
+    answer.
+    """
+    delays, found = _torque_correlations(pieces, airframe, _WIDE)
+    peaks = []
+    for row in found[:, :2].T:
+        best = int(np.argmax(row)) if np.isfinite(row).all() else 0
+        if 0 < best < row.size - 1 and row[best] > _SEEN and row[best] > -row.min():
+            before, at, after = row[best - 1 : best + 2]
+            between = 0.5 * (before - after) / (before - 2 * at + after)
+            # Accelerations are those of the end of a sample, torques those of its middle.
+            peaks.append(delays[best] + (between + 0.5) * (delays[1] - delays[0]))
+    if not peaks:
+        return ""
+    if max(peaks) < _LATE:
+        least = "at least " if pieces[0].commanded else "about "
+        return f"motors are recorded {least}{-1e3 * np.mean(peaks):.0f} ms late, or the gyro early (term `delay`)"
+    if min(peaks) > _EARLY and not pieces[0].commanded:
+        return f"motors are recorded about {1e3 * np.mean(peaks):.0f} ms early, or the gyro late (term `delay`)"
+    return ""
+
+
 def _torque_correlations(
-    pieces: Sequence[Recording], airframe: Airframe
+    pieces: Sequence[Recording], airframe: Airframe, between: tuple[float, float]
 ) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, "delays 3"]]:
     """How the torque about each axis correlates with its angular acceleration, by delay [s]. NaN: too little torque."""
     mixer = np.asarray(airframe.mixer, dtype=float)[:3]
-    delays, found = _correlations(pieces, mixer, _SHIFTED)
+    delays, found = _correlations(pieces, mixer, between)
     hover = float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
     torques = [(piece.omega[:-1] ** 2 @ mixer.T).std(axis=0) for piece in pieces]
     weak = np.max(torques, axis=0, initial=0.0) < _LEAST_TORQUE * hover
