@@ -21,9 +21,18 @@ from synthetic_identification import (
 )
 from test_report import stands_alone, words
 
-from jaxos4.identification.results import Disturbance, Doubt, HeldParameter, RigidBody, Validation
+from jaxos4.identification.results import (
+    Constant,
+    Disturbance,
+    Doubt,
+    HeldParameter,
+    ParameterEstimate,
+    RigidBody,
+    SampleTime,
+    Validation,
+)
 from jaxos4.report import print_identification, write_flight_page
-from jaxos4.report.identification_page import frequency_responses, predicted_rates
+from jaxos4.report.identification_page import frequency_responses, inertias_by_sample_time, predicted_rates
 from jaxos4.report.style import drawing, pdf, styles, svg
 from jaxos4.report.text import MISSING, Listing, plain
 
@@ -98,6 +107,38 @@ def test_the_figure_says_how_strongly_each_axis_answers():
     # What is not clear has no band and no strong line.
     assert not figure.axes[2].collections[0].get_paths()
     assert np.isnan(np.asarray(figure.axes[2].lines[1].get_ydata(), dtype=float)).all()
+
+
+SAMPLE_TIMES = tuple(
+    SampleTime(step, {"Ix": Constant(ix, 2e-7, "kg m^2"), "Iy": Constant(1.8e-5, 3e-7, "kg m^2")}, 0.1)
+    for step, ix in ((0.004, 1.64e-5), (0.008, 1.78e-5), (0.016, 1.8e-5))
+)
+
+
+def test_the_inertias_of_all_sample_times_are_shown(tmp_path):
+    changes = {"sample_times": SAMPLE_TIMES, "provenance": {"sample_time": 0.008}}
+    says(
+        printed(identified_vehicle(**changes)),
+        "sample times: 4 ms Ix 1.64e-05 Iy 1.8e-05, 8 ms Ix 1.78e-05 Iy 1.8e-05 (chosen), 16 ms Ix 1.8e-05 ",
+    )
+    _, shown = written(tmp_path / "flight.html", **changes)
+    says(shown, "Moment of inertia against sample time")
+    with drawing():
+        figure = inertias_by_sample_time(SAMPLE_TIMES, 0.008, styles(["ibss"])["ibss"])
+    drawn = np.asarray(figure.axes[0].lines[0].get_ydata(), dtype=float)
+    np.testing.assert_allclose(drawn, np.array([1.64, 1.78, 1.8]) / 1.78)
+    bar = figure.axes[0].collections[0].get_segments()[1]
+    assert np.ptp(bar[:, 1]) == pytest.approx(2 * 1.96 * 2e-7 / 1.78e-5, rel=1e-3)
+    assert figure.axes[2].get_title(loc="left") == "Iz: not identified"
+    svg(figure)
+
+
+def test_motors_that_are_recorded_late_are_named(tmp_path):
+    late = {"rotor_delay": ParameterEstimate(-0.02, 0.001, 0.001, (-0.022, -0.018), "s", "")}
+    says(printed(identified_vehicle(parameters=late)), "note: motors are recorded 20 ms late (rotor_delay)")
+    says(written(tmp_path / "flight.html", parameters=late)[1], "motors are recorded 20 ms late")
+    small = {"rotor_delay": msgspec.structs.replace(late["rotor_delay"], estimate=-0.004)}
+    assert "late" not in printed(identified_vehicle(parameters=small))
 
 
 def test_without_predictions_and_constants_the_page_leaves_them_out(tmp_path):

@@ -236,6 +236,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         predicted, skill = predict_held_out(fit, held_out)
     doubts = doubts_of(fit.problem.model, table, body.constants, skill)
     step = float(fit.problem.flight.dt)
+    doubts += tuple(_implausible(cause, remedy) for cause, remedy in case.doubts)
     doubts += (*vibration(fit.disturbances, step), *_moved(sample_times, step))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
     return Judgement(

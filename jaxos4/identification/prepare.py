@@ -48,6 +48,7 @@ class Case(NamedTuple):
     - `held_out`: the measurements that are not fitted, if there are any.
     - `recording`: the number of the recording of each sample.
     - `provenance`: data, settings and versions.
+    - `doubts`: cause and remedy of each doubt about the logs. `log_step`: the longest sample of the logs [s].
     """
 
     problem: ShootingProblem | InnovationsProblem
@@ -59,6 +60,8 @@ class Case(NamedTuple):
     held_out: HeldOut | None
     recording: np.ndarray
     provenance: Provenance
+    doubts: tuple[tuple[str, str], ...] = ()
+    log_step: float = 0.0
 
     @property
     def is_vehicle(self) -> bool:

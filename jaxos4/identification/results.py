@@ -81,6 +81,9 @@ class RigidBody(msgspec.Struct, frozen=True):
         return msgspec.to_builtins(self.constants) | {k: v for k, v in tests.items() if v is not None}
 
 
+# Motors that act earlier than they are recorded by more than this are recorded late [s].
+_LATE = 0.005
+
 COLOURED = 0.3
 """Residuals are coloured if neighbours correlate by more than this: intervals then allow for it."""
 
@@ -280,6 +283,14 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     def has_answer(self) -> bool:
         """Whether there is an estimate at all."""
         return self.result not in NO_ANSWER
+
+    @property
+    def motor_clock(self) -> str:
+        """How late motors are recorded, if `rotor_delay` is clearly negative; else empty."""
+        delay = self.parameters.get("rotor_delay")
+        if delay is None or delay.estimate is None or delay.estimate > -_LATE:
+            return ""
+        return f"motors are recorded {-1e3 * delay.estimate:.0f} ms late"
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 estimate` writes as JSON.

@@ -108,7 +108,10 @@ def _case(
     )
     recording = np.asarray(prepared.recordings)[number]
     problem = _innovations(shooting, prepared, like, airframe)
-    return Case(problem, shooting, FilterError(), name, "flight", FilterError.prior, held_out, recording, provenance)
+    return Case(
+        problem, shooting, FilterError(), name, "flight", FilterError.prior, held_out, recording, provenance,
+        doubts=prepared.doubts, log_step=prepared.log_step,
+    )  # fmt: skip
 
 
 def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int, progress: Progress) -> Case:

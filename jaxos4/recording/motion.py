@@ -23,9 +23,15 @@ _OVER_NOISE = 5.0  # a rate below this many times the gyro's noise is not excite
 _ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi"))
 _STEP = 0.008  # [s]
 _SMOOTH, _SLOW = 3, 63  # samples: differences of these means are the motion between about 2 and 20 Hz
-_DELAYS = 7  # samples, up to 48 ms: lag and delay of rotors
+# Motors against gyro [s]: lag and delay of rotors; and the same with clocks that may be shifted either way.
+_CAUSAL, _SHIFTED, _WIDE = (0.0, 0.048), (-0.04, 0.06), (-0.08, 0.08)
+# Motors are late or early beyond these delays [s]; rotors that were measured act at once.
+_LATE, _EARLY, _SEEN = -0.005, 0.02, 0.6
 _LEAST_SECONDS = 3.0
 _OPPOSITE, _CLEAR = 0.4, 1.5  # correlation, and by how much it exceeds that of another sign or pair of rotors
+# The same before a sign of the airframe is called wrong, by axis. A controller turns the sign at negative shifts.
+_WRONG = {"roll": (0.7, 1.2), "pitch": (0.7, 1.2), "yaw": (0.5, 1.5)}
+_LEAST_TORQUE = 0.005  # of all the torque of the rotors in hover
 # Two rotors against the other two: the three ways are roll, pitch and yaw of an X, in an order that depends on the log.
 _PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -1.0, 1.0]])
 
@@ -47,6 +53,18 @@ class Excitation(NamedTuple):
     rate: float
     noise: float
     verdict: str
+
+
+class Opposite(NamedTuple):
+    """An axis about which the vehicle turns against the torque that the airframe gives to its rotors.
+
+    `wrong`, `right`: the largest correlation of torque and angular acceleration with the opposite sign, and with that
+    of the airframe.
+    """
+
+    axis: str
+    wrong: float
+    right: float
 
 
 class RotorSigns(NamedTuple):
@@ -83,32 +101,45 @@ def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
     return float(np.median(second)) / 0.6745 / math.sqrt(6) if second.size else math.nan
 
 
-def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> list[str]:
+def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> list[Opposite]:
     """The axes about which the vehicle turns against the torque that the airframe gives to its rotors.
 
-    Axes without clear motion are not judged.
+    Axes without clear motion and torque are not judged. The clocks of motors and gyro may be shifted.
 
     **Arguments:** usable stretches of flights, each of one vehicle.
     """
-    found = _correlations(pieces, np.asarray(airframe.mixer, dtype=float)[:3])
-    return [axis for i, axis in enumerate(AXES) if _clear_sign(found[:, i, i]) < 0]
+    _, found = _torque_correlations(pieces, airframe, _SHIFTED)
+    every = [Opposite(axis, -float(row.min()), float(row.max())) for axis, row in zip(AXES, found.T, strict=True)]
+    limits = _WRONG.values()
+    return [
+        each for each, (least, times) in zip(every, limits, strict=True) if each.wrong > max(least, times * each.right)
+    ]
 
 
-def opposite_note(axes: Sequence[str]) -> str:
-    """The fault and the remedy, if the vehicle turns against the torque about these axes; empty without axes."""
-    if not axes:
+def refused_note(axes: Sequence[Opposite]) -> str:
+    """The fault and the remedy, if the vehicle rolls or pitches against the torque; else empty."""
+    named = [each.axis for each in axes if each.axis != "yaw"]
+    if not named:
         return ""
-    if list(axes) == ["yaw"]:
-        return (
-            "yaw answers the rotors with the opposite sign: the rotors turn the other way than `rotor_spins` of the "
-            "airframe say (props in or out); change all four signs"
-        )
-    verb = "answers" if len(axes) == 1 else "answer"
+    verb = "answers" if len(named) == 1 else "answer"
     return (
-        f"{' and '.join(axes)} {verb} the rotors with the opposite sign: the rotors of the log are in another order "
+        f"{' and '.join(named)} {verb} the rotors with the opposite sign: the rotors of the log are in another order "
         "than `rotor_positions` and `rotor_spins` of the airframe, or the gyro has other axes than x forward, y left, "
         "z up (with z down, q and r have the opposite sign); correct one of them"
     )
+
+
+def yaw_doubt(axes: Sequence[Opposite]) -> tuple[str, str] | None:
+    """Cause and remedy, if the vehicle seems to yaw against the torque."""
+    for each in axes:
+        if each.axis == "yaw":
+            return (
+                "yaw answers the rotors with the opposite sign (torque and angular acceleration correlate by "
+                f"{-each.wrong:.2f})",
+                "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
+                "all four signs",
+            )
+    return None
 
 
 def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
@@ -118,7 +149,7 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
 
     **Arguments:** usable stretches of flights, each of one vehicle, with motors and gyro logged fast.
     """
-    found = _correlations(pieces, _PAIRS)
+    _, found = _correlations(pieces, _PAIRS, _CAUSAL)
     roll, pitch = (_pair(found[:, :, axis]) for axis in (0, 1))
     if roll is None or pitch is None or roll == pitch:
         return None
@@ -149,27 +180,71 @@ def _excitation(recording: Recording, axis: str, torque: float) -> Excitation:
     return Excitation(axis, torque, size, noise, verdict)
 
 
+def motor_clock_note(pieces: Sequence[Recording], airframe: Airframe) -> str:
+    """By how much motors are recorded late or early against the gyro, if roll and pitch show it clearly; else empty.
+
+    Commands precede the motion by an unknown lag of the rotors: they are never called early, and late by at least the
+    answer.
+    """
+    delays, found = _torque_correlations(pieces, airframe, _WIDE)
+    peaks = []
+    for row in found[:, :2].T:
+        best = int(np.argmax(row)) if np.isfinite(row).all() else 0
+        if 0 < best < row.size - 1 and row[best] > _SEEN and row[best] > -row.min():
+            before, at, after = row[best - 1 : best + 2]
+            between = 0.5 * (before - after) / (before - 2 * at + after)
+            # Accelerations are those of the end of a sample, torques those of its middle.
+            peaks.append(delays[best] + (between + 0.5) * (delays[1] - delays[0]))
+    if not peaks:
+        return ""
+    if max(peaks) < _LATE:
+        least = "at least " if pieces[0].commanded else "about "
+        return f"motors are recorded {least}{-1e3 * np.mean(peaks):.0f} ms late, or the gyro early (term `delay`)"
+    if min(peaks) > _EARLY and not pieces[0].commanded:
+        return f"motors are recorded about {1e3 * np.mean(peaks):.0f} ms early, or the gyro late (term `delay`)"
+    return ""
+
+
+def _torque_correlations(
+    pieces: Sequence[Recording], airframe: Airframe, between: tuple[float, float]
+) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, "delays 3"]]:
+    """How the torque about each axis correlates with its angular acceleration, by delay [s]. NaN: too little torque."""
+    mixer = np.asarray(airframe.mixer, dtype=float)[:3]
+    delays, found = _correlations(pieces, mixer, between)
+    hover = float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
+    torques = [(piece.omega[:-1] ** 2 @ mixer.T).std(axis=0) for piece in pieces]
+    weak = np.max(torques, axis=0, initial=0.0) < _LEAST_TORQUE * hover
+    return delays, np.where(weak, np.nan, np.diagonal(found, axis1=1, axis2=2))
+
+
 def _correlations(
-    pieces: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"]
-) -> Float[np.ndarray, "delays rows 3"]:
+    pieces: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"], between: tuple[float, float]
+) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, "delays rows 3"]]:
     """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
 
-    A controller that answers gusts does not change the sign. One number for each delay of up to 48 ms, each row of
-    `mixer` (the weight of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion.
+    A controller that answers gusts does not change the sign. One number for each delay, each row of `mixer` (the weight
+    of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion. Also the delays [s].
+
+    **Arguments:** `between`: the first and the last delay of the gyro after the motors [s].
     """
-    pairs = [_response(piece, mixer) for piece in pieces if np.ptp(piece.time) > _SLOW * _STEP * 2]
-    found = np.full((_DELAYS, mixer.shape[0], len(AXES)), np.nan)
-    for delay in range(_DELAYS if pairs else 0):
-        torque = np.concatenate([a[: a.shape[0] - delay] for a, _ in pairs])
-        acceleration = np.concatenate([b[delay:] for _, b in pairs])
+    pieces = [piece for piece in pieces if np.ptp(piece.time) > _SLOW * _STEP * 2]
+    step = max([_STEP, *(piece.dt for piece in pieces)])
+    pairs = [_response(piece, mixer, step) for piece in pieces]
+    first, last = (round(end / step) for end in between)
+    shifts = range(first, last + 1)
+    found = np.full((len(shifts), mixer.shape[0], len(AXES)), np.nan)
+    for place, shift in enumerate(shifts if pairs else ()):
+        early, late = max(-shift, 0), max(shift, 0)
+        torque = np.concatenate([a[early : max(a.shape[0] - late, 0)] for a, _ in pairs])
+        acceleration = np.concatenate([b[late : max(b.shape[0] - early, 0)] for _, b in pairs])
         for i, along in enumerate(acceleration.T):
             measured = np.isfinite(torque).all(axis=1) & np.isfinite(along)
             if np.count_nonzero(measured) * _STEP < _LEAST_SECONDS:
                 continue
             x, y = torque[measured] - torque[measured].mean(axis=0), along[measured] - along[measured].mean()
             spreads = x.std(axis=0) * y.std()
-            found[delay, :, i] = np.where(spreads > 0, y @ x / y.size, np.nan) / np.where(spreads > 0, spreads, 1.0)
-    return found
+            found[place, :, i] = np.where(spreads > 0, y @ x / y.size, np.nan) / np.where(spreads > 0, spreads, 1.0)
+    return step * np.array(shifts), found
 
 
 def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
@@ -192,9 +267,8 @@ def _pair(found: np.ndarray) -> int | None:
     return best if alone and _clear_sign(found[:, best]) else None
 
 
-def _response(piece: Recording, mixer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Torques and angular accelerations [rad/s^2], one sample every 8 ms, between about 2 and 20 Hz."""
-    step = max(_STEP, piece.dt)
+def _response(piece: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
     _, omega, rates = average(piece.time, piece.omega, piece.states[:, RATE_COLUMNS], step)
     acceleration = np.diff(rates, axis=0) / step
     for i, axis in enumerate(excitation(piece)):

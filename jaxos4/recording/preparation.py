@@ -21,7 +21,7 @@ from ..models.terms import (
     VOLTAGE,
     has_full_scale,
 )
-from .motion import opposite_axes, opposite_note
+from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
@@ -50,6 +50,8 @@ class Prepared(NamedTuple):
     - `upright`: the cosine of the tilt at each sample. `None`: unknown.
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
+    - `doubts`: cause and remedy of each doubt about the logs.
+    - `log_step`: the longest sample of the logs [s].
     """
 
     fitted: Flight
@@ -60,6 +62,8 @@ class Prepared(NamedTuple):
     upright: Float[np.ndarray, " samples"] | None
     seconds: tuple[float, float]
     notes: tuple[str, ...]
+    doubts: tuple[tuple[str, str], ...]
+    log_step: float
 
     @property
     def windows(self) -> int:
@@ -78,11 +82,13 @@ class Usable(NamedTuple):
     - `parts`: each with the number of its recording, from 0.
     - `recordings`: whole.
     - `notes`: what the reader changed, and which stretches are not used.
+    - `doubts`: cause and remedy of each doubt about the logs.
     """
 
     parts: tuple[tuple[int, Recording], ...]
     recordings: tuple[Recording, ...]
     notes: tuple[str, ...]
+    doubts: tuple[tuple[str, str], ...]
 
     @property
     def slowest(self) -> float:
@@ -143,20 +149,24 @@ def usable_parts(
     _check_recordings(recordings)
     notes: list[str] = []
     parts: list[tuple[int, Recording]] = []
+    doubts: list[tuple[str, str]] = []
     for number, recording in enumerate(recordings):
         slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
         pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
         if slow:
             raise InputError(f"{recording.name}: {slow}.")
-        if opposite := opposite_note(opposite_axes(pieces, airframe)):
-            raise InputError(f"{recording.name}: {opposite}.")
+        opposite = opposite_axes(pieces, airframe)
+        if refused := refused_note(opposite):
+            raise InputError(f"{recording.name}: {refused}.")
+        if doubt := yaw_doubt(opposite):
+            doubts.append((f"{recording.name}: {doubt[0]}", doubt[1]))
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
         parts += [(number, piece) for piece in pieces]
     if len({piece.commanded for _, piece in parts}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
-    return Usable(tuple(parts), tuple(recordings), tuple(notes))
+    return Usable(tuple(parts), tuple(recordings), tuple(notes), tuple(doubts))
 
 
 def sampled(
@@ -192,6 +202,8 @@ def sampled(
         np.concatenate([motion.up[:, 2] for motion in motions]) if moved else None,
         seconds,
         usable.notes,
+        usable.doubts,
+        usable.slowest,
     )
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from matplotlib.ticker import MultipleLocator
 from .._files import check_writable, write_atomically
 from ..analysis.frequency_response import AxisResponse, FrequencyResponse
 from ..analysis.prediction import Predictions
-from ..identification.results import Identification
+from ..identification.results import Identification, SampleTime
 from ..results import NINETY_FIVE
 from .html import drawings, render
 from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg, ticks_at
@@ -38,7 +39,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
     check_writable(path)
     look = styles([found.estimator])[found.estimator]
-    predictions, responses = (), ()
+    predictions, responses, sample_times = (), (), ()
     with drawing():
         if (predicted := found.predictions) is not None:
             labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
@@ -51,6 +52,10 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
             files = {"": svg(frequency_responses(found.response, look))}
             description = "Frequency response of roll, pitch and yaw"
             responses = drawings(files, 0, stem="response", description=description)
+        if found.sample_times:
+            files = {"": svg(inertias_by_sample_time(found.sample_times, found.provenance.sample_time, look))}
+            description = "Moments of inertia against the sample time"
+            sample_times = drawings(files, 0, stem="sample_times", description=description)
     text = render(
         "identification.html.j2",
         filters={"number": _number, "interval": _interval, "share": _share, "plain": plain},
@@ -60,8 +65,9 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         predictions=predictions,
         band=f"{100 * BAND:g}",
         responses=responses,
+        sample_times=sample_times,
         command=found.provenance.command or "",
-        notes=found.provenance.notes,
+        notes=[*found.provenance.notes, *([found.motor_clock] if found.motor_clock else [])],
         provenance=[
             (name.replace("_", " "), _text(x))
             for name, x in found.provenance.to_dict().items()
@@ -159,6 +165,33 @@ def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
         panel.set_ylabel(label)
     labels = ("measured over modelled", "95 %", "coherence below 0.6", "the model")
     figure.legend(shown, labels, loc="outside lower left", ncols=4)
+    return figure
+
+
+def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: Style) -> Figure:
+    """Ix, Iy and Iz at each sample time, relative to those of the chosen one, with 95 % intervals.
+
+    **Arguments:** `chosen`: the sample time of the estimate [s].
+    """
+    own = next((each.constants for each in answers if math.isclose(each.sample_time, chosen)), {})
+    figure, panels = grid(3, columns=3, width=9.0, height=2.4)
+    ticks = [1e3 * each.sample_time for each in answers]
+    for panel, name in zip(panels, ("Ix", "Iy", "Iz"), strict=True):
+        rows = [(1e3 * each.sample_time, each.constants[name]) for each in answers if name in each.constants]
+        scale = own[name].estimate if name in own else math.nan
+        times = [time for time, _ in rows]
+        values, errors = ([getattr(row, field) / scale for _, row in rows] for field in ("estimate", "std"))
+        errors = [NINETY_FIVE * error for error in errors]
+        bars = panel.errorbar(times, values, yerr=errors, color=look.color, marker="o", markersize=4, capsize=3)
+        mark = panel.axvline(1e3 * chosen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
+        level = panel.axhline(1.0, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[2])
+        panel.set_title(f"{name} / chosen" if rows and name in own else f"{name}: not identified")
+        panel.set_xscale("log")
+        panel.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
+        ticks_at(panel.xaxis, ticks)
+        panel.set_xlabel("sample time [ms]")
+    labels = ("moment of inertia, 95 %", "chosen sample time", "chosen moment of inertia")
+    figure.legend([bars, mark, level], labels, loc="outside lower left", ncols=3)
     return figure
 
 

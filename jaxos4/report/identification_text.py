@@ -1,5 +1,6 @@
 """An identification as text, for a terminal."""
 
+import math
 from collections.abc import Iterator
 
 from rich.console import Console
@@ -17,7 +18,18 @@ Section = Iterator[str | Listing]
 
 def print_identification(console: Console, found: Identification) -> None:
     """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; or why there is no answer."""
-    sections = (_notes, _parameters, _held, _fit, _inertias, _validation, _disturbances, _skill, _summary)
+    sections = (
+        _notes,
+        _parameters,
+        _held,
+        _fit,
+        _inertias,
+        _sample_times,
+        _validation,
+        _disturbances,
+        _skill,
+        _summary,
+    )
     for section in sections if found.has_answer else (_notes, _failure):
         for part in section(found):
             if isinstance(part, Listing):
@@ -29,6 +41,8 @@ def print_identification(console: Console, found: Identification) -> None:
 def _notes(found: Identification) -> Section:
     yield from (f"not to be trusted because {doubt}." for doubt in found.doubts)
     yield from (f"note: {note}" for note in found.provenance.notes)
+    if found.motor_clock:
+        yield f"note: {found.motor_clock} (rotor_delay)"
 
 
 def _failure(found: Identification) -> Section:
@@ -119,6 +133,16 @@ def _inertias(found: Identification) -> Section:
             verdict = f"; the alphas agree with one rigid body, p = {body.consistency_p:.2g}"
     if inertias:
         yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}{verdict}."
+
+
+def _sample_times(found: Identification) -> Section:
+    rows = []
+    for each in found.sample_times:
+        chosen = " (chosen)" if math.isclose(each.sample_time, found.provenance.sample_time) else ""
+        inertias = [f"{name} {row.estimate:.3g}" for name, row in each.constants.items()]
+        rows.append(f"{1e3 * each.sample_time:.3g} ms {' '.join(inertias) or 'no answer'}{chosen}")
+    if rows:
+        yield f"sample times: {', '.join(rows)}."
 
 
 def _validation(found: Identification) -> Section:
