@@ -229,7 +229,6 @@ def test_the_text_of_a_vehicle():
         doubtful,
         "not to be trusted because Ix is negative; check the arms.",
         "their correlation time: p 1.2 rad/s^2 over 0.1 s.",
-        "of means over 0.25 s]: p 0.02.",
         "by the factor: alpha3 1.7.",
     )
     assert "Predictions" not in doubtful

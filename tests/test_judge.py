@@ -66,7 +66,6 @@ def test_nothing_speaks_against_a_good_estimate():
         ({"alpha1": (4.0, 0.1)}, ("alpha1", "contradict", "gyro")),
         ({"alpha7": (-3.0, 0.1)}, ("alpha7", "contradict")),
         ({"rotor_lag": (-0.02, 0.003)}, ("rotor_lag = -0.02 s is negative", "omega1..4")),
-        ({"rotor_delay": (-0.02, 0.003)}, ("rotor_delay", "time stamps")),
         ({"thrust_gain": (0.02, 0.01)}, ("accelerometer", "does not follow")),
         ({"thrust_gain": (-1.0, 0.05)}, ("z axis points down",)),
         ({"thrust_gain": (9.8, 0.2)}, ("thrust_gain = 9.8 (the accelerometer shows more thrust", "mass")),
