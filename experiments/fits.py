@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -86,9 +86,12 @@ def run_cases(
     settings: dict,
     cases: Iterable[tuple[str, str]],
     vehicle: jaxos4.Airframe,
-    flights_of: Callable[[str], list[jaxos4.Flight]],
+    flights_of: Callable[[str], Sequence[jaxos4.Flight | None]],
 ) -> dict:
-    """The report of all cases, each a kind of flights and an estimator; continued if `out` exists."""
+    """The report of all cases, each a kind of flights and an estimator; continued if `out` exists.
+
+    `flights_of`: the flights of a kind; `None`: one that was lost.
+    """
     settings = settings | {"version": jaxos4.__version__, "precision": "float64"}
     report: dict = {**settings, "cases": []}
     if out is not None and out.exists():
@@ -98,7 +101,8 @@ def run_cases(
     for kind, estimator in cases:
         if any((case["kind"], case["estimator"]) == (kind, estimator) for case in report["cases"]):
             continue
-        rows = [fit(estimator, flight, vehicle, i) for i, flight in enumerate(flights_of(kind))]
+        flown = [(i, flight) for i, flight in enumerate(flights_of(kind)) if flight is not None]
+        rows = [fit(estimator, flight, vehicle, i) for i, flight in flown]
         report["cases"].append({"kind": kind, "estimator": estimator, "flights": rows, "summary": summary(rows)})
         if out is not None:
             out.write_text(json.dumps(report, indent=1) + "\n")

@@ -67,6 +67,7 @@ def fall_and_turn(motion, speeds, change, v):
 
 def reference_motion(v, omega, samples, fine=10):
     """Rates, attitude and velocity at each sample, mean rotor speeds over it, from commands: small midpoint steps."""
+    v = jax.tree.map(np.asarray, v)  # JAX takes long for single numbers
     h, lag, delay = DT / fine, float(v.rotor_lag), float(v.rotor_delay)
     weight = float(v.airframe.mass * v.airframe.gravity)
     hover = np.sqrt(np.linalg.solve(np.asarray(v.airframe.mixer), [0, 0, 0, weight]))

@@ -409,10 +409,18 @@ OTHERS = {
     "vtol": (
         [states("vehicle_status", [0.0, 1.0], is_vtol=[0, 1])],
         {},
-        "vehicle_status.is_vtol: this is a VTOL",
+        "field vehicle_status.is_vtol: this is a VTOL",
     ),
-    "plane": ([states("vehicle_status", [0.0], vehicle_type=[2])], {}, "vehicle_status.vehicle_type: this is a fixed"),
-    "hexarotor": ([states("vehicle_status", [0.0], system_type=[13])], {}, "system_type: this is a hexarotor"),
+    "plane": (
+        [states("vehicle_status", [0.0], vehicle_type=[2])],
+        {},
+        "field vehicle_status.vehicle_type: this is a fi",
+    ),
+    "hexarotor": (
+        [states("vehicle_status", [0.0], system_type=[13])],
+        {},
+        "vehicle_status.system_type: this is a hexarotor",
+    ),
     "type": ([], {"MAV_TYPE": 22}, "parameter MAV_TYPE: this is a VTOL"),
     "frame": ([], {"CA_AIRFRAME": 3}, "parameter CA_AIRFRAME: this is a VTOL"),
     "rotors": ([], {"CA_ROTOR_COUNT": 6}, "parameter CA_ROTOR_COUNT: this is a vehicle with 6 rotors"),

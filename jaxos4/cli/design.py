@@ -17,36 +17,6 @@ if TYPE_CHECKING:
 
 # A list would make the names lower-case.
 Criterion = StrEnum("Criterion", {"D": "D", "A": "A", "worst": "worst"})
-SlowestOption = Annotated[float | None, Option(help="Slowest rotor speed [rad/s].")]
-FastestOption = Annotated[float | None, Option(help="Fastest rotor speed [rad/s].")]
-SlewOption = Annotated[float | None, Option(help="Fastest change of a rotor speed [rad/s^2].")]
-AngleOption = Annotated[
-    float | None,
-    Option(help="Largest roll, pitch and yaw angle [rad]; with --closed-loop: that of the references. Default: 0.3."),
-]
-RateOption = Annotated[float | None, Option(help="Largest body rate [rad/s].")]
-VelocityOption = Annotated[float | None, Option(help="Largest velocity [m/s].")]
-DistanceOption = Annotated[float | None, Option(help="Largest distance from the start [m].")]
-BandwidthOption = Annotated[
-    float | None, Option(help="Highest frequency [Hz]. Default: 4; with --closed-loop: 6.", metavar="HERTZ")
-]
-StartOption = Annotated[
-    options.InitialState | None, Option(help="free: estimated too; known: equal to the first sample. Default: free.")
-]
-DesignedChannelsOption = Annotated[
-    options.Channels | None, Option(help="Channels that will be measured. Default: all.")
-]
-CriterionOption = Annotated[
-    Criterion, Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound.")
-]
-AccuracyOption = Annotated[
-    float | None,
-    Option(
-        help="Wanted standard deviation [% of the bracket's half-width]. Default: 1; "
-        "with --closed-loop: 5 % of Ix, Iy and Iz.",
-        metavar="PERCENT",
-    ),
-]
 
 
 def design(
@@ -58,19 +28,38 @@ def design(
     model: options.OpenLoopModelOption = None,
     duration: options.DurationOption = None,
     dt: options.SampleTimeOption = None,
-    slowest: SlowestOption = None,
-    fastest: FastestOption = None,
-    slew: SlewOption = None,
-    angle: AngleOption = None,
-    rate: RateOption = None,
-    velocity: VelocityOption = None,
-    distance: DistanceOption = None,
-    bandwidth: BandwidthOption = None,
+    slowest: Annotated[float | None, Option(help="Slowest rotor speed [rad/s].")] = None,
+    fastest: Annotated[float | None, Option(help="Fastest rotor speed [rad/s].")] = None,
+    slew: Annotated[float | None, Option(help="Fastest change of a rotor speed [rad/s^2].")] = None,
+    angle: Annotated[
+        float | None,
+        Option(
+            help="Largest roll, pitch and yaw angle [rad]; with --closed-loop: that of the references. Default: 0.3."
+        ),
+    ] = None,
+    rate: Annotated[float | None, Option(help="Largest body rate [rad/s].")] = None,
+    velocity: Annotated[float | None, Option(help="Largest velocity [m/s].")] = None,
+    distance: Annotated[float | None, Option(help="Largest distance from the start [m].")] = None,
+    bandwidth: Annotated[
+        float | None, Option(help="Highest frequency [Hz]. Default: 4; with --closed-loop: 6.", metavar="HERTZ")
+    ] = None,
     bracket: options.BracketOption = None,
-    channels: DesignedChannelsOption = None,
-    initial_state: StartOption = None,
-    criterion: CriterionOption = Criterion["D"],
-    accuracy: AccuracyOption = None,
+    channels: Annotated[options.Channels | None, Option(help="Channels that will be measured. Default: all.")] = None,
+    initial_state: Annotated[
+        options.InitialState | None,
+        Option(help="free: estimated too; known: equal to the first sample. Default: free."),
+    ] = None,
+    criterion: Annotated[
+        Criterion, Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound.")
+    ] = Criterion["D"],
+    accuracy: Annotated[
+        float | None,
+        Option(
+            help="Wanted standard deviation [% of the bracket's half-width]. Default: 1; "
+            "with --closed-loop: 5 % of Ix, Iy and Iz.",
+            metavar="PERCENT",
+        ),
+    ] = None,
     gust: options.GustOption = None,
     lag: options.LagOption = None,
     delay: options.DelayOption = None,

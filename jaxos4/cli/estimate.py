@@ -17,54 +17,43 @@ if TYPE_CHECKING:
 
 _OS4, _PUBLISHED = "os4", "published"
 
-FlightsArgument = Annotated[list[Path], Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")]
-EstimatorOption = Annotated[
-    options.Estimator | None, Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
-]
-ModelOption = Annotated[
-    options.VehicleModel | None,
-    Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
-]
-AirframeOption = Annotated[
-    str | None, Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
-]
-NetworkOption = Annotated[
-    Path | None, Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
-]
-ValidateOption = Annotated[Path | None, Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")]
-TermsOption = Annotated[str | None, Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")]
-BeginOption = Annotated[
-    float | None, Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on.")
-]
-EndOption = Annotated[
-    float | None, Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
-]
-AveragedTimeOption = Annotated[
-    float | None, Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
-]
-HoldoutOption = Annotated[
-    float | None, Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
-]
-ReportOption = Annotated[Path | None, Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")]
-
 
 def estimate(
-    flights: FlightsArgument,
-    estimator: EstimatorOption = None,
-    model: ModelOption = None,
-    airframe: AirframeOption = None,
+    flights: Annotated[list[Path], Argument(metavar="FLIGHT...", help="A flight, or logs of one vehicle.")],
+    estimator: Annotated[
+        options.Estimator | None, Option(help="The algorithm; default: ibss, or filter-error for a vehicle.")
+    ] = None,
+    model: Annotated[
+        options.VehicleModel | None,
+        Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
+    ] = None,
+    airframe: Annotated[
+        str | None, Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
+    ] = None,
     bracket: options.BracketOption = None,
     channels: options.ChannelsOption = None,
     initial_state: options.InitialStateOption = options.InitialState["free"],
     window: options.WindowOption = None,
-    network: NetworkOption = None,
-    validate: ValidateOption = None,
-    terms: TermsOption = None,
-    begin: BeginOption = None,
-    end: EndOption = None,
-    sample_time: AveragedTimeOption = None,
-    holdout: HoldoutOption = None,
-    report: ReportOption = None,
+    network: Annotated[
+        Path | None, Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
+    ] = None,
+    validate: Annotated[
+        Path | None, Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
+    ] = None,
+    terms: Annotated[str | None, Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")] = None,
+    begin: Annotated[
+        float | None, Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on.")
+    ] = None,
+    end: Annotated[
+        float | None, Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
+    ] = None,
+    sample_time: Annotated[
+        float | None, Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
+    ] = None,
+    holdout: Annotated[
+        float | None, Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
+    ] = None,
+    report: Annotated[Path | None, Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")] = None,
     out: options.OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""

@@ -12,22 +12,9 @@ from ._output import check_outputs, stages
 
 if TYPE_CHECKING:
     from ..airframe import Airframe
-    from ..closed_loop import ClosedLoop
     from ..flight import Flight
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
-ExcitationOption = Annotated[options.Excitation | None, Option(help="Shape of the inputs. Default: multisine.")]
-SpeedsOption = Annotated[
-    Path | None, Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation.")
-]
-MethodOption = Annotated[options.Method | None, Option(help="Integrator of the equations of motion. Default: euler.")]
-NoiseOption = Annotated[
-    float | None, Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
-]
-ReferencesOption = Annotated[
-    Path | None,
-    Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
-]
 
 
 def simulate(
@@ -37,10 +24,16 @@ def simulate(
     dt: options.SampleTimeOption = None,
     seed: Annotated[int, Option(help="Random seed.")] = 0,
     model: options.OpenLoopModelOption = None,
-    excitation: ExcitationOption = None,
-    speeds: SpeedsOption = None,
-    method: MethodOption = None,
-    noise: NoiseOption = None,
+    excitation: Annotated[options.Excitation | None, Option(help="Shape of the inputs. Default: multisine.")] = None,
+    speeds: Annotated[
+        Path | None, Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation.")
+    ] = None,
+    method: Annotated[
+        options.Method | None, Option(help="Integrator of the equations of motion. Default: euler.")
+    ] = None,
+    noise: Annotated[
+        float | None, Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
+    ] = None,
     closed_loop: Annotated[
         bool, Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
     ] = False,
@@ -48,7 +41,10 @@ def simulate(
     lag: options.LagOption = None,
     delay: options.DelayOption = None,
     sensors: options.SensorsOption = None,
-    references: ReferencesOption = None,
+    references: Annotated[
+        Path | None,
+        Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
+    ] = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
     check_outputs(airframe, references, speeds, out=out)
@@ -75,8 +71,12 @@ def simulate(
         vehicle = load_airframe(airframe)
         if closed_loop:
             try:
+                from ..closed_loop import fly_standard
+                from ..design import read_references
+
                 loop = options.make_loop(airframe, gust, lag, delay, sensors)
-                flight, dt = _closed_loop(loop, references, duration, dt, seed)
+                flown, dt = (None, dt) if references is None else read_references(references)
+                flight = fly_standard(loop, references=flown, duration=duration, dt=dt, seed=seed)
             except ValueError as error:
                 raise InputError(f"--closed-loop: {error}") from None
             how = f"closed loop, {loop.logged}, gusts of {5.0 if gust is None else gust:g} rad/s^2"
@@ -101,20 +101,6 @@ def _check_not_given(file: Path | None, **given: object) -> None:
     for name, value in given.items():
         if file is not None and value is not None:
             raise InputError(f"--{name}: {file} has its own; leave it out.")
-
-
-def _closed_loop(
-    loop: "ClosedLoop", references: Path | None, duration: float, dt: float, seed: int
-) -> tuple["Flight", float]:
-    """A flight under the controller, with random references or those of a file. Returns its sample time [s] too."""
-    from ..closed_loop import fly_standard
-
-    flown = None
-    if references is not None:
-        from ..design import read_references
-
-        flown, dt = read_references(references)
-    return fly_standard(loop, references=flown, duration=duration, dt=dt, seed=seed), dt
 
 
 def _open_loop(

@@ -75,7 +75,7 @@ class Fit(NamedTuple):
 def fit_case(case: Case, *, progress: Progress = lambda stage: None) -> Fit:
     """The fit of a prepared case, by its likelihood."""
     if isinstance(case.problem, InnovationsProblem):
-        return fit_innovations(case, case.problem, progress=progress)
+        return fit_innovations(case.estimator, case.problem, case.recording, shooting=case.shooting, progress=progress)
     return fit_flight(case.estimator, case.problem, progress=progress)
 
 
@@ -121,16 +121,25 @@ def fit_flight(
     return Fit(problem, estimate, np.sqrt(np.diagonal(bound)), rollouts, diagnostics, evaluation)
 
 
-def fit_innovations(case: Case, problem: InnovationsProblem, *, progress: Progress = lambda stage: None) -> Fit:
+def fit_innovations(
+    estimator: AbstractEstimator,
+    problem: InnovationsProblem,
+    recording: np.ndarray,
+    *,
+    shooting: ShootingProblem | None = None,
+    progress: Progress = lambda stage: None,
+) -> Fit:
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
 
     The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket is not
     estimated. A parameter that came out negative, though physics forbids it, is held at 0. Intervals widen if parts of
     the flights disagree.
 
-    **Arguments:** `problem`: that of the case, perhaps with another start.
+    **Arguments:**
+
+    - `recording`: the number of the recording of each sample.
+    - `shooting`: the flight and its model, if that of the problem is padded.
     """
-    estimator = case.estimator
     own, names = problem.problem.unknowns, problem.model.parameter_names
     unknowns = own.count + 3 * len(problem.channels)
     progress("compiling, and fitting parameters and disturbances")
@@ -148,7 +157,7 @@ def fit_innovations(case: Case, problem: InnovationsProblem, *, progress: Progre
     values, std = np.asarray(found.parameters)[: own.count], _std(found)[: own.count]
     half_width, factor = np.asarray(own.half_width), np.ones(own.count)
     if has_answer(found):
-        factor[~at_zero] = _widening(problem, found, ~at_zero, case.recording)
+        factor[~at_zero] = _widening(problem, found, ~at_zero, recording)
     identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
     if not has_answer(found) or not identifiable.any():
         identifiable[:] = True
@@ -159,7 +168,7 @@ def fit_innovations(case: Case, problem: InnovationsProblem, *, progress: Progre
     spread = np.asarray(found.covariance) * scale[:, None] * scale
     noise = LogNoise(*np.asarray(found.parameters)[own.count :].reshape(-1, 3).T)
     return Fit(
-        problem=_with_sensors(case.shooting, noise),
+        problem=_with_sensors(problem.problem if shooting is None else shooting, noise),
         estimate=eqx.tree_at(lambda e: e.covariance, found, as_float(spread)),
         bound=std,
         rollouts=rollouts,

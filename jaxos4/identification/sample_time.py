@@ -3,21 +3,27 @@
 Short samples contain the vibration of the sensors and the noise of measured rotor speeds. Long samples hide motion. The
 flight is fitted at several sample times, from the longest on, each starting at the answer before.
 
-The rule: the shortest sample time at which innovations are nearly white, and whose moments of inertia are those of
-samples twice as long, within two standard deviations. If there is none: the shortest with nearly white innovations.
+The rule: the shortest sample time at which innovations are nearly white, measured rotor speeds have little noise, and
+the moments of inertia are those of samples twice as long, within two standard deviations. If there is none: the
+shortest without vibration and noise. If all have it: the longest.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from ..airframe import Airframe
+from ..flight import Flight
 from .answers import vehicle_constants
 from .fit import Fit, fit_innovations
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
 
-# Innovations that correlate by less count as white. Two answers agree within so many standard deviations.
-WHITE, AGREE = 0.3, 2.0
+# Innovations that correlate by less count as white. Two answers agree within so many standard deviations and this
+# share, which allows for errors of discretisation.
+WHITE, AGREE, _DISCRETE = 0.3, 2.0, 0.03
+# Noise may be this share of the changes of the rotors' torque from sample to sample. More makes inertias too large.
+NOISY = 0.1
 _RATES = ("p", "q", "r")
 
 
@@ -32,7 +38,7 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
         progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
         if fits and fits[0].answered:
             problem = problem.starting_from(np.asarray(fits[0].estimate.parameters))
-        fits.insert(0, fit_innovations(case, problem))
+        fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
     answers = tuple(_answer(case, fit) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
@@ -40,15 +46,31 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
 
 def shortest(answers: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `answers`: the shortest sample time first."""
-    white = [i for i, answer in enumerate(answers) if abs(answer.correlation) <= WHITE and answer.constants] or [0]
-    return next((i for i in white[:-1] if not moved(answers[i], answers[i + 1])), white[0])
+    clean = [i for i, answer in enumerate(answers) if answer.constants and _is_clean(answer)] or [len(answers) - 1]
+    return next((i for i in clean[:-1] if not moved(answers[i], answers[i + 1])), clean[0])
+
+
+def _is_clean(answer: SampleTime) -> bool:
+    return abs(answer.correlation) <= WHITE and answer.speed_noise <= NOISY
+
+
+def noise_of_speeds(flight: Flight, airframe: Airframe) -> float:
+    """The share of white noise in the changes of the rotors' roll or pitch torque from sample to sample.
+
+    Commands have no noise. White noise has second differences of 6 times its variance, and first differences of twice.
+    """
+    if flight.commanded:
+        return 0.0
+    torque = np.square(np.asarray(flight.omega)) @ np.asarray(airframe.mixer, dtype=float)[:2].T
+    noise, changes = (np.median(np.abs(np.diff(torque, order, axis=0)), axis=0) ** 2 for order in (2, 1))
+    return float(np.max(noise / 3 / np.where(changes > 0, changes, np.inf)))
 
 
 def moved(answer: SampleTime, other: SampleTime) -> list[str]:
     """The moments of inertia that another sample time contradicts."""
 
     def differs(one: Constant, two: Constant) -> bool:
-        return abs(one.estimate - two.estimate) > AGREE * max(one.std, two.std)
+        return abs(one.estimate - two.estimate) > AGREE * max(one.std, two.std) + _DISCRETE * one.estimate
 
     both = [name for name in answer.constants if name in other.constants]
     return [name for name in both if differs(answer.constants[name], other.constants[name])]
@@ -58,4 +80,5 @@ def _answer(case: Case, fit: Fit) -> SampleTime:
     constants = vehicle_constants(fit).constants if fit.answered else {}
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in _RATES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
-    return SampleTime(float(case.shooting.flight.dt), constants, largest)
+    flight = case.shooting.flight
+    return SampleTime(float(flight.dt), constants, largest, noise_of_speeds(flight, fit.problem.model.airframe))

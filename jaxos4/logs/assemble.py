@@ -21,7 +21,6 @@ from .table import (
     PITCH,
     ROLL,
     SPEED_NAMES as SPEED_NAMES,
-    LogFacts,
     Recording,
     Sampling,
     Table,
@@ -55,8 +54,15 @@ def recording_of(
     """Make a recording from the columns of a log and the `notes` of its reader; see `read_log`."""
     found = [*notes, *([_unknown_note(table.unknown)] if table.unknown else [])]
     table = table._replace(columns={n: column for n, column in table.columns.items() if not np.isnan(column).all()})
-    _check_columns(table)
-    facts = _facts(table)
+    if not table.holds("t"):
+        table.refuse(_missing("there is no time", ("t",), table) + "; each row needs its time [s]", column="t")
+    if not any(map(table.holds, STATE_NAMES)):
+        what = _missing("no state was measured", STATE_NAMES, table)
+        table.refuse(f"{what}; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
+    # Cells that hold no value were not logged, also those of a rotor.
+    motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
+    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
+    facts = table.facts._replace(**{name: getattr(table.facts, name) or found for name, found in rarest.items()})
     dt = _check_time(table)
     table = _check_units(table.without_impossible())
     if table.impossible:
@@ -68,7 +74,7 @@ def recording_of(
         found += _thrust_note(float(thrust / (airframe.mass * airframe.gravity)))
     channels, voltage = _channels(table, found), _voltage(table)
     with_force = any(map(table.holds, FORCE_NAMES))
-    commanded = not any(map(table.holds, SPEED_NAMES))
+    commanded = motors is COMMAND_NAMES
     table = table._replace(columns={"t": table.columns["t"]})  # frees the memory of a long log
     time, omega, channels, voltage = _evenly(table, dt, omega, channels, voltage, found)
     dt = float(time[-1] - time[0]) / (time.size - 1)
@@ -76,26 +82,8 @@ def recording_of(
         found.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
         time = dt * np.arange(time.size)
     states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
-    return Recording(
-        time,
-        omega,
-        states,
-        specific_force=force if with_force else None,
-        voltage=voltage,
-        commanded=commanded,
-        name=os.fspath(table.path),
-        notes=tuple(found),
-        facts=facts,
-    )
-
-
-def _check_columns(table: Table) -> None:
-    """Refuse a log without time or without any state."""
-    if not table.holds("t"):
-        table.refuse(_missing("there is no time", ("t",), table) + "; each row needs its time [s]", column="t")
-    if not any(map(table.holds, STATE_NAMES)):
-        what = _missing("no state was measured", STATE_NAMES, table)
-        table.refuse(f"{what}; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
+    about = {"commanded": commanded, "name": os.fspath(table.path), "notes": tuple(found), "facts": facts}
+    return Recording(time, omega, states, force if with_force else None, voltage, **about)
 
 
 def _missing(what: str, wanted: tuple[str, ...], table: Table) -> str:
@@ -113,13 +101,6 @@ def _unknown_note(unknown: tuple[str, ...]) -> str:
     shown = [quoted(name) + (f" (did you mean {_meant(name)}?)" if _meant(name) else "") for name in unknown[:8]]
     more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
     return f"unknown columns are ignored: {', '.join(shown)}{more}"
-
-
-def _facts(table: Table) -> LogFacts:
-    """The facts beside the columns. Cells that hold no value were not logged, also those of a rotor."""
-    motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
-    rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
-    return table.facts._replace(**{name: getattr(table.facts, name) or found for name, found in rarest.items()})
 
 
 def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:

@@ -191,18 +191,14 @@ def _numbers(path: Path, column: str, cells: Sequence[str], row: int) -> np.ndar
     for i, cell in enumerate(map(str.strip, cells)):
         values[i] = float(cell) if _NUMBER.fullmatch(cell) else math.nan
         if cell and not math.isfinite(values[i]):
-            refuse(path, _complaint(cell), row=row + i, column=column)
+            fault = ", which is not a number; correct it, or"
+            if cell.lower().lstrip("+-") in _NO_NUMBER:
+                fault = ";"
+            elif _NUMBER.fullmatch(cell):
+                fault = ", which is too large for a number;"
+            what = f"contains {quoted(cell)}{fault} {_EMPTY}"
+            refuse(path, what if _readable(cell) else _NOT_UTF8, row=row + i, column=column)
     return values
-
-
-def _complaint(cell: str) -> str:
-    """The fault of a cell that is no finite number, and the remedy."""
-    if not _readable(cell):
-        return _NOT_UTF8
-    if cell.lower().lstrip("+-") in _NO_NUMBER:
-        return f"contains {quoted(cell)}; {_EMPTY}"
-    fault = "too large for a number;" if _NUMBER.fullmatch(cell) else "not a number; correct it, or"
-    return f"contains {quoted(cell)}, which is {fault} {_EMPTY}"
 
 
 def _readable(text: str) -> bool:

@@ -10,12 +10,13 @@ from typing import NamedTuple, TypeVar
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, Float
 
 from .._custom_types import RotorSpeeds, Scalar
 from ..airframe import Airframe
 from .abstract import Contradiction
 from .rotors import Grid, Speeds, SquaredSpeeds, delayed, lagged
-from .state import Forcing, Rates, Samples, Vector
+from .state import Forcing, Rates, Vector
 
 # What a term can need from the logs or from the airframe.
 COMMANDS = "commands"
@@ -44,7 +45,7 @@ _AXES = ("roll", "pitch", "yaw")
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
 
 T = TypeVar("T")
-Values = Mapping[str, Samples]
+Values = Mapping[str, Float[Array, "..."]]
 Constant = float | Callable[[Airframe], Scalar]
 
 

@@ -162,7 +162,7 @@ def _disturbances(found: Identification) -> Section:
         gusts = ", ".join(f"{name} {x.strength:.2g} {x.unit} over {x.time_constant:.2g} s" for name, x in rows)
         yield f"disturbances that the model lacks, and their correlation time: {gusts}."
         sensors = ", ".join(f"{name} {x.sensor:.2g}" for name, x in rows)
-        yield f"white noise of the sensors [rad/s; m/s^2, of means over 0.25 s]: {sensors}."
+        yield f"white noise of the sensors [rad/s; m/s^2]: {sensors}."
     if found.widened:
         factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
         yield f"intervals widened, because parts of the flights disagree, by the factor: {factors}."

@@ -130,7 +130,7 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
             | {"trouble": study_tables.troubled_flights(scenario.data)}
             for scenario, drawn in sections
         ],
-        level=study_tables.shown_level(dataset),
+        level=f"{100 * study_tables.shown_level(dataset):g} %",
         example=example,
         failed=study_tables.failed_cells(dataset),
         missing=missing,

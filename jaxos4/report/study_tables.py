@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -57,15 +57,17 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     return {
         "error": error_table(data),
         "efficiency": table(metrics.efficiency(data), "efficiency", plain, parameters),
-        "coverage": table(metrics.coverage(data).isel(level=_shown_level(data)), "coverage", percent, parameters),
-        "levels": table(metrics.mean_coverage(data), "coverage", percent, [_percents(x) for x in data["level"].values]),
+        "coverage": table(metrics.coverage(data).sel(level=shown_level(data)), "coverage", percent, parameters),
+        "levels": table(
+            metrics.mean_coverage(data), "coverage", percent, [f"{100 * x:g} %" for x in data["level"].values]
+        ),
         "results": _result_table(data),
     }
 
 
-def shown_level(data: xr.Dataset) -> str:
-    """The level of the intervals in the table of coverage, in percent."""
-    return _percents(data["level"].values[_shown_level(data)])
+def shown_level(data: xr.Dataset) -> float:
+    """The level of the intervals in the table of coverage."""
+    return min(data["level"].values.tolist(), key=lambda level: abs(level - _LEVEL))
 
 
 def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
@@ -107,15 +109,8 @@ def _result_table(data: xr.Dataset) -> Table:
     return _by_estimator(data, [*headings, "rollouts", "seed hits"], cells)
 
 
-class Trouble(NamedTuple):
-    """Flights or cells without numbers: a description of the first 20, and the total."""
-
-    listed: list[str]
-    total: int
-
-
-def troubled_flights(data: xr.Dataset) -> Trouble:
-    """The flights that were run and did not converge."""
+def troubled_flights(data: xr.Dataset) -> dict[str, Any]:
+    """The flights that were run and did not converge: the first 20 `listed`, and the `total`."""
     order = ("scale", "estimator", "flight")
     bad = (metrics.was_run(data) & ~metrics.converged(data)).transpose(*order).values
     results, places = data["result"].transpose(*order).values[bad], np.argwhere(bad)
@@ -125,32 +120,24 @@ def troubled_flights(data: xr.Dataset) -> Trouble:
         f"{scales[i]}, {estimators[j]}, flight {flights[k]}: {known.get(int(result), 'unknown result')}"
         for (i, j, k), result in zip(places[:_MOST_LISTED], results[:_MOST_LISTED], strict=True)
     ]
-    return Trouble(listed, len(places))
+    return {"listed": listed, "total": len(places)}
 
 
-def failed_cells(dataset: xr.Dataset) -> Trouble:
-    """The cells of a study that raised an error, with the error's message."""
+def failed_cells(dataset: xr.Dataset) -> dict[str, Any]:
+    """The cells of a study that raised an error, with its message: the first 20 `listed`, and the `total`."""
     failures = json.loads(dataset.attrs.get("failures", "[]"))
     shown = [name for name in metrics.SCENARIO if dataset.sizes[name] > 1] or ["estimator"]
     listed = [
         f"cell {failure['cell']}, {', '.join(f'{name} {failure[name]}' for name in shown)}: {failure['message']}"
         for failure in failures[:_MOST_LISTED]
     ]
-    return Trouble(listed, len(failures))
+    return {"listed": listed, "total": len(failures)}
 
 
 def cells_not_run(dataset: xr.Dataset) -> tuple[int, int]:
     """The number of cells that have not been run, and the number of all cells."""
     missing = (dataset["result"] == metrics.codes(dataset)["not_run"]).all("flight")
     return int(missing.sum()), missing.size
-
-
-def _percents(level: float) -> str:
-    return f"{100 * level:g} %"
-
-
-def _shown_level(data: xr.Dataset) -> int:
-    return int(np.argmin(np.abs(data["level"].values - _LEVEL)))
 
 
 def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[str, int]], tuple[Cell, ...]]) -> Table:
