@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scipy.special import chdtri
@@ -9,13 +10,15 @@ from scipy.special import chdtri
 import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.identification.jackknife import disagreement, parts_of
-from jaxos4.identification.judge import doubts_of, vibration
+from jaxos4.identification.judge import doubts_of, overwhelmed, vibration
 from jaxos4.identification.results import Constant, Disturbance, ParameterEstimate, PredictionSkill, RateSkill
 from jaxos4.models.corrected import CorrectedOS4
 from jaxos4.recording import read_recording
 
 AIRFRAME = Path(__file__).parents[1] / "experiments" / "real_flight" / "crazyflie.toml"
-VEHICLE = jaxos4.FlightModel(OS4, terms=("lag", "delay", "accelerometer"))
+VEHICLE = jaxos4.FlightModel(
+    eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(400.0)), terms=("lag", "delay", "curve", "accelerometer")
+)
 IMPLAUSIBLE = "implausible"
 
 
@@ -43,12 +46,12 @@ def skill(**rates):
     return PredictionSkill([0.1, 0.248, 0.5], 100, **{name: rate(rates.get(name, 0.8)) for name in "pqr"})
 
 
-def doubts(changed=None, inertias=None, skill=None):
+def doubts(changed=None, inertias=None, skill=None, **others):
     """The doubts about a believable estimate, some of whose parameters or inertias (value, std) are changed."""
     parameters, constants = believable()
     parameters |= {name: parameter(*values) for name, values in (changed or {}).items()}
     constants |= {name: Constant(*values, "kg m^2") for name, values in (inertias or {}).items()}
-    return doubts_of(VEHICLE, parameters, constants, skill)
+    return doubts_of(VEHICLE, parameters, constants, skill, **others)
 
 
 def test_nothing_speaks_against_a_good_estimate():
@@ -66,6 +69,9 @@ def test_nothing_speaks_against_a_good_estimate():
         ({"alpha1": (4.0, 0.1)}, ("alpha1", "contradict", "gyro")),
         ({"alpha7": (-3.0, 0.1)}, ("alpha7", "contradict")),
         ({"rotor_lag": (-0.02, 0.003)}, ("rotor_lag = -0.02 s is negative", "omega1..4")),
+        ({"rotor_delay": (-0.06, 0.003)}, ("rotor_delay", "60 ms late", "time stamps")),
+        ({"thrust_curve": (1.5, 0.03)}, ("thrust_curve = 1.5 is outside of 0 (linear) to 1.2", "climbs")),
+        ({"az_bias": (1.2, 0.02)}, ("az_bias = 1.2 m/s^2", "levelled accelerometer", "mass")),
         ({"thrust_gain": (0.02, 0.01)}, ("accelerometer", "does not follow")),
         ({"thrust_gain": (-1.0, 0.05)}, ("z axis points down",)),
         ({"thrust_gain": (9.8, 0.2)}, ("thrust_gain = 9.8 (the accelerometer shows more thrust", "mass")),
@@ -123,6 +129,36 @@ def test_a_fit_without_skill_is_not_believed(rates, axes):
     assert doubt.result == "no_skill"
     assert axes in str(doubt)
     assert doubts(skill=skill(**dict.fromkeys(rates))) == ()  # not measured
+
+
+def test_an_axis_that_the_held_out_part_hardly_shows_has_no_skill_to_lose():
+    poor = skill(p=0.5, q=0.5, r=-2.0)
+    assert doubts(skill=poor, still=["yaw"]) == ()
+    (doubt,) = doubts(skill=poor, still=["roll", "pitch", "yaw"])
+    assert doubt.result == "no_skill"
+    assert "`validate`" in doubt.remedy
+
+
+def test_the_cause_comes_before_the_missing_skill():
+    first, second = doubts({"rotor_lag": (0.002, 0.001)}, skill=skill(p=-1.0), log_step=0.01)
+    assert "rotor_lag = 0.002 s is shorter than a sample of the log, 0.01 s" in first.cause
+    assert second.result == "no_skill"
+
+
+def test_a_disturbance_larger_than_the_control_is_named():
+    omega = np.asarray(OS4.hover_speed) + np.random.default_rng(0).normal(0, 1.0, (1000, 4))
+    torque = (omega[:-1] ** 2 @ np.asarray(OS4.mixer)[:3].T).std(axis=0)
+    found = {
+        name: (1.0 / inertia, 0.1)
+        for name, inertia in zip(("alpha3", "alpha6", "alpha8"), OS4.inertia.tolist(), strict=True)
+    }
+    sizes = torque / np.asarray(OS4.inertia) * np.array([0.9, 1.1, 0.9])
+    gusts = {
+        rate: Disturbance(size, "rad/s^2", 0.1, 0.01, 0.0) for rate, size in zip("pqr", sizes.tolist(), strict=True)
+    }
+    (doubt,) = overwhelmed(omega, OS4, gusts, found)
+    assert "about pitch, the disturbance" in doubt.cause
+    assert not list(overwhelmed(omega, OS4, gusts, {}))
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.

@@ -11,7 +11,7 @@ from jaxos4.errors import InputError
 from jaxos4.logs import read_recording, write_flight
 from jaxos4.recording import Recording, cut, usable_stretches
 from jaxos4.recording.motion import motor_clock_note, opposite_axes as opposites, refused_note, yaw_doubt
-from jaxos4.recording.preparation import prepare
+from jaxos4.recording.preparation import at_limit, prepare
 
 DT = 0.004
 
@@ -131,6 +131,14 @@ def test_the_lag_of_commands_is_no_error_of_clocks(shared_flights):
         flight = read_recording(path, CRAZYFLIE)
         parts = [cut(flight, stretch) for stretch in usable_stretches(flight, CRAZYFLIE)]
         assert motor_clock_note(parts, CRAZYFLIE) == ""
+
+
+def test_rotors_at_their_limit_are_named(shared_flights):
+    limits = {"B2_circle_fast_rep2": "rotor 4 is at its limit for 8 %", "B3_figure8_fast_rep1": None}
+    for name, words in limits.items():
+        doubt = at_limit(read_recording(shared_flights / "nanobench" / f"{name}.csv", CRAZYFLIE), CRAZYFLIE)
+        assert doubt is None if words is None else doubt is not None and words in doubt[0]
+    assert at_limit(flown(CRAZYFLIE, 0), CRAZYFLIE) is None
 
 
 def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():

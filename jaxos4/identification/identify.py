@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 
+import msgspec
 import numpy as np
 
 from ..airframe import Airframe
@@ -103,7 +104,7 @@ def describe(
         seconds=seconds,
         parameters=verdict.parameters,
         rigid_body=verdict.rigid_body,
-        provenance=case.provenance,
+        provenance=msgspec.structs.replace(case.provenance, notes=[*case.provenance.notes, *verdict.notes]),
         covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
         estimate=fit.estimate,
         problem=fit.problem,

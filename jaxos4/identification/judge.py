@@ -12,7 +12,8 @@ from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import Predictions
 from ..models.abstract import AbstractModel, Parameter
 from ..models.corrected import CorrectedOS4
-from .answers import parameter_table, rigid_body
+from ..recording.motion import OVER_NOISE, WEAK
+from .answers import INVERSE, parameter_table, rigid_body
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
@@ -26,7 +27,7 @@ from .results import (
     SampleTime,
     Validation,
 )
-from .sample_time import moved
+from .sample_time import NOISY, moved
 
 # Doubts need this many standard deviations.
 _SURE = 3.0
@@ -42,6 +43,7 @@ _HORIZON = 0.25  # [s]
 # Value and standard deviation of each parameter that has an estimate.
 Found = dict[str, tuple[float, float]]
 _PLACES = {"p": "roll", "q": "pitch", "r": "yaw"}
+_LONGEST_DELAY = 0.04  # [s], of rotors; more is an error of clocks
 
 
 def doubts_of(
@@ -49,16 +51,17 @@ def doubts_of(
     parameters: dict[str, ParameterEstimate],
     constants: dict[str, Constant],
     skill: PredictionSkill | None,
+    still: Sequence[str] = (),
+    log_step: float = 0.0,
 ) -> tuple[Doubt, ...]:
     """The reasons not to trust the estimate of a vehicle; empty if there are none.
 
+    `still`: the axes about which the held-out part hardly turns. `log_step`: the longest sample of the logs [s].
+
     The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
     """
-    found: Found = {}
-    stds: dict[str, float] = {}
-    for name, row in parameters.items():
-        if row.estimate is not None and row.std is not None:
-            found[name], stds[name] = (row.estimate, row.std if row.bound is None else row.bound), row.std
+    found = _found(parameters)
+    stds = {name: row.std for name, row in parameters.items() if name in found and row.std is not None}
     contradicted = dict(_contradicted(model, found))
     is_thrust_wrong = any(parameter.scales_torque for parameter in contradicted)
     return (
@@ -66,8 +69,17 @@ def doubts_of(
         *(() if is_thrust_wrong else _impossible_inertias(constants, model.airframe)),
         *_contradictions(found, stds, model.airframe),
         *_no_answer(found),
-        *_skill(skill),
+        *_unseen(found, log_step),
+        *_skill(skill, still),
     )
+
+
+def _found(parameters: dict[str, ParameterEstimate]) -> Found:
+    return {
+        name: (row.estimate, row.std if row.bound is None else row.bound)
+        for name, row in parameters.items()
+        if row.estimate is not None and row.std is not None
+    }
 
 
 def _contradicted(model: AbstractModel, found: Found) -> Iterator[tuple[Parameter, Doubt]]:
@@ -129,6 +141,16 @@ def vibration(disturbances: dict[str, Disturbance], sample_time: float) -> Itera
             )
 
 
+def _noisy_speeds(sample_times: Sequence[SampleTime], step: float) -> Iterator[Doubt]:
+    """Noise of measured rotor speeds makes moments of inertia too large. `step`: the chosen sample time [s]."""
+    for own in sample_times:
+        if own.sample_time == step and own.speed_noise > NOISY:
+            yield _implausible(
+                f"measured rotor speeds are noisy: {own.speed_noise:.0%} of their changes from sample to sample are noise",
+                "give longer samples by `sample_time`, or log the speeds better",
+            )
+
+
 def _moved(sample_times: Sequence[SampleTime], step: float) -> Iterator[Doubt]:
     """A moment of inertia that is another one at the next longer sample time. `step`: the chosen one [s]."""
     place = next((i for i, each in enumerate(sample_times) if each.sample_time == step), len(sample_times))
@@ -183,12 +205,74 @@ def _contradictions(found: Found, stds: dict[str, float], airframe: Airframe) ->
         )
 
 
-def _skill(skill: PredictionSkill | None) -> Iterator[Doubt]:
+def overwhelmed(
+    omega: np.ndarray, airframe: Airframe, disturbances: dict[str, Disturbance], found: Found
+) -> Iterator[Doubt]:
+    """Axes on which disturbances are larger than the torque of the rotors.
+
+    `omega`: speeds of the rotors, shape (samples, 4) [rad/s].
+    """
+    torques = (omega[:-1].astype(float) ** 2 @ np.asarray(airframe.mixer, dtype=float)[:3].T).std(axis=0)
+    for (rate, axis), row, torque in zip(_PLACES.items(), INVERSE.values(), torques, strict=True):
+        value, _ = found.get(f"alpha{row + 1}", (np.inf, 0.0))
+        if rate in disturbances and disturbances[rate].strength > abs(value) * torque:
+            yield _implausible(
+                f"about {axis}, the disturbance ({disturbances[rate].strength:.2g} rad/s^2) is larger than what the "
+                f"rotors do ({abs(value) * torque:.2g} rad/s^2)",
+                f"fly more {axis}, or in calmer air",
+            )
+
+
+def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
+    """A lag or delay of the rotors that the log is too slow to show. `log_step`: its longest sample [s]."""
+    lag, error = found.get("rotor_lag", (np.inf, 0.0))
+    if -_SURE * error <= lag < log_step - _SURE * error:
+        yield _implausible(
+            f"rotor_lag = {lag:.2g} s is shorter than a sample of the log, {log_step:.2g} s",
+            "log faster, or leave out the term `lag`",
+        )
+    delay, error = found.get("rotor_delay", (0.0, 0.0))
+    if abs(delay) - _SURE * error > _LONGEST_DELAY:
+        how = "late" if delay < 0 else "early"
+        yield _implausible(
+            f"rotor_delay = {delay:.2g} s: motors are recorded {1e3 * abs(delay):.0f} ms {how}, more than any rotor",
+            "check the time stamps of motors and gyro",
+        )
+
+
+def _negative_drag(fit: Fit) -> Iterator[Doubt]:
+    """A vertical drag that came out negative, and is held at 0."""
+    if "z_drag" in fit.held and fit.held["z_drag"].value == 0:
+        yield _implausible(
+            "z_drag came out negative: no inflow makes thrust grow with the velocity along z",
+            "check the z axes of the log and `mass`, and fly climbs and descents",
+        )
+
+
+def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:
+    """The axes about which the held-out part hardly turns."""
+    still = []
+    for (rate, axis), measured in zip(_PLACES.items(), np.moveaxis(predicted.measured, 2, 0), strict=True):
+        noise = fit.disturbances[rate].sensor if rate in fit.disturbances else 0.0
+        seen = measured[np.isfinite(measured)]
+        if seen.size and seen.std() < max(WEAK, OVER_NOISE * noise):
+            still.append(axis)
+    return tuple(still)
+
+
+def _skill(skill: PredictionSkill | None, still: Sequence[str]) -> Iterator[Doubt]:
     if skill is None:
+        return
+    if len(still) == len(_PLACES):
+        yield Doubt(
+            "no_skill",
+            "the held-out part hardly turns, so that no prediction checks the fit",
+            "choose another part with `begin` and `end`, or another flight with `validate`",
+        )
         return
     place = int(np.argmin(np.abs(np.array(skill.horizons) - _HORIZON)))
     values = {rate: getattr(skill, rate).skill[place] for rate in _PLACES}
-    poor = [rate for rate, value in values.items() if value is not None and value <= 0]
+    poor = [rate for rate, value in values.items() if value is not None and value <= 0 and _PLACES[rate] not in still]
     if poor:
         named = ", ".join(f"{rate} {values[rate]:.2g}" for rate in poor)
         axes = " and ".join(_PLACES[rate] for rate in poor)
@@ -208,6 +292,7 @@ class Judgement(NamedTuple):
 
     - `parameters`, `rigid_body`: the answer itself; empty for a vehicle without one.
     - `doubts`: why a vehicle's answer is not to be trusted.
+    - `notes`: what could not be checked.
     - `validation`: how well an OS4 model explains another flight.
     - `skill`, `predictions`: of measurements of a vehicle that were not fitted.
     - `response`: the frequency response of a vehicle.
@@ -216,6 +301,7 @@ class Judgement(NamedTuple):
     parameters: dict[str, ParameterEstimate] = {}
     rigid_body: RigidBody = RigidBody()
     doubts: tuple[Doubt, ...] = ()
+    notes: tuple[str, ...] = ()
     validation: Validation | None = None
     skill: PredictionSkill | None = None
     predictions: Predictions | None = None
@@ -234,11 +320,26 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     if held_out is not None:
         progress("predicting what was not fitted")
         predicted, skill = predict_held_out(fit, held_out)
-    doubts = doubts_of(fit.problem.model, table, body.constants, skill)
+    omega, airframe = np.asarray(fit.problem.flight.omega), fit.problem.model.airframe
+    still = () if predicted is None else _still_axes(fit, predicted)
+    doubts = (
+        *(_implausible(cause, remedy) for cause, remedy in case.doubts),
+        *overwhelmed(omega, airframe, fit.disturbances, _found(table)),
+        *_negative_drag(fit),
+        *doubts_of(fit.problem.model, table, body.constants, skill, still, case.log_step),
+    )
+    notes = [
+        f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`"
+    ] * (0 < len(still) < len(_PLACES))
     step = float(fit.problem.flight.dt)
-    doubts += tuple(_implausible(cause, remedy) for cause, remedy in case.doubts)
-    doubts += (*vibration(fit.disturbances, step), *_moved(sample_times, step))
+    doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(sample_times, step), *_moved(sample_times, step))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
     return Judgement(
-        table, body, doubts, skill=skill, predictions=predicted, response=frequency_response(fit.problem, values)
+        table,
+        body,
+        doubts,
+        tuple(notes),
+        skill=skill,
+        predictions=predicted,
+        response=frequency_response(fit.problem, values),
     )

@@ -36,6 +36,8 @@ _EARLY = 0.002
 # A thrust gain beyond this factor, or its reciprocal, is no error of a scale or of a propeller's table. An
 # accelerometer that follows less than the second number does not measure the thrust.
 _FAR_GAIN, _DEAD = 2.0, 0.2
+# A thrust curve beyond these is no propeller's. No levelled accelerometer has twice this bias [m/s^2].
+_CURVES, _BIAS = (0.0, 1.2), 0.3
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 # The yaw torque of the rotors as a share of their roll torque.
 _YAW = 0.2
@@ -152,6 +154,25 @@ def _contradicts_thrust(gain: float, error: float) -> tuple[str, str] | None:
         (gain + error < 1 / _FAR_GAIN, "shows less thrust than the airframe has", _SCALES),
     )
     return next(((f"(the accelerometer {cause})", remedy) for is_so, cause, remedy in verdicts if is_so), None)
+
+
+def _contradicts_curve(curve: float, error: float) -> tuple[str, str] | None:
+    low, high = _CURVES
+    if low <= curve + error and curve - error <= high:
+        return None
+    return (
+        f"is outside of {low:g} (linear) to {high:g}: the thrust of no propeller grows so with its speed",
+        "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `curve`",
+    )
+
+
+def _contradicts_bias(bias: float, error: float) -> tuple[str, str] | None:
+    if abs(bias) - error <= 2 * _BIAS:
+        return None
+    return (
+        f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so that the thrust is not the weight",
+        "correct `mass` or `gravity`, or calibrate the accelerometer",
+    )
 
 
 def _add_offset(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
@@ -290,7 +311,7 @@ TERMS: dict[str, Term] = {
     ),
     "curve": Term(
         "thrust between linear (0) and quadratic (1) in the rotor speed: thrust_curve",
-        (TermParameter("thrust_curve", "1", 1.0, center=1.0),),
+        (TermParameter("thrust_curve", "1", 1.0, center=1.0, contradiction=_contradicts_curve),),
         needs=frozenset({FULL_SCALE}),
         # The proportion of commands to thrust is unknown, and a measured specific force identifies it.
         by_default=lambda available: {COMMANDS, VERTICAL_FORCE} <= available,
@@ -301,7 +322,12 @@ TERMS: dict[str, Term] = {
         (
             TermParameter("thrust_gain", "1", 0.5, center=1.0, scales_torque=True, contradiction=_contradicts_thrust),
             # A sensor that was levelled before take-off has a smaller bias.
-            *(TermParameter(name, "m/s^2", 0.3, force_axis=axis) for axis, name in enumerate(_FORCE_BIASES)),
+            *(
+                TermParameter(
+                    name, "m/s^2", _BIAS, force_axis=axis, contradiction=_contradicts_bias if axis == 2 else None
+                )
+                for axis, name in enumerate(_FORCE_BIASES)
+            ),
         ),
         needs=frozenset({VERTICAL_FORCE}),
         by_default=lambda available: True,

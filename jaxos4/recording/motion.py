@@ -19,7 +19,7 @@ RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
 AXES = ("roll", "pitch", "yaw")
 WEAK = 0.1  # [rad/s], standard deviation of a body rate; less is not excited
 _GOOD = 0.3  # [rad/s]
-_OVER_NOISE = 5.0  # a rate below this many times the gyro's noise is not excited
+OVER_NOISE = 5.0  # a rate below this many times the gyro's noise is not excited
 _ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi"))
 _STEP = 0.008  # [s]
 _SMOOTH, _SLOW = 3, 63  # samples: differences of these means are the motion between about 2 and 20 Hz
@@ -173,7 +173,7 @@ def _excitation(recording: Recording, axis: str, torque: float) -> Excitation:
     size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
     if math.isnan(size):
         verdict = "not measured"
-    elif size < WEAK or size < _OVER_NOISE * noise:
+    elif size < WEAK or size < OVER_NOISE * noise:
         verdict = "none"
     else:
         verdict = "good" if size >= _GOOD else "weak"

@@ -37,6 +37,8 @@ _MOST_REASONS = 3
 _FEWEST_SAMPLES = 4
 # Sample times that differ by less than this factor count as equal.
 _NEARLY_EQUAL = 1.01
+# The share of time of a rotor at its limit, and how close to full speed that is.
+_OFTEN, _FULL = 0.01, 0.999
 
 
 class Prepared(NamedTuple):
@@ -155,6 +157,8 @@ def usable_parts(
         pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
         if slow:
             raise InputError(f"{recording.name}: {slow}.")
+        if doubt := at_limit(recording, airframe):
+            doubts.append(doubt)
         opposite = opposite_axes(pieces, airframe)
         if refused := refused_note(opposite):
             raise InputError(f"{recording.name}: {refused}.")
@@ -167,6 +171,15 @@ def usable_parts(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
     return Usable(tuple(parts), tuple(recordings), tuple(notes), tuple(doubts))
+
+
+def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None:
+    """Cause and remedy, if rotors are at full speed for a noticeable time. These stretches are not used."""
+    shares = (recording.omega >= _FULL * float(airframe.max_rotor_speed)).mean(axis=0)
+    often = [
+        f"rotor {i + 1} is at its limit for {100 * x:.0f} % of the time" for i, x in enumerate(shares) if x > _OFTEN
+    ]
+    return (f"{recording.name}: {', '.join(often)}", "fly gentler, or with a fuller battery") if often else None
 
 
 def sampled(
