@@ -7,7 +7,7 @@ from helpers import CRAZYFLIE, compiled_programs
 
 import jaxos4
 from jaxos4.identification.results import Constant, SampleTime
-from jaxos4.identification.sample_time import moved, shortest
+from jaxos4.identification.sample_time import moved, noise_of_speeds, shortest
 
 
 def table(*rows):
@@ -34,7 +34,7 @@ A, B, C = (10.0, 20.0), (13.0, 20.0), (10.0, 25.0)
         (table((A, 0.1), (C, 0.0), (C, -0.2)), 1),
         (table((A, 0.5), (A, 0.1), (A, 0.1)), 1),
         (table((A, -0.5), (A, 0.1), (A, 0.1)), 1),
-        (table((A, 0.9), (A, 0.8), (A, 0.7)), 0),
+        (table((A, 0.9), (A, 0.8), (A, 0.7)), 2),
         (table((A, 0.9), (A, 0.8), (A, 0.1)), 2),
         (table((A, 0.1), (B, 0.1), (A, 0.1)), 0),
         (table(((), 0.1), (A, 0.1), (A, 0.1)), 1),
@@ -44,6 +44,18 @@ A, B, C = (10.0, 20.0), (13.0, 20.0), (10.0, 25.0)
 )  # fmt: skip
 def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(answers, place):
     assert shortest(answers) == place
+
+
+@pytest.mark.parametrize(("noise", "least", "most"), [(0.0, 0.0, 0.02), (1.0, 0.4, 0.9), (10.0, 0.9, 1.1)])
+def test_noise_of_measured_speeds_is_its_share_of_their_changes(noise, least, most):
+    """Smooth speeds with white noise [rad/s]: at 10 rad/s nearly all changes from sample to sample are noise."""
+    random, time = np.random.default_rng(0), 0.004 * np.arange(4000)
+    smooth = 1700 + 60 * np.sin(2 * np.pi * np.array([0.7, 1.1, 1.6, 2.3]) * time[:, None] + np.arange(4))
+    speeds = smooth + noise * random.normal(size=smooth.shape)
+    flight = jaxos4.Flight(time, speeds, np.zeros((time.size, 12)))
+    assert least <= noise_of_speeds(flight, CRAZYFLIE) <= most
+    commands = jaxos4.Flight(time, speeds, np.zeros((time.size, 12)), commanded=True)
+    assert noise_of_speeds(commands, CRAZYFLIE) == 0
 
 
 def test_answers_agree_within_two_standard_deviations_and_three_percent():
