@@ -229,6 +229,7 @@ def test_the_text_of_a_vehicle():
         doubtful,
         "not to be trusted because Ix is negative; check the arms.",
         "their correlation time: p 1.2 rad/s^2 over 0.1 s.",
+        "white noise of the sensors [rad/s; m/s^2]: p 0.02.",
         "by the factor: alpha3 1.7.",
     )
     assert "Predictions" not in doubtful
