@@ -146,7 +146,7 @@ def _noisy_speeds(sample_times: Sequence[SampleTime], step: float) -> Iterator[D
     for own in sample_times:
         if own.sample_time == step and own.speed_noise > NOISY:
             yield _implausible(
-                f"measured rotor speeds are noisy: {own.speed_noise:.0%} of their changes from sample to sample are noise",
+                f"measured rotor speeds are noisy: noise is {own.speed_noise:.0%} of their changes in a sample",
                 "give longer samples by `sample_time`, or log the speeds better",
             )
 
