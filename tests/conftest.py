@@ -23,7 +23,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # Before the first import of jaxos4: all its annotated functions and modules are checked. The two files that decode a
 # log number by number have no arrays, and the checks would take four times as long as the decoding.
 PACKAGE = pathlib.Path(__file__).resolve().parents[1] / "jaxos4"
-UNCHECKED = ("__init__", "blackbox_frames", "blackbox_numbers")
+UNCHECKED = ("__init__", "blackbox_frames")
 modules = [path.relative_to(PACKAGE.parent) for path in PACKAGE.rglob("*.py") if path.stem not in UNCHECKED]
 jaxtyping.install_import_hook([".".join(module.with_suffix("").parts) for module in modules], "typechecker.check")
 
