@@ -76,17 +76,26 @@ def identify(
     sample_times: tuple[SampleTime, ...] = ()
     if isinstance(subject, Airframe):
         cases = prepare_vehicle(recordings, subject, vehicle_settings(settings), **common)
-        place, fit, sample_times = fit_at_sample_times(cases, progress=progress)
-        case = cases[place]
-        if estimator not in (None, DEFAULT):
-            case = with_estimator(case, estimator, seed=seed, progress=progress)
-            fit = fit_case(case, progress=progress)
+        case, fit, sample_times = _fit_vehicle(cases, estimator or DEFAULT, seed=seed, progress=progress)
     else:
         own = flight_settings(subject, settings)
         case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
         fit = fit_case(case, progress=progress)
     verdict = judge(case, fit, sample_times, progress=progress)
     return describe(case, fit, verdict, sample_times, time.perf_counter() - begin)
+
+
+def _fit_vehicle(
+    cases: Sequence[Case], estimator: str | AbstractEstimator, *, seed: int, progress: Callable[[str], None]
+) -> tuple[Case, Fit, tuple[SampleTime, ...]]:
+    """The case at the chosen sample time and its fit. Newton's method compares several sample times."""
+    place, sample_times, is_default = 0, (), isinstance(estimator, str) and estimator == DEFAULT
+    if is_default or len(cases) > 1:
+        place, fit, sample_times = fit_at_sample_times(cases, progress=progress)
+        if is_default:
+            return cases[place], fit, sample_times
+    case = with_estimator(cases[place], estimator, seed=seed, progress=progress)
+    return case, fit_case(case, progress=progress), sample_times
 
 
 def describe(

@@ -27,7 +27,7 @@ from .results import (
     SampleTime,
     Validation,
 )
-from .sample_time import NOISY, moved
+from .sample_time import NOISY, moved, noise_of_speeds
 
 # Doubts need this many standard deviations.
 _SURE = 3.0
@@ -141,14 +141,13 @@ def vibration(disturbances: dict[str, Disturbance], sample_time: float) -> Itera
             )
 
 
-def _noisy_speeds(sample_times: Sequence[SampleTime], step: float) -> Iterator[Doubt]:
-    """Noise of measured rotor speeds makes moments of inertia too large. `step`: the chosen sample time [s]."""
-    for own in sample_times:
-        if own.sample_time == step and own.speed_noise > NOISY:
-            yield _implausible(
-                f"measured rotor speeds are noisy: noise is {own.speed_noise:.0%} of their changes in a sample",
-                "give longer samples by `sample_time`, or log the speeds better",
-            )
+def _noisy_speeds(share: float) -> Iterator[Doubt]:
+    """Noise of measured rotor speeds makes moments of inertia too large. `share`: see `noise_of_speeds`."""
+    if share > NOISY:
+        yield _implausible(
+            f"measured rotor speeds are noisy: noise is {share:.0%} of their changes in a sample",
+            "give longer samples by `sample_time`, or log the speeds better",
+        )
 
 
 def _moved(sample_times: Sequence[SampleTime], step: float) -> Iterator[Doubt]:
@@ -332,7 +331,8 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`"
     ] * (0 < len(still) < len(_PLACES))
     step = float(fit.problem.flight.dt)
-    doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(sample_times, step), *_moved(sample_times, step))
+    noise = noise_of_speeds(fit.problem.flight, airframe)
+    doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(noise), *_moved(sample_times, step))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
     return Judgement(
         table,

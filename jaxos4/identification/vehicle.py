@@ -66,13 +66,11 @@ def prepare_vehicle(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
     times = usable.sample_times if settings.sample_time is None else (settings.sample_time,)
-
     prepared = [preparation.sampled(usable, airframe, sample_time=step, holdout=holdout) for step in times]
-    # All but the shortest sample time share one program: their flights get as many rows.
-    likes = [prepared[0], *(prepared[1] for _ in prepared[1:])]
+    # All but the shortest sample time share one program: their flights get as many rows as the second.
     return [
-        _case(recordings, airframe, settings, each, like, name, bracket=bracket, validate=validate)
-        for each, like in zip(prepared, likes, strict=True)
+        _case(recordings, airframe, settings, each, prepared[min(i, 1)], name, bracket=bracket, validate=validate)
+        for i, each in enumerate(prepared)
     ]
 
 
@@ -169,7 +167,7 @@ def _innovations(
 
 
 def _balance(prepared: Prepared, airframe: Airframe, capacity: int) -> Balance | None:
-    """What the weight says, if the tilt is known: over each stretch the vehicle gains a velocity of about 1 m/s."""
+    """The balance of weight, if the tilt is known: over each stretch the vehicle gains a velocity of about 1 m/s."""
     if prepared.upright is None:
         return None
     samples, gravity = prepared.upright.size, float(airframe.gravity)

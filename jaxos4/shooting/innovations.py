@@ -29,7 +29,7 @@ from .filters import Innovations, LogNoise, Observed, innovate
 from .problem import ShootingProblem
 from .rows import Rows, windowed
 from .scans import Curvature, Parts, Shot
-from .segments import observe_in_segments, segments_of
+from .segments import observe_in_segments, owned, segments_of
 from .unknowns import Unknowns, Values
 
 # The number of samples in a segment, and of those that settle its filter.
@@ -45,7 +45,7 @@ _STRIDE = 1.0  # the cost is roughly quadratic in a logarithm over such a step
 
 
 class Balance(NamedTuple):
-    """What a vehicle's weight says: over a flight its thrust carries it.
+    """The balance of thrust and weight: over a flight the thrust carries the weight.
 
     - `weight`: of the specific force along z at each sample: the cosine of the tilt over the number of samples.
     - `gravity`, `sigma`: the weighted sum, and its standard deviation [m/s^2].
@@ -286,9 +286,7 @@ class InnovationsProblem(AbstractProblem):
         if balance is None or not isinstance(model, FlightModel) or 2 not in model.force_axes:
             return None
         index, samples = self.index, self.flight.time.shape[0]
-        settling = self.settling if index.shape[0] > 1 else 0
-        own = ((np.arange(index.shape[1]) >= settling) | (index[:, :1] == 0)) & (index < samples)
-        weight = jnp.where(own, balance.weight[np.minimum(index, samples - 1)], 0.0).T
+        weight = jnp.where(owned(index, samples, self.settling), balance.weight[np.minimum(index, samples - 1)], 0.0).T
         positions = np.asarray(model.forcing_parameters, dtype=int)
 
         def excess(parameters: Parameters, thrust: Array, forcing: Forcing) -> Scalar:

@@ -30,6 +30,11 @@ def segments_of(samples: int, wanted: int, settling: int) -> Int[np.ndarray, "se
     return length * np.arange(segments)[:, None] + np.arange(settling + length)
 
 
+def owned(index: Int[np.ndarray, "segments time"], samples: int, settling: int) -> Bool[np.ndarray, "segments time"]:
+    """Whether a sample belongs to a segment. Each belongs to one; in other segments it settles the filter."""
+    return ((np.arange(index.shape[1]) >= settling) | (index[:, :1] == 0)) & (index < samples)
+
+
 def observe_in_segments(problem: ShootingProblem, index: Int[np.ndarray, "segments time"], settling: int) -> Observed:
     """The measurements in segments, where filters restart, and which innovations count.
 
@@ -38,10 +43,7 @@ def observe_in_segments(problem: ShootingProblem, index: Int[np.ndarray, "segmen
     they count: a simulation begins at rest.
     """
     flight, samples, segments = problem.flight, problem.flight.time.shape[0], index.shape[0]
-    row = np.arange(index.shape[1])
     exists, place = (index < samples).T, np.minimum(index, samples - 1)
-    # Each sample counts in one segment.
-    own = ((row >= settling) | (index[:, :1] == 0)).T
     measured = problem.measured()
     restart, settled = _restarts(jnp.isnan(measured[:, :3]).all(axis=1), flight, settling)
 
@@ -49,7 +51,7 @@ def observe_in_segments(problem: ShootingProblem, index: Int[np.ndarray, "segmen
         return jnp.moveaxis(series[place], 0, -1)  # segments last
 
     known = None
-    begins = np.broadcast_to(row[:, None] == 0, exists.shape)
+    begins = np.broadcast_to(np.arange(index.shape[1])[:, None] == 0, exists.shape)
     if problem.initial_state is not None:
         is_first = np.arange(segments) == 0
         begins = begins & ~is_first
@@ -57,7 +59,7 @@ def observe_in_segments(problem: ShootingProblem, index: Int[np.ndarray, "segmen
         known = jnp.where(is_first, rates[:, None], 0.0)
     restarts = in_segments(restart) | begins | ~exists
     measured = jnp.where(exists[:, None], in_segments(measured), jnp.nan)
-    return Observed(measured, restarts, in_segments(settled) & exists & own, known)
+    return Observed(measured, restarts, in_segments(settled) & owned(index, samples, settling).T, known)
 
 
 def _restarts(
