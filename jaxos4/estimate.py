@@ -207,6 +207,7 @@ def from_starts(
     firsts = starts if start is None else jnp.where(jnp.isnan(start), starts, start)
     if starts.shape[0] == 1:
         return search(firsts[0])
+    search = jax.jit(search)  # traced once, although it is called twice
     shapes = jax.eval_shape(search, firsts[0])
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 

@@ -89,6 +89,7 @@ class Newton(NamedTuple):
         problem, count = self.problem, self.problem.unknowns.count
         at, known = problem.evaluator(), problem.first_state()[0]
 
+        @jax.jit  # traced once, although it is called twice
         def evaluate(unknowns: WindowUnknowns) -> Curvature:
             return at(unknowns[0, :count], unknowns[:, count:].ravel() if problem.free_size else known)
 
