@@ -43,6 +43,7 @@ _HORIZON = 0.25  # [s]
 # Value and standard deviation of each parameter that has an estimate.
 Found = dict[str, tuple[float, float]]
 _PLACES = {"p": "roll", "q": "pitch", "r": "yaw"}
+_OF_YAW = ("alpha7", "alpha8")
 _LONGEST_DELAY = 0.04  # [s], of rotors; more is an error of clocks
 
 
@@ -150,11 +151,11 @@ def _noisy_speeds(share: float) -> Iterator[Doubt]:
         )
 
 
-def _moved(sample_times: Sequence[SampleTime], step: float) -> Iterator[Doubt]:
-    """A moment of inertia that is another one at the next longer sample time. `step`: the chosen one [s]."""
+def _moved(sample_times: Sequence[SampleTime], step: float, body: RigidBody) -> Iterator[Doubt]:
+    """A moment of inertia of `body` that is another one at the next longer sample time. `step`: the chosen one [s]."""
     place = next((i for i, each in enumerate(sample_times) if each.sample_time == step), len(sample_times))
     for own, other in zip(sample_times[place : place + 1], sample_times[place + 1 : place + 2], strict=False):
-        for name in moved(own, other):
+        for name in (each for each in moved(own, other) if each in body.constants):
             values = [
                 f"{each.constants[name].estimate:.3g} at {1e3 * each.sample_time:.3g} ms" for each in (own, other)
             ]
@@ -205,21 +206,25 @@ def _contradictions(found: Found, stds: dict[str, float], airframe: Airframe) ->
 
 
 def overwhelmed(
-    omega: np.ndarray, airframe: Airframe, disturbances: dict[str, Disturbance], found: Found
-) -> Iterator[Doubt]:
-    """Axes on which disturbances are larger than the torque of the rotors.
+    omega: np.ndarray,
+    airframe: Airframe,
+    disturbances: dict[str, Disturbance],
+    parameters: dict[str, ParameterEstimate],
+) -> dict[str, str]:
+    """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
 
     `omega`: speeds of the rotors, shape (samples, 4) [rad/s].
     """
     torques = (omega[:-1].astype(float) ** 2 @ np.asarray(airframe.mixer, dtype=float)[:3].T).std(axis=0)
+    found, weak = _found(parameters), {}
     for (rate, axis), row, torque in zip(_PLACES.items(), INVERSE.values(), torques, strict=True):
         value, _ = found.get(f"alpha{row + 1}", (np.inf, 0.0))
         if rate in disturbances and disturbances[rate].strength > abs(value) * torque:
-            yield _implausible(
+            weak[axis] = (
                 f"about {axis}, the disturbance ({disturbances[rate].strength:.2g} rad/s^2) is larger than what the "
-                f"rotors do ({abs(value) * torque:.2g} rad/s^2)",
-                f"fly more {axis}, or in calmer air",
+                f"rotors do ({abs(value) * torque:.2g} rad/s^2)"
             )
+    return weak
 
 
 def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
@@ -321,18 +326,25 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         predicted, skill = predict_held_out(fit, held_out)
     omega, airframe = np.asarray(fit.problem.flight.omega), fit.problem.model.airframe
     still = () if predicted is None else _still_axes(fit, predicted)
-    doubts = (
-        *(_implausible(cause, remedy) for cause, remedy in case.doubts),
-        *overwhelmed(omega, airframe, fit.disturbances, _found(table)),
-        *_negative_drag(fit),
-        *doubts_of(fit.problem.model, table, body.constants, skill, still, case.log_step),
-    )
     notes = [
         f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`"
     ] * (0 < len(still) < len(_PLACES))
+    weak, trusted = overwhelmed(omega, airframe, fit.disturbances, table), table
+    if yaw := weak.pop("yaw", None):
+        # Vehicles hardly yaw. The other axes do not need it.
+        body = RigidBody({name: row for name, row in body.constants.items() if name != "Iz"})
+        trusted = {name: row for name, row in table.items() if name not in _OF_YAW}
+        still = tuple({*still, "yaw"})
+        notes.append(f"Iz is not identified: {yaw}; fly more yaw, or in calmer air")
+    doubts = (
+        *(_implausible(cause, remedy) for cause, remedy in case.doubts),
+        *(_implausible(why, f"fly more {axis}, or in calmer air") for axis, why in weak.items()),
+        *_negative_drag(fit),
+        *doubts_of(fit.problem.model, trusted, body.constants, skill, still, case.log_step),
+    )
     step = float(fit.problem.flight.dt)
     noise = noise_of_speeds(fit.problem.flight, airframe)
-    doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(noise), *_moved(sample_times, step))
+    doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(noise), *_moved(sample_times, step, body))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
     return Judgement(
         table,

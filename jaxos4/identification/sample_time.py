@@ -5,7 +5,7 @@ flight is fitted at several sample times, from the longest on, each starting at 
 
 The rule: the shortest sample time at which innovations are nearly white, measured rotor speeds have little noise, and
 the moments of inertia are those of samples twice as long, within two standard deviations. If there is none: the
-shortest without vibration and noise. If all have it: the longest.
+shortest without vibration and noise. If all have it: the longest with an answer.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import Airframe
+from ..estimate import REACH
 from ..flight import Flight
+from ..shooting import InnovationsProblem
 from .answers import vehicle_constants
 from .fit import Fit, fit_innovations
 from .prepare import Case, Progress
@@ -25,6 +27,8 @@ WHITE, AGREE, _DISCRETE = 0.3, 2.0, 0.03
 # Noise may be this share of the changes of the rotors' torque from sample to sample. More makes inertias too large.
 NOISY = 0.1
 _RATES = ("p", "q", "r")
+# The share of the way to its limit at which an unknown counts as being there.
+_NEAR = 0.95
 
 
 def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[int, Fit, tuple[SampleTime, ...]]:
@@ -36,17 +40,25 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     for case in reversed(cases):
         problem = case.innovations
         progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-        if fits and fits[0].answered:
-            problem = problem.starting_from(np.asarray(fits[0].estimate.parameters))
+        if fits and fits[0].answered and _is_inside(problem, found := np.asarray(fits[0].estimate.parameters)):
+            problem = problem.starting_from(found)
         fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
     answers = tuple(_answer(case, fit) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
 
 
+def _is_inside(problem: InnovationsProblem, found: np.ndarray) -> bool:
+    """Whether no parameter went to its limit: it may have gone to another minimum, and another start may not."""
+    count = problem.problem.unknowns.count
+    lower, upper = (np.asarray(limit)[:count] for limit in problem.unknowns.limits(_NEAR * REACH))
+    return bool(((found[:count] >= lower) & (found[:count] <= upper)).all())
+
+
 def shortest(answers: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `answers`: the shortest sample time first."""
-    clean = [i for i, answer in enumerate(answers) if answer.constants and _is_clean(answer)] or [len(answers) - 1]
+    answered = [i for i, answer in enumerate(answers) if answer.constants] or [0]
+    clean = [i for i in answered if _is_clean(answers[i])] or answered[-1:]
     return next((i for i in clean[:-1] if not moved(answers[i], answers[i + 1])), clean[0])
 
 

@@ -1,40 +1,51 @@
-"""Rotors between command and thrust: a delay, a first-order lag, and the thrust that the speeds make."""
+"""Rotors between command and thrust: a delay, the motor, and the thrust that the speeds make."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import RotorSpeeds, Scalar
 from ..flight import Inputs
 
-# The lag that acts is at least this share of a sample, so that the filter stays stable wherever a search looks.
+# The lag that acts is at least this share of a sample, so that a step stays finite wherever a search looks.
 _SHORTEST_LAG = 0.05
+# Steps of the motors in a sample. The voltage, as a share of the full one, over which a motor passes from driving to
+# braking: the ripple of its current.
+_STEPS, _SMOOTH = 2, 0.005
+_LEAST = 1e-6
 
 
 class Grid(NamedTuple):
     """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that.
 
-    `voltage`: the battery's, divided by the voltage to which the airframe's rotor speeds belong.
+    `elapsed`: since the recording began [s]. `voltage`: the battery's, divided by the voltage to which the airframe's
+    rotor speeds belong.
     """
 
     dt: Scalar
     stretch: Int[Array, " samples"]
     first: Int[Array, " samples"]
     last: Int[Array, " samples"]
+    elapsed: Float[Array, " samples"]
     voltage: Float[Array, " samples"] | None = None
 
     @classmethod
-    def of(cls, inputs: Inputs, battery_voltage: Scalar | None = None) -> "Grid":
-        """The grid of a flight's inputs. `battery_voltage`: to which the airframe's rotor speeds belong [V]."""
-        voltage = inputs.voltage
+    def of(
+        cls, inputs: Inputs, battery_voltage: Scalar | None = None, recordings: tuple[int, ...] | None = None
+    ) -> "Grid":
+        """The grid of a flight's inputs.
+
+        `battery_voltage`: to which the airframe's rotor speeds belong [V]. `recordings`: of each stretch, by default 0.
+        """
+        voltage, samples = inputs.voltage, inputs.omega.shape[0]
         voltage = None if voltage is None or battery_voltage is None else voltage / battery_voltage
-        if inputs.stretches is not None:
-            return cls(inputs.dt, *inputs.stretches, voltage)
-        zeros = jnp.zeros(inputs.omega.shape[0], dtype=int)
-        return cls(inputs.dt, zeros, zeros, zeros + inputs.omega.shape[0] - 1, voltage)
+        zeros = jnp.zeros(samples, dtype=int)
+        stretches = inputs.stretches or (zeros, zeros, zeros + samples - 1)
+        recording = zeros if recordings is None else jnp.asarray(recordings)[stretches[0]]
+        elapsed = inputs.dt * (jnp.arange(samples) - jnp.searchsorted(recording, recording))
+        return cls(inputs.dt, *stretches, elapsed, voltage)
 
 
 class Speeds(NamedTuple):
@@ -96,39 +107,55 @@ def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:
     return total
 
 
-def lagged(omega: RotorSpeeds, lag: Scalar, grid: Grid) -> Speeds:
-    """Speeds of rotors that follow their commands as first-order systems with the time constant `lag` [s].
+class Motor(NamedTuple):
+    """What an electric motor does to a command, see `driven`.
 
-    In each stretch the rotors begin at their first command. The recursion w_{k+1} = a w_k + (1 - a) u_k runs in all
-    blocks of samples in parallel, each from rest; then each block adds the effect of earlier blocks. This takes as many
-    steps as the square root of the number of samples.
+    - `lag`: time constant of a motor without a load [s].
+    - `curve`: 1: the thrust is quadratic in the command, as without a load. 0: it is linear.
+    - `braking`: the torque of a motor that is faster than its voltage, as a share of that of a drive. 0: it coasts.
+    - `full`: the speed at the full command [rad/s].
     """
-    lag = jnp.maximum(lag, _SHORTEST_LAG * grid.dt)
-    decay, samples = jnp.exp(-grid.dt / lag), omega.shape[0]
-    length = max(int(np.sqrt(samples)), 1)
-    blocks = -(-samples // length)
 
-    def in_blocks(x: Num[Array, "samples columns"]) -> Num[Array, "length blocks columns"]:
-        padded = jnp.pad(x, ((0, blocks * length - samples), (0, 0)))
-        return jnp.swapaxes(padded.reshape(blocks, length, x.shape[1]), 0, 1)
+    lag: Scalar
+    curve: Scalar | float = 1.0
+    braking: Scalar | float = 1.0
+    full: Scalar | float = 1.0
 
-    # The first sample of a stretch forgets the past and takes its own command.
-    is_first = (grid.first == jnp.arange(samples))[:, None]
-    before = jnp.concatenate([omega[:1], omega[:-1]])
-    rows = in_blocks(jnp.where(is_first, 0.0, decay)), in_blocks(jnp.where(is_first, omega, (1 - decay) * before))
 
-    def step(speed: Float[Array, "blocks 4"], row):
-        speed = row[0] * speed + row[1]
-        return speed, speed
+def driven(omega: RotorSpeeds, motor: Motor, grid: Grid) -> Speeds:
+    """Speeds of rotors whose motors follow commands `omega` [rad/s].
 
-    last, from_rest = jax.lax.scan(step, jnp.zeros((blocks, omega.shape[1]), omega.dtype), rows)
-    # A later block of the same stretch adds the end of each earlier block, decayed over the samples between them.
-    begins = length * np.arange(blocks)
-    stretch_begins = in_blocks(grid.first[:, None])[:, :, 0]
-    apart = np.maximum(begins[:, None] - begins, 0) - length
-    reaches = (apart >= 0) & (stretch_begins[0][:, None] < begins + length)
-    inherited = jnp.where(reaches, decay ** np.maximum(apart, 0), 0.0) @ last
-    kept = jnp.where(stretch_begins < begins, decay ** np.arange(1, length + 1)[:, None], 0.0)
-    begin = jnp.swapaxes(from_rest + kept[:, :, None] * inherited, 0, 1).reshape(blocks * length, -1)[:samples]
-    end = decay * begin + (1 - decay) * omega
-    return Speeds(begin, end, end - begin)
+    With command u and speed w as shares of the full speed, curve c, and the propeller's load k = 1 - c,
+
+        lag w' = g(u - c w) - k w^2.
+
+    u - c w is the voltage less that which the motor itself makes; it drives the current and the torque, g(x) = x. Below
+    0 the torque is g(x) = braking x, reached smoothly. At rest u = c w + k w^2. Without a load, and with full braking,
+    this is a first-order system. In each stretch the rotors begin at the speed of their first command.
+    """
+    lag, load = jnp.maximum(motor.lag, _SHORTEST_LAG * grid.dt), 1 - motor.curve
+    u, step = omega / motor.full, grid.dt / _STEPS
+    settled = 2 * u / (motor.curve + jnp.sqrt(jnp.maximum(motor.curve**2 + 4 * load * u, _LEAST)))
+
+    def move(w: Float[Array, "4"], u: Float[Array, "4"]) -> Float[Array, "4"]:
+        """An exponential Euler step: exact for a first-order system, stable for any step, of second order."""
+        x = u - motor.curve * w
+        faded = jnp.exp(jnp.minimum(x, 0.0) / _SMOOTH)
+        braking = motor.braking * x - (1 - motor.braking) * _SMOOTH * (1 - faded)
+        torque = jnp.where(x >= 0, x, braking) - load * w * w
+        slope = jnp.where(x >= 0, 1.0, motor.braking + (1 - motor.braking) * faded)
+        z = step * (slope * motor.curve + 2 * load * w) / lag
+        share = jnp.where(jnp.abs(z) > _LEAST, -jnp.expm1(-z) / jnp.where(jnp.abs(z) > _LEAST, z, 1.0), 1 - z / 2)
+        return jnp.maximum(w + step / lag * share * torque, 0.0)
+
+    def over_a_sample(w: Float[Array, "4"], row):
+        u, settled, is_first = row
+        begin = jnp.where(is_first, settled, w)
+        end = begin
+        for _ in range(_STEPS):
+            end = move(end, u)
+        return end, (begin, end)
+
+    is_first = grid.first == jnp.arange(omega.shape[0])
+    begin, end = jax.lax.scan(over_a_sample, settled[0], (u, settled, is_first))[1]
+    return Speeds(begin * motor.full, end * motor.full, (end - begin) * motor.full)

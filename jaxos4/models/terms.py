@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .._custom_types import RotorSpeeds, Scalar
 from ..airframe import Airframe
 from .abstract import Contradiction
-from .rotors import Grid, Speeds, SquaredSpeeds, delayed, lagged
+from .rotors import Grid, Motor, Speeds, delayed, driven
 from .state import Forcing, Rates, Vector
 
 # What a term can need from the logs or from the airframe.
@@ -42,6 +42,8 @@ _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 # The yaw torque of the rotors as a share of their roll torque.
 _YAW = 0.2
 _AXES = ("roll", "pitch", "yaw")
+# The half-width of the damping [1/s]: rotors resist roll and pitch by their thrust, and yaw by their drag only.
+_DAMPING = (5.0, 5.0, 2.0)
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
 
 T = TypeVar("T")
@@ -84,15 +86,14 @@ class Term:
     with the term. The contributions act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s].
-    - `speed(speeds, values, grid)`: the rotor speeds that follow from the commands.
-    - `thrust(squares, values, speeds, airframe)`: the thrust that follows from the speeds.
+    - `speed(speeds, values, grid, airframe)`: the rotor speeds that follow from the commands.
     - `angular_acceleration(total, values, rates, forcing)`: p', q', r' [rad/s^2].
     - `specific_force(force, values, forcing)`: along the body's axes [m/s^2].
     - `gyro(rates, values)`: the measured body rates [rad/s].
     - `accelerometer(force, values)`: the measured specific force [m/s^2]. It makes specific force a measurement.
 
     If each recording has its own value of a parameter, `values` holds that of the sample's recording. This is not
-    possible in the first three contributions, which act on a whole flight at once: `ValueError`.
+    possible in the first two contributions, which act on a whole flight at once: `ValueError`.
     """
 
     description: str
@@ -101,8 +102,7 @@ class Term:
     by_default: Callable[[frozenset[str]], bool] = lambda available: False
     force_axes: tuple[int, ...] = ()
     command: Callable[[RotorSpeeds, Values, Grid], RotorSpeeds] | None = None
-    speed: Callable[[Speeds, Values, Grid], Speeds] | None = None
-    thrust: Callable[[SquaredSpeeds, Values, Speeds, Airframe], SquaredSpeeds] | None = None
+    speed: Callable[[Speeds, Values, Grid, Airframe], Speeds] | None = None
     angular_acceleration: Callable[[Rates, Values, Rates, Forcing], Rates] | None = None
     specific_force: Callable[[Vector, Values, Forcing], Vector] | None = None
     gyro: Callable[[Rates, Values], Rates] | None = None
@@ -115,7 +115,7 @@ class Term:
     @property
     def in_forcing(self) -> bool:
         """Whether the forcing depends on the term's parameters."""
-        return any((self.command, self.speed, self.thrust))
+        return any((self.command, self.speed))
 
     @property
     def changes_rates(self) -> bool:
@@ -213,10 +213,10 @@ def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpee
     return omega * (voltage ** values["voltage_exponent"])[:, None]
 
 
-def _bend_thrust(squares: SquaredSpeeds, values: Values, speeds: Speeds, airframe: Airframe) -> SquaredSpeeds:
-    curve, full = values["thrust_curve"], jnp.asarray(airframe.max_rotor_speed)
-    mean = curve * squares.mean + (1 - curve) * full * (speeds.begin + speeds.end) / 2
-    return SquaredSpeeds(mean, curve * squares.begin + (1 - curve) * full * speeds.begin)
+def _drive(speeds: Speeds, values: Values, grid: Grid, airframe: Airframe) -> Speeds:
+    full = jnp.asarray(airframe.max_rotor_speed)
+    motor = Motor(values["rotor_lag"], values["thrust_curve"], values["motor_braking"], full)
+    return driven(speeds.begin, motor, grid)
 
 
 def _scale_thrust(force: Vector, values: Values, forcing: Forcing) -> Vector:
@@ -261,7 +261,7 @@ TERMS: dict[str, Term] = {
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
-        tuple(TermParameter(f"{x}_damping", "1/s", 5.0, nonnegative=True) for x in _AXES),
+        tuple(TermParameter(f"{x}_damping", "1/s", y, nonnegative=True) for x, y in zip(_AXES, _DAMPING, strict=True)),
         by_default=lambda available: True,
         angular_acceleration=_add_damping,
     ),
@@ -287,14 +287,32 @@ TERMS: dict[str, Term] = {
         by_default=lambda available: True,
         command=_scale_commands,
     ),
-    "lag": Term(
-        "rotors follow their commands as first-order systems: rotor_lag [s]",
+    "fade": Term(
+        "commands lose effect as the battery empties: battery_fade [1/s], the share of rotor speed lost in a second",
+        (TermParameter("battery_fade", "1/s", 3e-3),),
+        needs=frozenset({COMMANDS, VERTICAL_FORCE}),
+        # A logged voltage knows it.
+        by_default=lambda available: VOLTAGE not in available,
+        command=lambda omega, values, grid: omega * (1 - values["battery_fade"] * grid.elapsed)[:, None],
+    ),
+    "motor": Term(
+        "motors follow their commands under the load of the propellers: rotor_lag [s], thrust_curve, motor_braking",
         (
             # Small vehicles have 0.02 to 0.1 s.
             TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_contradicts_lag),
+            TermParameter("thrust_curve", "1", 0.25, center=0.85, contradiction=_contradicts_curve),
+            TermParameter("motor_braking", "1", 0.3, center=0.5, nonnegative=True),
         ),
-        by_default=lambda available: COMMANDS in available,
-        speed=lambda speeds, values, grid: lagged(speeds.begin, values["rotor_lag"], grid),
+        # A measured specific force tells the propellers' load from their thrust.
+        needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),
+        by_default=lambda available: True,
+        speed=_drive,
+    ),
+    "lag": Term(
+        "rotors follow their commands as first-order systems: rotor_lag [s], where no load is known",
+        (TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_contradicts_lag),),
+        by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
+        speed=lambda speeds, values, grid, airframe: driven(speeds.begin, Motor(values["rotor_lag"]), grid),
     ),
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
@@ -308,14 +326,6 @@ TERMS: dict[str, Term] = {
         (TermParameter("rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction),),
         by_default=lambda available: True,
         angular_acceleration=_add_reaction,
-    ),
-    "curve": Term(
-        "thrust between linear (0) and quadratic (1) in the rotor speed: thrust_curve",
-        (TermParameter("thrust_curve", "1", 1.0, center=1.0, contradiction=_contradicts_curve),),
-        needs=frozenset({FULL_SCALE}),
-        # The proportion of commands to thrust is unknown, and a measured specific force identifies it.
-        by_default=lambda available: {COMMANDS, VERTICAL_FORCE} <= available,
-        thrust=_bend_thrust,
     ),
     "accelerometer": Term(
         "specific force is measured: thrust_gain, and ax_bias, ay_bias, az_bias [m/s^2] along the predicted axes",

@@ -44,10 +44,12 @@ class FlightModel(AbstractModel):
         q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset + pitch_thrust (U_c / m - 9.81)
              - pitch_damping q + pitch_velocity v_x + pitch_flapping a_x
         r' = alpha7 p q + alpha8 d_yaw + yaw_offset - yaw_damping r - rotor_reaction Omega_r'
-        omega_i' = (u_i(t - rotor_delay) - omega_i) / rotor_lag,    u_i = command_i (V / V_0)^voltage_exponent
+        rotor_lag w_i' = g(u_i(t - rotor_delay) - thrust_curve w_i) - (1 - thrust_curve) w_i^2
+        u_i = command_i (V / V_0)^voltage_exponent (1 - battery_fade t)
         a_z = thrust_gain U_c / m + az_bias,    a_x = ax_bias - x_drag v_x,    a_y = ay_bias - y_drag v_y
 
-    The last line is the specific force, as an accelerometer at the centre of mass measures it.
+    The last line is the specific force, as an accelerometer at the centre of mass measures it. `jaxos4.models.rotors`
+    explains the motors, whose speeds w_i = omega_i / `max_rotor_speed`.
 
     A centre of mass at (x_c, y_c) in the frame of the rotor positions gives the thrust U_c the torque
     (-x_c, -y_c, 0) x (0, 0, U_c) = (-y_c U_c, x_c U_c, 0). So roll_thrust = -alpha3 m y_c and pitch_thrust =
@@ -58,8 +60,8 @@ class FlightModel(AbstractModel):
 
     - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity` and `drag` need
       `Flight.body_velocity`. `flapping` needs `Flight.specific_force`, and replaces `velocity` if there is none.
-      `gyro_bias` and `offset` can be distinguished only if the attitude is compared too. Leave out `lag` and `delay` if
-      rotor speeds were measured.
+      `gyro_bias` and `offset` can be distinguished only if the attitude is compared too. Leave out `motor`, `lag`
+      and `delay` if rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
       own offsets and gyro biases. All other parameters are the vehicle's.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V]. The term `voltage`
@@ -93,6 +95,8 @@ class FlightModel(AbstractModel):
         powered = [term for term in terms if VOLTAGE in TERMS[term].needs]
         if powered and battery_voltage is None:
             raise ValueError(f"`battery_voltage` must be given for the term {powered[0]}: it is the usual voltage.")
+        if {"motor", "lag"} <= set(terms):
+            raise ValueError("`terms`: motor includes the lag of the rotors; leave out lag.")
         self.airframe, self.terms, self.recordings = airframe, tuple(terms), tuple(recordings)
         self.battery_voltage = None if battery_voltage is None else as_float(battery_voltage)
 
@@ -130,15 +134,13 @@ class FlightModel(AbstractModel):
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The chain from commands to torque and thrust: each term acts at its place."""
-        airframe, grid, omega = self.airframe, Grid.of(inputs, self.battery_voltage), inputs.omega
+        airframe, grid, omega = self.airframe, Grid.of(inputs, self.battery_voltage, self.recordings), inputs.omega
         for change, values in self._contributions("command", parameters):
             omega = change(omega, values, grid)
         speeds = measured_speeds(omega, grid)
         for change, values in self._contributions("speed", parameters):
-            speeds = change(speeds, values, grid)
+            speeds = change(speeds, values, grid, airframe)
         squares = squared(speeds)
-        for change, values in self._contributions("thrust", parameters):
-            squares = change(squares, values, speeds, airframe)
         roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
         recording = jnp.asarray(self.recordings)[grid.stretch]
