@@ -54,14 +54,14 @@ def named(problem, found):
 
 
 def test_the_balance_has_its_cost_gradient_and_information():
-    terms, flight = ("delay", "curve", "accelerometer", "inflow"), flown()
+    terms, flight = ("delay", "fade", "accelerometer", "inflow"), flown()
     velocity = np.random.default_rng(0).normal(size=(SAMPLES, 3))
     flight = dataclasses.replace(flight, body_velocity=velocity)
     balance = weight_of(flight)
     bare, weighed = (problem_of(flight, terms=terms, balance=each) for each in (None, balance))
     values = np.array(bare.starts[0])
     place = {name: i for i, name in enumerate(bare.unknowns.names)}
-    values[[place[n] for n in ("rotor_delay", "thrust_curve", "thrust_gain", "z_drag")]] = 0.0, 0.9, 1.2, 0.6
+    values[[place[n] for n in ("rotor_delay", "battery_fade", "thrust_gain", "z_drag")]] = 0.0, 0.01, 1.2, 0.6
 
     def differences(at):
         one, two = (curvature(problem, jnp.asarray(at)) for problem in (bare, weighed))
@@ -70,15 +70,14 @@ def test_the_balance_has_its_cost_gradient_and_information():
         )
 
     (gradient, information), cost = differences(values)
-    speeds = np.asarray(flight.omega)
-    squares = 0.9 * speeds**2 + 0.1 * float(CRAZYFLIE.max_rotor_speed) * speeds
+    squares = np.asarray(flight.omega) ** 2 * np.square(1 - 0.01 * np.asarray(flight.time))[:, None]
     thrust = float(CRAZYFLIE.thrust_coefficient / CRAZYFLIE.mass) * squares.sum(axis=1)
     excess = (balance.weight @ (1.2 * thrust - 0.6 * velocity[:, 2]) - 9.81) / balance.sigma
     np.testing.assert_allclose(cost, excess**2 / 2, rtol=1e-6)
     slopes = gradient / excess
     size = np.abs(np.outer(slopes, slopes)).max()
     np.testing.assert_allclose(information / size, np.outer(slopes, slopes) / size, atol=1e-6)
-    for name, step in (("thrust_gain", 1e-4), ("thrust_curve", 1e-4), ("z_drag", 1e-3), ("rotor_delay", 1e-5)):
+    for name, step in (("thrust_gain", 1e-4), ("battery_fade", 1e-5), ("z_drag", 1e-3), ("rotor_delay", 1e-5)):
         costs = [differences(values + sign * step * (np.arange(values.size) == place[name]))[1] for sign in (1, -1)]
         slope = (costs[0] - costs[1]) / (2 * step)
         np.testing.assert_allclose(gradient[place[name]], slope, rtol=1e-3, atol=1e-3 * np.abs(gradient).max())

@@ -60,7 +60,9 @@ def test_what_is_exported_of_a_vehicle(write):
     vehicle = read_result(write(vehicle_result())).vehicle
     np.testing.assert_allclose(vehicle.inertia, [1.1 / VALUES[name] for name in ("alpha3", "alpha6", "alpha8")])
     assert vehicle.thrust_coefficient == pytest.approx(1.1 * 2.4e-8)
-    assert (vehicle.lag, vehicle.delay, vehicle.thrust_curve) == (0.05, 0.01, 0.8)
+    assert (vehicle.delay, vehicle.thrust_curve) == (0.01, 0.8)
+    # The load of the propeller, 0.2 w^2, shortens the lag of small changes.
+    assert vehicle.lag == pytest.approx(0.05 / (0.8 + 0.4 * vehicle.hover_speed / vehicle.max_rotor_speed))
     assert vehicle.rotor_inertia == pytest.approx(7e-4 * 1.1 / 3.5e4)
     np.testing.assert_allclose(vehicle.drag, 0.027 * np.array([0.3, 0.4]))
 
@@ -95,15 +97,14 @@ CURVES = {
 
 def test_the_thrust_curve_is_noted_in_the_words_of_the_file(write):
     curved = read_result(write(result := vehicle_result()))
-    # No thrust below a sixth of a full command.
-    dead = read_result(write(vehicle_result(VALUES | {"thrust_curve": 1.2})))
+    steep = read_result(write(vehicle_result(VALUES | {"thrust_curve": 1.2})))
     # It cannot be distinguished from 1: three standard deviations are 0.21.
     result["parameters"]["thrust_curve"]["std"] = 0.07
     found = read_result(write(result))
     for target, formula in CURVES.items():
         note = "thrust_curve: for the u-th part of a full command, " + formula
-        assert note.format("0.8 u^2 + 0.2 u") in export_vehicle(curved, target).notes
-        assert note.format("max(0, 1.2 u^2 - 0.2 u)") in export_vehicle(dead, target).notes
+        assert note.format("(2 u / (0.8 + sqrt(0.64 + 0.8 u)))^2") in export_vehicle(curved, target).notes
+        assert note.format("(2 u / (1.2 + sqrt(1.44 - 0.8 u)))^2") in export_vehicle(steep, target).notes
         assert "thrust_curve" not in " ".join(export_vehicle(found, target).notes)
     assert found.vehicle.thrust_curve == 1
     assert "thrust_curve" not in found.drawn
@@ -142,7 +143,8 @@ def test_an_sdf_is_valid_and_has_the_inertia(write):
         assert int(plugin.findtext("motorNumber") or -1) == number
         moment = vector(plugin, "momentConstant") * vector(plugin, "motorConstant")
         assert moment == pytest.approx(1.1 * 1.2e-10)
-        assert vector(plugin, "timeConstantUp") == vector(plugin, "timeConstantDown") == 0.05
+        lags = [vector(plugin, f"timeConstant{way}") for way in ("Up", "Down")]
+        np.testing.assert_allclose(lags, found.vehicle.lag, rtol=1e-3)
     assert vector(links[0], "collision/geometry/box/size").min() > 0  # it can stand on the ground
     # All links together are the vehicle.
     mass = np.array(masses)

@@ -20,7 +20,7 @@ PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "into_your_simulat
 PROGRAMS = ("mujoco", "mujoco", "rotorpy")
 STATES = 1000
 # Terms that make a torque or a force.
-TERMS = ("offset", "center_of_mass", "damping", "curve", "accelerometer", "drag")
+TERMS = ("offset", "center_of_mass", "damping", "motor", "accelerometer", "drag")
 # RotorPy has neither.
 NOT_ROTORPY = ("roll_offset", "pitch_offset", "yaw_offset", "roll_damping", "pitch_damping", "yaw_damping")
 DRAG = ("x_drag", "y_drag")
@@ -135,7 +135,8 @@ def test_a_vehicle_accelerates_as_the_model(target, tmp_path):
         values |= {f"{axis}_offset": 9.81 * VALUES[f"{axis}_thrust"] for axis in ("roll", "pitch")}
     states, omega = random_states(500, 2500)
     curve = values["thrust_curve"]
-    effective = np.sqrt(curve * omega**2 + (1 - curve) * AIRFRAME["max_rotor_speed"] * omega)  # they make the thrust
+    u = omega / AIRFRAME["max_rotor_speed"]
+    effective = 2 * omega / (curve + np.sqrt(curve**2 + 4 * (1 - curve) * u))  # they make the thrust
     simulated = SIMULATORS[target](read(tmp_path, vehicle_result(values)), states, effective)
     assert agree(simulated, vehicle_acceleration(values, states, omega))
 
@@ -167,13 +168,16 @@ def test_the_rotors_of_mujoco_lag_and_are_late(mujoco, tmp_path, step, delay, er
         mujoco.mj_step(model, data)
         thrust.append(data.act[0])
     late = np.maximum(step * np.arange(1, len(thrust) + 1) - delay, 0.0)
-    np.testing.assert_allclose(thrust, 0.1 * -np.expm1(-late / VALUES["rotor_lag"]), atol=error)
+    np.testing.assert_allclose(thrust, 0.1 * -np.expm1(-late / found.vehicle.lag), atol=error)
 
 
 def test_the_rotors_of_rotorpy_lag(tmp_path):
-    vehicle = rotorpy_vehicle(read(tmp_path, vehicle_result()))
+    found = read(tmp_path, vehicle_result())
+    vehicle = rotorpy_vehicle(found)
     rest = {"x": np.zeros(3), "v": np.zeros(3), "q": np.array([0, 0, 0, 1.0]), "w": np.zeros(3), "wind": np.zeros(3)}
-    state = vehicle.step(rest | {"rotor_speeds": np.zeros(4)}, {"cmd_motor_speeds": np.full(4, 1000.0)}, 0.05)
+    state = vehicle.step(
+        rest | {"rotor_speeds": np.zeros(4)}, {"cmd_motor_speeds": np.full(4, 1000.0)}, found.vehicle.lag
+    )
     np.testing.assert_allclose(state["rotor_speeds"], -1000 * np.expm1(-1.0), rtol=1e-3)
 
 

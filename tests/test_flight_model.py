@@ -26,7 +26,7 @@ from jaxos4.models.terms import (
 )
 from jaxos4.models.vehicle import DEFAULT_TERMS
 
-ALL = tuple(jaxos4.TERMS)
+ALL = tuple(term for term in jaxos4.TERMS if term != "lag")  # the motor has a lag of its own
 RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "flapping", "inflow", "drag"))
 FULL = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, np.asarray(500.0))
 VOLTS = 11.1
@@ -37,10 +37,11 @@ NAMES = {
     "velocity": ["roll_velocity", "pitch_velocity"],
     "flapping": ["roll_flapping", "pitch_flapping"],
     "voltage": ["voltage_exponent"],
+    "fade": ["battery_fade"],
+    "motor": ["rotor_lag", "thrust_curve", "motor_braking"],
     "lag": ["rotor_lag"],
     "delay": ["rotor_delay"],
     "reaction": ["rotor_reaction"],
-    "curve": ["thrust_curve"],
     "accelerometer": ["thrust_gain", "az_bias"],
     "inflow": ["z_drag"],
     "drag": ["x_drag", "y_drag"],
@@ -51,10 +52,10 @@ VALUES = {
     **dict(roll_offset=0.3, pitch_offset=-0.2, yaw_offset=0.1, roll_damping=1.5, pitch_damping=0.8, yaw_damping=0.4),
     **dict(roll_velocity=0.3, pitch_velocity=-0.4, roll_flapping=0.2, pitch_flapping=-0.1, rotor_lag=0.06),
     **dict(
-        rotor_delay=0.02, rotor_reaction=0.02, thrust_curve=0.6, thrust_gain=1.2, x_drag=0.4, y_drag=0.3, z_drag=0.6
+        rotor_delay=0.02, rotor_reaction=0.02, thrust_curve=0.97, thrust_gain=1.2, x_drag=0.4, y_drag=0.3, z_drag=0.6
     ),
     **dict(ax_bias=0.5, ay_bias=-0.4, az_bias=0.2, p_bias=0.03, q_bias=-0.02, r_bias=0.01),
-    **dict(roll_thrust=-0.5, pitch_thrust=0.9, voltage_exponent=0.7),
+    **dict(roll_thrust=-0.5, pitch_thrust=0.9, voltage_exponent=0.7, battery_fade=0.02, motor_braking=0.3),
 }
 
 
@@ -89,15 +90,16 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
     a1, a2, a3, a4, a5, a6, a7, a8 = np.asarray(jaxos4.CorrectedOS4(airframe).alpha)
     b, d, m, g = (float(getattr(airframe, n)) for n in ("thrust_coefficient", "drag_coefficient", "mass", "gravity"))
     (x, y), spin = np.asarray(airframe.rotor_positions).T, np.asarray(airframe.rotor_spins)
-    curve = values["thrust_curve"] if "curve" in terms else 1.0
+    curve = values["thrust_curve"] if "motor" in terms else 1.0
     full = float(airframe.max_rotor_speed)
     omega = omega * ((battery(omega.shape[0], dt) / VOLTS) ** v["voltage_exponent"])[:, None]
+    omega = omega * (1 - v["battery_fade"] * dt * np.arange(omega.shape[0]))[:, None]
     # The centre of mass (x_c, y_c): its torque in hover belongs to the offset.
     x_c, y_c = v["pitch_thrust"] / (a6 * m), -v["roll_thrust"] / (a3 * m)
 
     def body(state, w, w_dot):
         p, q, r, phi, theta, psi = state[:6]
-        force = b * (curve * w**2 + (1 - curve) * (full * w if curve != 1 else 0.0))
+        force = b * w**2
         cx, sx, cy, sy, cz, sz = (f(angle) for angle in (phi, theta, psi) for f in (np.cos, np.sin))
         turn = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]
         turn = turn @ [[1, 0, 0], [0, cx, -sx], [0, sx, cx]]
@@ -119,13 +121,22 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
         return np.array([*rates_dot, *turning, state[7], ax, state[9], ay, state[11], az]), biased
 
     def whole(z, u):
-        w = z[12:] if "lag" in terms else u
-        w_dot = (u - w) / v["rotor_lag"] if "lag" in terms else np.zeros(4)
+        if not {"lag", "motor"} & set(terms):
+            w, w_dot = u, np.zeros(4)
+        else:
+            w = z[12:]
+            drive = u - curve * w
+            if "motor" in terms:
+                brake, smooth = v["motor_braking"], 0.005 * full
+                weak = brake * drive - (1 - brake) * smooth * (1 - np.exp(np.minimum(drive, 0) / smooth))
+                drive = np.where(drive < 0, weak, drive)
+            w_dot = (drive - (1 - curve) * w**2 / full) / v["rotor_lag"]
         dz, force = body(z[:12], w, w_dot)
         return np.concatenate([dz, w_dot]), force
 
     late = round(v["rotor_delay"] / dt)
-    z = np.concatenate([np.zeros(12), omega[0]])
+    settled = 2 * omega[0] / (curve + np.sqrt(curve**2 + 4 * (1 - curve) * omega[0] / full))
+    z = np.concatenate([np.zeros(12), settled])
     states, forces, h = [], [], dt / fine
     for k in range(omega.shape[0]):
         u = omega[max(k - late, 0)]
@@ -179,12 +190,13 @@ def test_without_terms_it_is_the_corrected_model():
         (("offset", "damping", "velocity", "gyro_bias"), 1e-7),
         (("offset", "center_of_mass"), 1e-7),
         (("voltage", "accelerometer"), 1e-7),
-        (("curve", "accelerometer"), 1e-7),
+        (("motor", "accelerometer"), 3e-3),
+        (("fade", "accelerometer"), 1e-7),
         (("accelerometer", "drag", "inflow"), 1e-7),
         (("lag", "delay", "reaction"), 2e-3),
         (tuple(term for term in ALL if term != "flapping"), 2e-3),
     ],
-    ids=["air", "center of mass", "voltage", "curve", "drag", "rotors", "all"],
+    ids=["air", "center of mass", "voltage", "motor", "fade", "drag", "rotors", "all"],
 )
 def test_terms_are_their_equations(terms, tolerance):
     """Inputs are held, so that without a lag only Runge-Kutta errs; with one, straight lines over samples do."""
@@ -252,7 +264,7 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
         center, half_width = np.asarray(model.alpha), np.asarray(model.half_width)
         assert center.shape == half_width.shape == (len(names),)
         assert np.all(np.isfinite(half_width) & (half_width > 0) & np.isfinite(center))
-        chain = {"rotor_lag", "rotor_delay", "thrust_curve", "voltage_exponent"} & set(names)
+        chain = {*NAMES["motor"], "rotor_delay", "voltage_exponent", "battery_fade"} & set(names)
         assert {names[i] for i in model.forcing_parameters} == chain
         assert model.is_linear == (not chain)
     # The order is that of TERMS, in whatever order they were given, and within a term recording by recording.
@@ -264,7 +276,8 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"terms": ("curve",)}, "max_rotor_speed"),
+        ({"terms": ("motor",)}, "max_rotor_speed"),
+        ({"terms": ("motor", "lag")}, "leave out lag"),
         ({"terms": ("voltage",)}, "`battery_voltage` must be given for the term voltage"),
         ({"terms": ("wind",)}, "`terms` must be some of offset, center_of_mass, damping"),
         ({"terms": ("lag", "lag")}, "`terms` must be some of"),
@@ -306,7 +319,7 @@ def test_a_new_term_is_one_object(monkeypatch):
     found = jaxos4.OutputError()(problem)
     np.testing.assert_allclose(found.parameters[-3:], [0.5, 0.3, 0.8], atol=1e-4)
     with pytest.raises(ValueError, match="acts on the forcing"):
-        Term("", (TermParameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda speeds, values, grid: speeds)
+        Term("", (TermParameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda speeds, *other: speeds)
 
 
 def test_an_estimate_uses_the_terms_that_the_logs_allow():
@@ -321,8 +334,9 @@ def test_an_estimate_uses_the_terms_that_the_logs_allow():
         (force | {AXIAL_VELOCITY}, (*basic, "flapping", "accelerometer", "inflow")),
         (frozenset({AXIAL_VELOCITY, VOLTAGE}), basic),
         (frozenset({COMMANDS, VOLTAGE}), (*rotors, "voltage")),
-        (force | {COMMANDS}, (*rotors, "flapping", "accelerometer")),
-        (force | {COMMANDS, FULL_SCALE}, (*rotors, "flapping", "curve", "accelerometer")),
+        (force | {COMMANDS}, (*rotors, "fade", "flapping", "accelerometer")),
+        (force | {COMMANDS, FULL_SCALE}, (*basic, "fade", "motor", "flapping", "accelerometer")),
+        (force | {COMMANDS, FULL_SCALE, VOLTAGE}, (*basic, "voltage", "motor", "flapping", "accelerometer")),
     ):
         assert set(default_terms(available)) == set(terms)
         assert list(default_terms(available)) == [name for name in jaxos4.TERMS if name in terms]

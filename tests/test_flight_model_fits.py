@@ -39,7 +39,7 @@ def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="
 
 @pytest.mark.parametrize("recordings", [(0, 0), (0, 1)])
 def test_gradient_and_information_are_the_residuals_derivatives(recordings):
-    terms = ("offset", "lag", "delay", "curve", "accelerometer", "gyro_bias")
+    terms = ("offset", "motor", "delay", "accelerometer", "gyro_bias")
     problem = two_flights(jaxos4.FlightModel(FULL, terms=terms, recordings=recordings), windows=4, noise=0.01)
     count = len(problem.model.parameter_names)
     parameters = truth(problem.model) * 1.03

@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 from helpers import forcing_of
 from test_flight_model import FULL, commands, truth
 
 import jaxos4
 from jaxos4.flight import Inputs, Stretches
+from jaxos4.models.rotors import Grid, Motor, driven
 
 
 @pytest.mark.parametrize("counts", [(1,), (2,), (37,), (5, 1, 20, 11), (1, 1, 1), (64, 64)])
@@ -89,3 +91,31 @@ def test_the_delay_has_a_continuous_derivative():
     middle = 0.0137
     difference = (delayed(omega, middle + 1e-7) - delayed(omega, middle - 1e-7)) / 2e-7
     np.testing.assert_allclose(slope(middle), difference, rtol=1e-5, atol=1e-5 * size)
+
+
+def test_a_motor_is_its_equation():
+    """Its steps are of second order, with a load and with weak braking, and agree with scipy's integration."""
+    motor, dt = Motor(lag=0.06, curve=0.7, braking=0.2, full=500.0), 0.02
+    commands = np.random.default_rng(0).uniform(50, 450, (60, 4))
+
+    def slope(t, w):
+        u = commands[min(int(t / dt + 1e-9), 59), 0] / 500
+        x = u - 0.7 * w
+        torque = np.where(x < 0, 0.2 * x - 0.8 * 0.005 * (1 - np.exp(np.minimum(x, 0) / 0.005)), x)
+        return (torque - 0.3 * w * w) / 0.06
+
+    def error(finer):
+        omega = jnp.asarray(np.repeat(commands, finer, axis=0))
+        samples, zeros = omega.shape[0], jnp.zeros(omega.shape[0], dtype=int)
+        grid = Grid(jnp.asarray(dt / finer), zeros, zeros, zeros + samples - 1, jnp.zeros(samples))
+        return np.abs(np.asarray(jax.jit(driven)(omega, motor, grid).begin[::finer, 0]) / 500 - exact).max()
+
+    u = commands[0, 0] / 500
+    w, exact = 2 * u / (0.7 + np.sqrt(0.49 + 1.2 * u)), []
+    for k in range(60):
+        exact.append(float(np.squeeze(w)))
+        inside = (k * dt + 1e-7, (k + 1) * dt - 1e-7)
+        w = scipy.integrate.solve_ivp(slope, inside, np.atleast_1d(w), rtol=1e-10, atol=1e-12).y[:, -1]
+    coarse, fine = error(1), error(4)
+    assert coarse < 3e-3
+    assert fine < coarse / 10

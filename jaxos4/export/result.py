@@ -27,7 +27,8 @@ _NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "y
 _NOT_EXPORTED = {
     ("roll_velocity", "pitch_velocity"): "no simulator has a moment proportional to the body velocity",
     ("roll_flapping", "pitch_flapping"): "no simulator has a moment proportional to the lateral specific force",
-    ("voltage_exponent",): "no simulator has the battery's voltage",
+    ("voltage_exponent", "battery_fade"): "no simulator has the battery's voltage",
+    ("motor_braking",): "no simulator has motors that brake less than they drive",
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }

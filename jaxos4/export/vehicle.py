@@ -32,7 +32,7 @@ class RigidVehicle(NamedTuple):
     - `torque`: constant, about each axis [N m].
     - `damping`: torque against the body rate about each axis [N m s].
     - `drag`: force against the body velocity along x and y [N s/m].
-    - `thrust_curve`: c. A command u of full scale makes the speed sqrt(c u^2 + (1 - c) u) `max_rotor_speed`.
+    - `thrust_curve`: c. A command u of full scale makes the speed w `max_rotor_speed` with c w + (1 - c) w^2 = u.
     """
 
     mass: float
@@ -81,10 +81,8 @@ class RigidVehicle(NamedTuple):
     @property
     def thrust_share(self) -> str:
         """Thrust over `full_thrust` as a formula of the command u (1: full scale). Empty if it is u^2."""
-        curve = self.thrust_curve
-        if curve > 1:
-            return f"max(0, {curve:.4g} u^2 - {curve - 1:.4g} u)"
-        return "" if curve == 1 else f"{curve:.4g} u^2 + {1 - curve:.4g} u"
+        c = self.thrust_curve
+        return "" if c == 1 else f"(2 u / ({c:.4g} + sqrt({c * c:.4g} {'+-'[c > 1]} {4 * abs(1 - c):.4g} u)))^2"
 
     def curve(self, formula: str) -> str:
         """The note on the thrust curve, with the simulator's `formula` for a function {} of the command."""
@@ -110,8 +108,8 @@ class RigidVehicle(NamedTuple):
             return "the thrust is not positive"
         if not 0 <= 4 * self.rotor_inertia < self.inertia[2]:
             return "the rotors have no inertia that a part of the vehicle can have"
-        if not self.thrust_curve >= -1:
-            return f"thrust_curve = {self.thrust_curve:.3g} makes thrust fall before full scale"
+        if not 0 < self.thrust_curve < 2:
+            return f"thrust_curve = {self.thrust_curve:.3g} is no motor's; it must be between 0 and 2"
         for number, thrust in enumerate(self.hover_thrust, start=1):
             if not 0 <= thrust <= self.full_thrust:
                 return f"rotor {number} can make 0 to {self.full_thrust:.3g} N, and hover needs {thrust:.3g} N of it"
@@ -161,5 +159,8 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
         drag=mass * np.array([values.get("x_drag", 0.0), values.get("y_drag", 0.0)]),
         thrust_curve=values.get("thrust_curve", 1.0),
     )
-    unknown = not np.isfinite(speed) and gain > 0
-    return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed) if unknown else vehicle
+    if not np.isfinite(speed) and gain > 0:
+        return vehicle._replace(max_rotor_speed=_FULL_SCALE * vehicle.hover_speed)
+    # The load of the propeller shortens the lag of a motor: that of small changes in hover (`jaxos4.models.rotors`).
+    curve, share = vehicle.thrust_curve, vehicle.hover_speed / speed if gain > 0 else 0.0
+    return vehicle._replace(lag=vehicle.lag / (curve + 2 * (1 - curve) * share)) if 0 < curve < 2 else vehicle

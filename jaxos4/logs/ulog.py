@@ -37,7 +37,7 @@ and psi change their signs; x, p and phi do not.
    f = THR_MDL_FAC. Speed is the square root of thrust.
 
 `actuator_motors` holds the fraction of thrust; `actuator_outputs` holds the signal. If f is 0, its default, nobody
-measured the thrust, and both topics hold u. Speed then counts as proportional to u, and the term `curve` of a vehicle's
+measured the thrust, and both topics hold u. Speed then counts as proportional to u, and the term `motor` of a vehicle's
 model fits the thrust.
 
 | protocol | smallest | largest |
@@ -304,7 +304,7 @@ def _thrust_curve(log: Topics) -> tuple[float, str]:
         return curve, f"taken as fractions of full-scale rotor speed by THR_MDL_FAC = {curve:.3g}"
     return 0.0, (
         "taken as fractions of full-scale rotor speed, because THR_MDL_FAC is 0: the thrust curve was not measured "
-        "(the term curve of a vehicle fits it, if the accelerometer was logged)"
+        "(the term motor of a vehicle fits it, if the accelerometer was logged)"
     )
 
 

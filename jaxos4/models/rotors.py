@@ -129,9 +129,10 @@ def driven(omega: RotorSpeeds, motor: Motor, grid: Grid) -> Speeds:
 
         lag w' = g(u - c w) - k w^2.
 
-    u - c w is the voltage less that which the motor itself makes; it drives the current and the torque, g(x) = x. Below
-    0 the torque is g(x) = braking x, reached smoothly. At rest u = c w + k w^2. Without a load, and with full braking,
-    this is a first-order system. In each stretch the rotors begin at the speed of their first command.
+    u - c w is the voltage less that which the motor itself makes. It drives the current and so the torque, g(x) = x.
+    Below 0 the motor brakes with a share of it, g(x) = braking x - (1 - braking) s (1 - exp(x / s)) with s = 0.005.
+    At rest u = c w + k w^2. Without a load, and with full braking, this is a first-order system. In each stretch the
+    rotors begin at the speed of their first command.
     """
     lag, load = jnp.maximum(motor.lag, _SHORTEST_LAG * grid.dt), 1 - motor.curve
     u, step = omega / motor.full, grid.dt / _STEPS

@@ -87,6 +87,8 @@ class FlightModel(AbstractModel):
         unknown = [term for term in terms if term not in TERMS]
         if unknown or len(set(terms)) < len(terms):
             raise ValueError(f"`terms` must be some of {', '.join(TERMS)}, each once, got {', '.join(terms)}.")
+        if {"motor", "lag"} <= set(terms):
+            raise ValueError("`terms`: motor includes the lag of the rotors; leave out lag.")
         if not recordings or sorted(set(recordings)) != list(range(max(recordings) + 1)):
             raise ValueError(f"`recordings` must count from 0 and leave no number out, got {recordings}.")
         unscaled = [term for term in terms if FULL_SCALE in TERMS[term].needs]
@@ -95,8 +97,6 @@ class FlightModel(AbstractModel):
         powered = [term for term in terms if VOLTAGE in TERMS[term].needs]
         if powered and battery_voltage is None:
             raise ValueError(f"`battery_voltage` must be given for the term {powered[0]}: it is the usual voltage.")
-        if {"motor", "lag"} <= set(terms):
-            raise ValueError("`terms`: motor includes the lag of the rotors; leave out lag.")
         self.airframe, self.terms, self.recordings = airframe, tuple(terms), tuple(recordings)
         self.battery_voltage = None if battery_voltage is None else as_float(battery_voltage)
 
