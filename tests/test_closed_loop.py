@@ -241,7 +241,7 @@ def fleet():
         jaxos4.ClosedLoop(CRAZYFLIE, gust=10.0),
         jaxos4.ClosedLoop(jaxos4.OS4, gust=2.0, rotor_lag=0.02, rotor_delay=0.005),
         loop_of(offset=(0.0, 2.0, 0.0), **NO_GAINS),
-        loop_of(offset=(1.0, 0.0, 0.0), damping=-1e3, **NO_GAINS),
+        loop_of(offset=(1.0, 1.0, 0.0), damping=-1e3, **NO_GAINS),
     ]
 
 

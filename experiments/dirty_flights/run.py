@@ -43,7 +43,7 @@ CRAZYFLIE = jaxos4.Airframe(
 # The paper gives no largest rotor speed: twice that of hover.
 FAST_OS4 = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, 450.0)
 AIRFRAMES = {"os4": FAST_OS4, "crazyflie": CRAZYFLIE}
-TERMS = (*DEFAULT_TERMS, "curve", "accelerometer")
+TERMS = (*(term for term in DEFAULT_TERMS if term != "lag"), "motor", "accelerometer")
 # Parameters whose true values are those that follow from the airframe.
 FROM_AIRFRAME = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7", "rotor_reaction", "az_bias")
 LAG, DELAY, CURVE = 0.06, 0.008, (0.4, 1.0)
@@ -85,9 +85,8 @@ def commands(model: jaxos4.FlightModel, truth: np.ndarray, duration: float, rng:
     trim = np.array([-values[f"{axis}_offset"] / values[alpha] for axis, alpha in axes] + [0.0])
     squares = np.maximum(squares + np.linalg.solve(np.asarray(airframe.mixer), trim), 0.0)
     # Commands that give this thrust through the thrust curve.
-    curve = values["thrust_curve"]
-    linear = (1 - curve) * float(airframe.max_rotor_speed)
-    omega = (np.sqrt(linear**2 + 4 * curve * squares) - linear) / (2 * curve)
+    curve, speeds = values["thrust_curve"], np.sqrt(squares)
+    omega = speeds * (curve + (1 - curve) * speeds / float(airframe.max_rotor_speed))
     held = np.arange(omega.shape[0]) // COMMANDED * COMMANDED
     return omega[held]
 

@@ -233,7 +233,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     h, vehicle, airframe = period / steps, _Vehicle.of(loop), loop.airframe
     sense_key, log_key = jax.random.split(jax.random.fold_in(key, 1))
     sense = None if loop.sensors is None else Sense.of(loop.sensors, airframe.hover_speed, period, sense_key)
-    mixer, spins = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins)
+    mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
     # A command acts `late` runs after its own, and in the first `part` of a run the one before it still acts.
     late = jnp.floor(loop.rotor_delay / period).astype(int)
     part = loop.rotor_delay / period - late
@@ -263,7 +263,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
             j, *gust_and_wind = row
             share = jnp.clip(steps * part - j, 0, 1)
             wanted = now + share * (before - now)
-            after = wanted + (speeds - wanted) * jnp.exp(-h / loop.rotor_lag)
+            after = motor.step(speeds, wanted, h)
             squares = (speeds * speeds + speeds * after + after * after) / 3
             residual, spin_up = (speeds + after) @ spins / 2, (after - speeds) @ spins / h
             forcing = acting(weak, squares, residual, spin_up, *gust_and_wind)
@@ -282,7 +282,8 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     velocity = None if loop.air is None else (zero, zero, zero)
     motion = Motion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
     signals = None if sense is None else Signals.hovering(vehicle.gravity)
-    first = _Carry(motion, hover, jnp.zeros(3), jnp.broadcast_to(hover, (runs + 1, 4)), signals)
+    commands = jnp.broadcast_to(motor.command(hover), (runs + 1, 4))
+    first = _Carry(motion, hover, jnp.zeros(3), commands, signals)
     draws = _Draws.of(loop, key, runs, steps, h)
     inputs = (jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), draws)
     return log(loop, dt, jax.lax.scan(run, first, inputs)[1], log_key)
@@ -304,8 +305,8 @@ def _control(
     upright = jnp.maximum(jnp.cos(attitude[0]) * jnp.cos(attitude[1]), _STEEPEST)
     thrust = as_float(airframe.mass * (reference[3] + airframe.gravity) / upright)
     inertia = as_float(airframe.inertia) if loop.controller_inertia is None else loop.controller_inertia
-    command, saturated = _speeds(mixer, inertia * demand, thrust, airframe.max_rotor_speed)
-    return command, jnp.where(saturated, integral, integral + period * loop.integral_gain * error)
+    speeds, saturated = _speeds(mixer, inertia * demand, thrust, airframe.max_rotor_speed)
+    return loop.motor.command(speeds), jnp.where(saturated, integral, integral + period * loop.integral_gain * error)
 
 
 def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> tuple[Float[Array, "4"], Array]:

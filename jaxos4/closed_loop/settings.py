@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._custom_types import Scalar, as_float
 from ..airframe import Airframe
+from ..models.rotors import Motor
 from ..noise import FORCE_SIGMA
 
 PerAxis = Float[Array, "3"]
@@ -116,6 +117,8 @@ class ClosedLoop(eqx.Module):
     - `airframe`: the true constants. Rotor speeds lie between 0 and its `max_rotor_speed`. Its `rotor_inertia` makes
       the gyroscopic torque and the yaw moment of rotors that accelerate.
     - `rotor_lag`, `rotor_delay`: lag and delay of the rotors behind their commands [s], not only whole samples.
+    - `thrust_curve`, `motor_braking`: 1 for rotors that follow as first-order systems, else see `jaxos4.models.rotors`.
+      Both need `max_rotor_speed`.
     - `offset`: a constant torque over the inertia, for each axis [rad/s^2].
     - `damping`: a moment against the body rate, for each axis [1/s].
     - `sag`: the share of their thrust and drag that the rotors lose during the flight, linearly in time.
@@ -148,6 +151,8 @@ class ClosedLoop(eqx.Module):
     airframe: Airframe
     rotor_lag: Scalar = eqx.field(converter=_setting("rotor_lag"), default=0.05)
     rotor_delay: Scalar = eqx.field(converter=_setting("rotor_delay"), default=0.01)
+    thrust_curve: Scalar = eqx.field(converter=_setting("thrust_curve"), default=1.0)
+    motor_braking: Scalar = eqx.field(converter=_setting("motor_braking"), default=1.0)
     offset: PerAxis = eqx.field(converter=_setting("offset", _BODY, low=-np.inf), default=0.0)
     damping: PerAxis = eqx.field(converter=_setting("damping", _BODY, low=-np.inf), default=0.0)
     sag: Scalar = eqx.field(converter=_setting("sag", high=1.0), default=0.0)
@@ -173,3 +178,9 @@ class ClosedLoop(eqx.Module):
             raise ValueError(f"`logged` must be one of {', '.join(LOGGED)}, got {self.logged!r}.")
         if self.log_every < 1:
             raise ValueError(f"`log_every` must be at least 1, got {self.log_every}.")
+
+    @property
+    def motor(self) -> Motor:
+        """The motor of each rotor. If no full speed is known, it is 1 rad/s: a first-order system needs none."""
+        full = jnp.where(jnp.isfinite(self.airframe.max_rotor_speed), self.airframe.max_rotor_speed, 1.0)
+        return Motor(self.rotor_lag, self.thrust_curve, self.motor_braking, full)

@@ -9,6 +9,8 @@ from jaxtyping import Array, Float, Int
 from .._custom_types import RotorSpeeds, Scalar
 from ..flight import Inputs
 
+Speed = Float[Array, "*samples"]
+
 # The lag that acts is at least this share of a sample, so that a step stays finite wherever a search looks.
 _SHORTEST_LAG = 0.05
 # Steps of the motors in a sample. The voltage, as a share of the full one, over which a motor passes from driving to
@@ -108,9 +110,17 @@ def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:
 
 
 class Motor(NamedTuple):
-    """What an electric motor does to a command, see `driven`.
+    """An electric motor with a propeller, which follows a command.
 
-    - `lag`: time constant of a motor without a load [s].
+    With command u and speed w as shares of the full speed, curve c, and the propeller's load k = 1 - c,
+
+        lag w' = g(u - c w) - k w^2.
+
+    u - c w is the voltage less that which the motor itself makes. It drives the current and so the torque, g(x) = x.
+    Below 0 the motor brakes with a share of it, g(x) = braking x - (1 - braking) s (1 - exp(x / s)) with s = 0.005.
+    Without a load, and with full braking, this is a first-order system.
+
+    - `lag`: time constant without a load [s].
     - `curve`: 1: the thrust is quadratic in the command, as without a load. 0: it is linear.
     - `braking`: the torque of a motor that is faster than its voltage, as a share of that of a drive. 0: it coasts.
     - `full`: the speed at the full command [rad/s].
@@ -121,42 +131,41 @@ class Motor(NamedTuple):
     braking: Scalar | float = 1.0
     full: Scalar | float = 1.0
 
+    def command(self, omega: Speed) -> Speed:
+        """The command [rad/s] that keeps a speed."""
+        return omega * (self.curve + (1 - self.curve) * omega / self.full)
+
+    def settled(self, command: Speed) -> Speed:
+        """The speed [rad/s] that a command keeps."""
+        root = jnp.sqrt(jnp.maximum(self.curve**2 + 4 * (1 - self.curve) * command / self.full, _LEAST))
+        return 2 * command / (self.curve + root)
+
+    def step(self, omega: Speed, command: Speed, dt: Scalar) -> Speed:
+        """The speed after a time `dt` [s], by exponential Euler steps.
+
+        They are exact for a first-order system, stable for any `dt`, and of second order.
+        """
+        w, u, lag = omega / self.full, command / self.full, jnp.maximum(self.lag, _SHORTEST_LAG * dt)
+        for _ in range(_STEPS):
+            x, load = u - self.curve * w, (1 - self.curve) * w
+            weak = (1 - self.braking) * jnp.exp(jnp.minimum(x, 0.0) / _SMOOTH)
+            braking = self.braking * x - _SMOOTH * (1 - self.braking - weak)
+            slope = jnp.where(x >= 0, 1.0, self.braking + weak) * self.curve + 2 * load
+            z = dt / _STEPS * slope / lag
+            share = jnp.where(jnp.abs(z) > _LEAST, -jnp.expm1(-z) / jnp.where(jnp.abs(z) > _LEAST, z, 1.0), 1 - z / 2)
+            w = jnp.maximum(w + dt / _STEPS / lag * share * (jnp.where(x >= 0, x, braking) - load * w), 0.0)
+        return w * self.full
+
 
 def driven(omega: RotorSpeeds, motor: Motor, grid: Grid) -> Speeds:
-    """Speeds of rotors whose motors follow commands `omega` [rad/s].
+    """Speeds of rotors whose motors follow commands [rad/s]. A stretch begins at the speed of its first command."""
 
-    With command u and speed w as shares of the full speed, curve c, and the propeller's load k = 1 - c,
-
-        lag w' = g(u - c w) - k w^2.
-
-    u - c w is the voltage less that which the motor itself makes. It drives the current and so the torque, g(x) = x.
-    Below 0 the motor brakes with a share of it, g(x) = braking x - (1 - braking) s (1 - exp(x / s)) with s = 0.005.
-    At rest u = c w + k w^2. Without a load, and with full braking, this is a first-order system. In each stretch the
-    rotors begin at the speed of their first command.
-    """
-    lag, load = jnp.maximum(motor.lag, _SHORTEST_LAG * grid.dt), 1 - motor.curve
-    u, step = omega / motor.full, grid.dt / _STEPS
-    settled = 2 * u / (motor.curve + jnp.sqrt(jnp.maximum(motor.curve**2 + 4 * load * u, _LEAST)))
-
-    def move(w: Float[Array, "4"], u: Float[Array, "4"]) -> Float[Array, "4"]:
-        """An exponential Euler step: exact for a first-order system, stable for any step, of second order."""
-        x = u - motor.curve * w
-        faded = jnp.exp(jnp.minimum(x, 0.0) / _SMOOTH)
-        braking = motor.braking * x - (1 - motor.braking) * _SMOOTH * (1 - faded)
-        torque = jnp.where(x >= 0, x, braking) - load * w * w
-        slope = jnp.where(x >= 0, 1.0, motor.braking + (1 - motor.braking) * faded)
-        z = step * (slope * motor.curve + 2 * load * w) / lag
-        share = jnp.where(jnp.abs(z) > _LEAST, -jnp.expm1(-z) / jnp.where(jnp.abs(z) > _LEAST, z, 1.0), 1 - z / 2)
-        return jnp.maximum(w + step / lag * share * torque, 0.0)
-
-    def over_a_sample(w: Float[Array, "4"], row):
-        u, settled, is_first = row
-        begin = jnp.where(is_first, settled, w)
-        end = begin
-        for _ in range(_STEPS):
-            end = move(end, u)
+    def over_a_sample(speed: Speed, row):
+        command, settled, is_first = row
+        begin = jnp.where(is_first, settled, speed)
+        end = motor.step(begin, command, grid.dt)
         return end, (begin, end)
 
-    is_first = grid.first == jnp.arange(omega.shape[0])
-    begin, end = jax.lax.scan(over_a_sample, settled[0], (u, settled, is_first))[1]
-    return Speeds(begin * motor.full, end * motor.full, (end - begin) * motor.full)
+    settled, is_first = motor.settled(omega), grid.first == jnp.arange(omega.shape[0])
+    begin, end = jax.lax.scan(over_a_sample, settled[0], (omega, settled, is_first))[1]
+    return Speeds(begin, end, end - begin)

@@ -162,7 +162,7 @@ def _contradicts_curve(curve: float, error: float) -> tuple[str, str] | None:
         return None
     return (
         f"is outside of {low:g} (linear) to {high:g}: the thrust of no propeller grows so with its speed",
-        "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `curve`",
+        "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`",
     )
 
 
