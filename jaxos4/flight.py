@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ._custom_types import RotorSpeeds, Scalar, States, as_float
+from ._custom_types import Count, RotorSpeeds, Scalar, States, as_float
 from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
@@ -43,6 +43,7 @@ class Inputs(NamedTuple):
     - `force`: the measured specific force along the body's axes [m/s^2], an input of some models. `None`: not measured.
     - `stretches`: `None`: the flight is one stretch.
     - `voltage`: of the battery [V]. `None`: not logged.
+    - `length`: the number of samples that count; the others are padding. `None`: all count.
     """
 
     omega: RotorSpeeds
@@ -51,6 +52,7 @@ class Inputs(NamedTuple):
     force: Float[Array, "samples 3"] | None = None
     stretches: Stretches | None = None
     voltage: Float[Array, " samples"] | None = None
+    length: Count | None = None
 
 
 class Flight(eqx.Module):

@@ -18,9 +18,10 @@ from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, name
 import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.models.state import CASCADE_ORDER
-from jaxos4.shooting import InnovationsProblem
-from jaxos4.shooting.filters import LogNoise, filter_gains as gains_of
-from jaxos4.shooting.innovations import SETTLING, segments_of
+from jaxos4.shooting import InnovationsProblem, pad_flight
+from jaxos4.shooting.filters import BLOCK, LogNoise, Observed, gains_of
+from jaxos4.shooting.innovations import SETTLING
+from jaxos4.shooting.segments import Segments
 
 MODEL = jaxos4.PublishedOS4()
 RATES = CASCADE_ORDER[:3]
@@ -36,7 +37,9 @@ filter_gains = eqx.filter_jit(gains_of)
 @eqx.filter_jit
 def observed_in(problem, segment=501):
     """The measurements in segments of about this many samples, by default in one."""
-    return InnovationsProblem(problem, segment=segment).observed()
+    found = InnovationsProblem(problem, segment=segment)
+    rows, (measured, restart, counts, known) = found.cut.rows, found.observed()
+    return Observed(measured[:rows], restart[:rows], counts[:rows], known)
 
 
 @eqx.filter_jit
@@ -98,7 +101,7 @@ def textbook(noise, measured, restart):
 
 def test_the_gains_are_those_of_a_textbook_filter():
     observed = observed_in(disturbed())
-    (gains, _), measured = filter_gains(observed, NOISE, jnp.asarray(DT)), ~np.isnan(observed.measured)
+    gains, measured = filter_gains(observed, NOISE, jnp.asarray(DT)), ~np.isnan(observed.measured)
     assert observed.restart[:, 0].nonzero()[0].tolist() == [0, *range(210, 231)]
     assert observed.counts[:, 0].nonzero()[0].tolist() == [*range(210), *range(230 + SETTLING, 501)]
     for i in range(3):
@@ -116,7 +119,7 @@ def test_the_variance_that_a_disturbance_adds_is_exact(tau):
     """Also for time constants of thousands of samples, where its formula is a difference of nearly equal numbers."""
     noise = LogNoise(*(jnp.asarray(np.log([x, 1.0, 1.0])) for x in (3.0, tau, 1e-9)))
     two = jax.tree.map(lambda leaf: jnp.asarray(np.zeros_like(leaf[:2])), observed_in(disturbed()))
-    gains, _ = filter_gains(two, noise, jnp.asarray(DT))
+    gains = filter_gains(two, noise, jnp.asarray(DT))
     moved, added = transition(3.0, tau)
     start = np.diag([0.0, 9.0])
     expected = (moved @ start @ moved.T + added)[0, 0] + 1e-18
@@ -247,7 +250,7 @@ def test_a_known_start_is_used_in_flights_of_several_segments():
     assert observed.restart[0].tolist() == [False, True, True, True]
     assert observed.known is not None
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
-    gains, _ = filter_gains(observed, NOISE, jnp.asarray(DT))
+    gains = filter_gains(observed, NOISE, jnp.asarray(DT))
     # After one sample only the disturbance is unknown.
     moved, added = transition(4.0, 0.2)
     expected = (moved @ np.diag([0.0, 16.0]) @ moved.T + added)[0, 0] + 0.02**2
@@ -258,10 +261,17 @@ def test_a_known_start_is_used_in_flights_of_several_segments():
     ("samples", "segment"), [(2, 384), (50, 384), (501, 90), (501, 384), (1500, 384), (153_601, 384)]
 )
 def test_each_sample_counts_once(samples, segment):
-    index = segments_of(samples, segment, SETTLING)
-    own = np.concatenate([index[0], index[1:, SETTLING:].ravel()])
-    np.testing.assert_array_equal(own[own < samples], np.arange(samples))
-    assert (index[:, 0] >= 0).all()
+    """Also if the flight is padded: then its length is data."""
+    room = samples + 100
+    number = Segments.of(samples, segment, SETTLING).place.shape[0]
+    padded = jax.jit(lambda length: Segments.number(number, room, length, SETTLING))(samples)
+    for index, owned, rows in (Segments.of(samples, segment, SETTLING), map(np.asarray, padded)):
+        assert index.shape == owned.shape
+        assert index.shape[1] % BLOCK == 0
+        assert (index >= 0).all()
+        np.testing.assert_array_equal(np.sort(index[owned]), np.arange(samples))
+        assert not owned[:, rows:].any()
+        assert not owned[1:, :SETTLING].any()
 
 
 # Gaps, recordings, failures.
@@ -325,3 +335,19 @@ def test_a_flight_too_short_to_say_anything_leaves_the_bracket(samples):
     assert jaxos4.result_names(found.result) == "unidentifiable"
     assert (np.abs(found.parameters - bracket.center) < 4 * bracket.half_width).all()
     assert (found.std <= bracket.half_width * 1.001).all()
+
+
+def test_padding_changes_nothing():
+    """Rows beyond the length of a flight are not summed, whatever the rotors do in them."""
+    problem = standard_problem(channels="rates", free=True, states=noisy_states(1, seed=2)[0])
+    longer = pad_flight(problem.flight, 700)
+    longer = dataclasses.replace(longer, omega=longer.omega.at[501:].set(400.0))
+    padded = eqx.tree_at(
+        lambda p: (p.flight, p.length), problem, (longer, jnp.asarray(501)), is_leaf=lambda leaf: leaf is None
+    )
+    one, two = (
+        eqx.filter_jit(lambda p: p.innovations(MODEL.alpha, NOISE))(InnovationsProblem(each, segments=3))
+        for each in (problem, padded)
+    )
+    for name, alone, beside in zip(one._fields, one, two, strict=True):
+        np.testing.assert_allclose(alone, beside, rtol=1e-10, atol=1e-10 * np.abs(alone).max(), err_msg=name)

@@ -193,11 +193,10 @@ def _widening(
     problem: InnovationsProblem, found: Estimate, fitted: np.ndarray, recording: np.ndarray
 ) -> Float[np.ndarray, " fitted"]:
     """The factor by which the interval of each fitted parameter widens. `recording`: of each sample."""
-    index = problem.index
-    # The middle of the samples of each segment that count.
-    middle = index[:, (problem.settling + index.shape[1]) // 2 if index.shape[0] > 1 else 0]
+    index, owned, _ = map(np.asarray, problem.cut)
+    middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
     some, parts = np.flatnonzero(fitted), _parts(found)
-    # Padding fills whole segments, in which nothing was measured.
+    # In a segment of padding nothing was measured.
     used = np.asarray(parts.information).any(axis=(1, 2))
     number = recording[np.minimum(middle, recording.size - 1)][used]
     gradient = np.asarray(parts.gradient)[used][:, some]

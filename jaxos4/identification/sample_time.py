@@ -50,9 +50,9 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
 
 def _is_inside(problem: InnovationsProblem, found: np.ndarray) -> bool:
     """Whether no parameter went to its limit: it may have gone to another minimum, and another start may not."""
-    count = problem.problem.unknowns.count
-    lower, upper = (np.asarray(limit)[:count] for limit in problem.unknowns.limits(_NEAR * REACH))
-    return bool(((found[:count] >= lower) & (found[:count] <= upper)).all())
+    own = problem.problem.unknowns
+    off = np.abs(found[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
+    return bool((off < _NEAR * REACH).all())
 
 
 def shortest(answers: Sequence[SampleTime]) -> int:

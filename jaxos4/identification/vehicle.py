@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import msgspec
 import numpy as np
 
@@ -18,8 +19,8 @@ from ..models.vehicle import FlightModel
 from ..recording import preparation
 from ..recording.preparation import Prepared
 from ..recording.reading import Recording
-from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, pad_flight
-from ..shooting.innovations import SEGMENT, SETTLING, Balance
+from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, pad_flight
+from ..shooting.innovations import Balance
 from .network import GivenNetwork, vehicle_network_for
 from .prepare import Case, HeldOut, Progress
 from .problem import Intervals, bracket_of
@@ -29,10 +30,9 @@ from .settings import VehicleSettings
 
 # The scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
 _FIRST_SIGMA = 0.5
-# A flight has at least so many segments, whose disagreement shows errors of the model, unless they would be too short.
-_FEWEST_SEGMENTS, _SHORTEST_SEGMENT = 8, 80
-# A filter has settled after this time [s].
-_SETTLED = 0.512
+# A flight has so many segments, which are filtered in parallel, and whose disagreement shows errors of the model; more
+# if there are several times so many recordings; fewer if they would be shorter than the last number [s].
+_SEGMENTS, _FEW_RECORDINGS, _SHORTEST_SEGMENT = 16, 4, 1.25
 # The cost has kinks where a delay passes a sample. Slopes jump closer to the minimum than this [standard deviations].
 _KINKS = 0.05
 # The thrust carries the weight but for the velocity that a stretch gains [m/s], and for this share of the weight.
@@ -67,10 +67,10 @@ def prepare_vehicle(
     )
     times = usable.sample_times if settings.sample_time is None else (settings.sample_time,)
     prepared = [preparation.sampled(usable, airframe, sample_time=step, holdout=holdout) for step in times]
-    # All but the shortest sample time share one program: their flights get as many rows as the second.
+    # All sample times share one program, with room for the shortest.
     return [
-        _case(recordings, airframe, settings, each, prepared[min(i, 1)], name, bracket=bracket, validate=validate)
-        for i, each in enumerate(prepared)
+        _case(recordings, airframe, settings, each, prepared[0], name, bracket=bracket, validate=validate)
+        for each in prepared
     ]
 
 
@@ -79,7 +79,7 @@ def _case(
     airframe: Airframe,
     settings: VehicleSettings,
     prepared: Prepared,
-    like: Prepared,
+    room: Prepared,
     name: str,
     *,
     bracket: Intervals,
@@ -105,7 +105,7 @@ def _case(
         **versions(shooting),
     )
     recording = np.asarray(prepared.recordings)[number]
-    problem = _innovations(shooting, prepared, like, airframe)
+    problem = _innovations(shooting, prepared, room, airframe)
     return Case(
         problem, shooting, FilterError(), name, "flight", FilterError.prior, held_out, recording, provenance,
         doubts=prepared.doubts, log_step=prepared.log_step,
@@ -153,17 +153,20 @@ def _vehicle_shooting(model: FlightModel, prepared: Prepared, bracket: Bracket, 
 
 
 def _innovations(
-    shooting: ShootingProblem, prepared: Prepared, like: Prepared, airframe: Airframe
+    shooting: ShootingProblem, prepared: Prepared, room: Prepared, airframe: Airframe
 ) -> InnovationsProblem:
-    """The likelihood of a vehicle, in a program for flights as long as `like`."""
-    capacity = max(like.fitted.time.shape[0], prepared.fitted.time.shape[0])
-    flight = pad_flight(prepared.fitted, capacity)
-    segment = min(SEGMENT, max(capacity // _FEWEST_SEGMENTS, _SHORTEST_SEGMENT))
-    settling = min(SETTLING, max(round(_SETTLED / float(like.fitted.dt)), 1))
-    balance = _balance(prepared, airframe, capacity)
+    """The likelihood of a vehicle, in a program for all flights that are not longer than `room`."""
+    samples, recordings = prepared.fitted.time.shape[0], max(prepared.recordings) + 1
+    capacity = capacity_of(room.fitted.time.shape[0])
+    # Segments are as many for all sample times, and last a while at the longest.
+    seconds = float(room.fitted.dt) * room.fitted.time.shape[0]
+    most = _SEGMENTS * max(recordings // _FEW_RECORDINGS, 1)
+    segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 1, most))
     # The likelihood knows no windows.
-    padded = dataclasses.replace(shooting, flight=flight, windows=1)
-    return InnovationsProblem(padded, segment=segment, settling=settling, balance=balance)
+    padded = dataclasses.replace(
+        shooting, flight=pad_flight(prepared.fitted, capacity), windows=1, length=jax.device_put(np.asarray(samples))
+    )
+    return InnovationsProblem(padded, segments=segments, balance=_balance(prepared, airframe, capacity))
 
 
 def _balance(prepared: Prepared, airframe: Airframe, capacity: int) -> Balance | None:

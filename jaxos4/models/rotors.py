@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._custom_types import RotorSpeeds, Scalar
+from .._custom_types import Count, RotorSpeeds, Scalar
 from ..flight import Inputs
 
 Speed = Float[Array, "*samples"]
@@ -23,7 +23,7 @@ class Grid(NamedTuple):
     """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that.
 
     `elapsed`: since the recording began [s]. `voltage`: the battery's, divided by the voltage to which the airframe's
-    rotor speeds belong.
+    rotor speeds belong. `length`: see `Inputs`.
     """
 
     dt: Scalar
@@ -32,6 +32,7 @@ class Grid(NamedTuple):
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]
     voltage: Float[Array, " samples"] | None = None
+    length: Count | None = None
 
     @classmethod
     def of(
@@ -47,7 +48,7 @@ class Grid(NamedTuple):
         stretches = inputs.stretches or (zeros, zeros, zeros + samples - 1)
         recording = zeros if recordings is None else jnp.asarray(recordings)[stretches[0]]
         elapsed = inputs.dt * (jnp.arange(samples) - jnp.searchsorted(recording, recording))
-        return cls(inputs.dt, *stretches, elapsed, voltage)
+        return cls(inputs.dt, *stretches, elapsed, voltage, inputs.length)
 
 
 class Speeds(NamedTuple):
@@ -159,6 +160,8 @@ class Motor(NamedTuple):
 
 def driven(omega: RotorSpeeds, motor: Motor, grid: Grid) -> Speeds:
     """Speeds of rotors whose motors follow commands [rad/s]. A stretch begins at the speed of its first command."""
+    settled, is_first = motor.settled(omega), grid.first == jnp.arange(omega.shape[0])
+    rows = omega, settled, is_first
 
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
@@ -166,6 +169,13 @@ def driven(omega: RotorSpeeds, motor: Motor, grid: Grid) -> Speeds:
         end = motor.step(begin, command, grid.dt)
         return end, (begin, end)
 
-    settled, is_first = motor.settled(omega), grid.first == jnp.arange(omega.shape[0])
-    begin, end = jax.lax.scan(over_a_sample, settled[0], (omega, settled, is_first))[1]
+    def fill(i: Count, carry):
+        speed, *filled = carry
+        speed, found = over_a_sample(speed, jax.tree.map(lambda leaf: leaf[i], rows))
+        return speed, *(before.at[i].set(now) for before, now in zip(filled, found, strict=True))
+
+    if grid.length is None:
+        begin, end = jax.lax.scan(over_a_sample, settled[0], rows)[1]
+    else:
+        begin, end = jax.lax.fori_loop(0, grid.length, fill, (settled[0], omega, omega))[1:]
     return Speeds(begin, end, end - begin)

@@ -3,7 +3,7 @@
 from .abstract import AbstractProblem as AbstractProblem, Stages as Stages
 from .batching import in_blocks as in_blocks
 from .innovations import InnovationsProblem as InnovationsProblem
-from .padding import pad_flight as pad_flight, padded as padded
+from .padding import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded
 from .problem import ShootingProblem as ShootingProblem
 from .rows import Rows as Rows, each_window as each_window
 from .scans import FASTEST as FASTEST, Curvature as Curvature, Length as Length, Parts as Parts, Shot as Shot

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Numeric, Parameters, Scalar
+from .._custom_types import Count, Numeric, Parameters, Scalar
 from ..models.state import Forcing, Rates, State
 from .scans import FASTEST
 
@@ -33,6 +33,9 @@ _Row = tuple[Channels, Bool[Array, " segments"]]
 
 LAGS = 8
 """The largest lag at which innovations are compared, in samples."""
+
+BLOCK = 32
+"""So many rows are filtered, and then their likelihood is summed."""
 
 # The number of body rates, which come first among the channels.
 _RATES = 3
@@ -182,22 +185,24 @@ def _predict(p: _Covariance, step: _Step) -> _Covariance:
 
 def gains_of(observed: Observed, noise: LogNoise, dt: Scalar) -> Gains:
     """The gains of the filters of all channels."""
-    is_measured, step = ~jnp.isnan(observed.measured), _step_of(noise, dt)
+    return _gains(_first_covariance(observed, noise, dt), noise, observed, dt)[1]
+
+
+def _first_covariance(observed: Observed, noise: LogNoise, dt: Scalar) -> _Covariance:
+    zero = jnp.zeros(observed.measured.shape[1:], dtype=float)
+    return _Covariance(zero, zero, zero + _step_of(noise, dt).variance)
+
+
+def _gains(p: _Covariance, noise: LogNoise, observed: Observed, dt: Scalar) -> tuple[_Covariance, Gains]:
+    """The gains of some rows, and the covariance after them, from that before them."""
+    step = _step_of(noise, dt)
 
     def body(p: _Covariance, row):
         is_measured, restart = row
         p, gain = _measure(_restart(p, restart, step), is_measured, step)
         return _predict(p, step), gain
 
-    zero = jnp.zeros(is_measured.shape[1:], dtype=float)
-    first = _Covariance(zero, zero, zero + step.variance)
-    return jax.lax.scan(body, first, (is_measured, observed.restart))[1]
-
-
-def filter_gains(observed: Observed, noise: LogNoise, dt: Scalar) -> tuple[Gains, Gains]:
-    """`gains_of`, and its derivatives in the three logarithms, on the second axis."""
-    found, push = jax.linearize(lambda noise: gains_of(observed, noise, dt), noise)
-    return found, jax.vmap(push, out_axes=1)(_basis(noise))
+    return jax.lax.scan(body, p, (~jnp.isnan(observed.measured), observed.restart))
 
 
 def _basis(noise: LogNoise) -> LogNoise:
@@ -246,6 +251,19 @@ def _advance(
     return _Known(Rates(*pushed), faded), errors
 
 
+class _Carry(NamedTuple):
+    """The state of the filters between blocks of rows, each part with its derivatives, and the sums so far.
+
+    - `covariance`: derivatives in the noise on the first axis. `known`: in all unknowns on the first axis.
+    - `last`: the last `LAGS` standardised innovations.
+    """
+
+    covariance: tuple[_Covariance, _Covariance]
+    known: tuple[_Known, _Known]
+    last: Float[Array, "lags channels segments"]
+    sums: Innovations
+
+
 def innovate(
     move: Move,
     observe: Observe,
@@ -255,6 +273,7 @@ def innovate(
     noise: LogNoise,
     dt: Scalar,
     *,
+    rows: Count | int,
     forcing_tangents: Forcing | None,
     forcing_parameters: tuple[int, ...],
 ) -> Innovations:
@@ -266,13 +285,61 @@ def innovate(
 
     - `move`, `observe`: from a state, the forcing and the parameters, the state one sample later and the outputs of the
       sensors.
+    - `observed`: its number of rows is a multiple of `BLOCK`.
     - `forcing`: leaves (time, segments). `forcing_tangents`: their derivatives (time, positions, segments) in the
       parameters at the positions `forcing_parameters`.
+    - `rows`: how many rows are filtered; the others are padding. It is data, so that flights of different lengths share
+      a program.
     """
-    count, (_, channels, segments) = parameters.shape[0], observed.measured.shape
-    scalars, positions, unknowns = tuple(parameters), np.asarray(forcing_parameters, dtype=int), count + 3
-    basis = tuple(np.eye(unknowns, count, dtype=parameters.dtype).T)
-    gains, gain_slopes = filter_gains(observed, noise, dt)
+    count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
+    unknowns, first = count + 3, _first_covariance(observed, noise, dt)
+    push = jax.linearize(lambda noise: _first_covariance(observed, noise, dt), noise)[1]
+    start = _start(observed, jnp.zeros((channels, segments), dtype=float))
+    zero = jnp.zeros(segments, dtype=float)
+    known = _Known(Rates(*start[:_RATES]), (zero,) * channels)
+    nothing = Innovations(
+        cost=zero,
+        sound=jnp.ones(segments, dtype=bool),
+        gradient=jnp.zeros((channels, unknowns, segments), dtype=float),
+        information=jnp.zeros((channels, unknowns, unknowns, segments), dtype=float),
+        products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
+    )
+    carry = _Carry(
+        (first, jax.vmap(push)(_basis(noise))),
+        (known, jax.tree.map(lambda leaf: jnp.zeros((unknowns, *leaf.shape), dtype=float), known)),
+        jnp.zeros((LAGS, channels, segments), dtype=float),
+        nothing,
+    )
+    filtered = functools.partial(
+        _filter_rows, move, observe, parameters, noise, dt, np.asarray(forcing_parameters, int)
+    )
+    data = observed._replace(known=None), forcing, forcing_tangents
+    blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
+
+    def block(i: Count, carry: _Carry) -> _Carry:
+        return filtered(carry, *jax.tree.map(lambda leaf: leaf[i], blocks))
+
+    return jax.lax.fori_loop(0, -(-rows // BLOCK), block, carry).sums
+
+
+def _filter_rows(
+    move: Move,
+    observe: Observe,
+    parameters: Parameters,
+    noise: LogNoise,
+    dt: Scalar,
+    positions: np.ndarray,
+    carry: _Carry,
+    observed: Observed,
+    forcing: Forcing,
+    forcing_tangents: Forcing | None,
+) -> _Carry:
+    """The filters after some more rows. Other arguments as of `innovate`."""
+    count, segments = parameters.shape[0], observed.measured.shape[2]
+    scalars, basis = tuple(parameters), tuple(np.eye(count + 3, count, dtype=parameters.dtype).T)
+    (at, gains), push = jax.linearize(lambda p, noise: _gains(p, noise, observed, dt), carry.covariance[0], noise)
+    by_noise, gain_slopes = jax.vmap(push, out_axes=(0, 1))(carry.covariance[1], _basis(noise))
+    covariance = at, by_noise
     advance = functools.partial(_advance, *(jax.vmap(each, in_axes=(0, 0, None)) for each in (move, observe)))
 
     def over_a_sample(noise: LogNoise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
@@ -295,7 +362,7 @@ def innovate(
         direction = _Feedback(*by_gain, *by_noise)
         at, directions = (known, scalars, feedback), (slopes, basis, direction)
         if tangents is not None:
-            wide = jax.tree.map(lambda t: jnp.zeros((unknowns, segments), dtype=float).at[positions].set(t), tangents)
+            wide = jax.tree.map(lambda t: jnp.zeros((count + 3, segments), dtype=float).at[positions].set(t), tangents)
             at, directions = (*at, forcing), (*directions, wide)
 
         def step(known: _Known, scalars, feedback: _Feedback, forcing: Forcing = forcing):
@@ -305,25 +372,23 @@ def innovate(
         slopes, by_errors = jax.vmap(push)(*directions)
         return (known, slopes, sound), (jnp.stack(errors), jnp.stack(by_errors))
 
-    zero = jnp.zeros(segments, dtype=float)
-    start = _start(observed, jnp.zeros((channels, segments), dtype=float))
-    first = _Known(Rates(*start[:_RATES]), (zero,) * channels)
-    slopes = jax.tree.map(lambda leaf: jnp.zeros((unknowns, *leaf.shape), dtype=float), first)
     rows = forcing, forcing_tangents, gains, gain_slopes, (observed.measured, observed.restart)
-    (_, _, sound), (errors, slopes) = jax.lax.scan(body, (first, slopes, jnp.ones(segments, dtype=bool)), rows)
-
-    return _likelihood(observed, gains, gain_slopes.variance, sound, errors, slopes)
+    (known, known_slopes, sound), (errors, slopes) = jax.lax.scan(body, (*carry.known, carry.sums.sound), rows)
+    found, last = _likelihood(observed, gains, gain_slopes.variance, carry.last, sound, errors, slopes)
+    sums = jax.tree.map(jnp.add, carry.sums, found)._replace(sound=sound)
+    return _Carry(covariance, (known, known_slopes), last, sums)
 
 
 def _likelihood(
     observed: Observed,
     gains: Gains,
     variance_slopes: Float[Array, "time 3 channels segments"],
+    last: Float[Array, "lags channels segments"],
     sound: Bool[Array, " segments"],
     errors: Series,
     slopes: Float[Array, "time channels unknowns segments"],
-) -> Innovations:
-    """The likelihood of innovations `errors` with the derivatives `slopes`."""
+) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
+    """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations."""
     count = slopes.shape[2] - 3
     counts = ~jnp.isnan(observed.measured) & observed.counts[:, None]
     weight = jnp.where(counts, 1 / gains.variance, 0.0)
@@ -335,6 +400,7 @@ def _likelihood(
     information = jnp.einsum("tcul,tcvl->cuvl", slopes * weight[:, :, None], slopes)
     information = information.at[:, count:, count:].add(jnp.einsum("tcul,tcvl->cuvl", relative, relative) / 2)
     cost = (weight * errors**2 + logarithm).sum(axis=(0, 1)) / 2
-    standard = jnp.sqrt(weight) * errors
-    products = [(standard[lag:] * standard[: standard.shape[0] - lag]).sum(axis=0) for lag in range(LAGS + 1)]
-    return Innovations(cost, sound, gradient, information, jnp.stack(products, axis=1))
+    standard = jnp.concatenate([last, jnp.sqrt(weight) * errors])
+    now = standard[LAGS:]
+    products = [(now * standard[LAGS - lag : standard.shape[0] - lag]).sum(axis=0) for lag in range(LAGS + 1)]
+    return Innovations(cost, sound, gradient, information, jnp.stack(products, axis=1)), standard[-LAGS:]

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
@@ -29,7 +30,7 @@ from .filters import Innovations, LogNoise, Observed, innovate
 from .problem import ShootingProblem
 from .rows import Rows, windowed
 from .scans import Curvature, Parts, Shot
-from .segments import observe_in_segments, owned, segments_of
+from .segments import Segments, observe_in_segments
 from .unknowns import Unknowns, Values
 
 # The number of samples in a segment, and of those that settle its filter.
@@ -70,6 +71,8 @@ class InnovationsProblem(AbstractProblem):
       sigma do not matter.
     - `segment`: about how many samples are filtered in a row; segments are filtered in parallel. A short segment loses
       information if the disturbance is weak, because its filter begins without memory.
+    - `segments`: how many segments there are, instead. Padded flights (`ShootingProblem.length`) with equal numbers of
+      segments and equal room share a program, whatever their lengths.
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
@@ -80,6 +83,7 @@ class InnovationsProblem(AbstractProblem):
     problem: ShootingProblem
     start: Values = eqx.field(converter=as_float)
     segment: int = eqx.field(static=True, default=SEGMENT)
+    segments: int | None = eqx.field(static=True, default=None)
     settling: int = eqx.field(static=True, default=SETTLING)
     balance: Balance | None = None
 
@@ -88,12 +92,14 @@ class InnovationsProblem(AbstractProblem):
         problem: ShootingProblem,
         *,
         segment: int = SEGMENT,
+        segments: int | None = None,
         settling: int = SETTLING,
         start: Float[ArrayLike, " unknowns"] | None = None,
         balance: Balance | None = None,
     ):
         self.balance = None if balance is None else jax.tree.map(as_float, balance)
         self.problem, self.segment, self.settling = problem.restrict("rates"), segment, settling
+        self.segments = segments
         # An array in any case, so that all starts share one program.
         unknowns = problem.unknowns.count + 3 * self.problem.columns.size
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
@@ -124,9 +130,14 @@ class InnovationsProblem(AbstractProblem):
         return 0
 
     @property
-    def index(self) -> Int[np.ndarray, "segments time"]:
+    def cut(self) -> Segments:
         """The samples of each segment."""
-        return segments_of(self.flight.time.shape[0], self.segment, self.settling)
+        room, length = self.flight.time.shape[0], self.problem.length
+        if self.segments is None:
+            return Segments.of(room, self.segment, self.settling)
+        # A length that is known needs no compiled program.
+        samples = room if length is None else length if isinstance(length, Tracer) else int(length)
+        return Segments.number(self.segments, room, samples, self.settling)
 
     @property
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -241,7 +252,7 @@ class InnovationsProblem(AbstractProblem):
 
     def observed(self) -> Observed:
         """The measurements in segments, see `observe_in_segments`."""
-        return observe_in_segments(self.problem, self.index, self.settling)
+        return observe_in_segments(self.problem, self.cut, self.settling)
 
     def innovations(self, parameters: Parameters, noise: LogNoise) -> Innovations:
         """The innovations of all segments."""
@@ -251,7 +262,7 @@ class InnovationsProblem(AbstractProblem):
         self, observed: Observed
     ) -> Callable[[Parameters, LogNoise, Forcing, Forcing | None], Innovations]:
         """The innovations of all segments, as a function of the parameters, the noise, and what `_forced` returns."""
-        problem, model, dt = self.problem, self.model, self.flight.dt
+        problem, model, dt, rows = self.problem, self.model, self.flight.dt, self.cut.rows
 
         def at(parameters: Parameters, noise: LogNoise, forcing: Forcing, tangents: Forcing | None) -> Innovations:
             return innovate(
@@ -262,6 +273,7 @@ class InnovationsProblem(AbstractProblem):
                 parameters,
                 noise,
                 dt,
+                rows=rows,
                 forcing_tangents=tangents,
                 forcing_parameters=model.forcing_parameters,
             )
@@ -270,9 +282,9 @@ class InnovationsProblem(AbstractProblem):
 
     def _forced(self) -> Callable[[Parameters], tuple[Forcing, Forcing | None]]:
         """The forcing of all segments and its tangents, as functions of the parameters; segments are the last axis."""
-        problem, inputs = self.problem, self.flight.inputs
-        samples = np.minimum(self.index, self.flight.time.shape[0] - 1)
-        rows = Rows(windowed(problem.forcing(self.model.alpha), samples), ())
+        problem, inputs = self.problem, self.flight.inputs._replace(length=self.problem.length)
+        samples = jnp.minimum(jnp.asarray(self.cut.place), self.flight.time.shape[0] - 1)
+        rows = Rows(windowed(self.model.forcing(inputs, self.model.alpha), samples), ())
 
         def forced(parameters: Parameters) -> tuple[Forcing, Forcing | None]:
             found = problem.with_forcing(rows, parameters, inputs=inputs, index=samples)
@@ -285,8 +297,9 @@ class InnovationsProblem(AbstractProblem):
         balance, model = self.balance, self.model
         if balance is None or not isinstance(model, FlightModel) or 2 not in model.force_axes:
             return None
-        index, samples = self.index, self.flight.time.shape[0]
-        weight = jnp.where(owned(index, samples, self.settling), balance.weight[np.minimum(index, samples - 1)], 0.0).T
+        index, owned, _ = self.cut
+        place = jnp.minimum(jnp.asarray(index), self.flight.time.shape[0] - 1)
+        weight = jnp.where(owned, balance.weight[place], 0.0).T
         positions = np.asarray(model.forcing_parameters, dtype=int)
 
         def excess(parameters: Parameters, thrust: Array, forcing: Forcing) -> Scalar:

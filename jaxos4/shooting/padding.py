@@ -22,11 +22,16 @@ def padded(problem: ShootingProblem) -> ShootingProblem:
     A flight in windows is not padded.
     """
     samples = problem.flight.time.shape[0]
-    capacity = next((capacity for capacity in _CAPACITIES if capacity >= samples), None)
-    if capacity is None or problem.windows > 1 or problem.length is not None:
+    capacity = capacity_of(samples)
+    if capacity == samples or problem.windows > 1 or problem.length is not None:
         return problem
     longer, length = pad_flight(problem.flight, capacity), jax.device_put(np.asarray(samples))
     return eqx.tree_at(lambda p: (p.flight, p.length), problem, (longer, length), is_leaf=lambda leaf: leaf is None)
+
+
+def capacity_of(samples: int) -> int:
+    """The number of rows of a padded flight; `samples` if it is not padded."""
+    return next((capacity for capacity in _CAPACITIES if capacity >= samples), samples)
 
 
 def pad_flight(flight: Flight, capacity: int) -> Flight:

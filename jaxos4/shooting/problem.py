@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialState, InitialStates, Parameters, Scalar, StateVector, as_float
+from .._custom_types import InitialState, InitialStates, Numeric, Parameters, Scalar, StateVector, as_float
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight, Inputs
@@ -177,7 +177,7 @@ class ShootingProblem(AbstractProblem):
         parameters: Parameters,
         *,
         inputs: Inputs | None = None,
-        index: Int[np.ndarray, "windows length"] | None = None,
+        index: Int[Numeric, "windows length"] | None = None,
     ) -> Rows:
         """Recompute the forcing for these parameters, with its derivatives.
 

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
-import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._custom_types import Numeric
 from ..models.state import Forcing
 
 Series = TypeVar("Series", Forcing, tuple[Array, ...])
@@ -32,7 +32,7 @@ def each_window(function: Callable, *arguments: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[None], function(*only))
 
 
-def windowed(series: Series, index: Int[np.ndarray, "windows length"]) -> Series:
+def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
     """The series of each window, from those of the flight. Windows of equal length need no copy."""
 
     def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:

@@ -4,46 +4,64 @@ A filter that starts in the middle of a flight does not know the disturbance, an
 of a segment settle the filter.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from .._custom_types import Count, Numeric
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, CHANNELS
-from .filters import Observed
+from .filters import BLOCK, Observed
 from .problem import ShootingProblem
 
 # A gap of this length ends what a filter knows [s].
 _GAP = 0.1
 
 
-def segments_of(samples: int, wanted: int, settling: int) -> Int[np.ndarray, "segments time"]:
-    """The samples of each segment, of which there are about `wanted` after those that settle its filter.
+class Segments(NamedTuple):
+    """How a flight is cut.
 
     A segment begins with the end of the segment before it, which its filter needs to settle. The first begins with the
     flight. Samples beyond the last do not exist.
+
+    - `place`: the samples of each segment, in a multiple of `BLOCK` rows.
+    - `owned`: whether a sample belongs to a segment. Each belongs to one; in other segments it settles the filter.
+    - `rows`: of the segments; what follows is padding.
     """
-    segments = max(round((samples - settling) / wanted), 1)
-    settling = settling if segments > 1 else 0
-    length = -(-(samples - settling) // segments)
-    return length * np.arange(segments)[:, None] + np.arange(settling + length)
+
+    place: Int[Numeric, "segments time"]
+    owned: Bool[Numeric, "segments time"]
+    rows: Count | int
+
+    @classmethod
+    def of(cls, samples: int, wanted: int, settling: int) -> "Segments":
+        """Segments with about `wanted` samples after those that settle the filter."""
+        number = max(round((samples - settling) / wanted), 1)
+        return cls.number(number, samples, samples, settling)
+
+    @classmethod
+    def number(cls, number: int, capacity: int, samples: Count | int, settling: int) -> "Segments":
+        """So many segments of a flight with room for `capacity` samples, of which some exist."""
+        settling = settling if number > 1 else 0
+        length, most = -(-(samples - settling) // number), -(-(capacity - settling) // number)
+        row, segment = np.arange(-(-(settling + most) // BLOCK) * BLOCK), np.arange(number)[:, None]
+        samples_of = length * segment + row
+        owned = (row < settling + length) & ((row >= settling) | (segment == 0)) & (samples_of < samples)
+        return cls(samples_of, owned, settling + length)
 
 
-def owned(index: Int[np.ndarray, "segments time"], samples: int, settling: int) -> Bool[np.ndarray, "segments time"]:
-    """Whether a sample belongs to a segment. Each belongs to one; in other segments it settles the filter."""
-    return ((np.arange(index.shape[1]) >= settling) | (index[:, :1] == 0)) & (index < samples)
-
-
-def observe_in_segments(problem: ShootingProblem, index: Int[np.ndarray, "segments time"], settling: int) -> Observed:
+def observe_in_segments(problem: ShootingProblem, segments: Segments, settling: int) -> Observed:
     """The measurements in segments, where filters restart, and which innovations count.
 
     A filter restarts in a gap, and where another stretch begins. Until it has settled its innovations do not count:
     the controller knew the disturbance then, and the filter does not. At the beginning of a flight in one piece
     they count: a simulation begins at rest.
     """
-    flight, samples, segments = problem.flight, problem.flight.time.shape[0], index.shape[0]
-    exists, place = (index < samples).T, np.minimum(index, samples - 1)
+    flight, index, samples = problem.flight, jnp.asarray(segments.place), problem.flight.time.shape[0]
+    exists, place = (index < samples).T, jnp.minimum(index, samples - 1)
     measured = problem.measured()
     restart, settled = _restarts(jnp.isnan(measured[:, :3]).all(axis=1), flight, settling)
 
@@ -53,13 +71,13 @@ def observe_in_segments(problem: ShootingProblem, index: Int[np.ndarray, "segmen
     known = None
     begins = np.broadcast_to(np.arange(index.shape[1])[:, None] == 0, exists.shape)
     if problem.initial_state is not None:
-        is_first = np.arange(segments) == 0
+        is_first = np.arange(index.shape[0]) == 0
         begins = begins & ~is_first
         rates = problem.initial_state[CASCADE_ORDER[: CHANNELS["rates"]]]
         known = jnp.where(is_first, rates[:, None], 0.0)
     restarts = in_segments(restart) | begins | ~exists
     measured = jnp.where(exists[:, None], in_segments(measured), jnp.nan)
-    return Observed(measured, restarts, in_segments(settled) & owned(index, samples, settling).T, known)
+    return Observed(measured, restarts, in_segments(settled) & segments.owned.T, known)
 
 
 def _restarts(
