@@ -3,7 +3,8 @@
 The flights are those of `run.py`: a quadrotor as small as a Crazyflie, 20 s of random references, gusts of 5 rad/s^2.
 Each case adds one effect, of the size in `EFFECTS`. In the case `all`, each flight has every effect, with a random
 share of its size. Clock offsets and flapping have random signs. The airframe that is given, also to the controller, has
-a thrust coefficient that is 20 % wrong and moments of inertia that are 25 % wrong. The true thrust of `sag` is that at
+a thrust coefficient that is 20 % wrong and moments of inertia that are 25 % wrong. The motors of `motors` are those of a
+Crazyflie. The true thrust of `sag` is that at
 the begin of the flight; on average it is 5 % smaller.
 """
 
@@ -33,12 +34,13 @@ GUST = 5.0  # [rad/s^2]
 class Effect(NamedTuple):
     """Settings of `Air`, `Sensors` and `ClosedLoop`, and those that cannot be mixed in one batch.
 
-    `fastest`: the largest speed of the rotors as a share of that of `VEHICLE`.
+    `motor`: by how much `thrust_curve` and `motor_braking` are below 1. `fastest`: the largest speed of the rotors as a share of that of `VEHICLE`.
     """
 
     air: dict = {}
     sensors: dict = {}
     loop: dict = {}
+    motor: dict = {}
     fastest: float = 1.0
     log_every: int = 1
     logged: str = "commands"
@@ -55,6 +57,7 @@ EFFECTS = {
     "clock": Effect(sensors={"clock_offset": 0.004}),
     "dropouts": Effect(sensors={"dropouts": 0.03}),
     "bad samples": Effect(sensors={"bad_samples": 5.0}),
+    "motors": Effect(motor={"thrust_curve": 0.12, "motor_braking": 0.65}),
     "sag": Effect(loop={"sag": 0.1}),
     "saturation": Effect(fastest=0.78),
 }
@@ -72,15 +75,16 @@ def effect_of(kind: str, random: np.random.Generator) -> Effect:
         signs = {name: random.choice([-1, 1]) if name in _SIGNED else 1 for name in settings}
         return {name: size * shares[name] * signs[name] for name, size in settings.items()}
 
-    air, sensors, loop = (
-        drawn({k: v for e in every for k, v in getattr(e, part).items()}) for part in ("air", "sensors", "loop")
+    air, sensors, loop, motor = (
+        drawn({k: v for e in every for k, v in getattr(e, part).items()})
+        for part in ("air", "sensors", "loop", "motor")
     )
     if not single:
         # Half of the controllers answer the log.
         sensors["controller_gyro_noise"] = 0.02 * random.uniform() if random.uniform() < 0.5 else None
     fastest = min(e.fastest for e in every)
     fastest = fastest if single else 1 - random.uniform() * (1 - fastest)
-    return Effect(air, sensors, loop, fastest, max(e.log_every for e in every), every[0].logged)
+    return Effect(air, sensors, loop, motor, fastest, max(e.log_every for e in every), every[0].logged)
 
 
 def flights_of(kind: str, flights: int, duration: float, seed: int) -> list[jaxos4.Flight | None]:
@@ -90,6 +94,7 @@ def flights_of(kind: str, flights: int, duration: float, seed: int) -> list[jaxo
         effect = effect_of(kind, np.random.default_rng([seed, i]))
         vehicle = eqx.tree_at(lambda a: a.max_rotor_speed, VEHICLE, VEHICLE.max_rotor_speed * effect.fastest)
         settings = {"gust": GUST, "rotor_lag": LAG, "rotor_delay": DELAY, **effect.loop}
+        settings |= {name: 1 - below for name, below in effect.motor.items()}
         loop = jaxos4.ClosedLoop(
             vehicle,
             air=jaxos4.Air(**effect.air),
