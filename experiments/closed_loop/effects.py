@@ -3,9 +3,8 @@
 The flights are those of `run.py`: a quadrotor as small as a Crazyflie, 20 s of random references, gusts of 5 rad/s^2.
 Each case adds one effect, of the size in `EFFECTS`. In the case `all`, each flight has every effect, with a random
 share of its size. Clock offsets and flapping have random signs. The airframe that is given, also to the controller, has
-a thrust coefficient that is 20 % wrong and moments of inertia that are 25 % wrong. The motors of `motors` are those of a
-Crazyflie. The true thrust of `sag` is that at
-the begin of the flight; on average it is 5 % smaller.
+a thrust coefficient that is 20 % wrong and moments of inertia that are 25 % wrong. The motors of `motors` are those of
+a Crazyflie. The true thrust of `sag` is that at the begin of the flight; on average it is 5 % smaller.
 """
 
 import itertools
@@ -34,7 +33,8 @@ GUST = 5.0  # [rad/s^2]
 class Effect(NamedTuple):
     """Settings of `Air`, `Sensors` and `ClosedLoop`, and those that cannot be mixed in one batch.
 
-    `motor`: by how much `thrust_curve` and `motor_braking` are below 1. `fastest`: the largest speed of the rotors as a share of that of `VEHICLE`.
+    `motor`: by how much `thrust_curve` and `motor_braking` are below 1. `fastest`: the largest speed of the rotors as a
+    share of that of `VEHICLE`.
     """
 
     air: dict = {}
