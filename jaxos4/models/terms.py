@@ -301,7 +301,7 @@ TERMS: dict[str, Term] = {
             # Small vehicles have 0.02 to 0.1 s.
             TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_contradicts_lag),
             TermParameter("thrust_curve", "1", 0.25, center=0.85, contradiction=_contradicts_curve),
-            TermParameter("motor_braking", "1", 0.3, center=0.5, nonnegative=True),
+            TermParameter("motor_braking", "1", 0.5, center=0.5, nonnegative=True),
         ),
         # A measured specific force tells the propellers' load from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),
