@@ -1,6 +1,5 @@
 """PX4's logs: our frame and units, any rates of logging, and one line for a damaged file."""
 
-import builtins
 import struct
 
 import numpy as np
@@ -186,19 +185,6 @@ BOMBS = {  # formats that announce much
     "empty arrays": message("F", b"sensor_combined:uint64_t timestamp;sensor_combined[0] inner;"),
     "long": b"\xff\xff\x01" * 2000,
 }
-
-
-def test_without_pyulog_it_is_said_what_to_install(save, monkeypatch):
-    path, original = save(everything()), builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.startswith("pyulog"):
-            raise ImportError(name)
-        return original(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match=r"install jaxos4\[ulog\]\.$"):
-        read_log(path)
 
 
 def parameter(name, value):

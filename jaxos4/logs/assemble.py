@@ -13,7 +13,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
-from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, uniform_grid, unwrap
+from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, unwrap
 from .table import (
     COMMAND_NAMES as COMMAND_NAMES,
     LIMITS,
@@ -75,8 +75,19 @@ def recording_of(
     channels, voltage = _channels(table, found), _voltage(table)
     with_force = any(map(table.holds, FORCE_NAMES))
     commanded = motors is COMMAND_NAMES
-    table = table._replace(columns={"t": table.columns["t"]})  # frees the memory of a long log
-    time, omega, channels, voltage = _evenly(table, dt, omega, channels, voltage, found)
+    t = table.columns["t"]
+    table = table._replace(columns={"t": t})  # frees the memory of a long log
+    samples = grid_size(t, dt)
+    if samples > min(MAX_ROWS, _MOST_SAMPLES + 10 * t.size):
+        row = int(np.argmax(np.diff(t)))
+        what = f"comes after a gap of {t[row + 1] - t[row]:.6g} s: at the median step of {dt:.3g} s the flight would "
+        table.refuse(what + f"have {samples:.3g} samples; cut the file there", index=row + 1, column="t")
+    (time, omega, channels), figures = resample(t, omega, channels, dt)
+    if figures:
+        found.append(figures)
+        voltage = None if voltage is None else np.interp(time, t, voltage)
+    if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
+        table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
     dt = float(time[-1] - time[0]) / (time.size - 1)
     if np.finfo(jnp.result_type(float)).eps * abs(time[0]) > UNIFORM * dt:
         found.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
@@ -283,23 +294,3 @@ def _voltage(table: Table) -> np.ndarray | None:
     t, voltage = table.columns["t"], table.columns["voltage"]
     measured = voltage > 0
     return np.interp(t, t[measured], voltage[measured]) if measured.any() else None
-
-
-def _evenly(
-    table: Table, dt: float, omega: np.ndarray, channels: np.ndarray, voltage: np.ndarray | None, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Time, rotor speeds, channels and voltage on a uniform grid. Rows that already lie on one keep their values."""
-    t = table.columns["t"]
-    time = uniform_grid(t)
-    if time is not None:
-        return time, omega, channels, voltage
-    samples = grid_size(t, dt)
-    if samples > min(MAX_ROWS, _MOST_SAMPLES + 10 * t.size):
-        row = int(np.argmax(np.diff(t)))
-        what = f"comes after a gap of {t[row + 1] - t[row]:.6g} s: at the median step of {dt:.3g} s the flight would "
-        table.refuse(what + f"have {samples:.3g} samples; cut the file there", index=row + 1, column="t")
-    (time, omega, channels), figures = resample(t, omega, channels, dt)
-    notes.append(figures)
-    if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
-        table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
-    return time, omega, channels, None if voltage is None else np.interp(time, t, voltage)

@@ -1,4 +1,4 @@
-"""ULog: the logs of PX4. Reading needs `pip install 'jaxos4[ulog]'`.
+"""ULog: the logs of PX4.
 
 | column | topic and field of the log | unit in the log |
 | --- | --- | --- |

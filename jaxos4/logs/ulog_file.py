@@ -1,16 +1,11 @@
 """A ULog file: its topics as series in our frame, and the autopilot's parameters.
 
-A walk over the messages checks the file, and keeps only what a flight needs, before pyulog decodes it. pyulog alone
-does not return within 20 s from a file of 500 bytes whose formats nest arrays in arrays (1e8 fields), takes the zeros
-that a loss of power leaves at the end of a file for corruption, and names no place in the file.
+Only the topics that a flight needs are decoded. What a message announces is checked before memory is used for it.
 
 Reference: the ULog file format in the PX4 user guide.
 """
 
-import contextlib
-import io
 import math
-import os
 import re
 import struct
 from collections.abc import Sequence
@@ -18,8 +13,6 @@ from typing import IO, NamedTuple, NoReturn
 
 import numpy as np
 
-from .._files import BROKEN
-from ..errors import InputError
 from .sampling import Series, in_order, logged_rate
 from .table import Path, opened, printable, refuse
 
@@ -31,7 +24,12 @@ _MOST_FIELDS = 1024  # of one message, with those of arrays and nested messages;
 _DEEPEST = 3  # levels of messages inside messages
 _HEADER = struct.Struct("<HB")
 _FIELD = re.compile(rb"([A-Za-z0-9_]+)(?:\[(\d{1,5})\])? ([A-Za-z0-9_]+)")
-_BASIC = re.compile(rb"u?int(8|16|32|64)_t|float|double|bool|char")
+_BASIC = {
+    f"{sign}int{8 * size}_t".encode(): f"<{code}{size}"
+    for sign, code in (("", "i"), ("u", "u"))
+    for size in (1, 2, 4, 8)
+}
+_BASIC |= {b"float": "<f4", b"double": "<f8", b"bool": "i1", b"char": "i1"}
 _PARAMETER = re.compile(rb"(int32_t|float) ([A-Za-z0-9_]{1,32})")
 
 Fields = dict[str, np.ndarray]
@@ -125,91 +123,96 @@ class Topics(NamedTuple):
 
 def decoded(path: Path, topics: Sequence[str]) -> Topics:
     """Decode the topics that are needed. Raises `InputError`, one line, for a file that cannot be decoded."""
-    walk = _Walk(path, {name.encode() for name in topics})
+    walk = _Walk(path, topics)
     with opened(path, "rb") as file:
-        content, cut = walk.through(file)
-    try:
-        from pyulog.core import ULog
-        from pyulog.exceptions import ULogException
-    except ImportError:
-        name = printable(os.fspath(path))
-        raise InputError(f"{name}: reading a ULog file needs pyulog; install jaxos4[ulog].") from None
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            log = ULog(io.BytesIO(content))
-    except (*BROKEN, ULogException) as error:
-        refuse(path, f"cannot be decoded ({type(error).__name__}); copy the log again from the vehicle")
-    if log.file_corruption:
-        refuse(path, "is corrupt: a message does not have its topic's size; copy the log again from the vehicle")
+        cut = walk.through(file)
     found: dict[str, list[Fields]] = {}
-    for data in sorted(log.data_list, key=lambda data: data.multi_id):
-        if "timestamp" in data.data:
-            found.setdefault(data.name, []).append(data.data)
+    for name, _, layout, data in sorted(walk.announced.values(), key=lambda each: each.instance):
+        records = np.frombuffer(data, layout) if data else np.empty(0)
+        if records.size and "timestamp" in (names := layout.names or ()):
+            found.setdefault(name, []).append({field: records[field] for field in names})
     notes = [f"the log ends abruptly: its last {cut} bytes are ignored"] * (cut > 0)
     return Topics(path, found, walk.parameters, {}, notes)
 
 
+class _Announced(NamedTuple):
+    """One instance of a topic, with the bytes of its samples."""
+
+    topic: str
+    instance: int
+    layout: np.dtype
+    data: bytearray
+
+
 class _Walk:
-    """One pass through a file, which keeps the formats and data of `topics`, and the autopilot's parameters.
+    """One pass through a file, which keeps the samples of `topics`, and the autopilot's parameters.
 
     A loss of power ends a log in the middle of a message or fills its end with zeros. All messages before are kept. If
     a parameter was changed while the log was written, its last value counts.
     """
 
-    def __init__(self, path: Path, topics: set[bytes]):
+    def __init__(self, path: Path, topics: Sequence[str]):
         self.path, self.topics, self.position = path, topics, 0
         self.formats: dict[bytes, bytes] = {}
-        self.definitions: dict[bytes, bytes] = {}
-        self.data = bytearray()
+        self.announced: dict[int, _Announced] = {}
+        self.ignored: set[int] = set()  # the numbers of the other topics
         self.appended: tuple[int, ...] = ()
         self.parameters: dict[str, float] = {}
-        self.wanted: dict[int, bool] = {}  # of the topics' numbers
 
-    def through(self, file: IO[bytes]) -> tuple[bytes, int]:
-        """A smaller file, and the number of bytes that were cut off its end. Raises `InputError`."""
+    def through(self, file: IO[bytes]) -> int:
+        """Read the file; returns the number of bytes that were cut off its end. Raises `InputError`."""
         start = file.read(16)
         if not start.startswith(MAGIC):
             refuse(self.path, "is not a ULog file of version 1; give a .ulg file")
         if len(start) < 16:
             refuse(self.path, "ends within its header; copy the log again from the vehicle")
-        self.position, cut = len(start), 0
+        self.position = len(start)
         while header := file.read(3):
             length, kind = _HEADER.unpack(header) if len(header) == 3 else (0, 0)
             appended = min((each for each in self.appended if each > self.position), default=math.inf)
             if self.position + 3 + length > appended:  # the message was cut by a crash; the log goes on after it
                 self.position = file.seek(int(appended))
                 continue
-            message = header + (body := file.read(length))
-            if len(message) < 3 + length:
-                cut = len(message)
-                break
+            body = file.read(length)
+            if len(header) + len(body) < 3 + length:
+                return len(header) + len(body)
             if kind == 0:
-                while message:
-                    if message.strip(b"\0"):
+                rest, cut = header + body, 0
+                while rest:
+                    if rest.strip(b"\0"):
                         self._corrupt("no message begins there")
-                    cut += len(message)
-                    message = file.read(1 << 20)
-                break
-            self._take(chr(kind), message, body)
-            self.position += len(message)
-        return start + b"".join(self.definitions.values()) + bytes(self.data), cut
+                    cut += len(rest)
+                    rest = file.read(1 << 20)
+                return cut
+            self._take(chr(kind), body)
+            self.position += 3 + length
+        return 0
 
-    def _take(self, kind: str, message: bytes, body: bytes) -> None:
+    def _take(self, kind: str, body: bytes) -> None:
         if kind == "D":
-            wanted = self.wanted.get(int.from_bytes(body[:2], "little")) if len(body) > 1 else None
-            if wanted is None:
+            number = int.from_bytes(body[:2], "little")
+            if number in self.announced:
+                if len(body) - 2 != self.announced[number].layout.itemsize:
+                    self._corrupt("a message does not have its topic's size")
+                self.announced[number].data.extend(body[2:])
+            elif number not in self.ignored or len(body) < 2:
                 self._corrupt("data of a topic that was never announced")
-            if wanted:
-                self.data += message
         elif kind == "F":
-            self.formats[body.partition(b":")[0]] = message
+            name, _, fields = body.partition(b":")
+            self.formats[name] = fields
         elif kind == "A":
             if len(body) < 4:
                 self._corrupt("a topic without a name")
-            wanted = self.wanted[int.from_bytes(body[1:3], "little")] = body[3:] in self.topics
-            if wanted:
-                self._define(body[3:], 0)
-                self.data += message
+            number, topic = int.from_bytes(body[1:3], "little"), body[3:].decode(errors="replace")
+            if topic in self.topics:
+                fields = self._layout(body[3:])
+                while fields and fields[-1][0].startswith("_padding"):  # not logged at the end of a message
+                    fields.pop()
+                if len(dict(fields)) < len(fields):
+                    self._corrupt("a field occurs twice")
+                self.announced[number] = _Announced(topic, body[0], np.dtype(fields), bytearray())
+            else:
+                self.ignored.add(number)
         elif kind == "P":
             # A damaged parameter is ignored: the flight does not depend on most of them.
             parts = _PARAMETER.fullmatch(body[1:-4])
@@ -224,24 +227,24 @@ class _Walk:
         elif not "A" <= kind <= "Z":
             self._corrupt("no message begins there")
 
-    def _define(self, name: bytes, depth: int) -> int:
-        """Keep the format of a message and the formats inside it. Returns the number of its fields."""
-        message = self.formats.get(name)
-        if message is None:
+    def _layout(self, name: bytes, depth: int = 0) -> list[tuple[str, str]]:
+        """The fields of a message with their types for NumPy; those of nested messages as `esc[0].esc_rpm`."""
+        if name not in self.formats:
             self._corrupt(f"topic {printable(name[:40].decode(errors='replace'))} has no format")
         if depth > _DEEPEST:
             self._corrupt("messages are nested too deeply")
-        total = 0
-        for field in filter(None, message[3:].partition(b":")[2].split(b";")):
-            parts = _FIELD.fullmatch(field)
+        fields: list[tuple[str, str]] = []
+        for text in filter(None, self.formats[name].split(b";")):
+            parts = _FIELD.fullmatch(text)
             if parts is None:
                 self._corrupt("a field cannot be read")
-            count = int(parts[2] or 1)
-            total += count * (1 if _BASIC.fullmatch(parts[1]) else self._define(parts[1], depth + 1) if count else 0)
-            if total > _MOST_FIELDS:
+            kind, count, own = parts[1], int(parts[2] or 1), parts[3].decode()
+            inner = [("", _BASIC[kind])] if kind in _BASIC else self._layout(kind, depth + 1) if count else []
+            if len(fields) + count * max(len(inner), 1) > _MOST_FIELDS:
                 self._corrupt(f"a message has more than {_MOST_FIELDS} fields")
-        self.definitions.setdefault(name, message)
-        return total
+            for element in [f"{own}[{i}]" for i in range(count)] if parts[2] else [own]:
+                fields += [(f"{element}.{field}" if field else element, code) for field, code in inner]
+        return fields
 
     def _corrupt(self, why: str) -> NoReturn:
         refuse(self.path, f"is corrupt at byte {self.position}: {why}; copy it again from the vehicle, or repair it")
