@@ -199,18 +199,6 @@ def test_a_log_that_is_not_decoded_is_the_same_flight(save):
     assert not any("taken as" in note or "default" in note for note in notes)
 
 
-def test_settings_are_read_from_the_log_beside_its_csv(save):
-    fine = {"acc_1G": 512, "motor_poles": 12, "motorOutput": "48,2047", "blackbox_high_resolution": 1}
-    columns = recorded(T, poles=12, one_g=512, scale=10)
-    save(bbl(columns) + bbl(columns, settings=fine), "LOG1.BFL")
-    flight, notes = read_log(save(blackbox_csv(columns), "LOG1.02.csv"))
-    check(flight, names=RATES, atol=3e-2)
-    np.testing.assert_allclose(flight.omega, speeds(np.asarray(flight.time)), atol=100 / 6 * RPM)
-    assert any("from LOG1.BFL beside it" in note for note in notes)
-    for name in ("LOG1.csv", "LOG1.03.csv", "LOG2.01.csv"):  # which session, none, none
-        assert "settings are taken" not in str(read_log(save(blackbox_csv(columns), name))[1])
-
-
 def test_the_gyros_scale_is_read(save):
     scale = {"gyro_scale": "0x" + struct.pack(">f", 1 / 16.4).hex()}
     flight, _ = read_log(save(bbl(recorded(T, scale=16.4), settings=scale)))

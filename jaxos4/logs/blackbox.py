@@ -17,9 +17,9 @@ estimators would attribute to the vehicle. Commands count as fractions of the ai
 
 **Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
 reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle`, `gyro_scale` and
-`blackbox_high_resolution` (rates are in tenths of a deg/s). For the CSV of `blackbox_decode` they are taken from the
-`.bbl` or `.BFL` file beside it (`LOG00001.02.csv`: second session of `LOG00001.BFL`). Without settings, the reader
-assumes 14 poles, deg/s, 1 g from the accelerometer's median, the protocol from the commands' range, and notes it.
+`blackbox_high_resolution` (rates are in tenths of a deg/s). The CSV of `blackbox_decode` has none. Without settings,
+the reader assumes 14 poles, deg/s, 1 g from the accelerometer's median, the protocol from the commands' range, and
+notes it: give the `.bbl` or `.BFL` file instead.
 
 **Sessions.** A vehicle writes one session each time that it is armed. The sessions of a file follow each other in one
 flight, with an unmeasured second between them.
@@ -39,7 +39,6 @@ import contextlib
 import csv
 import itertools
 import math
-import os
 import re
 import struct
 from collections.abc import Iterable
@@ -157,15 +156,11 @@ BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
 
 
 def _csv(path: Path) -> _Log:
-    """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
+    """A CSV, with the settings above its header, if there are some."""
     settings, skip = _settings_above(path)
-    notes = []
-    if not settings:
-        settings, beside = _settings_beside(path)
-        notes += [f"settings are taken from {beside} beside it"] * bool(settings)
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    return _Log(path, skip + 1, settings, raw, {}, {}, notes)
+    return _Log(path, skip + 1, settings, raw, {}, {}, [])
 
 
 def _is_header(line: str) -> bool:
@@ -189,21 +184,6 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _settings_beside(path: Path) -> tuple[Settings, str]:
-    """The settings of the log that a CSV of `blackbox_decode` was made from, if it lies beside it, and its name."""
-    folder, name = os.path.split(os.fspath(path))
-    match = re.fullmatch(r"(.+?)(?:\.(\d{2}))?\.csv", name, re.IGNORECASE)
-    if match is None:
-        return {}, ""
-    for ending in ("bbl", "BBL", "bfl", "BFL", "txt", "TXT"):
-        beside = os.path.join(folder, f"{match[1]}.{ending}")
-        every = _sessions(beside) if os.path.isfile(beside) else []
-        number = int(match[2]) if match[2] else 1 if len(every) == 1 else 0
-        if 0 < number <= len(every):
-            return every[number - 1][0], os.path.basename(beside)
-    return {}, ""
-
-
 def _is_raw(path: Path) -> bool:
     """Whether a file is a blackbox log that was not decoded."""
     with opened(path, "rb") as file:
@@ -211,11 +191,11 @@ def _is_raw(path: Path) -> bool:
 
 
 def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
-    """The settings and the frames of the sessions of a file, in order; none if it is no blackbox log.
+    """The settings and the frames of the sessions of a file, in order.
 
     A header ends at the first line that does not begin with `H `, or is not text.
     """
-    content, found = read_bytes(path, _LARGEST) if _is_raw(path) else b"", []
+    content, found = read_bytes(path, _LARGEST), []
     places = [match.start() for match in re.finditer(_MAGIC, content)]
     for at, end in itertools.pairwise([*places, len(content)]):
         settings: Settings = {}
@@ -264,16 +244,16 @@ def _decoded(path: Path) -> _Log:
 def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
     """The columns of one session with the time from 0, or `None`, and a remark on what is lost."""
     try:
-        decoded = decode_frames(settings, frames, _KNOWN)
+        columns, damaged, ended = decode_frames(settings, frames, _KNOWN)
     except BadHeader as error:
         return None, f"{error}: it is ignored"
-    later = in_order(decoded.columns["time"])
+    later = in_order(columns["time"])
     if later is None or later.size < 2:
         return None, "holds no frames that can be decoded: it is ignored"
-    places = counted(decoded.damaged, "place")
-    damage = f"is damaged in {places}; what follows up to the next complete frame is ignored" if decoded.damaged else ""
-    end = "" if decoded.ended else "has no end: it was cut while it was written, or is corrupt"
-    return {name: column[later] for name, column in decoded.columns.items()}, "; ".join(filter(None, (damage, end)))
+    damage = f"is damaged in {counted(damaged, 'place')}; what follows up to the next complete frame is ignored"
+    end = "has no end: it was cut while it was written, or is corrupt"
+    remarks = [damage] * (damaged > 0) + [end] * (not ended)
+    return {name: column[later] for name, column in columns.items()}, "; ".join(remarks)
 
 
 def _add_rates(log: _Log) -> None:
@@ -285,7 +265,7 @@ def _add_rates(log: _Log) -> None:
     if unit == "":
         factor *= _gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
         fine = "with blackbox_high_resolution its unit is 0.1 deg/s"
-        remedy = "give the .bbl or .BFL file, or keep it beside this one"
+        remedy = "give the .bbl or .BFL file instead"
         log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}; {remedy}"])
     log.add(dict(zip("pqr", names, strict=True)), factor)
 
