@@ -9,6 +9,7 @@ import math
 import re
 import struct
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import IO, NamedTuple, NoReturn
 
 import numpy as np
@@ -127,21 +128,12 @@ def decoded(path: Path, topics: Sequence[str]) -> Topics:
     with opened(path, "rb") as file:
         cut = walk.through(file)
     found: dict[str, list[Fields]] = {}
-    for name, _, layout, data in sorted(walk.announced.values(), key=lambda each: each.instance):
+    for name, _, layout, data in sorted(filter(None, walk.announced.values()), key=itemgetter(1)):
         records = np.frombuffer(data, layout) if data else np.empty(0)
         if records.size and "timestamp" in (names := layout.names or ()):
             found.setdefault(name, []).append({field: records[field] for field in names})
     notes = [f"the log ends abruptly: its last {cut} bytes are ignored"] * (cut > 0)
     return Topics(path, found, walk.parameters, {}, notes)
-
-
-class _Announced(NamedTuple):
-    """One instance of a topic, with the bytes of its samples."""
-
-    topic: str
-    instance: int
-    layout: np.dtype
-    data: bytearray
 
 
 class _Walk:
@@ -154,8 +146,8 @@ class _Walk:
     def __init__(self, path: Path, topics: Sequence[str]):
         self.path, self.topics, self.position = path, topics, 0
         self.formats: dict[bytes, bytes] = {}
-        self.announced: dict[int, _Announced] = {}
-        self.ignored: set[int] = set()  # the numbers of the other topics
+        # Name, instance, layout and samples of the topics by their numbers; None: another topic.
+        self.announced: dict[int, tuple[str, int, np.dtype, bytearray] | None] = {}
         self.appended: tuple[int, ...] = ()
         self.parameters: dict[str, float] = {}
 
@@ -177,13 +169,10 @@ class _Walk:
             if len(header) + len(body) < 3 + length:
                 return len(header) + len(body)
             if kind == 0:
-                rest, cut = header + body, 0
-                while rest:
-                    if rest.strip(b"\0"):
-                        self._corrupt("no message begins there")
-                    cut += len(rest)
-                    rest = file.read(1 << 20)
-                return cut
+                rest = header + body + file.read()
+                if rest.strip(b"\0"):
+                    self._corrupt("no message begins there")
+                return len(rest)
             self._take(chr(kind), body)
             self.position += 3 + length
         return 0
@@ -191,28 +180,25 @@ class _Walk:
     def _take(self, kind: str, body: bytes) -> None:
         if kind == "D":
             number = int.from_bytes(body[:2], "little")
-            if number in self.announced:
-                if len(body) - 2 != self.announced[number].layout.itemsize:
-                    self._corrupt("a message does not have its topic's size")
-                self.announced[number].data.extend(body[2:])
-            elif number not in self.ignored or len(body) < 2:
+            if len(body) < 2 or number not in self.announced:
                 self._corrupt("data of a topic that was never announced")
+            if topic := self.announced[number]:
+                if len(body) - 2 != topic[2].itemsize:
+                    self._corrupt("a message does not have its topic's size")
+                topic[3].extend(body[2:])
         elif kind == "F":
             name, _, fields = body.partition(b":")
             self.formats[name] = fields
         elif kind == "A":
             if len(body) < 4:
                 self._corrupt("a topic without a name")
-            number, topic = int.from_bytes(body[1:3], "little"), body[3:].decode(errors="replace")
-            if topic in self.topics:
-                fields = self._layout(body[3:])
-                while fields and fields[-1][0].startswith("_padding"):  # not logged at the end of a message
-                    fields.pop()
-                if len(dict(fields)) < len(fields):
-                    self._corrupt("a field occurs twice")
-                self.announced[number] = _Announced(topic, body[0], np.dtype(fields), bytearray())
-            else:
-                self.ignored.add(number)
+            number, name = int.from_bytes(body[1:3], "little"), body[3:].decode(errors="replace")
+            fields = self._layout(body[3:]) if name in self.topics else []
+            while fields and fields[-1][0].startswith("_padding"):  # not logged at the end of a message
+                fields.pop()
+            if len(dict(fields)) < len(fields):
+                self._corrupt("a field occurs twice")
+            self.announced[number] = (name, body[0], np.dtype(fields), bytearray()) if name in self.topics else None
         elif kind == "P":
             # A damaged parameter is ignored: the flight does not depend on most of them.
             parts = _PARAMETER.fullmatch(body[1:-4])
