@@ -165,12 +165,12 @@ def _check_units(table: Table) -> Table:
             continue
         if name == "phi" and 1 / 3 < ratio < 3:
             limits = PITCH
-        if 1 / _SPREAD < ratio / _DEGREES < _SPREAD:
-            what = table.remedy or "it looks like degrees, divide by 57.3"
-            table.refuse(f"changes {ratio:.3g} times as fast as {rate}: {what}", column=name)
-        if 1 / _SPREAD < ratio * _DEGREES < _SPREAD:
-            what = table.remedy or "it looks like deg/s, divide by 57.3"
-            table.refuse(f"is {1 / ratio:.3g} times as fast as {name} changes: {what}", column=rate)
+        for wrong, unit, off, what in (
+            (name, "degrees", ratio / _DEGREES, f"changes {ratio:.3g} times as fast as {rate}"),
+            (rate, "deg/s", ratio * _DEGREES, f"is {1 / ratio:.3g} times as fast as {name} changes"),
+        ):
+            if 1 / _SPREAD < off < _SPREAD:
+                table.refuse(f"{what}: {table.remedy or f'it looks like {unit}, divide by 57.3'}", column=wrong)
     if table.holds("psi"):
         measured = np.flatnonzero(np.isfinite(columns["psi"]))
         jumps = np.zeros(columns["psi"].size, dtype=bool)
@@ -198,11 +198,11 @@ def _scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | 
     rates = Series(t[with_rate], rate[with_rate, None])
     with_angle = np.isfinite(angle) & (t >= rates.t[0]) & (t <= rates.t[-1])
     instants, angle = t[with_angle], angle[with_angle]
-    if instants.size <= _FEWEST:
-        return None
-    windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
-    knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
-    knots = knots[knots < instants.size]
+    knots = np.empty(0)
+    if instants.size > _FEWEST:
+        windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
+        knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
+        knots = knots[knots < instants.size]
     if knots.size <= _FEWEST:
         return None
     steps = np.diff(angle)
@@ -261,8 +261,8 @@ def _thrust_note(ratio: float) -> list[str]:
     if ratio == 0:
         return ["the rotors do not turn for at least half of the flight: keep only the part in the air"]
     unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
-    what = f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight"
-    return [f"{what}: check the airframe, and whether rotor speeds are in {unit}"]
+    advice = f"check the airframe, and whether rotor speeds are in {unit}"
+    return [f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight: {advice}"]
 
 
 def _channels(table: Table, notes: list[str]) -> np.ndarray:

@@ -83,8 +83,7 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     if first == "command1":
         notes.append(f"commands are {names[first]}.., taken as fractions of full-scale rotor speed")
     motors, gyro = (Sampling(names[name], logged_rate(each.t)) for name, each in ((first, rotors), ("p", rates)))
-    facts = LogFacts(motors, gyro, _OFTEN)
-    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=facts)
+    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=LogFacts(motors, gyro, _OFTEN))
     return gyro_rows(table, rates, rotors, measured=first == "omega1", others=others)[1], tuple(notes)
 
 
