@@ -198,7 +198,7 @@ def _scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | 
     rates = Series(t[with_rate], rate[with_rate, None])
     with_angle = np.isfinite(angle) & (t >= rates.t[0]) & (t <= rates.t[-1])
     instants, angle = t[with_angle], angle[with_angle]
-    knots = np.empty(0)
+    knots = np.empty(0, dtype=int)
     if instants.size > _FEWEST:
         windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
         knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))

@@ -129,7 +129,7 @@ def decoded(path: Path, topics: Sequence[str]) -> Topics:
         cut = walk.through(file)
     found: dict[str, list[Fields]] = {}
     for name, _, layout, data in sorted(filter(None, walk.announced.values()), key=itemgetter(1)):
-        records = np.frombuffer(data, layout) if data else np.empty(0)
+        records = np.frombuffer(data, layout) if data else np.empty(0, layout)
         if records.size and "timestamp" in (names := layout.names or ()):
             found.setdefault(name, []).append({field: records[field] for field in names})
     notes = [f"the log ends abruptly: its last {cut} bytes are ignored"] * (cut > 0)
