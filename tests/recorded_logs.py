@@ -178,6 +178,15 @@ def blackbox_csv(columns, *, settings=None):
     return "\n".join(lines) + "\n"
 
 
+# CSV
+
+
+def table_csv(names, *columns):
+    """A flight CSV; a NaN is an empty cell."""
+    lines = [",".join(map(str, row)).replace("nan", "") for row in np.column_stack(columns).tolist()]
+    return "\n".join([",".join(names), *lines]).encode()
+
+
 # Crazyflie
 
 

@@ -1,31 +1,20 @@
 """Flights to CSV and back; what a log may look like, what it may not, and what is done to an uneven one."""
 
 import inspect
-import os
-import stat
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, same
-from hypothesis import given, settings, strategies as st
-from hypothesis.extra import numpy as hnp
 
-import jaxos4.logs.assemble as assemble_module
 import jaxos4.logs.csv as csv_module
 import jaxos4.logs.table as table_module
-from jaxos4._files import write_atomically
 from jaxos4.airframe import OS4
 from jaxos4.errors import InputError
-from jaxos4.flight import STATE_NAMES, Flight
-from jaxos4.logs import read_flight, read_recording, write_flight
-from jaxos4.logs.sampling import resample, unwrap
+from jaxos4.flight import STATE_NAMES
+from jaxos4.logs import read_flight, read_recording
 
 HEADER = "t,omega1,omega2,omega3,omega4,p,q,psi"
 ROWS = [f"{0.01 * k:.2f},100,101,102,103,{0.1 * k:.1f},-0.2,0.3" for k in range(6)]
-LIMITS = {"phi": 1.5, "theta": 1.5, "psi": 1.5, "p": 60, "q": 60, "r": 60, "vx": 1e3, "vy": 1e3, "vz": 1e3}
 
 
 def read_flight_and_notes(path, airframe=None):
@@ -53,155 +42,6 @@ def refusal(path, airframe=None):
     assert message.startswith(f"{path}: ")
     assert message.endswith(".")
     return message.removeprefix(f"{path}: ")
-
-
-def masked(draw, shape, limits):
-    values = draw(hnp.arrays(float, shape, elements=st.floats(-1, 1, width=64))) * limits
-    return np.where(draw(hnp.arrays(bool, shape)), np.nan, values)
-
-
-@st.composite
-def flights(draw):
-    n = draw(st.integers(2, 12))
-    time = draw(st.floats(-1e4, 1e4)) + draw(st.floats(1e-3, 0.02)) * np.arange(n)
-    omega = draw(hnp.arrays(float, (n, 4), elements=st.floats(0, 1e5)))
-    states = masked(draw, (n, 12), [LIMITS.get(name, 1e6) for name in STATE_NAMES])
-    states[draw(st.integers(0, n - 1)), draw(st.integers(0, 11))] = 0.1
-    force = masked(draw, (n, 3), 1e3) if draw(st.booleans()) else None
-    force = None if force is None or np.isnan(force).all() else jnp.asarray(force)
-    voltage = draw(hnp.arrays(float, n, elements=st.floats(1e-3, 200))) if draw(st.booleans()) else None
-    return Flight(time, omega, states, force, voltage=voltage)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("flights")
-
-
-# Round trip
-
-
-@given(flight=flights())
-@settings(max_examples=150)
-def test_reading_gives_back_every_bit(flight, folder):
-    path = folder / "flight.csv"
-    write_flight(flight, path)
-    again, notes = read_flight_and_notes(path)
-    for one, other in zip(jax.tree.leaves(flight), jax.tree.leaves(again), strict=True):
-        assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
-    assert all("in g" in note for note in notes)  # small forces may be in other units
-
-
-def test_only_what_was_measured_gets_a_column(tmp_path):
-    states = np.full((3, 12), np.nan)
-    states[1, STATE_NAMES.index("p")] = 0.25
-    flight = Flight(np.arange(3) * 0.5, np.full((3, 4), 7.0), states, jnp.asarray([[np.nan, 1e-300, np.nan]] * 3))
-    write_flight(flight, tmp_path / "f.csv")
-    text = (tmp_path / "f.csv").read_bytes().decode()
-    row = ",7.0,7.0,7.0,7.0,{},1e-300"
-    assert "\r" not in text
-    assert text.splitlines() == [
-        "t,omega1,omega2,omega3,omega4,p,ay",
-        "0.0" + row.format(""),
-        "0.5" + row.format("0.25"),
-        "1.0" + row.format(""),
-    ]
-
-
-def test_commands_are_written_as_shares_of_the_largest_speed(tmp_path):
-    flight = Flight(np.arange(3.0), np.full((3, 4), 250.0), np.zeros((3, 12)), commanded=True)
-    airframe = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(500.0))
-    write_flight(flight, tmp_path / "f.csv", airframe)
-    assert (tmp_path / "f.csv").read_text().startswith("t,command1,command2,command3,command4,")
-    again = read_flight(tmp_path / "f.csv", airframe)
-    assert again.commanded
-    assert same(flight, again)
-    # Without the largest speed they cannot be written as commands.
-    for unknown in (None, OS4):
-        write_flight(flight, tmp_path / "g.csv", unknown)
-        assert not read_flight(tmp_path / "g.csv").commanded
-
-
-def test_single_precision_gives_back_its_bits_and_moves_a_late_start(save):
-    with jax.enable_x64(False):
-        flight = Flight(0.1 * np.arange(9), np.full((9, 4), 1 / 3), np.full((9, 12), 0.1))
-        path = save("")
-        write_flight(flight, path)
-        again = read_flight(path)
-        assert again.states.dtype == jnp.float32
-        assert same(flight, again)
-        late = csv(rows=[f"{1.7e9 + 0.01 * k:.2f},1,1,1,1,0,0,0" for k in range(500)])
-        with pytest.warns(UserWarning, match="starts at 1700000000 s"):
-            moved = read_flight(save(late))
-        assert moved.time[0] == 0
-        assert moved.dt == pytest.approx(0.01, rel=1e-6)
-    assert read_flight(save(late)).time[0] == 1.7e9
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "words"),
-    [
-        ("states", np.inf, "sample 1, column x: is inf"),
-        ("omega", np.nan, "sample 1, column omega1: is nan"),
-        ("time", np.nan, "sample 1, column t: is nan"),
-        ("batch", 2, r"one file holds one flight, got a batch of shape \(2,\)"),
-    ],
-)
-def test_what_a_file_cannot_hold_is_not_written(field, value, words, tmp_path):
-    flight = Flight(np.arange(3.0), np.ones((3, 4)), np.zeros((3, 12)))
-    if field == "batch":
-        flight = jax.tree.map(lambda leaf: jnp.stack([leaf] * value), flight)
-    else:
-        array = getattr(flight, field)
-        flight = eqx.tree_at(lambda f: getattr(f, field), flight, array.at[(1,) + (0,) * (array.ndim - 1)].set(value))
-    with pytest.raises(InputError, match=words):
-        write_flight(flight, tmp_path / "f.csv")
-    assert list(tmp_path.iterdir()) == []
-
-
-# Whole files or none
-
-
-def test_a_failed_write_keeps_the_old_file(tmp_path):
-    path = tmp_path / "old.csv"
-    path.write_text("old")
-
-    def interrupted():
-        with write_atomically(path) as beside:
-            beside.write_text("half of the n")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_write_replaces_the_file_behind_a_link_and_keeps_its_mode(tmp_path):
-    path, link = tmp_path / "old.csv", tmp_path / "link.csv"
-    path.write_text("old")
-    path.chmod(0o640)
-    link.symlink_to(path)
-    with write_atomically(link) as beside:
-        assert beside.parent == tmp_path
-        assert beside.suffix == ".csv"
-        beside.write_text("new")
-        assert path.read_text() == "old"
-    assert path.read_text() == "new"
-    assert link.is_symlink()
-    assert stat.S_IMODE(path.stat().st_mode) == 0o640
-    assert sorted(tmp_path.iterdir()) == [link, path]
-
-
-def test_a_device_is_written_to_and_a_folder_that_is_none_is_named(tmp_path):
-    with write_atomically(os.devnull) as beside:
-        beside.write_text("nothing")
-    assert not os.path.isfile(os.devnull)
-    flight = Flight(np.arange(3.0), np.ones((3, 4)), np.zeros((3, 12)))
-    with pytest.raises(FileNotFoundError, match=r"no such folder to write to.*nowhere/f\.csv"):
-        write_flight(flight, tmp_path / "nowhere" / "f.csv")
-    with pytest.raises(IsADirectoryError, match="is a folder"):
-        write_flight(flight, tmp_path)
 
 
 # What a file may look like
@@ -390,150 +230,6 @@ def test_too_many_rows_are_refused(save, monkeypatch):
     assert "more than 5 rows" in refusal(save(csv()))
 
 
-# Angles against rates
-
-
-def columns(names, t, *values):
-    """A file of some columns, with rotors that turn at 9 rad/s."""
-    rows = [",".join(map(repr, [row[0], 9, 9, 9, 9, *row[1:]])) for row in np.column_stack([t, *values]).tolist()]
-    return csv(",".join(["t,omega1,omega2,omega3,omega4", *names]), rows)
-
-
-def spin(scale_angle=1.0, scale_rate=1.0, rate=3.0, noise=0.0, names=("phi", "p")):
-    """A file of five seconds of one angle and its rate, in units of choice."""
-    rng = np.random.default_rng(0)
-    t = np.arange(500) * 0.01
-    angle = 0.4 * np.sin(rate * t) + noise * 0.005 * rng.normal(size=500)
-    speed = 0.4 * rate * np.cos(rate * t) + noise * 0.01 * rng.normal(size=500)
-    return columns(names, t, scale_angle * angle, scale_rate * speed)
-
-
-@pytest.mark.parametrize("names", [("phi", "p"), ("theta", "q"), ("psi", "r")])
-def test_an_angle_at_odds_with_its_rate_is_refused(names, save):
-    degrees = 180 / np.pi
-    assert read_flight_and_notes(save(spin(names=names, noise=1)))[1] == ()
-    message = refusal(save(spin(degrees, names=names, noise=1)))
-    assert message.startswith(f"column {names[0]}: ")
-    assert "degrees" in message
-    message = refusal(save(spin(scale_rate=degrees, rate=2.0, names=names, noise=1)))
-    assert message.startswith(f"column {names[1]}: ")
-    assert "deg/s" in message
-    for scale in ((20.0, 1.0), (1.0, 15.0), (1.5, -1.0)) if names[0] == "psi" else ():  # other disagreements
-        read_flight(save(spin(*scale, rate=2.0, names=names)))
-
-
-def test_noise_alone_is_no_degrees(save):
-    """Hovering: over 0.2 s, noise in the angle is some 57 times the integral of noise in the rate, by chance."""
-    rng = np.random.default_rng(1)
-    angle, rate = 0.005 * rng.normal(size=500), 2.8e-3 * rng.normal(size=500)
-    path = save(columns(("psi", "r"), 0.01 * np.arange(500), angle, rate))
-    assert read_flight_and_notes(path)[1] == ()
-    with pytest.MonkeyPatch.context() as patch:  # without the check that the two are similar
-        patch.setattr(assemble_module, "_SIMILARITY", -1.0)
-        assert "looks like degrees" in refusal(path)
-
-
-def test_a_flip_is_no_degree(save):
-    """Three turns of roll are 19 rad, as the roll rate says; without it they are refused."""
-    t = np.arange(200) * 0.01
-    flight = read_flight(save(columns(("phi", "p"), t, 10 * t, 10.0 + 0 * t)))
-    assert flight.states[-1, STATE_NAMES.index("phi")] == 10 * t[-1]
-    message = refusal(save(columns(("phi", "q"), t, 10 * t, 10.0 + 0 * t)))
-    assert message.startswith("row 65, column phi: is 6.3 rad")
-
-
-# Uneven times
-
-
-def uneven(n, dt, seed=0, jitter=0.2):
-    rng = np.random.default_rng(seed)
-    return dt * (np.arange(n) + rng.uniform(-jitter, jitter, n))
-
-
-def worst(n):
-    """Largest error of a sine sampled n times in 2 s at uneven times and brought to a grid."""
-    t = uneven(n, 2.0 / n)
-    (grid, _, channels), _ = resample(t, np.ones((n, 4)), np.sin(5 * t)[:, None], 2.0 / n)
-    assert not np.isnan(channels).any()
-    return np.abs(channels[:, 0] - np.sin(5 * grid)).max()
-
-
-def test_resampling_is_second_order():
-    assert 1.8 < np.log2(worst(250) / worst(1000)) / 2 < 2.3
-    assert worst(1000) < 25 / 8 * (2 / 1000) ** 2 * 1.4**2
-
-
-@given(seed=st.integers(0, 999), lost=st.floats(0, 0.6), slow=st.integers(1, 5))
-@settings(max_examples=100)
-def test_nothing_is_invented_across_gaps(seed, lost, slow):
-    rng = np.random.default_rng(seed)
-    dt = 0.01
-    t = uneven(80, dt, seed)
-    t = t[np.sort(rng.choice(80, 60, replace=False))]
-    y = np.cumsum(rng.normal(size=60))
-    y[rng.random(60) < lost] = np.nan
-    y[np.arange(60) % slow != 0] = np.nan
-    (grid, _, channels), _ = resample(t, np.ones((60, 4)), y[:, None], dt)
-    ts, ys = t[np.isfinite(y)], y[np.isfinite(y)]
-    for g, value in zip(grid, channels[:, 0], strict=True):
-        if np.isnan(value):
-            continue
-        right = np.searchsorted(ts, g)
-        assert np.abs(ts - g).min() <= 0.75 * dt + 1e-12  # a sample is near
-        around = ys[max(right - 1, 0) : right + 1]  # and the value lies between those around it
-        assert around.min() - 1e-9 <= value <= around.max() + 1e-9
-
-
-def test_rows_that_are_missing_from_a_grid_are_not_measured(save):
-    rows = [f"{0.01 * k:.2f},{k},0,0,0,{k},0,0" for k in range(20) if k not in (5, 11, 12)]
-    flight, notes = read_flight_and_notes(save(csv(rows=rows)))
-    p = np.asarray(flight.states)[:, STATE_NAMES.index("p")]
-    assert flight.time.shape == (20,)
-    assert np.flatnonzero(np.isnan(p)).tolist() == [5, 11, 12]
-    np.testing.assert_allclose(p[~np.isnan(p)], np.delete(np.arange(20.0), [5, 11, 12]), atol=1e-9)
-    np.testing.assert_allclose(flight.omega[[4, 5, 6, 10, 11, 12, 13], 0], [4, 4, 6, 10, 10, 10, 13], rtol=1e-9)
-    assert len(notes) == 1
-    assert "17 rows were resampled to 20 samples, one every 10 ms" in notes[0]
-    assert "2 gaps of up to 30 ms: the 3 samples in gaps hold the rotor speeds" in notes[0]
-
-
-@pytest.mark.parametrize("offset", [0.004, 0.009])
-def test_rows_near_a_grid_stand_as_recorded_and_time_is_the_grid(offset, save):
-    dt = 0.01
-    t = dt * np.arange(50)
-    t[1:-1] += dt * offset * np.random.default_rng(0).choice([-1, 1], 48)
-    flight, notes = read_flight_and_notes(save(columns("p", t, np.sin(99 * t))))
-    assert notes == ()
-    np.testing.assert_array_equal(np.asarray(flight.states)[:, STATE_NAMES.index("p")], np.sin(99 * t))
-    np.testing.assert_allclose(np.diff(flight.time), dt, rtol=1e-12)
-    t[7] = dt * 7.02
-    assert "resampled" in read_flight_and_notes(save(columns("p", t, np.sin(99 * t))))[1][0]
-
-
-def test_turns_are_taken_out_before_interpolation(save):
-    t = uneven(400, 0.01)
-    flight, notes = read_flight_and_notes(save(columns(["psi"], t, (7 * t + np.pi) % (2 * np.pi) - np.pi)))
-    np.testing.assert_allclose(flight.states[:, STATE_NAMES.index("psi")], 7 * np.asarray(flight.time), atol=1e-9)
-    assert notes[0] == "psi: 4 jumps of 2 pi removed"
-
-
-@given(turns=hnp.arrays(int, st.integers(2, 30), elements=st.integers(-3, 3)), seed=st.integers(0, 99))
-@settings(max_examples=50)
-def test_unwrapping_changes_by_whole_turns_and_leaves_the_smooth(turns, seed):
-    rng = np.random.default_rng(seed)
-    angle = np.cumsum(rng.uniform(-3, 3, turns.size))
-    angle[rng.random(turns.size) < 0.2] = np.nan
-    jumpy = angle + 2 * np.pi * turns
-    out, jumps = unwrap(jumpy)
-    steps = np.diff(out[np.isfinite(out)])
-    assert (np.abs(steps) <= np.pi + 1e-9).all()
-    whole = ((out - jumpy) / (2 * np.pi))[np.isfinite(out)]
-    np.testing.assert_allclose(whole, np.rint(whole), atol=1e-9)
-    again, none = unwrap(out)
-    assert none == 0
-    assert again is out
-
-
 # Real flights
 
 REAL = {
@@ -566,14 +262,3 @@ def test_a_real_flight_is_read(name, shared_flights):
     np.testing.assert_allclose(impulse, held, rtol=1e-3)
     # thrust over the flight carries the weight, so the units and the rotor columns are what they are taken for
     assert 0.6 < impulse.sum() * CRAZYFLIE.thrust_coefficient / (time[-1] * 0.027 * 9.81) < 1.6
-
-
-def test_an_accelerometer_that_never_changes_is_off(save):
-    rows = [f"{0.01 * k:.2f},{','.join(['200'] * 4)},0.1,0,0,9.81" for k in range(200)]
-    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows)))
-    assert any("is off" in note for note in notes)
-    assert flight.specific_force is None or np.isnan(flight.specific_force).all()
-    rows[100] = rows[100].replace("9.81", "9.80")
-    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows)))
-    assert not any("is off" in note for note in notes)
-    assert np.isfinite(flight.specific_force).all()

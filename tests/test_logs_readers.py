@@ -11,20 +11,18 @@ import tracemalloc
 import equinox as eqx
 import numpy as np
 import pytest
-import recorded_logs
 import test_flight_csv as flight_csv
 import test_logs_blackbox as blackbox
 import test_logs_crazyflie as crazyflie
 import test_logs_ulog as ulog
-from helpers import CRAZYFLIE, refused, same
+from helpers import CRAZYFLIE, same
 from hypothesis import given, settings, strategies as st
-from recorded_logs import RPM, VEHICLE, blackbox_csv, check, damaged, outcome, rates, speeds
+from recorded_logs import RPM, blackbox_csv, check, damaged, outcome, speeds
 
 import jaxos4.logs.csv as csv_module
 from jaxos4.errors import InputError
 from jaxos4.flight import STATE_NAMES, Flight
-from jaxos4.logs import FORMATS, LogFacts, LogFormat, Sampling, Table, log_format, read_log, read_recording
-from jaxos4.logs.sampling import held_regularly, logged_rate
+from jaxos4.logs import FORMATS, LogFormat, Table, log_format, read_log
 from jaxos4.logs.table import opened, refuse
 
 # Each reader: a good log, the bytes at its beginning that are its header, and bad logs with words of their messages.
@@ -188,97 +186,6 @@ def test_a_log_cut_by_a_loss_of_power_is_read_to_there(name, save):
     assert not any(words in note for note in read_log(save(content))[1])
 
 
-# Impossible samples
-
-
-def spoilt(truth, bad, column, value):
-    """Samples of a sensor, of which the rows `bad` of one column are impossible."""
-
-    def values(t):
-        out = truth(t)
-        out[bad, column] = value
-        return out
-
-    return values
-
-
-def table_csv(names, *columns):
-    """A flight CSV; a NaN is an empty cell."""
-    lines = [",".join(map(str, row)).replace("nan", "") for row in np.column_stack(columns).tolist()]
-    return "\n".join([",".join(names), *lines]).encode()
-
-
-def csv_of(t, *sensors):
-    names = ["t", "p", "q", "r", "ax", "ay", "az", *(f"omega{i}" for i in range(1, 5))]
-    return table_csv(names, t, *(sensor(t) for sensor in sensors))
-
-
-def ulog_of(t, gyro, accelerometer, rotors):
-    return ulog.log(ulog.combined(t, gyro, accelerometer), ulog.escs(t, speeds=rotors))
-
-
-def crazyflie_of(t, gyro, accelerometer, rotors):
-    names = [*crazyflie.GYRO, *(f"rpm.m{i}(f)" for i in range(1, 5))]
-    values = [np.rad2deg(gyro(t)), accelerometer(t) / recorded_logs.GRAVITY, rotors(t) / RPM]
-    return recorded_logs.crazyflie([("e", names, t, np.column_stack(values))])
-
-
-def blackbox_of(t, gyro, accelerometer, rotors):
-    sensors = {"gyroADC": np.rad2deg(gyro(t)), "accSmooth": np.rint(accelerometer(t) / recorded_logs.GRAVITY * 2048)}
-    sensors["eRPM"] = np.rint(rotors(t) / RPM * 7 / 100)
-    columns = {f"{name}[{i}]": column for name, values in sensors.items() for i, column in enumerate(values.T)}
-    columns = {"loopIteration": np.arange(t.size), "time (us)": np.rint(1e6 * t)} | columns
-    return blackbox_csv(columns, settings=blackbox.SETTINGS | {"motor_poles": "14"}).encode()
-
-
-IMPOSSIBLE = {
-    csv_of: ("p", "az", "omega4"),
-    ulog_of: ("gyro_rad[0]", "accelerometer_m_s2[2]", "esc[3].esc_rpm"),
-    crazyflie_of: ("gyro.x", "acc.z", "rpm.m4"),
-    blackbox_of: ("gyroADC[0]", "accSmooth[2]", "eRPM[3]"),
-}
-
-
-@pytest.mark.parametrize("write", IMPOSSIBLE)
-def test_ten_impossible_samples_are_missing_and_the_rest_is_as_it_was(write, save):
-    t, bad = ulog.grid(0.004, 5.0), 7 + 120 * np.arange(10)
-
-    def log(gyro=bad, accelerometer=bad + 1, rotors=bad):
-        sensors = (rates, gyro, 0, 1e6), (recorded_logs.force, accelerometer, 2, -1e5), (speeds, rotors, 3, 104_720.0)
-        return save(write(t, *(spoilt(*each) for each in sensors)))
-
-    clean, found = read_recording(log([], [], [])), read_recording(log())
-    (note,) = set(found.notes) - set(clean.notes)
-    assert note.startswith("impossible values count as not measured, in ")
-    words = zip(
-        IMPOSSIBLE[write], ("1e+06 rad/s at 0.028 s", "-100000 m/s^2 at 0.032 s", "104720 rad/s at 0.028"), strict=True
-    )
-    for name, first in words:
-        assert f"{name}: 10 (first {first}" in note
-    p = STATE_NAMES.index("p")
-    expected = clean.states.copy()
-    expected[bad, p] = np.nan
-    np.testing.assert_array_equal(found.states, expected)
-    expected = clean.specific_force.copy()
-    expected[bad + 1, 2] = np.nan
-    np.testing.assert_array_equal(found.specific_force, expected)
-    elsewhere = np.delete(np.arange(t.size - 1), [bad - 1, bad])
-    np.testing.assert_allclose(found.omega[elsewhere], clean.omega[elsewhere], rtol=1e-12)
-    np.testing.assert_allclose(found.omega, clean.omega, atol=1.6)  # a step of eRPM is 1.5
-    many = np.arange(13) * 90  # of 1250
-    for kind, name in zip(("gyro", "accelerometer", "rotors"), IMPOSSIBLE[write], strict=True):
-        message = outcome(read_log, log(**{kind: many}))
-        assert f"{name}: " in message
-        assert " (13 of 1250 values, more than 1 %); " in message
-
-
-def test_an_impossible_first_value_of_a_rotor_is_the_next_one(save):
-    rows = [f"{0.01 * k:.2f},{2e5 if k in (0, 1, 9) else 100 + k},1,1,1,0.1" for k in range(400)]
-    found = read_recording(save("\n".join(["t,omega1,omega2,omega3,omega4,p", *rows])))
-    assert found.omega[[0, 1, 2, 8, 9, 10], 0].tolist() == [102, 102, 102, 108, 108, 110]
-    assert found.notes == ("impossible values count as not measured, in omega1: 3 (first 200000 rad/s at 0 s)",)
-
-
 COSTLY = {name: ulog.announced(formats) for name, formats in ulog.BOMBS.items()}
 COSTLY["empty events"] = crazyflie.EMPTY_EVENTS
 
@@ -333,114 +240,3 @@ def test_a_new_format_is_read_and_inspected(log, save, run):
     with pytest.raises(InputError, match=r"bad: row 2: has no columns; write them as one JSON object\.$"):
         read_log(save('{"log": 1}\n', "bad"))
     assert log_format(save("t,p\n", "other")).name == "CSV"
-
-
-# How often motors and gyro were logged
-
-ROWS, COMMANDS = 1000, [f"command{i}" for i in range(1, 5)]
-
-
-def repeating(tmp_path, held, *, stagger=0, lost=0.0):
-    """250 rows a second, with commands that are held for so many rows: each motor `stagger` rows after the last."""
-    rng = np.random.default_rng(0)
-    commands = np.repeat(rng.uniform(0.4, 0.6, (ROWS // held + 9, 4)), held, axis=0)
-    commands = np.stack([commands[stagger * i :, i][:ROWS] for i in range(4)], axis=1)
-    commands[1:][rng.uniform(size=ROWS - 1) < lost] = np.nan
-    path = tmp_path / "log.csv"
-    path.write_bytes(
-        table_csv(["t", *COMMANDS, "p", "q", "r"], 0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3)))
-    )
-    return read_recording(path, full_scale=1.0)
-
-
-@pytest.mark.parametrize(("held", "rate"), [(25, 10.0), (5, 50.0), (1, 250.0)])
-def test_values_that_repeat_were_not_logged(tmp_path, held, rate):
-    facts = repeating(tmp_path, held).facts
-    assert facts.motors.rate == pytest.approx(rate, rel=0.01)
-    assert facts.gyro.rate == pytest.approx(250.0, rel=0.01)
-    assert bool(facts.too_slow) == (rate < 40)
-    if facts.too_slow:
-        assert "the motors were logged at 10 Hz (the values of command1 change so often)" in facts.too_slow
-
-
-@pytest.mark.parametrize("kind", [{"stagger": 6}, {"lost": 0.2}])
-def test_motors_that_are_held_one_after_the_other_or_with_empty_cells(tmp_path, kind):
-    assert repeating(tmp_path, 25, **kind).facts.motors.rate == pytest.approx(10.0, rel=0.05)
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_inputs_that_change_now_and_then_are_no_rate(seed):
-    steps = np.random.default_rng(seed).exponential(0.3, 200)
-    assert not held_regularly(np.cumsum(steps))
-    assert not held_regularly(0.3 * np.arange(10.0))  # a 3-2-1-1 of few steps
-    assert held_regularly(0.1 * np.arange(50.0))
-
-
-@given(step=st.floats(0.001, 0.9), seed=st.integers(0, 99), pauses=st.integers(0, 3), bursts=st.booleans())
-@settings(max_examples=60)
-def test_the_rate_is_that_of_the_samples_whatever_pauses_and_bursts_come_between(step, seed, pauses, bursts):
-    rng = np.random.default_rng(seed)
-    steps = step * rng.uniform(0.9, 1.1, 300)
-    if bursts:  # five samples at once, then nothing for five steps: this is no high rate
-        steps = np.tile([1e-6, 1e-6, 1e-6, 1e-6, step], 60)
-    steps[rng.integers(0, 300, pauses)] = 500.0
-    assert logged_rate(np.cumsum(steps)) == pytest.approx(1 / step, rel=0.11)
-
-
-def test_the_rate_of_almost_nothing():
-    assert logged_rate(np.zeros(1)) == 0
-    assert logged_rate(np.array([0.0, 5.0])) == pytest.approx(0.2)
-    assert LogFacts().too_slow == ""
-    assert LogFacts(Sampling("m", 38.5), Sampling("g", 250.0)).too_slow == ""  # a nominal 40 Hz with jitter
-
-
-def slow_ulog(step):
-    t = ulog.grid(step, 3.4, offset=-0.2)
-    topics = (
-        ulog.combined(ulog.grid(0.004)),
-        ulog.vehicle_attitude(ulog.grid(0.02)),
-        ulog.motors(t, ulog.thrusts(t).tolist()),
-    )
-    return ulog.log(*topics, SDLOG_PROFILE=131)
-
-
-def slow_csv(step):
-    t = ulog.grid(0.004)
-    commands = ulog.thrusts(t)
-    commands[np.arange(t.size) % round(step / 0.004) != 0] = np.nan
-    return table_csv(["t", *COMMANDS, "p", "q", "r"], t, commands, rates(t))
-
-
-def slow_crazyflie(step):
-    t, slow = ulog.grid(0.004), ulog.grid(step, 3.4)
-    gyro = ["gyro.x(f)", "gyro.y(f)", "gyro.z(f)"]
-    events = [("g", gyro, t, np.degrees(rates(t)))]
-    events.append(("m", [f"motor.m{i}(H)" for i in range(1, 5)], slow, np.rint(65535 * ulog.thrusts(slow))))
-    return recorded_logs.crazyflie(events)
-
-
-REMEDIES = {
-    slow_ulog: ("actuator_motors", "set SDLOG_PROFILE to 147 (which includes 16, 'high rate')"),
-    slow_csv: ("command1", "log motors and gyro at 100 Hz or more"),
-    slow_crazyflie: ("motor.m1", "raise the frequency of these variables in the deck's config.txt"),
-}
-
-
-@pytest.mark.parametrize("kind", REMEDIES)
-def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, tmp_path):
-    (tmp_path / "vehicle.toml").write_text(VEHICLE)
-    name, remedy = save(kind(0.1)).name, REMEDIES[kind][1]
-    words = f"the motors were logged at 10 Hz ({REMEDIES[kind][0]}), too rarely to identify a vehicle: "
-    code, out, err = run("inspect", name, "--airframe", "vehicle.toml", "--out", "found.json")
-    assert (code, err) == (0, "")
-    first = out.splitlines()[1]
-    assert first.startswith(f"cannot identify a vehicle: {words}")
-    assert remedy in first
-    assert "rotor4: 10 Hz" in out
-    assert "identifiable: alpha1" not in out
-    result = run("estimate", name, "--model", "flight", "--airframe", "vehicle.toml")
-    refused(result, f"jaxos4: {name}: {words}", remedy)
-    assert read_log(save(kind(0.1)), CRAZYFLIE)[1][-1].startswith(words)
-    fast = read_recording(save(kind(0.02)), CRAZYFLIE).facts
-    assert fast.motors == Sampling(REMEDIES[kind][0], pytest.approx(50.0, rel=0.01))
-    assert fast.too_slow == ""

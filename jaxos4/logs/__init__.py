@@ -33,11 +33,10 @@ _FIRST_BYTES = 1 << 18
 def read_log(
     path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
-    """Read a log of any known format.
+    """Read a log of any known format, recognised from the first bytes of the file.
 
-    The format is recognised from the first bytes of the file; its name does not matter. The columns of each format
-    are listed in `jaxos4.logs.csv`, `jaxos4.logs.ulog` (PX4), `jaxos4.logs.blackbox` (Betaflight and INAV) and
-    `jaxos4.logs.crazyflie` (micro-SD card).
+    The columns of each format are listed in `jaxos4.logs.csv`, `jaxos4.logs.ulog` (PX4), `jaxos4.logs.blackbox`
+    (Betaflight and INAV) and `jaxos4.logs.crazyflie` (micro-SD card).
 
     **Arguments:**
 
@@ -63,16 +62,8 @@ def read_recording(path: Path, airframe: Airframe | None = None, *, full_scale: 
 def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
     """Read a flight from a CSV file. The columns are listed in `jaxos4.logs.csv`.
 
-    **Arguments:**
-
-    - `airframe`: its `max_rotor_speed` turns `command1..4` into rotor speeds. A file with `omega1..4` needs none.
-
-    **Returns:** a `Flight`. Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such
-    a grid (see `jaxos4.logs.sampling`). Jumps of 2 pi in roll and yaw are removed.
-
-    **Raises:** `InputError`, one line: file, row, column, what is wrong and what to do.
-
-    **Warns:** `UserWarning` for each change to the data: resampling, empty cells of a rotor, ignored columns.
+    Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such a grid. Jumps of 2 pi in
+    roll and yaw are removed. Each change to the data is a `UserWarning`. Arguments and errors are those of `read_log`.
     """
     found = recording_of(*CSV.read(path), airframe)
     for note in found.notes:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
-from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, uniform_grid, unwrap
+from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, unwrap
 from .table import (
     COMMAND_NAMES as COMMAND_NAMES,
     LIMITS,
@@ -75,8 +75,19 @@ def recording_of(
     channels, voltage = _channels(table, found), _voltage(table)
     with_force = any(map(table.holds, FORCE_NAMES))
     commanded = motors is COMMAND_NAMES
-    table = table._replace(columns={"t": table.columns["t"]})  # frees the memory of a long log
-    time, omega, channels, voltage = _evenly(table, dt, omega, channels, voltage, found)
+    t = table.columns["t"]
+    table = table._replace(columns={"t": t})  # frees the memory of a long log
+    samples = grid_size(t, dt)
+    if samples > min(MAX_ROWS, _MOST_SAMPLES + 10 * t.size):
+        row = int(np.argmax(np.diff(t)))
+        what = f"comes after a gap of {t[row + 1] - t[row]:.6g} s: at the median step of {dt:.3g} s the flight would "
+        table.refuse(what + f"have {samples:.3g} samples; cut the file there", index=row + 1, column="t")
+    (time, omega, channels), figures = resample(t, omega, channels, dt)
+    if figures:
+        found.append(figures)
+        voltage = None if voltage is None else np.interp(time, t, voltage)
+    if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
+        table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
     dt = float(time[-1] - time[0]) / (time.size - 1)
     if np.finfo(jnp.result_type(float)).eps * abs(time[0]) > UNIFORM * dt:
         found.append(f"t starts at {time[0]:.10g} s, too late for this precision: it was shifted to 0")
@@ -154,12 +165,12 @@ def _check_units(table: Table) -> Table:
             continue
         if name == "phi" and 1 / 3 < ratio < 3:
             limits = PITCH
-        if 1 / _SPREAD < ratio / _DEGREES < _SPREAD:
-            what = table.remedy or "it looks like degrees, divide by 57.3"
-            table.refuse(f"changes {ratio:.3g} times as fast as {rate}: {what}", column=name)
-        if 1 / _SPREAD < ratio * _DEGREES < _SPREAD:
-            what = table.remedy or "it looks like deg/s, divide by 57.3"
-            table.refuse(f"is {1 / ratio:.3g} times as fast as {name} changes: {what}", column=rate)
+        for wrong, unit, off, what in (
+            (name, "degrees", ratio / _DEGREES, f"changes {ratio:.3g} times as fast as {rate}"),
+            (rate, "deg/s", ratio * _DEGREES, f"is {1 / ratio:.3g} times as fast as {name} changes"),
+        ):
+            if 1 / _SPREAD < off < _SPREAD:
+                table.refuse(f"{what}: {table.remedy or f'it looks like {unit}, divide by 57.3'}", column=wrong)
     if table.holds("psi"):
         measured = np.flatnonzero(np.isfinite(columns["psi"]))
         jumps = np.zeros(columns["psi"].size, dtype=bool)
@@ -187,11 +198,11 @@ def _scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | 
     rates = Series(t[with_rate], rate[with_rate, None])
     with_angle = np.isfinite(angle) & (t >= rates.t[0]) & (t <= rates.t[-1])
     instants, angle = t[with_angle], angle[with_angle]
-    if instants.size <= _FEWEST:
-        return None
-    windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
-    knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
-    knots = knots[knots < instants.size]
+    knots = np.empty(0, dtype=int)
+    if instants.size > _FEWEST:
+        windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
+        knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
+        knots = knots[knots < instants.size]
     if knots.size <= _FEWEST:
         return None
     steps = np.diff(angle)
@@ -250,8 +261,8 @@ def _thrust_note(ratio: float) -> list[str]:
     if ratio == 0:
         return ["the rotors do not turn for at least half of the flight: keep only the part in the air"]
     unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
-    what = f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight"
-    return [f"{what}: check the airframe, and whether rotor speeds are in {unit}"]
+    advice = f"check the airframe, and whether rotor speeds are in {unit}"
+    return [f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight: {advice}"]
 
 
 def _channels(table: Table, notes: list[str]) -> np.ndarray:
@@ -283,23 +294,3 @@ def _voltage(table: Table) -> np.ndarray | None:
     t, voltage = table.columns["t"], table.columns["voltage"]
     measured = voltage > 0
     return np.interp(t, t[measured], voltage[measured]) if measured.any() else None
-
-
-def _evenly(
-    table: Table, dt: float, omega: np.ndarray, channels: np.ndarray, voltage: np.ndarray | None, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Time, rotor speeds, channels and voltage on a uniform grid. Rows that already lie on one keep their values."""
-    t = table.columns["t"]
-    time = uniform_grid(t)
-    if time is not None:
-        return time, omega, channels, voltage
-    samples = grid_size(t, dt)
-    if samples > min(MAX_ROWS, _MOST_SAMPLES + 10 * t.size):
-        row = int(np.argmax(np.diff(t)))
-        what = f"comes after a gap of {t[row + 1] - t[row]:.6g} s: at the median step of {dt:.3g} s the flight would "
-        table.refuse(what + f"have {samples:.3g} samples; cut the file there", index=row + 1, column="t")
-    (time, omega, channels), figures = resample(t, omega, channels, dt)
-    notes.append(figures)
-    if not np.isfinite(channels[:, : len(STATE_NAMES)]).any():
-        table.refuse("every measured sample is too far from its neighbours (1.5 steps); record at even times")
-    return time, omega, channels, None if voltage is None else np.interp(time, t, voltage)

@@ -264,16 +264,16 @@ def _decoded(path: Path) -> _Log:
 def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
     """The columns of one session with the time from 0, or `None`, and a remark on what is lost."""
     try:
-        decoded = decode_frames(settings, frames, _KNOWN)
+        columns, damaged, ended = decode_frames(settings, frames, _KNOWN)
     except BadHeader as error:
         return None, f"{error}: it is ignored"
-    later = in_order(decoded.columns["time"])
+    later = in_order(columns["time"])
     if later is None or later.size < 2:
         return None, "holds no frames that can be decoded: it is ignored"
-    places = counted(decoded.damaged, "place")
-    damage = f"is damaged in {places}; what follows up to the next complete frame is ignored" if decoded.damaged else ""
-    end = "" if decoded.ended else "has no end: it was cut while it was written, or is corrupt"
-    return {name: column[later] for name, column in decoded.columns.items()}, "; ".join(filter(None, (damage, end)))
+    damage = f"is damaged in {counted(damaged, 'place')}; what follows up to the next complete frame is ignored"
+    end = "has no end: it was cut while it was written, or is corrupt"
+    remarks = [damage] * (damaged > 0) + [end] * (not ended)
+    return {name: column[later] for name, column in columns.items()}, "; ".join(remarks)
 
 
 def _add_rates(log: _Log) -> None:

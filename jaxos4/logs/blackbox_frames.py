@@ -22,9 +22,10 @@ _MARKER = re.compile(rb"[IPSGHE]")
 _LONGEST_FRAME = 1024  # bytes
 _MOST_FIELDS = 512
 _FARTHEST, _MOST_ITERATIONS = 10_000_000, 5000  # [us], from one frame to the next: more is damage
-_END = b"End of log"
+_END, _BAD = b"End of log", "its header is damaged"
 _I, _P, _E = b"IPE"
-_EVENTS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}  # event: how many numbers it has
+_ADJUSTMENT, _RESUME, _LOG_END = 13, 14, 255
+_EVENTS = {0: 1, _ADJUSTMENT: 1, _RESUME: 2, 15: 1, 30: 2, 40: 1}  # event: how many numbers it has
 
 _SIGNED, _UNSIGNED, _NEGATIVE_14, _TAG8, _TAG2_3, _TAG8_4, _NULL, _TAG2_3_V = 0, 1, 3, 6, 7, 8, 9, 10
 # How many fields of an encoding are read together.
@@ -51,21 +52,14 @@ class BadHeader(Exception):
     """A header that does not describe frames which can be decoded; the text says why."""
 
 
-class Decoded(NamedTuple):
-    """The complete frames of a session.
+def decode_frames(
+    settings: dict[str, str], data: bytes, wanted: Collection[str]
+) -> tuple[dict[str, np.ndarray], int, bool]:
+    """Decode the complete frames of a session from the bytes after its header. Raises `BadHeader`.
 
-    - `columns`: by the names of the log; `time` [us] increases, from 0.
-    - `damaged`: the number of places where frames are damaged.
-    - `ended`: whether the session has an end.
+    **Returns:** the columns `wanted`, as far as there are, by the names of the log, with `time` [us], which increases
+    from 0; the number of places where frames are damaged; whether the session has an end.
     """
-
-    columns: dict[str, np.ndarray]
-    damaged: int
-    ended: bool
-
-
-def decode_frames(settings: dict[str, str], data: bytes, wanted: Collection[str]) -> Decoded:
-    """Decode the columns `wanted`, as far as there are, from the bytes after the header. Raises `BadHeader`."""
     stream, values = _Stream(settings, data), array.array("d")
     names = stream.kinds[_I].names
     places = [stream.time, *(i for i, name in enumerate(names) if name in wanted)]
@@ -75,7 +69,7 @@ def decode_frames(settings: dict[str, str], data: bytes, wanted: Collection[str]
     time = columns[_TIME]
     # The vehicle counts the time in 32 bits, so it wraps after 72 minutes.
     columns[_TIME] = np.cumsum(np.diff(time, prepend=time[:1]) % 2.0**32)
-    return Decoded(columns, stream.damaged, stream.ended)
+    return columns, stream.damaged, stream.ended
 
 
 def _kinds(settings: dict[str, str]) -> dict[int, _Kind]:
@@ -86,8 +80,9 @@ def _kinds(settings: dict[str, str]) -> dict[int, _Kind]:
         if not encodings:
             continue
         names = [name.strip() for name in settings.get(f"Field {letter} name", "").split(",")]
-        if not len(predictors) == len(encodings) <= _MOST_FIELDS or (letter != "P" and len(names) != len(encodings)):
-            raise BadHeader("its header is damaged")
+        same = len(predictors) == len(encodings) <= _MOST_FIELDS and (letter == "P" or len(names) == len(encodings))
+        if not same or (letter == "P" and _I in kinds and len(predictors) != len(kinds[_I].names)):
+            raise BadHeader(_BAD)
         groups: list[tuple[int, int]] = []
         for encoding, run in itertools.groupby(encodings):
             if encoding not in _TOGETHER:
@@ -99,8 +94,6 @@ def _kinds(settings: dict[str, str]) -> dict[int, _Kind]:
         kinds[ord(letter)] = _Kind(names, groups, predictors)
     if _I not in kinds or not {_TIME, _ITERATION} <= set(kinds[_I].names):
         raise BadHeader("its header does not describe the frames")
-    if _P in kinds and len(kinds[_P].predictors) != len(kinds[_I].names):
-        raise BadHeader("its header is damaged")
     return kinds
 
 
@@ -129,21 +122,17 @@ class Numbers:
             self.signed(count, values)
         elif encoding == _UNSIGNED:
             self.unsigned(count, values)
-        elif encoding == _NULL:
-            values += [0] * count
         elif encoding == _NEGATIVE_14:
-            begin = len(values)
-            self.unsigned(count, values)
-            values[begin:] = [-_extended(value, 14) for value in values[begin:]]
+            found: list[int] = []
+            self.unsigned(count, found)
+            values += [-_extended(value, 14) for value in found]
         elif encoding == _TAG8:
             header = self.byte()  # which of up to eight numbers are not 0
             for i in range(count):
-                if header >> i & 1:
-                    self.signed(1, values)
-                else:
-                    values.append(0)
+                self.signed(header >> i & 1, values)
+                values += [0] * (not header >> i & 1)
         else:
-            values += (self._tag8_4() if encoding == _TAG8_4 else self._three(encoding))[:count]
+            values += ([0] * count if encoding == _NULL else self._packed(encoding))[:count]
 
     def byte(self) -> int:
         """The next byte."""
@@ -172,32 +161,28 @@ class Numbers:
         for i in range(begin, len(values)):
             values[i] = (values[i] >> 1) ^ -(values[i] & 1)
 
-    def _three(self, encoding: int) -> list[int]:
-        """Three numbers of 2 bits, of `_IN_14_OR_22`, or of one to four bytes each, the lowest byte first."""
+    def _packed(self, encoding: int) -> list[int]:
+        """Three numbers of 2 bits, of `_IN_14_OR_22`, or of one to four bytes each, the lowest byte first.
+
+        With `_TAG8_4`: four numbers of 0, 4, 8 or 16 bits, in a row of half bytes.
+        """
         lead = self.byte()
+        if encoding == _TAG8_4:
+            values, bits, held = [], 0, 0
+            for width in ((0, 4, 8, 16)[lead >> shift & 3] for shift in (0, 2, 4, 6)):
+                while held < width:
+                    bits, held = bits << 8 | self.byte(), held + 8
+                held -= width
+                values.append(_extended(bits >> held, width) if width else 0)
+            return values
         size = lead >> 6
         if size == 0:
             return [_extended(lead >> shift, 2) for shift in (4, 2, 0)]
         if size < 3:
-            bits = lead
-            for _ in range(size):
-                bits = bits << 8 | self.byte()
+            bits = int.from_bytes([lead, *(self.byte() for _ in range(size))])
             return [_extended(bits >> place, width) for place, width in _IN_14_OR_22[encoding][size - 1]]
         lengths = [(lead >> shift & 3) + 1 for shift in (0, 2, 4)]
         return [_extended(sum(self.byte() << 8 * i for i in range(length)), 8 * length) for length in lengths]
-
-    def _tag8_4(self) -> list[int]:
-        """Four numbers of 0, 4, 8 or 16 bits, in a row of half bytes."""
-        header, values = self.byte(), []
-        bits = held = 0
-        for i in range(4):
-            width = (0, 4, 8, 16)[header >> 2 * i & 3]
-            while held < width:
-                bits, held = bits << 8 | self.byte(), held + 8
-            held -= width
-            values.append(_extended(bits >> held, width) if width else 0)
-            bits &= (1 << held) - 1
-        return values
 
 
 def _extended(value: int, bits: int) -> int:
@@ -221,7 +206,7 @@ class _Stream:
         self.interval = _whole(settings.get("I interval"), 1)
         self.share, self.apart = (_whole(first, 1), _whole(last, 1)) if last else (1, _whole(first, 1))
         if self.interval > 1 << 16 or not 0 < self.share <= self.apart:
-            raise BadHeader("its header is damaged")
+            raise BadHeader(_BAD)
         self.steps: dict[int, int] = {}
 
     def frames(self) -> Iterator[list[int]]:
@@ -275,19 +260,14 @@ class _Stream:
         """Add the predictions from the two frames before, in place."""
         constants = self.constants
         for i, predictor in enumerate(self.kinds[kind].predictors):
-            if predictor == _PREVIOUS:
-                values[i] += before[i]
+            if predictor in (_PREVIOUS, _INCREMENT):
+                values[i] += before[i] + (self._step(before[i]) if predictor == _INCREMENT else 0)
             elif predictor == _AVERAGE:
-                total = before[i] + earlier[i]
-                values[i] += total // 2 if total >= 0 else -(-total // 2)
+                values[i] += int((before[i] + earlier[i]) / 2)
             elif predictor == _LINE:
                 values[i] += 2 * before[i] - earlier[i]
-            elif predictor == _MOTOR0:
-                values[i] += values[self.motor0]
-            elif predictor == _INCREMENT:
-                values[i] += before[i] + self._step(before[i])
-            elif predictor in constants:
-                values[i] += constants[predictor]
+            elif predictor:
+                values[i] += values[self.motor0] if predictor == _MOTOR0 else constants.get(predictor, 0)
 
     def _step(self, iteration: int) -> int:
         """The iterations from a frame to the next one that the vehicle logs."""
@@ -300,31 +280,25 @@ class _Stream:
 
     def _values(self, letter: int) -> list[int] | None:
         """The encoded numbers of a frame; `None` if it is none. Raises `IndexError` at the end of the data."""
-        if letter == _E:
-            return self._event()
-        kind = self.kinds.get(letter)
-        if kind is None:
-            return None
         values: list[int] = []
-        for encoding, count in kind.groups:
+        if letter == _E:
+            return values if self._event() else None
+        if letter not in self.kinds:
+            return None
+        for encoding, count in self.kinds[letter].groups:
             self.numbers.read(encoding, count, values)
         return values
 
-    def _event(self) -> list[int] | None:
-        """Skip an event; `None` if it is not known."""
-        event, values = self.numbers.byte(), []
-        if event == 255:
+    def _event(self) -> bool:
+        """Skip an event. Returns whether it is known."""
+        event = self.numbers.byte()
+        if event == _LOG_END:
             self.ended = self.data.startswith(_END, self.numbers.at)
-            return [] if self.ended else None
-        if event == 13:  # an adjustment, of a whole number or of a real one
-            if self.numbers.byte() & 0x80:
-                self.numbers.at += 4
-            else:
-                self.numbers.unsigned(1, values)
-        elif event in _EVENTS:
-            self.numbers.unsigned(_EVENTS[event], values)
+            return self.ended
+        if event == _ADJUSTMENT and self.numbers.byte() & 0x80:  # of a real number, else of a whole one
+            self.numbers.at += 4
         else:
-            return None
-        if event == 14:  # logging goes on after a pause
+            self.numbers.unsigned(_EVENTS.get(event, 0), [])
+        if event == _RESUME:
             self.last = None
-        return values
+        return event in _EVENTS

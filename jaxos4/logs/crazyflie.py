@@ -83,8 +83,7 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     if first == "command1":
         notes.append(f"commands are {names[first]}.., taken as fractions of full-scale rotor speed")
     motors, gyro = (Sampling(names[name], logged_rate(each.t)) for name, each in ((first, rotors), ("p", rates)))
-    facts = LogFacts(motors, gyro, _OFTEN)
-    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=facts)
+    table = Table(path, {}, first_row=None, names=names, remedy=_REMEDY, facts=LogFacts(motors, gyro, _OFTEN))
     return gyro_rows(table, rates, rotors, measured=first == "omega1", others=others)[1], tuple(notes)
 
 
@@ -160,20 +159,16 @@ def _types(path: Path, content: bytes) -> tuple[Types, int, int]:
 
 def _places(path: Path, content: bytes, types: Types, at: int, *, valid: bool) -> tuple[dict[int, array.array], int]:
     """The position of each event by its type, and the number of bytes after the last complete event."""
+    places, end = {number: array.array("q") for number in types}, len(content)
     sizes = {number: layout.itemsize for number, layout in types.items()}
-    places = {number: array.array("q") for number in sizes}
-    end = len(content)
     while at + 2 <= end:
         number = content[at] | content[at + 1] << 8
-        size = sizes.get(number)
-        if size is None:
-            if not valid and end - at <= 4:  # a wrong checksum
-                break
+        if number not in sizes and (valid or end - at > 4):  # else a wrong checksum
             refuse(path, f"is corrupt at byte {at}: no event begins there; {_AGAIN}")
-        if at + size > end:
+        if at + sizes.get(number, end) > end:
             break
         places[number].append(at)
-        at += size
+        at += sizes[number]
     return places, end - at
 
 
@@ -203,11 +198,9 @@ def _rotors(variables: Variables, names: dict[str, str]) -> tuple[Series, str] |
 
 
 def _attitude(variables: Variables, names: dict[str, str]) -> Series | None:
-    series = _series(variables, _ANGLES, names)
-    if series is not None:
+    if (series := _series(variables, _ANGLES, names)) is not None:
         return unwrapped(series.t, series.values)
-    series = _series(variables, _QUATERNION, {})
-    if series is None:
+    if (series := _series(variables, _QUATERNION, {})) is None:
         return None
     names |= dict.fromkeys(_ANGLES, "stateEstimate.q")
     return attitude_of(series.t, series.values)

@@ -17,15 +17,13 @@ The first row holds the names of the columns, in any order. Cells are separated 
 A missing column or an empty cell means that the value was not measured. Voltage is interpolated over empty cells. A
 flight needs `t`, all four rotors (speeds or commands), and at least one of the twelve states of Eq. (14).
 
-The parser is our own: `numpy.loadtxt` takes no empty cells and accepts `nan` and `inf`, `numpy.genfromtxt` reads text
-as NaN, and neither gives the row of the file and the name of the column.
+The parser is our own, because those of NumPy give neither the row of the file nor the name of the column.
 """
 
 import contextlib
 import csv
 import itertools
 import math
-import os
 import re
 from collections.abc import Collection, Iterator, Sequence
 from typing import IO
@@ -34,16 +32,14 @@ import numpy as np
 
 from .._files import write_atomically
 from ..airframe import Airframe
-from ..errors import InputError
 from ..flight import FORCE_NAMES, STATE_NAMES, Flight
 from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES
-from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, printable, quoted, refuse
+from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, quoted, refuse
 
 _ROWS_AT_ONCE = 8192  # the whole text never has to fit in memory
 _LONGEST_LINE = 1 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
-_EMPTY = "leave the cell empty if it was not measured"
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
 CSV = LogFormat("CSV", "flight CSV", lambda begin: True, lambda path: (read_table(path, COLUMN_NAMES), ()))
@@ -96,10 +92,8 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
     speed that is not finite); `OSError` if the file cannot be written.
     """
     if flight.time.ndim != 1:
-        raise InputError(
-            f"{printable(os.fspath(path))}: one file holds one flight, got a batch of shape {flight.time.shape[:-1]}; "
-            "write each flight to its own file."
-        )
+        shape = flight.time.shape[:-1]
+        refuse(path, f"one file holds one flight, got a batch of shape {shape}; write each flight to its own file")
     names, omega = SPEED_NAMES, np.asarray(flight.omega)
     if flight.commanded and airframe is not None and np.isfinite(airframe.max_rotor_speed):
         names, omega = COMMAND_NAMES, omega / np.asarray(airframe.max_rotor_speed)
@@ -111,10 +105,8 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
         usable = np.isfinite(column) if name in needed else ~np.isinf(column)
         if not usable.all():
             index = int(np.argmin(usable))
-            raise InputError(
-                f"{printable(os.fspath(path))}: sample {index}, column {name}: is {column[index]}, "
-                "which a flight file cannot contain; cut the flight before it."
-            )
+            what = f"is {column[index]}, which a flight file cannot contain; cut the flight before it"
+            refuse(path, f"sample {index}, column {name}: {what}")
     columns = needed | {name: column for name, column in measured.items() if not np.isnan(column).all()}
     with write_atomically(path) as beside, open(beside, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -132,17 +124,15 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
     names = [name.strip() for name in _cells(path, line.rstrip("\n"), row)]
     separators = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
     wrong = next((shown for each, shown in separators.items() if len(names) == 1 and each in line.strip()), None)
-    for fault, what in (
-        (not line, "is empty; a flight needs a header row and at least two rows of data"),
-        (not any(names), "is empty; the first row must be the header"),
-        (wrong, f"is separated by {wrong}; separate by commas, with points in the numbers"),
-        (
-            all(_NUMBER.fullmatch(name) for name in names if name),
-            "contains numbers instead of the header; write the names of the columns in a first row",
-        ),
-    ):
-        if fault:
-            refuse(path, what, row=row if line else None)
+    numbers = all(_NUMBER.fullmatch(name) for name in names if name)
+    what = (
+        "is empty; a flight needs a header row and at least two rows of data" * (not line)
+        or "is empty; the first row must be the header" * (not any(names))
+        or (f"is separated by {wrong}; separate by commas, with points in the numbers" if wrong else "")
+        or "contains numbers instead of the header; write the names of the columns in a first row" * numbers
+    )
+    if what:
+        refuse(path, what, row=row if line else None)
     for name in known:
         if names.count(name) > 1:
             refuse(path, f"occurs {names.count(name)} times in the header; keep one of them", row=row, column=name)
@@ -189,14 +179,12 @@ def _numbers(path: Path, column: str, cells: Sequence[str], row: int) -> np.ndar
                 return values
     values = np.empty(len(cells))
     for i, cell in enumerate(map(str.strip, cells)):
-        values[i] = float(cell) if _NUMBER.fullmatch(cell) else math.nan
+        number = _NUMBER.fullmatch(cell) is not None
+        values[i] = float(cell) if number else math.nan
         if cell and not math.isfinite(values[i]):
-            fault = ", which is not a number; correct it, or"
-            if cell.lower().lstrip("+-") in _NO_NUMBER:
-                fault = ";"
-            elif _NUMBER.fullmatch(cell):
-                fault = ", which is too large for a number;"
-            what = f"contains {quoted(cell)}{fault} {_EMPTY}"
+            fault = ", which is too large for a number;" if number else ", which is not a number; correct it, or"
+            fault = ";" if cell.lower().lstrip("+-") in _NO_NUMBER else fault
+            what = f"contains {quoted(cell)}{fault} leave the cell empty if it was not measured"
             refuse(path, what if _readable(cell) else _NOT_UTF8, row=row + i, column=column)
     return values
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from .table import COMMAND_NAMES, MAX_ROWS, SPEED_NAMES, Table, counted, refuse
 
 UNIFORM = 0.01  # of a step: rows this close to a grid keep their values
-REACH = 1.5  # times the step: measured samples further apart have a gap between them
+_REACH = 1.5  # times the step: measured samples further apart have a gap between them
 _ROUNDING = 1e-6  # of a step: a smaller difference from a grid is a rounding error
 _FASTER = 0.9  # of the rows' step: a sensor with shorter steps is averaged
 _MEASURED = 0.45  # of a longer sample must be measured: below one half, because the ends have half of their rows
@@ -24,7 +24,6 @@ Columns = Float[np.ndarray, "samples columns"]
 Rotors = Float[np.ndarray, "samples 4"]
 Rows = Float[np.ndarray, " rows"]
 Resampled = tuple[Rows, Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows columns"]]
-"""Time, rotor speeds and channels on another grid."""
 
 
 class Series(NamedTuple):
@@ -104,11 +103,18 @@ def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[n
         if step is None and t.size > 1 and _step(t) < _FASTER * own:
             out[:, column] = _means(rows, own, Series(t, values[:, None]))[:, 0]
         elif t.size:
-            out[:, column] = _interpolated(rows, own, t, values, every=step is not None)
+            row, near = _around(rows, t)[2], np.zeros(rows.size, dtype=bool)
+            near[row[np.abs(rows[row] - t) <= (own / 2 if step else own)]] = True
+            left, right, nearest = _around(t, rows)
+            apart, between = t[right] - t[left], (t[left] <= rows) & (rows <= t[right])
+            joined = near & (apart <= _REACH * max(_step(t), own)) | ((apart <= _REACH * own) if step else False)
+            exact = near & ~(between & joined) & (np.abs(t[nearest] - rows) <= UNIFORM * own)
+            out[:, column] = np.where(between & joined, np.interp(rows, t, values), np.nan)
+            out[exact, column] = values[nearest[exact]]
     return out
 
 
-def averaged_to(step: float, series: Series) -> Series:
+def _averaged(series: Series, step: float = _FASTEST_ROWS) -> Series:
     """The series, averaged to one sample each `step` [s] if it is faster. Gaps stay gaps."""
     kept = np.isfinite(series.values).all(axis=1)
     if series.t.size < 2 or _step(series.t) >= _FASTER * step or np.count_nonzero(kept) < 2:
@@ -147,10 +153,10 @@ def gyro_rows(
         table = table._replace(columns=columns).without_impossible()
         return Series(series.t, np.column_stack([table.columns[name] for name in names]))
 
-    rates, rotors = averaged_to(_FASTEST_ROWS, possible(("p", "q", "r"), rates)), possible(rotor_names, rotors)
+    rates, rotors = _averaged(possible(("p", "q", "r"), rates)), possible(rotor_names, rotors)
     turning = np.isfinite(rotors.values).all(axis=1)
     rotors = Series(rotors.t[turning], rotors.values[turning])
-    inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + REACH * _step(rotors.t))
+    inside = (rates.t >= rotors.t[0]) & (rates.t <= rotors.t[-1] + _REACH * _step(rotors.t))
     if np.count_nonzero(inside) < 2:
         refuse(table.path, "rates and motors were not logged at the same time; record both in one flight")
     rows = rates.t[inside]
@@ -164,35 +170,40 @@ def gyro_rows(
     return rows, table._replace(columns=columns)
 
 
-def uniform_grid(t: Times) -> Times | None:
-    """The uniform grid from the first to the last time [s], or None if a row is more than 1 % of a step away from it.
-
-    If the times differ from the grid by rounding errors only, the times themselves are returned.
-    """
-    grid = np.linspace(t[0], t[-1], t.size)
-    dt = (t[-1] - t[0]) / (t.size - 1)
-    off = np.abs(t - grid).max()
-    if off > UNIFORM * dt:
-        return None
-    return t if off <= max(_ROUNDING * dt, 4 * np.spacing(np.abs(t).max())) else grid
-
-
 def grid_size(t: Times, dt: float) -> float:
     """The number of samples of a grid of step `dt` over the times `t` [s]. It may be too large for memory."""
     return math.floor((t[-1] - t[0]) / dt + UNIFORM) + 1.0
 
 
 def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Resampled, str]:
-    """Resample rows at uneven times [s] to the grid t_0, t_0 + dt, ...
+    """Bring rows at uneven times [s] to the grid t_0, t_0 + dt, ...
 
     `omega` is held until the next row (`root_mean_square`), `channels` are interpolated linearly (`at_rows`), with an
-    error of second order in dt. A gap is NaN, except for samples within 1 % of dt of a time of the grid.
+    error of second order in dt. A gap is NaN, except for samples within 1 % of dt of a time of the grid. If all rows
+    are within 1 % of a step of a uniform grid, their values stay, and so do times that are off by rounding only.
 
-    **Returns:** time, rotor speeds and channels; a note with the figures of the resampling.
+    **Returns:** time, rotor speeds, channels, and a note with the figures of the resampling, if there was any.
     """
-    grid = _grid(t, dt)
-    even = at_rows(grid, Series(t, channels), step=dt)
-    return (grid, root_mean_square(Series(t, omega), grid), even), _note(t, grid, dt)
+    own, grid = (t[-1] - t[0]) / (t.size - 1), np.linspace(t[0], t[-1], t.size)
+    off = np.abs(t - grid).max()
+    if off <= UNIFORM * own:
+        return (t if off <= max(_ROUNDING * own, 4 * np.spacing(np.abs(t).max())) else grid, omega, channels), ""
+    grid, step = _grid(t, dt), np.diff(t)
+    gap = step > _REACH * dt
+    jitter = np.std(step[~gap])
+    note = (
+        f"t is not uniform (jitter {1e3 * jitter * (jitter > _ROUNDING * dt):.3g} ms, standard deviation): {t.size} "
+        f"rows were resampled to {grid.size} samples, one every {1e3 * dt:.6g} ms"
+    )
+    if gap.any():
+        ends = [
+            np.searchsorted(grid, t[np.flatnonzero(gap) + k] + sign * UNIFORM * dt) for k, sign in ((0, 1), (1, -1))
+        ]
+        note += (
+            f"; {counted(int(gap.sum()), 'gap')} of up to {1e3 * step.max():.4g} ms: the "
+            f"{int((ends[1] - ends[0]).sum())} samples in gaps hold the rotor speeds and count as not measured"
+        )
+    return (grid, root_mean_square(Series(t, omega), grid), at_rows(grid, Series(t, channels), step=dt)), note
 
 
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:
@@ -265,51 +276,15 @@ def _means(rows: np.ndarray, width: float, series: Series) -> np.ndarray:
     """Means over `width` around each row, of values interpolated linearly. NaN at the ends and across a gap."""
     t, (begin, end) = series.t, (rows - width / 2, rows + width / 2)
     steps = np.diff(t)
-    gaps = np.append(0, np.cumsum(steps > REACH * np.median(steps)))
+    gaps = np.append(0, np.cumsum(steps > _REACH * np.median(steps)))
     first, last = (np.clip(np.searchsorted(t, edge, side="right") - 1, 0, t.size - 2) for edge in (begin, end))
     whole = (begin >= t[0]) & (end <= t[-1]) & (gaps[last + 1] == gaps[first])
     mean = (integral(series, end, linear=True) - integral(series, begin, linear=True)) / width
     return np.where(whole[:, None], mean, np.nan)
 
 
-def _interpolated(rows: np.ndarray, step: float, t: np.ndarray, values: np.ndarray, *, every: bool) -> np.ndarray:
-    """One quantity at the rows nearest to a sample of it, or at `every` row that is not in a gap."""
-    row, sample = _nearest(rows, t), _nearest(t, rows)
-    near = np.zeros(rows.size, dtype=bool)
-    near[row[np.abs(rows[row] - t) <= (step / 2 if every else step)]] = True
-    right = np.clip(np.searchsorted(t, rows), min(1, t.size - 1), t.size - 1)
+def _around(grid: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The indices of the times in `grid` on both sides of each time `t`, and of the nearest of the two."""
+    right = np.clip(np.searchsorted(grid, t), min(1, grid.size - 1), grid.size - 1)
     left = np.maximum(right - 1, 0)
-    apart, between = t[right] - t[left], (t[left] <= rows) & (rows <= t[right])
-    joined = between & ((near & (apart <= REACH * max(_step(t), step))) | (every & (apart <= REACH * step)))
-    exact = near & ~joined & (np.abs(t[sample] - rows) <= UNIFORM * step)
-    out = np.where(joined, np.interp(rows, t, values), np.nan)
-    out[exact] = values[sample[exact]]
-    return out
-
-
-def _nearest(grid: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """The index of the time in `grid` that is nearest to each time `t`."""
-    right = np.clip(np.searchsorted(grid, t), 1, max(grid.size - 1, 1))
-    left = right - 1
-    right = np.minimum(right, grid.size - 1)
-    return np.where(t - grid[left] <= grid[right] - t, left, right)
-
-
-def _note(t: np.ndarray, grid: np.ndarray, dt: float) -> str:
-    """The figures of a resampling."""
-    step = np.diff(t)
-    gap = step > REACH * dt
-    jitter = np.std(step[~gap])
-    jitter = jitter if jitter > _ROUNDING * dt else 0.0
-    text = (
-        f"t is not uniform (jitter {1e3 * jitter:.3g} ms, standard deviation): {t.size} rows were resampled to "
-        f"{grid.size} samples, one every {1e3 * dt:.6g} ms"
-    )
-    if not gap.any():
-        return text
-    starts = np.flatnonzero(gap)
-    inside = np.searchsorted(grid, t[starts + 1] - UNIFORM * dt) - np.searchsorted(grid, t[starts] + UNIFORM * dt)
-    return (
-        f"{text}; {counted(starts.size, 'gap')} of up to {1e3 * step.max():.4g} ms: the {int(inside.sum())} samples in "
-        "gaps hold the rotor speeds and count as not measured"
-    )
+    return left, right, np.where(t - grid[left] <= grid[right] - t, left, right)

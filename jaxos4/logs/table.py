@@ -63,17 +63,10 @@ class LogFacts(NamedTuple):
     @property
     def too_slow(self) -> str:
         """Why the log was written too rarely to identify a vehicle, and what to do; empty if it was not."""
-        slow = [
-            f"{what} logged at {sampling.rate:.2g} Hz ({sampling.source})"
-            for what, sampling in (("the motors were", self.motors), ("the gyro was", self.gyro))
-            if sampling is not None and not fast_enough(sampling.rate)
-        ]
-        if not slow:
-            return ""
-        return (
-            f"{' and '.join(slow)}, too rarely to identify a vehicle: rotors answer within 20 to 80 ms, which needs "
-            f"{SLOWEST_RATE:g} Hz or more; {self.faster}"
-        )
+        every = (("the motors were", self.motors), ("the gyro was", self.gyro))
+        slow = [f"{what} logged at {s.rate:.2g} Hz ({s.source})" for what, s in every if s and not fast_enough(s.rate)]
+        needs = f"rotors answer within 20 to 80 ms, which needs {SLOWEST_RATE:g} Hz or more; {self.faster}"
+        return f"{' and '.join(slow)}, too rarely to identify a vehicle: {needs}" if slow else ""
 
 
 def fast_enough(rate: float) -> bool:
@@ -91,33 +84,31 @@ class Limit(NamedTuple):
     below: str = ""
 
 
-def _within(largest: float, unit: str, advice: str) -> Limit:
-    return Limit(-largest, largest, unit, advice)
-
-
-_COMMAND = Limit(0, 1, "of full scale", "commands are fractions 0..1: divide by full scale (100, 65535)")
-_RPM = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
-_SPEED = Limit(0, 1e5, "rad/s", _RPM, "drop the sign, because rotor_spins gives the direction")
-_ANGLE = _within(1e4, "rad", "it looks like degrees: divide by 57.3")
-_RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
-_PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
-_VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
+_ANGLE = Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")
+_TIME = "t is in seconds: if these are milli-, micro- or nanoseconds, divide"
+_COMMAND = "commands are fractions 0..1: divide by full scale (100, 65535)"
+_SPEED = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
+_SIGN = "drop the sign, because rotor_spins gives the direction"
 _POSITION = "positions are in metres from a point near the flight; subtract an offset"
+_VELOCITY = "velocities are in m/s: if these are mm/s, divide by 1000"
 _FORCE = "specific force is in m/s^2: if these are thousandths of g, multiply by 0.00980665"
+_VOLTAGE = "the battery's voltage is in volts: if these are mV, divide by 1000"
+_PITCH = "pitch lies within +-pi/2: if this is in degrees, divide by 57.3"
+_RIGHT_ANGLE = math.nextafter(math.pi / 2, 0)
 LIMITS = {
-    "t": _within(1e11, "s", "t is in seconds: if these are milli-, micro- or nanoseconds, divide"),
-    **dict.fromkeys(SPEED_NAMES, _SPEED),
-    **dict.fromkeys(COMMAND_NAMES, _COMMAND),
-    **dict.fromkeys("xyz", _within(1e6, "m", _POSITION)),
-    **dict.fromkeys(("vx", "vy", "vz"), _within(1e3, "m/s", _VELOCITY)),
-    **dict.fromkeys("pqr", _within(60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
+    "t": Limit(-1e11, 1e11, "s", _TIME),
+    **dict.fromkeys(SPEED_NAMES, Limit(0, 1e5, "rad/s", _SPEED, _SIGN)),
+    **dict.fromkeys(COMMAND_NAMES, Limit(0, 1, "of full scale", _COMMAND)),
+    **dict.fromkeys("xyz", Limit(-1e6, 1e6, "m", _POSITION)),
+    **dict.fromkeys(("vx", "vy", "vz"), Limit(-1e3, 1e3, "m/s", _VELOCITY)),
+    **dict.fromkeys("pqr", Limit(-60.0, 60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
     **dict.fromkeys(("phi", "theta", "psi"), _ANGLE),
-    **dict.fromkeys(FORCE_NAMES, _within(1e3, "m/s^2", _FORCE)),
-    "voltage": _within(200.0, "V", "the battery's voltage is in volts: if these are mV, divide by 1000"),
+    **dict.fromkeys(FORCE_NAMES, Limit(-1e3, 1e3, "m/s^2", _FORCE)),
+    "voltage": Limit(-200.0, 200.0, "V", _VOLTAGE),
 }
 """A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
-ROLL = {"phi": _within(2 * math.pi, "rad", _ANGLE.advice)}  # without a flip
-PITCH = {"theta": _within(_RIGHT_ANGLE, "rad", _PITCH)}
+ROLL = {"phi": Limit(-2 * math.pi, 2 * math.pi, "rad", _ANGLE.advice)}  # without a flip
+PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
 
 
 class Table(NamedTuple):
@@ -147,7 +138,7 @@ class Table(NamedTuple):
         if self.first_row is None and index is not None and column != "t":
             what = f"at {self.columns['t'][index]:.6g} s {what}"
         row = None if index is None or self.first_row is None else index + self.first_row
-        name = None if column is None else self.names.get(column, column)
+        name = self.names.get(column, column) if column else None
         refuse(self.path, what, row=row, column=name, kind="column" if self.first_row is not None else "field")
 
     def holds(self, *names: str) -> bool:
@@ -274,9 +265,8 @@ def needed(path: Path, found: Found | None, what: str, remedy: str) -> Found:
 
 def order_note(first: str) -> str:
     """The note on the order of the rotors; `first`: what the log calls rotor 1."""
-    return (
-        f"rotors keep the log's order ({first} is rotor 1): rotor_positions and rotor_spins must be in the same order"
-    )
+    same = "rotor_positions and rotor_spins must be in the same order"
+    return f"rotors keep the log's order ({first} is rotor 1): {same}"
 
 
 _UNREADABLE = {
@@ -315,8 +305,8 @@ def refuse(
     path: Path, what: str, *, row: int | None = None, column: str | None = None, kind: str = "column"
 ) -> NoReturn:
     """Raise an `InputError` of one line: the place, `what` is wrong and what to do, without its full stop."""
-    place = ", ".join([f"row {row}"] * (row is not None) + [f"{kind} {printable(column or '')}"] * (column is not None))
-    raise InputError(": ".join(filter(None, (printable(os.fspath(path)), place, what))) + ".")
+    places = [f"row {row}"] * (row is not None) + [f"{kind} {printable(column or '')}"] * (column is not None)
+    raise InputError(": ".join(filter(None, (printable(os.fspath(path)), ", ".join(places), what))) + ".")
 
 
 def printable(text: str) -> str:

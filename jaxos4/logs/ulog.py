@@ -222,12 +222,12 @@ def _landed(log: Topics, rows: np.ndarray) -> tuple[tuple[float, float], ...]:
 
 
 class _Rotors(NamedTuple):
-    """Measured speeds [rad/s] or commands [0..1] of the four rotors, and their topic and fields in the log."""
+    """Speeds [rad/s] or commands [0..1] of the four rotors, their topic and fields, and what was assumed."""
 
     series: Series
     topic: str
     fields: Sequence[str]
-    note: str = ""  # what was assumed
+    note: str = ""
 
     @property
     def measured(self) -> bool:

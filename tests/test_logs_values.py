@@ -1,0 +1,247 @@
+"""What the values of a log must be: units against each other, impossible samples, rates of logging."""
+
+import numpy as np
+import pytest
+import recorded_logs
+import test_logs_blackbox as blackbox
+import test_logs_crazyflie as crazyflie
+import test_logs_ulog as ulog
+from helpers import CRAZYFLIE, refused
+from recorded_logs import RPM, VEHICLE, blackbox_csv, outcome, rates, speeds, table_csv
+from test_flight_csv import csv, read_flight_and_notes, refusal
+
+import jaxos4.logs.assemble as assemble_module
+from jaxos4.flight import STATE_NAMES
+from jaxos4.logs import Sampling, read_flight, read_log, read_recording
+
+# Angles against rates
+
+
+def columns(names, t, *values):
+    """A file of some columns, with rotors that turn at 9 rad/s."""
+    rows = [",".join(map(repr, [row[0], 9, 9, 9, 9, *row[1:]])) for row in np.column_stack([t, *values]).tolist()]
+    return csv(",".join(["t,omega1,omega2,omega3,omega4", *names]), rows)
+
+
+def spin(scale_angle=1.0, scale_rate=1.0, rate=3.0, noise=0.0, names=("phi", "p")):
+    """A file of five seconds of one angle and its rate, in units of choice."""
+    rng = np.random.default_rng(0)
+    t = np.arange(500) * 0.01
+    angle = 0.4 * np.sin(rate * t) + noise * 0.005 * rng.normal(size=500)
+    speed = 0.4 * rate * np.cos(rate * t) + noise * 0.01 * rng.normal(size=500)
+    return columns(names, t, scale_angle * angle, scale_rate * speed)
+
+
+@pytest.mark.parametrize("names", [("phi", "p"), ("theta", "q"), ("psi", "r")])
+def test_an_angle_at_odds_with_its_rate_is_refused(names, save):
+    degrees = 180 / np.pi
+    assert read_flight_and_notes(save(spin(names=names, noise=1)))[1] == ()
+    message = refusal(save(spin(degrees, names=names, noise=1)))
+    assert message.startswith(f"column {names[0]}: ")
+    assert "degrees" in message
+    message = refusal(save(spin(scale_rate=degrees, rate=2.0, names=names, noise=1)))
+    assert message.startswith(f"column {names[1]}: ")
+    assert "deg/s" in message
+    for scale in ((20.0, 1.0), (1.0, 15.0), (1.5, -1.0)) if names[0] == "psi" else ():  # other disagreements
+        read_flight(save(spin(*scale, rate=2.0, names=names)))
+
+
+def test_noise_alone_is_no_degrees(save):
+    """Hovering: over 0.2 s, noise in the angle is some 57 times the integral of noise in the rate, by chance."""
+    rng = np.random.default_rng(1)
+    angle, rate = 0.005 * rng.normal(size=500), 2.8e-3 * rng.normal(size=500)
+    path = save(columns(("psi", "r"), 0.01 * np.arange(500), angle, rate))
+    assert read_flight_and_notes(path)[1] == ()
+    with pytest.MonkeyPatch.context() as patch:  # without the check that the two are similar
+        patch.setattr(assemble_module, "_SIMILARITY", -1.0)
+        assert "looks like degrees" in refusal(path)
+
+
+def test_a_flip_is_no_degree(save):
+    """Three turns of roll are 19 rad, as the roll rate says; without it they are refused."""
+    t = np.arange(200) * 0.01
+    flight = read_flight(save(columns(("phi", "p"), t, 10 * t, 10.0 + 0 * t)))
+    assert flight.states[-1, STATE_NAMES.index("phi")] == 10 * t[-1]
+    message = refusal(save(columns(("phi", "q"), t, 10 * t, 10.0 + 0 * t)))
+    assert message.startswith("row 65, column phi: is 6.3 rad")
+
+
+def test_an_accelerometer_that_never_changes_is_off(save):
+    rows = [f"{0.01 * k:.2f},{','.join(['200'] * 4)},0.1,0,0,9.81" for k in range(200)]
+    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows)))
+    assert any("is off" in note for note in notes)
+    assert flight.specific_force is None or np.isnan(flight.specific_force).all()
+    rows[100] = rows[100].replace("9.81", "9.80")
+    flight, notes = read_flight_and_notes(save(csv("t,omega1,omega2,omega3,omega4,p,ax,ay,az", rows)))
+    assert not any("is off" in note for note in notes)
+    assert np.isfinite(flight.specific_force).all()
+
+
+# Impossible samples
+
+
+def spoilt(truth, bad, column, value):
+    """Samples of a sensor, of which the rows `bad` of one column are impossible."""
+
+    def values(t):
+        out = truth(t)
+        out[bad, column] = value
+        return out
+
+    return values
+
+
+def csv_of(t, *sensors):
+    names = ["t", "p", "q", "r", "ax", "ay", "az", *(f"omega{i}" for i in range(1, 5))]
+    return table_csv(names, t, *(sensor(t) for sensor in sensors))
+
+
+def ulog_of(t, gyro, accelerometer, rotors):
+    return ulog.log(ulog.combined(t, gyro, accelerometer), ulog.escs(t, speeds=rotors))
+
+
+def crazyflie_of(t, gyro, accelerometer, rotors):
+    names = [*crazyflie.GYRO, *(f"rpm.m{i}(f)" for i in range(1, 5))]
+    values = [np.rad2deg(gyro(t)), accelerometer(t) / recorded_logs.GRAVITY, rotors(t) / RPM]
+    return recorded_logs.crazyflie([("e", names, t, np.column_stack(values))])
+
+
+def blackbox_of(t, gyro, accelerometer, rotors):
+    sensors = {"gyroADC": np.rad2deg(gyro(t)), "accSmooth": np.rint(accelerometer(t) / recorded_logs.GRAVITY * 2048)}
+    sensors["eRPM"] = np.rint(rotors(t) / RPM * 7 / 100)
+    columns = {f"{name}[{i}]": column for name, values in sensors.items() for i, column in enumerate(values.T)}
+    columns = {"loopIteration": np.arange(t.size), "time (us)": np.rint(1e6 * t)} | columns
+    return blackbox_csv(columns, settings=blackbox.SETTINGS | {"motor_poles": "14"}).encode()
+
+
+IMPOSSIBLE = {
+    csv_of: ("p", "az", "omega4"),
+    ulog_of: ("gyro_rad[0]", "accelerometer_m_s2[2]", "esc[3].esc_rpm"),
+    crazyflie_of: ("gyro.x", "acc.z", "rpm.m4"),
+    blackbox_of: ("gyroADC[0]", "accSmooth[2]", "eRPM[3]"),
+}
+
+
+@pytest.mark.parametrize("write", IMPOSSIBLE)
+def test_ten_impossible_samples_are_missing_and_the_rest_is_as_it_was(write, save):
+    t, bad = ulog.grid(0.004, 5.0), 7 + 120 * np.arange(10)
+
+    def log(gyro=bad, accelerometer=bad + 1, rotors=bad):
+        sensors = (rates, gyro, 0, 1e6), (recorded_logs.force, accelerometer, 2, -1e5), (speeds, rotors, 3, 104_720.0)
+        return save(write(t, *(spoilt(*each) for each in sensors)))
+
+    clean, found = read_recording(log([], [], [])), read_recording(log())
+    (note,) = set(found.notes) - set(clean.notes)
+    assert note.startswith("impossible values count as not measured, in ")
+    words = zip(
+        IMPOSSIBLE[write], ("1e+06 rad/s at 0.028 s", "-100000 m/s^2 at 0.032 s", "104720 rad/s at 0.028"), strict=True
+    )
+    for name, first in words:
+        assert f"{name}: 10 (first {first}" in note
+    p = STATE_NAMES.index("p")
+    expected = clean.states.copy()
+    expected[bad, p] = np.nan
+    np.testing.assert_array_equal(found.states, expected)
+    expected = clean.specific_force.copy()
+    expected[bad + 1, 2] = np.nan
+    np.testing.assert_array_equal(found.specific_force, expected)
+    elsewhere = np.delete(np.arange(t.size - 1), [bad - 1, bad])
+    np.testing.assert_allclose(found.omega[elsewhere], clean.omega[elsewhere], rtol=1e-12)
+    np.testing.assert_allclose(found.omega, clean.omega, atol=1.6)  # a step of eRPM is 1.5
+    many = np.arange(13) * 90  # of 1250
+    for kind, name in zip(("gyro", "accelerometer", "rotors"), IMPOSSIBLE[write], strict=True):
+        message = outcome(read_log, log(**{kind: many}))
+        assert f"{name}: " in message
+        assert " (13 of 1250 values, more than 1 %); " in message
+
+
+def test_an_impossible_first_value_of_a_rotor_is_the_next_one(save):
+    rows = [f"{0.01 * k:.2f},{2e5 if k in (0, 1, 9) else 100 + k},1,1,1,0.1" for k in range(400)]
+    found = read_recording(save("\n".join(["t,omega1,omega2,omega3,omega4,p", *rows])))
+    assert found.omega[[0, 1, 2, 8, 9, 10], 0].tolist() == [102, 102, 102, 108, 108, 110]
+    assert found.notes == ("impossible values count as not measured, in omega1: 3 (first 200000 rad/s at 0 s)",)
+
+
+# How often motors and gyro were logged
+
+ROWS, COMMANDS = 1000, [f"command{i}" for i in range(1, 5)]
+
+
+def repeating(tmp_path, held, *, stagger=0, lost=0.0):
+    """250 rows a second, with commands that are held for so many rows: each motor `stagger` rows after the last."""
+    rng = np.random.default_rng(0)
+    commands = np.repeat(rng.uniform(0.4, 0.6, (ROWS // held + 9, 4)), held, axis=0)
+    commands = np.stack([commands[stagger * i :, i][:ROWS] for i in range(4)], axis=1)
+    commands[1:][rng.uniform(size=ROWS - 1) < lost] = np.nan
+    path = tmp_path / "log.csv"
+    path.write_bytes(
+        table_csv(["t", *COMMANDS, "p", "q", "r"], 0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3)))
+    )
+    return read_recording(path, full_scale=1.0)
+
+
+@pytest.mark.parametrize(("held", "rate"), [(25, 10.0), (5, 50.0), (1, 250.0)])
+def test_values_that_repeat_were_not_logged(tmp_path, held, rate):
+    facts = repeating(tmp_path, held).facts
+    assert facts.motors.rate == pytest.approx(rate, rel=0.01)
+    assert facts.gyro.rate == pytest.approx(250.0, rel=0.01)
+    assert bool(facts.too_slow) == (rate < 40)
+    if facts.too_slow:
+        assert "the motors were logged at 10 Hz (the values of command1 change so often)" in facts.too_slow
+
+
+@pytest.mark.parametrize("kind", [{"stagger": 6}, {"lost": 0.2}])
+def test_motors_that_are_held_one_after_the_other_or_with_empty_cells(tmp_path, kind):
+    assert repeating(tmp_path, 25, **kind).facts.motors.rate == pytest.approx(10.0, rel=0.05)
+
+
+def slow_ulog(step):
+    t = ulog.grid(step, 3.4, offset=-0.2)
+    topics = (
+        ulog.combined(ulog.grid(0.004)),
+        ulog.vehicle_attitude(ulog.grid(0.02)),
+        ulog.motors(t, ulog.thrusts(t).tolist()),
+    )
+    return ulog.log(*topics, SDLOG_PROFILE=131)
+
+
+def slow_csv(step):
+    t = ulog.grid(0.004)
+    commands = ulog.thrusts(t)
+    commands[np.arange(t.size) % round(step / 0.004) != 0] = np.nan
+    return table_csv(["t", *COMMANDS, "p", "q", "r"], t, commands, rates(t))
+
+
+def slow_crazyflie(step):
+    t, slow = ulog.grid(0.004), ulog.grid(step, 3.4)
+    gyro = ["gyro.x(f)", "gyro.y(f)", "gyro.z(f)"]
+    events = [("g", gyro, t, np.degrees(rates(t)))]
+    events.append(("m", [f"motor.m{i}(H)" for i in range(1, 5)], slow, np.rint(65535 * ulog.thrusts(slow))))
+    return recorded_logs.crazyflie(events)
+
+
+REMEDIES = {
+    slow_ulog: ("actuator_motors", "set SDLOG_PROFILE to 147 (which includes 16, 'high rate')"),
+    slow_csv: ("command1", "log motors and gyro at 100 Hz or more"),
+    slow_crazyflie: ("motor.m1", "raise the frequency of these variables in the deck's config.txt"),
+}
+
+
+@pytest.mark.parametrize("kind", REMEDIES)
+def test_motors_at_10_hz_identify_nothing_and_it_is_said_first(kind, save, run, tmp_path):
+    (tmp_path / "vehicle.toml").write_text(VEHICLE)
+    name, remedy = save(kind(0.1)).name, REMEDIES[kind][1]
+    words = f"the motors were logged at 10 Hz ({REMEDIES[kind][0]}), too rarely to identify a vehicle: "
+    code, out, err = run("inspect", name, "--airframe", "vehicle.toml", "--out", "found.json")
+    assert (code, err) == (0, "")
+    first = out.splitlines()[1]
+    assert first.startswith(f"cannot identify a vehicle: {words}")
+    assert remedy in first
+    assert "rotor4: 10 Hz" in out
+    assert "identifiable: alpha1" not in out
+    result = run("estimate", name, "--model", "flight", "--airframe", "vehicle.toml")
+    refused(result, f"jaxos4: {name}: {words}", remedy)
+    assert read_log(save(kind(0.1)), CRAZYFLIE)[1][-1].startswith(words)
+    fast = read_recording(save(kind(0.02)), CRAZYFLIE).facts
+    assert fast.motors == Sampling(REMEDIES[kind][0], pytest.approx(50.0, rel=0.01))
+    assert fast.too_slow == ""
