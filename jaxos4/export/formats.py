@@ -109,7 +109,7 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 def _limits(vehicle: RigidVehicle, to: str) -> tuple[str, ...]:
     """The notes on what a simulator does not have, or has differently."""
     no_rotors = "not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
-    some = [(to != "sdf" and vehicle.rotor_inertia, f"rotor inertia: {no_rotors}")]
+    some: list[tuple[object, str]] = [(to != "sdf" and vehicle.rotor_inertia, f"rotor inertia: {no_rotors}")]
     some.append((vehicle.thrust_share, vehicle.curve(TARGETS[to].curve)))
     if to != "mujoco":
         name, damped, late = {"rotorpy": ("RotorPy", "", "give"), "sdf": ("SDF", " of one axis", "send")}[to]
