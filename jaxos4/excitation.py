@@ -1,9 +1,8 @@
 """Inputs that excite the parameters: rotor speeds that turn a hovering quadrotor about its axes.
 
-Each function designs angular accelerations about roll, pitch and yaw. The torque is inertia x acceleration, the thrust
-is the weight, and Eqs. (10)-(13) are solved for the rotor speeds. The inputs are open loop: the rates follow the design
-except for the gyroscopic coupling. The functions compute in NumPy's double precision and cannot be traced by JAX. The
-paper does not state its inputs; these are our choice.
+Each function designs angular accelerations. The torque is inertia x acceleration, the thrust is the weight, and Eqs.
+(10)-(13) are solved for the rotor speeds. The rates follow the design except for the gyroscopic coupling. The functions
+compute in NumPy's double precision and cannot be traced by JAX. The paper does not state its inputs.
 """
 
 import math
@@ -53,9 +52,8 @@ def multisine(
     time = dt * np.arange(intervals + 1)
     acceleration = np.zeros((intervals + 1, 3))
     for axis, axis_tones in enumerate(tones):
-        for tone in axis_tones:
-            _check_frequency("tones", tone, dt)
-            angular = 2 * math.pi * tone
+        _check_frequencies("tones", axis_tones, dt)
+        for angular in 2 * math.pi * np.asarray(axis_tones):
             acceleration[:, axis] += peak[axis] * angular * np.cos(angular * time) / len(axis_tones)
     return _rotor_speeds(airframe, acceleration, dt)
 
@@ -71,10 +69,9 @@ def doublet(
 ) -> RotorSpeeds:
     """A doublet of torque about one axis after another.
 
-    From torque to angle a quadrotor is a double integrator: the pulses + - end at rate zero and an angle of
-    amplitude x width. The mirror image - + brings the angle back, and a rest follows: five widths for an axis. The
-    sequence repeats as often as it fits, then the quadrotor hovers. Only one axis turns at a time, so the products of
-    rates in Eqs. (1)-(3) are zero, and alpha1, alpha4 and alpha7 are not excited.
+    The pulses + - end at rate zero and an angle of amplitude x width. The mirror image - + brings the angle back, and a
+    rest follows: five widths for an axis. The sequence repeats as often as it fits, then the quadrotor hovers. Only one
+    axis turns at a time, so alpha1, alpha4 and alpha7 are not excited.
 
     **Arguments:** those of `multisine`, and:
 
@@ -112,10 +109,9 @@ def chirp(
     frequencies: tuple[float, float] = (0.6, 3.0),
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
-    """A linear frequency sweep about one axis after another. The axes share the duration equally.
+    """A linear frequency sweep about one axis after another, faded in and out. The axes share the duration equally.
 
-    The angle is sin(phase) / (2 pi f), faded in over the first fifth of the sweep and out over the last, so that rate
-    and angle return to zero. As with `doublet`, alpha1, alpha4 and alpha7 are not excited.
+    As with `doublet`, alpha1, alpha4 and alpha7 are not excited.
 
     **Arguments:** those of `multisine` and the `axes` of `doublet`, and:
 
@@ -125,8 +121,7 @@ def chirp(
     **Raises:** as `multisine`, and if an axis gets less than one cycle.
     """
     intervals, order = _intervals(duration, dt), _axis_indices(axes)
-    for frequency in frequencies:
-        _check_frequency("frequencies", frequency, dt)
+    _check_frequencies("frequencies", frequencies, dt)
     first, last = frequencies
     samples = intervals // len(order)
     span = (samples - 1) * dt
@@ -137,26 +132,14 @@ def chirp(
     angle = np.pad(sine / (2 * math.pi * frequency), 1)
     rate = np.diff(angle) / dt
     shape = np.diff(rate) / dt / np.abs(rate).max()
-    return _rotor_speeds(airframe, _in_turn(shape, intervals, order, _peak_rates(amplitude)), dt)
+    return _about_axes(airframe, shape, intervals, order, amplitude, dt)
 
 
-EXCITATIONS: dict[str, Callable[..., RotorSpeeds]] = {
-    "multisine": multisine,
-    "doublet": doublet,
-    "3211": step3211,
-    "chirp": chirp,
-}
+Excite = Callable[..., RotorSpeeds]
+EXCITATIONS: dict[str, Excite] = {"multisine": multisine, "doublet": doublet, "3211": step3211, "chirp": chirp}
 
 
-def _pulses(
-    airframe: Airframe,
-    heights: Sequence[float],
-    duration: float,
-    dt: float,
-    amplitude: Amplitude,
-    width: float,
-    axes: Sequence[str],
-) -> RotorSpeeds:
+def _pulses(airframe, heights, duration, dt, amplitude, width, axes) -> RotorSpeeds:
     intervals, order = _intervals(duration, dt), _axis_indices(axes)
     if not math.isfinite(width) or round(width / dt) < 1:
         raise ValueError(f"`width` must be at least one sample of {dt:g} s, got {width}.")
@@ -169,30 +152,23 @@ def _pulses(
             f"`duration` must be at least {sequence * dt:.6g} s for pulses of `width` {width:g} s on "
             f"{len(order)} axes, got {duration:g} s."
         )
-    return _rotor_speeds(airframe, _in_turn(shape, intervals, order, _peak_rates(amplitude)), dt)
+    return _about_axes(airframe, shape, intervals, order, amplitude, dt)
 
 
-def _in_turn(shape: np.ndarray, intervals: int, order: list[int], peak: np.ndarray) -> np.ndarray:
-    """Accelerations with `shape` (unit peak rate) about each axis in turn, repeated while a complete sequence fits."""
-    acceleration = np.zeros((intervals + 1, 3))
+def _about_axes(airframe, shape: np.ndarray, intervals: int, order: list[int], amplitude, dt: float) -> RotorSpeeds:
+    """`shape` (unit peak rate) about each axis in turn, repeated while a complete sequence fits."""
     slots = intervals // (len(order) * len(shape)) * order
-    for slot, axis in enumerate(slots):
-        acceleration[slot * len(shape) : (slot + 1) * len(shape), axis] = peak[axis] * shape
-    return acceleration
+    return _rotor_speeds(airframe, _peak_rates(amplitude) * _in_turn([shape], intervals + 1, 3, slots), dt)
 
 
 def _rotor_speeds(airframe: Airframe, acceleration: np.ndarray, dt: float) -> RotorSpeeds:
-    """Rotor speeds [rad/s] that produce these angular accelerations [rad/s^2] and carry the weight."""
-    mixer = np.asarray(airframe.mixer, dtype=np.float64)
+    """Rotor speeds [rad/s] that produce these angular accelerations [rad/s^2] and carry the weight.
+
+    Raises `ValueError` for squared speeds outside of 0 to `max_rotor_speed`^2, and says which amplitude can fly.
+    """
     torque = np.asarray(airframe.inertia, dtype=np.float64) * acceleration
-    hover = airframe.hover_squares
-    change = np.linalg.solve(mixer, np.pad(torque, ((0, 0), (0, 1))).T).T
-    _check_flyable(hover, change, float(airframe.max_rotor_speed), dt)
-    return as_float(np.sqrt(hover + change))
-
-
-def _check_flyable(hover: np.ndarray, change: np.ndarray, fastest: float, dt: float) -> None:
-    """Refuse squared rotor speeds `hover + change` outside 0..fastest^2, and say which share of `change` can fly."""
+    hover, fastest = airframe.hover_squares, float(airframe.max_rotor_speed)
+    change = np.linalg.solve(np.asarray(airframe.mixer, dtype=np.float64), np.pad(torque, ((0, 0), (0, 1))).T).T
     if (hover < 0).any() or (hover > fastest**2).any():
         raise ValueError(
             f"`airframe` cannot hover: it needs squared rotor speeds of {np.round(hover).tolist()} rad^2/s^2, but its "
@@ -201,35 +177,18 @@ def _check_flyable(hover: np.ndarray, change: np.ndarray, fastest: float, dt: fl
     reserve = np.where(change > 0, fastest**2 - hover, hover)
     share = np.divide(reserve, np.abs(change), out=np.full_like(change, np.inf), where=change != 0)
     row, rotor = np.unravel_index(np.argmin(share), share.shape)
-    largest = share[row, rotor]
-    if largest >= 1:
-        return
-    squared = hover[rotor] + change[row, rotor]
-    if squared < 0:
-        problem = f"the squared speed of rotor {rotor + 1} would be {squared:.4g} rad^2/s^2, below zero,"
-    else:
-        excess = math.sqrt(squared) - fastest
-        problem = f"rotor {rotor + 1} would exceed the `max_rotor_speed` of {fastest:g} rad/s by {excess:.4g} rad/s"
-    raise ValueError(
-        f"`amplitude` is too large to fly: {problem} at t = {row * dt:.4g} s; "
-        f"multiply it by {_floor(largest):.3g} or less."
-    )
-
-
-def _floor(x: float) -> float:
-    """`x` rounded down to three significant digits."""
-    if x <= 0:
-        return 0.0
-    unit = 10.0 ** (math.floor(math.log10(x)) - 2)
-    return math.floor(x / unit) * unit
+    if share[row, rotor] < 1:
+        raise ValueError(
+            f"`amplitude` is too large to fly: rotor {rotor + 1} would need a squared speed of "
+            f"{hover[rotor] + change[row, rotor]:.5g} rad^2/s^2 at t = {row * dt:.4g} s, outside of 0 to "
+            f"{fastest**2:.5g} (`max_rotor_speed`); multiply it by {0.995 * share[row, rotor]:.3g} or less."
+        )
+    return as_float(np.sqrt(hover + change))
 
 
 def _intervals(duration: float, dt: float) -> int:
-    for name, value in (("duration", duration), ("dt", dt)):
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"`{name}` must be positive and finite [s], got {value}.")
-    if round(duration / dt) < 1:
-        raise ValueError(f"`duration` must be at least one `dt` of {dt:g} s, got {duration:g} s.")
+    if not (0 < dt < math.inf and dt / 2 < duration < math.inf):
+        raise ValueError(f"`duration` and `dt` must be finite [s] and hold one sample, got {duration:g} and {dt:g} s.")
     return round(duration / dt)
 
 
@@ -246,10 +205,11 @@ def _axis_indices(axes: Sequence[str]) -> list[int]:
     return [AXES.index(axis) for axis in axes]
 
 
-def _check_frequency(name: str, frequency: float, dt: float) -> None:
-    limit = 0.5 / dt
-    if not 0 < frequency < limit:
-        raise ValueError(f"`{name}` must lie between 0 and half the sample rate, {limit:g} Hz, got {frequency:g} Hz.")
+def _check_frequencies(name: str, frequencies: Sequence[float], dt: float) -> None:
+    if not all(0 < frequency < 0.5 / dt for frequency in frequencies):
+        raise ValueError(
+            f"`{name}` must lie between 0 and half the sample rate, {0.5 / dt:g} Hz, got {list(frequencies)} Hz."
+        )
 
 
 # Pulses of a reference last about 0.3 periods of the controlled vehicle's attitude [s]. Each is as high as the others.
@@ -264,33 +224,30 @@ def standard_references(
 ) -> dict[str, Float[np.ndarray, "samples 4"]]:
     """Multisine, doublet, 3-2-1-1 and chirp as references for a controller.
 
-    References are roll, pitch and yaw angle [rad] and vertical acceleration [m/s^2] in each sample, as
-    `fly_closed_loop` takes them. A multisine excites them at once, the others in turn.
+    References are as `fly_closed_loop` takes them. A multisine excites them at once, the others in turn.
 
-    - `largest`: the largest value of each reference. References are 0 if a shape does not fit into the time.
+    - `largest`: the largest value of each. References are 0 if a shape does not fit into the time.
     """
     time = dt * np.arange(samples)[:, None]
     sines = [np.sin(2 * math.pi * time * np.asarray(some)).sum(axis=1) for some in (*STANDARD_TONES, _VERTICAL_TONES)]
     swept, _ = _sweep(samples // 4, samples // 4 * dt, _SWEPT)
     pulses = {name: np.repeat([*heights, 0.0], max(round(_WIDTH / dt), 1)) for name, heights in _REFERENCE_PULSES}
     shapes = {"multisine": np.stack(sines, axis=1)}
-    shapes |= {name: _references_in_turn([once, -once], samples) for name, once in pulses.items()}
-    shapes["chirp"] = _references_in_turn([swept], samples)
+    for name, parts in ({name: (once, -once) for name, once in pulses.items()} | {"chirp": (swept,)}).items():
+        shapes[name] = _in_turn(parts, samples, 4, [slot % 4 for slot in range(samples // len(parts[0]))])
     return {name: with_largest(shape, largest) for name, shape in shapes.items()}
 
 
-def with_largest(
-    shape: Float[np.ndarray, "samples 4"], largest: Float[np.ndarray, "4"]
-) -> Float[np.ndarray, "samples 4"]:
+def with_largest(shape: np.ndarray, largest: Float[np.ndarray, "4"]) -> Float[np.ndarray, "samples 4"]:
     """References with these largest values."""
     return largest * shape / np.maximum(np.abs(shape).max(axis=0), 1e-9)
 
 
-def _references_in_turn(shapes: Sequence[np.ndarray], samples: int) -> np.ndarray:
-    """One reference after another, with the next of `shapes` after all four, as often as they fit."""
-    found, length = np.zeros((samples, 4)), len(shapes[0])
-    for slot in range(samples // length):
-        found[slot * length : (slot + 1) * length, slot % 4] = shapes[slot // 4 % len(shapes)]
+def _in_turn(shapes: Sequence[np.ndarray], samples: int, columns: int, slots: Sequence[int]) -> np.ndarray:
+    """One column after another in the order of `slots`; the next of `shapes` follows after all columns."""
+    found, length = np.zeros((samples, columns)), len(shapes[0])
+    for slot, column in enumerate(slots):
+        found[slot * length : (slot + 1) * length, column] = shapes[slot // columns % len(shapes)]
     return found
 
 

@@ -262,8 +262,7 @@ OPEN = ("--initial-state", "known")
 @pytest.mark.parametrize(
     ("options", "line", "said"),
     [
-        (OPEN, "--duration 0", ("--duration", "must be positive")),
-        (OPEN, "--duration 1000", ("--duration", "50 to 2500 samples")),
+        (OPEN, "--duration 0", ("--duration", "50 to 2500 samples")),
         (OPEN, "--duration 2 --fastest 150", ("cannot hover", "225.7")),
         (OPEN, "--duration 2 --rate -1", ("--rate must be positive",)),
         (OPEN, "--accuracy 0", ("--accuracy",)),
@@ -290,7 +289,8 @@ def test_mistakes_are_one_line_and_write_nothing(run, tmp_path, options, line, s
     [
         ("input", "t,omega1,omega2,omega3,omega4\n0,1,1,1,1\n0.01,1,1,1,1\n", r"is not sampled every 0.02 s"),
         ("input", "t,omega1,omega2,omega3\n0,1,1,1\n0.02,1,1,1\n", r"column omega4 is missing"),
-        ("input", "t,omega1,omega2,omega3,omega4\n0,1,1,1,1\n0.02,1,1,,1\n", r"a cell is empty or negative"),
+        ("input", "t,omega1,omega2,omega3,omega4\n0,1,1,1,1\n0.02,1,1,,1\n", r"omega3: a cell is empty"),
+        ("input", "t,omega1,omega2,omega3,omega4\n0,1,1,1,1\n0.02,1,1,-1,1\n", r"has a negative cell"),
         ("references", "t,roll_reference\n0,0\n1,0\n", r"column pitch_reference is missing"),
         ("references", "t,{}\n0,0,0,0,0\n1,0,0,,0\n", r"a cell is empty"),
         ("references", "t,{}\n0,0,0,0,0\n1,0,0,0,0\n3,0,0,0,0\n", r"not sampled at equal times"),
@@ -336,7 +336,7 @@ def test_an_envelope_is_just_kept_by_its_flight_and_a_limit_must_be_a_positive_n
     failed = envelope.shares(flight.omega, flight.states.at[200:].set(np.nan), float(DT))
     assert failed["angle"] == failed["distance"] == np.inf
     for name, value, message in (
-        ("angle", [0.1, 0.2], "one number or three"),
+        ("angle", [0.1, 0.2], "one number or 3 "),
         ("distance", np.inf, "positive and finite"),
         ("slowest", 300.0, "below `fastest`"),
     ):

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from .._custom_types import Key, Numeric, Scalar, as_float
@@ -18,8 +17,8 @@ from ..models.rotation import attitude_rates
 from ..models.state import Attitude, Rates, Vector
 from ..simulation import rk4_step
 from ..trigonometry import sincos
-from .sensors import Logged, Motion, Sense, Signals, log
-from .settings import ClosedLoop, PerAxis
+from .sensors import Motion, Sense, Signals, log
+from .settings import ClosedLoop, PerAxis, setting
 
 References = Float[Array, "samples 4"]
 
@@ -39,8 +38,7 @@ def random_references(
 
     **Arguments:**
 
-    - `duration`, `dt`: length and sample time [s].
-    - `hold`: the time between two steps of one reference [s]. The references do not step at the same time.
+    - `duration`, `dt`: length and sample time [s]. `hold`: the time between two steps of one reference [s].
     - `amplitude`: levels are uniform between -amplitude and amplitude: roll, pitch, yaw [rad], acceleration [m/s^2].
 
     **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
@@ -48,8 +46,7 @@ def random_references(
     **Raises:** `ValueError` that names the argument.
     """
     for name, value in (("duration", duration), ("dt", dt), ("hold", hold)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"`{name}` must be positive and finite [s], got {value}.")
+        setting(name, positive=True)(value)
     if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
         raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
     time = dt * np.arange(round(duration / dt) + 1)
@@ -73,9 +70,7 @@ def fly_closed_loop(
     key: Key,
     substeps: int = 4,
 ) -> Flight:
-    """Fly a vehicle in closed loop from hovering, and return what its autopilot logs.
-
-    The flight is one `lax.scan`. `vmap` it over keys, gust strengths or airframes.
+    """Fly a vehicle in closed loop from hovering, and return what its autopilot logs. `vmap` it for a batch.
 
     **Arguments:**
 
@@ -94,12 +89,9 @@ def fly_closed_loop(
     shape = jnp.shape(references)
     if len(shape) != 2 or shape[0] < 2 or shape[1] != 4:
         raise ValueError(f"`references` must have shape (samples, 4), at least two samples, got {shape}.")
-    if not isinstance(dt, Tracer) and not np.asarray(dt) > 0:
-        raise ValueError(f"`dt` must be positive, got {dt}.")
     if substeps < 1 or substeps % loop.log_every:
-        several = "" if loop.log_every == 1 else f" and a multiple of `log_every` = {loop.log_every}"
-        raise ValueError(f"`substeps` must be at least 1{several}, got {substeps}.")
-    return _fly(loop, as_float(references), as_float(dt), key, substeps)
+        raise ValueError(f"`substeps` must be a positive multiple of `log_every` = {loop.log_every}, got {substeps}.")
+    return _fly(loop, as_float(references), setting("dt", positive=True)(dt), key, substeps)
 
 
 def fly_standard(
@@ -120,8 +112,8 @@ def fly_standard(
 class _Acting(NamedTuple):
     """What acts on the vehicle for a step.
 
-    - `torque`: [N m]. `thrust`: over the mass [m/s^2]. `gust`: of p', q', r' [rad/s^2] and the vertical force [m/s^2].
-    - `wind`: along the body's axes [m/s].
+    Torque [N m], thrust over the mass [m/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind
+    along the body's axes [m/s].
     """
 
     torque: Vector
@@ -209,21 +201,20 @@ class _Draws(NamedTuple):
     noise: Float[Array, "runs 9"]
     own_noise: Float[Array, "runs 3"] | None
 
-    @classmethod
-    def of(cls, loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> "_Draws":
-        """`steps` of length `h` in each run."""
-        (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
-        count, rows = runs * steps + 1, steps * np.arange(runs)[:, None] + np.arange(steps + 1)
-        gusts = jnp.append(loop.gust, loop.thrust_gust) * ornstein_uhlenbeck(gust_key, count, h / loop.gust_time)
-        gusts = jnp.append(loop.offset, 0.0) + gusts
-        spread = jnp.repeat(jnp.stack([loop.gyro_noise, loop.attitude_noise, loop.force_noise]), 3)
-        winds = own = None
-        if loop.air is not None:
-            winds = loop.air.wind * ornstein_uhlenbeck(wind_key, count, h / loop.air.wind_time)[:, :3]
-            winds = winds[rows]
-        if loop.sensors is not None:
-            own = jnp.nan_to_num(loop.sensors.controller_gyro_noise) * jax.random.normal(own_key, (runs, 3))
-        return cls(gusts[rows], winds, spread * jax.random.normal(noise_key, (runs, 9)), own)
+
+def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Draws:
+    """`steps` of length `h` in each run."""
+    (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
+    count, rows = runs * steps + 1, steps * np.arange(runs)[:, None] + np.arange(steps + 1)
+    gusts = jnp.append(loop.gust, loop.thrust_gust) * ornstein_uhlenbeck(gust_key, count, h / loop.gust_time)
+    noise = jnp.repeat(jnp.stack([loop.gyro_noise, loop.attitude_noise, loop.force_noise]), 3)
+    winds = own = None
+    if loop.air is not None:
+        winds = loop.air.wind * ornstein_uhlenbeck(wind_key, count, h / loop.air.wind_time)[rows][..., :3]
+    if loop.sensors is not None:
+        own = jnp.nan_to_num(loop.sensors.controller_gyro_noise) * jax.random.normal(own_key, (runs, 3))
+    noise = noise * jax.random.normal(noise_key, (runs, 9))
+    return _Draws((jnp.append(loop.offset, 0.0) + gusts)[rows], winds, noise, own)
 
 
 @quick_jit
@@ -274,17 +265,17 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         mean = means.mean(axis=0)
         signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)
         omega = command if loop.logged == "commands" else mean
-        logged = Logged(omega, carry.motion, gyro, attitude, specific)
-        return _Carry(motion, speeds, integral, commands, signals), logged
+        return _Carry(motion, speeds, integral, commands, signals), (omega, carry.motion, gyro, attitude, specific)
 
     weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())
     hover, _ = _speeds(mixer, jnp.zeros(3), weight, airframe.max_rotor_speed)
     velocity = None if loop.air is None else (zero, zero, zero)
     motion = Motion(Rates(zero, zero, zero), Attitude(zero, zero, zero), velocity)
-    signals = None if sense is None else Signals.hovering(vehicle.gravity)
+    still = jnp.zeros(9).at[8].set(vehicle.gravity)
+    signals = None if sense is None else Signals(still, still, jnp.zeros(4))
     commands = jnp.broadcast_to(motor.command(hover), (runs + 1, 4))
     first = _Carry(motion, hover, jnp.zeros(3), commands, signals)
-    draws = _Draws.of(loop, key, runs, steps, h)
+    draws = _draw(loop, key, runs, steps, h)
     inputs = (jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), draws)
     return log(loop, dt, jax.lax.scan(run, first, inputs)[1], log_key)
 
@@ -293,14 +284,14 @@ def _control(
     loop: ClosedLoop,
     mixer: Array,
     reference: Array,
-    rates: PerAxis,
+    seen: PerAxis,
     attitude: PerAxis,
     integral: PerAxis,
     period: Scalar,
 ) -> tuple[Float[Array, "4"], PerAxis]:
-    """The commands [rad/s] of one run, and the integrators after it."""
+    """The commands [rad/s] of one run, and the integrators after it. `seen`: the body rates that it answers."""
     airframe = loop.airframe
-    error = loop.attitude_gain * (reference[:3] - attitude) - rates
+    error = loop.attitude_gain * (reference[:3] - attitude) - seen
     demand = loop.rate_gain * error + integral
     upright = jnp.maximum(jnp.cos(attitude[0]) * jnp.cos(attitude[1]), _STEEPEST)
     thrust = as_float(airframe.mass * (reference[3] + airframe.gravity) / upright)

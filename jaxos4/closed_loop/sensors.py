@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Key, RotorSpeeds, Scalar
+from .._custom_types import Key, Scalar
 from ..flight import STATE_NAMES, Flight
 from ..models.rotation import to_earth
 from ..models.state import CASCADE_ORDER, Attitude, Rates, Vector
@@ -37,12 +37,6 @@ class Signals(NamedTuple):
     raw: Float[Array, "9"]
     filtered: Float[Array, "9"]
     angles: Float[Array, "4"]
-
-    @classmethod
-    def hovering(cls, gravity: Scalar) -> "Signals":
-        """The signals before the first sample."""
-        still = jnp.zeros(9).at[8].set(gravity)
-        return cls(still, still, jnp.zeros(4))
 
 
 class Sense(NamedTuple):
@@ -81,26 +75,20 @@ class Sense(NamedTuple):
         return Signals(raw, filtered, signals.angles), jnp.where(self.own, filtered[3:6], filtered[:3])
 
 
-class Logged(NamedTuple):
-    """What the recorder sees in each run of the controller."""
+def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, Motion, Array, Array, Array], key: Key) -> Flight:
+    """The log up to the first sample at which the vehicle pitches to 90 degrees or a number is not finite.
 
-    omega: Float[Array, "runs 4"]
-    motion: Motion
-    rates: Float[Array, "runs 3"]
-    attitude: Float[Array, "runs 3"]
-    specific: Float[Array, "runs 3"]
-
-
-def log(loop: ClosedLoop, dt: Scalar, logged: Logged, key: Key) -> Flight:
-    """The log up to the first sample at which the vehicle pitches to 90 degrees or a number is not finite."""
+    `logged`: rotor speeds, motion, body rates, attitude and specific force in each run of the controller.
+    """
     every, sensors, keys = loop.log_every, loop.sensors, jax.random.split(key, 3)
     commands = loop.logged == "commands"
-    omega = logged.omega if sensors is None else _late(logged.omega, sensors.clock_offset * every / dt)
+    omega = logged[0] if sensors is None else _late(logged[0], sensors.clock_offset * every / dt)
     omega = omega[::every] if commands else omega.reshape(-1, every, 4).mean(axis=1)
     motion, rates, attitude, specific = jax.tree.map(lambda x: x[::every], logged[1:])
     states = jnp.full((omega.shape[0], 12), jnp.nan).at[:, CASCADE_ORDER[3:6]].set(attitude)
     if sensors is not None:
-        omega = _rounded(sensors, omega, keys[0])
+        omega, step = omega + sensors.speed_noise * jax.random.normal(keys[0], omega.shape), sensors.speed_step
+        omega = jnp.where(step > 0, step * jnp.round(omega / jnp.where(step > 0, step, 1.0)), omega)
         rates, specific = _lossy(sensors, rates, specific, keys[1])
     if sensors is not None and motion.velocity is not None:
         velocity = jnp.stack(to_earth(motion.attitude, motion.velocity), axis=1)
@@ -126,13 +114,6 @@ def _late(omega: Float[Array, "runs 4"], runs: Scalar) -> Float[Array, "runs 4"]
     whole = jnp.floor(runs).astype(int)
     now, before = (omega[jnp.clip(jnp.arange(len(omega)) - whole - i, 0, len(omega) - 1)] for i in (0, 1))
     return now + (runs - whole) * (before - now)
-
-
-def _rounded(sensors: Sensors, omega: RotorSpeeds, key: Key) -> RotorSpeeds:
-    """Rotor speeds with noise, rounded."""
-    omega, rounds = omega + sensors.speed_noise * jax.random.normal(key, omega.shape), sensors.speed_step > 0
-    step = jnp.where(rounds, sensors.speed_step, 1.0)
-    return jnp.where(rounds, step * jnp.round(omega / step), omega)
 
 
 def _lossy(sensors: Sensors, rates: Array, specific: Array, key: Key) -> tuple[Array, Array]:

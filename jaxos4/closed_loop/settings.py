@@ -24,8 +24,14 @@ LOGGED = ("commands", "speeds")
 _BODY, _XYZ, _XY, _TILT = ("roll", "pitch", "yaw"), ("x", "y", "z"), ("x", "y"), ("roll", "pitch")
 
 
-def _setting(
-    name: str, axes: tuple[str, ...] = (), *, low: float = 0.0, high: float = np.inf, optional: bool = False
+def setting(
+    name: str,
+    axes: tuple[str, ...] = (),
+    *,
+    low: float = 0.0,
+    high: float = np.inf,
+    positive: bool = False,
+    optional: bool = False,
 ) -> Callable[[ArrayLike | Sequence[float] | None], Array]:
     """A field's converter: accepts one number, or one for each of `axes`, in a range unless traced.
 
@@ -34,18 +40,18 @@ def _setting(
 
     def convert(value: ArrayLike | Sequence[float] | None) -> Array:
         value = np.nan if value is None else value
-        array = as_float(np.asarray(value) if isinstance(value, Sequence) else value)
+        array = as_float(np.asarray(value, dtype=float) if isinstance(value, Sequence) else value)
         if array.shape not in ((), (len(axes),) if axes else ()):
-            several = f" or {len(axes)} ({', '.join(axes)})" if axes else ""
-            remedy = "" if axes else "; use `vmap` for a batch"
-            raise ValueError(f"`{name}` must be one number{several}, got shape {array.shape}{remedy}.")
+            several = f" or {len(axes)} ({', '.join(axes)})" if axes else "; use `vmap` for a batch"
+            raise ValueError(f"`{name}` must be one number{several}, got shape {array.shape}.")
         if not isinstance(array, Tracer):
             numbers = np.asarray(array)
-            allowed = (numbers >= low) & (numbers <= high) & np.isfinite(numbers)
-            if not np.all(allowed | (np.isnan(numbers) if optional else False)):
-                least = "" if low == -np.inf else f" and at least {low:g}"
+            allowed = (numbers >= low) & (numbers <= high) & np.isfinite(numbers) & ((numbers > 0) | (not positive))
+            if not np.all(allowed | (np.isnan(numbers) & optional)):
+                least = "" if low == -np.inf or positive else f" and at least {low:g}"
                 most = "" if high == np.inf else f" and at most {high:g}"
-                raise ValueError(f"`{name}` must be finite{least}{most}, got {numbers.tolist()}.")
+                kind = "positive and finite" if positive else "finite"
+                raise ValueError(f"`{name}` must be {kind}{least}{most}, got {numbers.tolist()}.")
         return jnp.broadcast_to(array, (len(axes),)) if axes else array
 
     return convert
@@ -66,11 +72,11 @@ class Air(eqx.Module):
     **Raises:** `ValueError` that names the setting.
     """
 
-    wind: PerAxis = eqx.field(converter=_setting("wind", _XYZ), default=0.0)
-    wind_time: Scalar = eqx.field(converter=_setting("wind_time"), default=0.5)
-    drag: Pair = eqx.field(converter=_setting("drag", _XY), default=0.0)
-    inflow: Scalar = eqx.field(converter=_setting("inflow"), default=0.0)
-    flapping: Pair = eqx.field(converter=_setting("flapping", _TILT, low=-np.inf), default=0.0)
+    wind: PerAxis = eqx.field(converter=setting("wind", _XYZ), default=0.0)
+    wind_time: Scalar = eqx.field(converter=setting("wind_time"), default=0.5)
+    drag: Pair = eqx.field(converter=setting("drag", _XY), default=0.0)
+    inflow: Scalar = eqx.field(converter=setting("inflow"), default=0.0)
+    flapping: Pair = eqx.field(converter=setting("flapping", _TILT, low=-np.inf), default=0.0)
 
 
 class Sensors(eqx.Module):
@@ -92,18 +98,18 @@ class Sensors(eqx.Module):
     **Raises:** `ValueError` that names the setting.
     """
 
-    gyro_vibration: Scalar = eqx.field(converter=_setting("gyro_vibration"), default=0.0)
-    force_vibration: Scalar = eqx.field(converter=_setting("force_vibration"), default=0.0)
-    gyro_filter: Scalar = eqx.field(converter=_setting("gyro_filter"), default=0.0)
-    force_filter: Scalar = eqx.field(converter=_setting("force_filter"), default=0.0)
-    speed_noise: Scalar = eqx.field(converter=_setting("speed_noise"), default=0.0)
-    speed_step: Scalar = eqx.field(converter=_setting("speed_step"), default=0.0)
-    clock_offset: Scalar = eqx.field(converter=_setting("clock_offset", low=-np.inf), default=0.0)
-    dropouts: Pair = eqx.field(converter=_setting("dropouts", ("gyro", "accelerometer"), high=1.0), default=0.0)
-    bad_samples: Scalar = eqx.field(converter=_setting("bad_samples"), default=0.0)
-    velocity_noise: Scalar = eqx.field(converter=_setting("velocity_noise", optional=True), default=None)
-    controller_gyro_noise: Scalar = eqx.field(converter=_setting("controller_gyro_noise", optional=True), default=None)
-    controller_gyro_filter: Scalar = eqx.field(converter=_setting("controller_gyro_filter"), default=0.0)
+    gyro_vibration: Scalar = eqx.field(converter=setting("gyro_vibration"), default=0.0)
+    force_vibration: Scalar = eqx.field(converter=setting("force_vibration"), default=0.0)
+    gyro_filter: Scalar = eqx.field(converter=setting("gyro_filter"), default=0.0)
+    force_filter: Scalar = eqx.field(converter=setting("force_filter"), default=0.0)
+    speed_noise: Scalar = eqx.field(converter=setting("speed_noise"), default=0.0)
+    speed_step: Scalar = eqx.field(converter=setting("speed_step"), default=0.0)
+    clock_offset: Scalar = eqx.field(converter=setting("clock_offset", low=-np.inf), default=0.0)
+    dropouts: Pair = eqx.field(converter=setting("dropouts", ("gyro", "accelerometer"), high=1.0), default=0.0)
+    bad_samples: Scalar = eqx.field(converter=setting("bad_samples"), default=0.0)
+    velocity_noise: Scalar = eqx.field(converter=setting("velocity_noise", optional=True), default=None)
+    controller_gyro_noise: Scalar = eqx.field(converter=setting("controller_gyro_noise", optional=True), default=None)
+    controller_gyro_filter: Scalar = eqx.field(converter=setting("controller_gyro_filter"), default=0.0)
 
 
 class ClosedLoop(eqx.Module):
@@ -149,26 +155,26 @@ class ClosedLoop(eqx.Module):
     """
 
     airframe: Airframe
-    rotor_lag: Scalar = eqx.field(converter=_setting("rotor_lag"), default=0.05)
-    rotor_delay: Scalar = eqx.field(converter=_setting("rotor_delay"), default=0.01)
-    thrust_curve: Scalar = eqx.field(converter=_setting("thrust_curve"), default=1.0)
-    motor_braking: Scalar = eqx.field(converter=_setting("motor_braking"), default=1.0)
-    offset: PerAxis = eqx.field(converter=_setting("offset", _BODY, low=-np.inf), default=0.0)
-    damping: PerAxis = eqx.field(converter=_setting("damping", _BODY, low=-np.inf), default=0.0)
-    sag: Scalar = eqx.field(converter=_setting("sag", high=1.0), default=0.0)
+    rotor_lag: Scalar = eqx.field(converter=setting("rotor_lag"), default=0.05)
+    rotor_delay: Scalar = eqx.field(converter=setting("rotor_delay"), default=0.01)
+    thrust_curve: Scalar = eqx.field(converter=setting("thrust_curve"), default=1.0)
+    motor_braking: Scalar = eqx.field(converter=setting("motor_braking"), default=1.0)
+    offset: PerAxis = eqx.field(converter=setting("offset", _BODY, low=-np.inf), default=0.0)
+    damping: PerAxis = eqx.field(converter=setting("damping", _BODY, low=-np.inf), default=0.0)
+    sag: Scalar = eqx.field(converter=setting("sag", high=1.0), default=0.0)
     air: Air | None = None
-    gust: PerAxis = eqx.field(converter=_setting("gust", _BODY), default=0.0)
-    thrust_gust: Scalar = eqx.field(converter=_setting("thrust_gust"), default=0.0)
-    gust_time: Scalar = eqx.field(converter=_setting("gust_time"), default=0.25)
-    gyro_noise: Scalar = eqx.field(converter=_setting("gyro_noise"), default=0.02)
-    attitude_noise: Scalar = eqx.field(converter=_setting("attitude_noise"), default=0.002)
-    force_noise: Scalar = eqx.field(converter=_setting("force_noise"), default=FORCE_SIGMA)
+    gust: PerAxis = eqx.field(converter=setting("gust", _BODY), default=0.0)
+    thrust_gust: Scalar = eqx.field(converter=setting("thrust_gust"), default=0.0)
+    gust_time: Scalar = eqx.field(converter=setting("gust_time"), default=0.25)
+    gyro_noise: Scalar = eqx.field(converter=setting("gyro_noise"), default=0.02)
+    attitude_noise: Scalar = eqx.field(converter=setting("attitude_noise"), default=0.002)
+    force_noise: Scalar = eqx.field(converter=setting("force_noise"), default=FORCE_SIGMA)
     sensors: Sensors | None = None
-    attitude_gain: PerAxis = eqx.field(converter=_setting("attitude_gain", _BODY), default=(4.0, 4.0, 2.0))
-    rate_gain: PerAxis = eqx.field(converter=_setting("rate_gain", _BODY), default=(12.0, 12.0, 6.0))
-    integral_gain: PerAxis = eqx.field(converter=_setting("integral_gain", _BODY), default=(10.0, 10.0, 5.0))
+    attitude_gain: PerAxis = eqx.field(converter=setting("attitude_gain", _BODY), default=(4.0, 4.0, 2.0))
+    rate_gain: PerAxis = eqx.field(converter=setting("rate_gain", _BODY), default=(12.0, 12.0, 6.0))
+    integral_gain: PerAxis = eqx.field(converter=setting("integral_gain", _BODY), default=(10.0, 10.0, 5.0))
     controller_inertia: PerAxis | None = eqx.field(
-        converter=lambda x: None if x is None else _setting("controller_inertia", _BODY)(x), default=None
+        converter=lambda x: None if x is None else setting("controller_inertia", _BODY)(x), default=None
     )
     log_every: int = eqx.field(static=True, default=1)
     logged: str = eqx.field(static=True, default="commands")

@@ -1,6 +1,6 @@
 """The envelope: limits of rotor speeds, angles, rates, velocity and distance."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -9,8 +9,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._custom_types import Numeric, RotorSpeeds, Scalar, as_float
+from .._custom_types import Numeric, RotorSpeeds, Scalar
 from ..airframe import Airframe
+from ..closed_loop.settings import setting
 from ..errors import InputError
 from ..flight import STATE_NAMES
 
@@ -20,20 +21,6 @@ ANGLES, RATES, POSITION, VELOCITY = (
 )
 # Shares of the limits by the name of the limit, for each sample.
 Uses = dict[str, Float[Array, "..."]]
-
-
-def _limit(name: str, shape: tuple[int, ...] = ()) -> Callable:
-    """A field's converter: one positive number, or one for each of three axes."""
-
-    def convert(value) -> Array:
-        array = as_float(np.asarray(value, dtype=float) if isinstance(value, list | tuple) else value)
-        if array.shape not in ((), shape):
-            raise ValueError(f"`{name}` must be one number{' or three' * len(shape)}, got shape {array.shape}.")
-        if not isinstance(array, Tracer) and not np.all((np.asarray(array) > 0) & np.isfinite(array)):
-            raise ValueError(f"`{name}` must be positive and finite, got {np.asarray(array).tolist()}.")
-        return jnp.broadcast_to(array, shape)
-
-    return convert
 
 
 class Envelope(eqx.Module):
@@ -49,13 +36,13 @@ class Envelope(eqx.Module):
     **Raises:** `ValueError` for a limit that is not positive and finite, or `slowest` not below `fastest`.
     """
 
-    slowest: Scalar = eqx.field(converter=_limit("slowest"))
-    fastest: Scalar = eqx.field(converter=_limit("fastest"))
-    slew: Scalar = eqx.field(converter=_limit("slew"))
-    angle: Float[Array, "3"] = eqx.field(converter=_limit("angle", (3,)))
-    rate: Float[Array, "3"] = eqx.field(converter=_limit("rate", (3,)))
-    velocity: Scalar = eqx.field(converter=_limit("velocity"))
-    distance: Scalar = eqx.field(converter=_limit("distance"))
+    slowest: Scalar = eqx.field(converter=setting("slowest", positive=True))
+    fastest: Scalar = eqx.field(converter=setting("fastest", positive=True))
+    slew: Scalar = eqx.field(converter=setting("slew", positive=True))
+    angle: Float[Array, "3"] = eqx.field(converter=setting("angle", ("phi", "theta", "psi"), positive=True))
+    rate: Float[Array, "3"] = eqx.field(converter=setting("rate", ("p", "q", "r"), positive=True))
+    velocity: Scalar = eqx.field(converter=setting("velocity", positive=True))
+    distance: Scalar = eqx.field(converter=setting("distance", positive=True))
 
     def __check_init__(self):
         ends = self.slowest, self.fastest
@@ -74,7 +61,7 @@ class Envelope(eqx.Module):
         if isinstance(limits, Envelope):
             return limits
         try:
-            return Envelope(**{**{name: getattr(self, name) for name in Envelope.__annotations__}, **limits})
+            return Envelope(**vars(self) | dict(limits))
         except ValueError as error:
             raise InputError(f"the envelope: {error}") from None
 

@@ -231,8 +231,7 @@ def design_references(
     for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
         if not 0 < value <= most:
             raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
-    remedy = "; longer flights repeat the references"
-    task.check_ranges(duration, dt, bandwidth, criterion, samples=(250, 20_000), cycles=2, fastest=0.1, remedy=remedy)
+    task.check_ranges(duration, dt, bandwidth, criterion, samples=(250, 20_000), cycles=2, fastest=0.1)
     progress("limits")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model_of(loop)) if bracket is None else bracket

@@ -96,9 +96,8 @@ class AbstractTask(eqx.Module):
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
     - `size`: the number of coefficients. `starts`: the number of searches. `first`: the length of their first
       coefficients. `steps`: the number of steps of BFGS in a stage.
-    - `names`, `units`: those of the parameters. The targets of the design come first.
-    - `scale`: for each target, a size of which accuracies are shares.
-    - `unexcited`: a parameter whose bound is not below this counts as not excited.
+    - `names`, `units`: those of the parameters, the targets first. `scale`: for each target, a size of which accuracies
+      are shares. `unexcited`: a parameter whose bound is not below this counts as not excited.
     """
 
     kind: ClassVar[str]
@@ -199,10 +198,7 @@ def _minimise(
 
 
 def bounds_of(information: Float[Array, "unknowns unknowns"], count: int) -> tuple[Float[Array, "count count"], Scalar]:
-    """The smallest covariance of the first `count` unknowns, and the logarithm of its determinant.
-
-    The others are estimated too, and eliminated by the Schur complement.
-    """
+    """The smallest covariance of the first `count` unknowns, and the logarithm of its determinant."""
     factor, basis = joint_factor(information[None], count)
     determinant = -2 * jnp.log(jnp.diagonal(factor[0, :count, -count:])).sum()
     return gram(basis[0, :count, -count:]), determinant
@@ -236,19 +232,15 @@ def check_ranges(
     samples: tuple[int, int],
     cycles: int,
     fastest: float,
-    remedy: str = "",
 ) -> None:
     """Raise `InputError` for settings that cannot be designed for.
 
-    `samples`: the fewest and the most; `remedy`: if they are too many. `cycles`: the fewest of the fastest tone.
-    `fastest`: its largest frequency over the sample rate.
+    `samples`: the fewest and the most. `cycles`: the fewest of the fastest tone. `fastest`: its largest frequency over
+    the sample rate.
     """
-    for name, value in (("duration", duration), ("dt", dt)):
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"`{name}` must be positive and finite [s], got {value:g}.")
-    if not samples[0] <= duration / dt <= samples[1]:
-        allowed = f"{samples[0]} to {samples[1]} samples of {dt:g} s (`dt`)"
-        raise InputError(f"`duration` must be {allowed}, got {duration:g} s{remedy}.")
+    if not (dt > 0 and samples[0] <= duration / dt <= samples[1]):
+        allowed = f"{samples[0]} to {samples[1]} samples of a positive `dt`"
+        raise InputError(f"`duration` must be {allowed}, got {duration:g} s and {dt:g} s.")
     if criterion not in CRITERIA:
         raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
     low, high = cycles / duration, fastest / dt
@@ -273,11 +265,10 @@ def write_references(designed: Designed, path: Path) -> None:
 
 def read_input(path: Path, dt: float) -> Float[np.ndarray, "samples 4"]:
     """Read rotor speeds [rad/s] with the sample time `dt` [s]. Raises `InputError` as `read_references` does."""
-    time, omega, name = _read(path, SPEED_NAMES, "an input has t and omega1..4")
-    if not (np.isfinite(time).all() and (omega >= 0).all()):
-        raise InputError(f"{name}: a cell is empty or negative; give every rotor speed of every sample.")
-    if len(time) < 2 or np.abs(np.diff(time) - dt).max() > _PRECISION * dt:
-        raise InputError(f"{name}: is not sampled every {dt:g} s; design the input with this sample time.")
+    omega, step = _read(path, SPEED_NAMES)
+    if (omega < 0).any() or abs(step - dt) > _PRECISION * dt:
+        name = printable(os.fspath(path))
+        raise InputError(f"{name}: has a negative cell, or is not sampled every {dt:g} s; design it for this `dt`.")
     return omega
 
 
@@ -286,19 +277,18 @@ def read_references(path: Path) -> tuple[Inputs, float]:
 
     **Raises:** `InputError`, one line: file, what is wrong and what to do.
     """
-    time, references, name = _read(path, _REFERENCE_NAMES, f"references have t, {', '.join(_REFERENCE_NAMES)}")
-    if not (np.isfinite(time).all() and np.isfinite(references).all()):
-        raise InputError(f"{name}: a cell is empty; give every reference at every sample.")
-    steps = np.diff(time)
-    if not steps.size or not np.all(np.abs(steps - steps.mean()) < _PRECISION * steps.mean()):
-        raise InputError(f"{name}: is not sampled at equal times; give one row for each sample.")
-    return references, float(steps.mean())
+    return _read(path, _REFERENCE_NAMES)
 
 
-def _read(path: Path, names: tuple[str, ...], contents: str) -> tuple[np.ndarray, np.ndarray, str]:
-    """Times, the columns `names`, and the name of the file for messages."""
+def _read(path: Path, names: tuple[str, ...]) -> tuple[Inputs, float]:
+    """The columns `names`, and the sample time."""
     columns, name = read_table(path, ("t", *names)).columns, printable(os.fspath(path))
     for column in ("t", *names):
         if column not in columns:
-            raise InputError(f"{name}: column {column} is missing; {contents}.")
-    return columns["t"], np.stack([columns[column] for column in names], axis=1), name
+            raise InputError(f"{name}: column {column} is missing; its columns must be t, {', '.join(names)}.")
+        if not np.isfinite(columns[column]).all():
+            raise InputError(f"{name}: column {column}: a cell is empty; give every sample a number.")
+    steps = np.diff(columns["t"])
+    if not steps.size or not np.all(np.abs(steps - steps.mean()) < _PRECISION * steps.mean()):
+        raise InputError(f"{name}: is not sampled at equal times; give one row for each sample.")
+    return np.stack([columns[column] for column in names], axis=1), float(steps.mean())

@@ -6,7 +6,7 @@ A new simulator has a template in this folder, a function for what it does not h
 import functools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jinja2
@@ -31,25 +31,21 @@ _ROTOR_MASS = 1e-3
 # Gazebo's links of rotors turn this many times slower than the rotors, so that long time steps can follow them.
 _SLOWDOWN = 10.0
 
-# Differences that several simulators have.
-_NO_ROTOR_INERTIA = (
-    "rotor inertia: not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
-)
-_DRAG_OF_ROTORS = "drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw"
-
 
 class Target(NamedTuple):
     """A simulator's format.
 
     - `label`: the name of the format. `suffix`: the suffix of its files.
-    - `text`: the file for a vehicle, with lines of comment at its top.
-    - `limits`: the effects that the simulator does not have, or has differently; one line each.
+    - `values`: what its template needs besides the vehicle.
+    - `curve`: the formula of a command, for a share {} of the thrust.
+    - `limits`: the effects that this simulator alone does not have, or has differently, each if it applies.
     """
 
     label: str
     suffix: str
-    text: Callable[[RigidVehicle, Sequence[str]], str]
-    limits: Callable[[RigidVehicle], tuple[str, ...]]
+    values: Callable[[RigidVehicle], dict[str, Any]]
+    curve: str
+    limits: Callable[[RigidVehicle], tuple[tuple[object, str], ...]]
 
 
 class Exported(NamedTuple):
@@ -94,73 +90,76 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 
     def text(vehicle: RigidVehicle, *lines: str) -> str:
         made = f"Made by jaxos4 {__version__} from {found.source}."
-        notes = (f"Note: {note}" for note in (*found.notes, *target.limits(vehicle)))
+        notes = (f"Note: {note}" for note in (*found.notes, *_limits(vehicle, to)))
         # A file's name can have line breaks.
-        return target.text(vehicle, [" ".join(line.split()) for line in (made, *lines, *warning, _FRAME, *notes)])
+        comments = [" ".join(line.split()) for line in (made, *lines, *warning, _FRAME, *notes)]
+        sizes = {"radius": _ROTOR * vehicle.arm, "thickness": _FLAT * vehicle.arm, "lag": vehicle.lag or _NO_LAG}
+        values = {"vehicle": vehicle, "comments": comments, **sizes, **target.values(vehicle)}
+        return _templates().get_template(f"{to}{target.suffix}.j2").render(values)
 
     draws = [found.draw(number, seed=seed) for number in range(samples)]
     return Exported(
         text=text(found.vehicle),
         samples=tuple(text(vehicle, f"Sample {i}, seed {seed}.") for i, (vehicle, _) in enumerate(draws, start=1)),
         impossible=sum(impossible for _, impossible in draws),
-        notes=(*found.notes, *target.limits(found.vehicle)),
+        notes=(*found.notes, *_limits(found.vehicle, to)),
     )
 
 
-def _mujoco_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
-    return _that_apply(
-        (vehicle.rotor_inertia, _NO_ROTOR_INERTIA),
-        (vehicle.thrust_share, vehicle.curve("control = ctrlrange x ({})")),
-        (vehicle.lag, "rotor_lag: acts on the thrust and not on the rotor speed; the same for small changes"),
-        (
-            vehicle.delay,
-            f"rotor_delay: right for time steps of {_SHORTEST_TIMESTEP:g} s or longer; it needs MuJoCo 3.5 or newer: "
-            "older versions refuse `delay`, `nsample` and `interp`: remove them",
-        ),
+def _limits(vehicle: RigidVehicle, to: str) -> tuple[str, ...]:
+    """The notes on what a simulator does not have, or has differently."""
+    no_rotors = "not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
+    some: list[tuple[object, str]] = [(to != "sdf" and vehicle.rotor_inertia, f"rotor inertia: {no_rotors}")]
+    some.append((vehicle.thrust_share, vehicle.curve(TARGETS[to].curve)))
+    if to != "mujoco":
+        name, damped, late = {"rotorpy": ("RotorPy", "", "give"), "sdf": ("SDF", " of one axis", "send")}[to]
+        some += [
+            (vehicle.torque.any(), f"offsets: not carried: {name} has no constant torque"),
+            (vehicle.damping.any(), f"damping: not carried: {name} has no torque against the body rates{damped}"),
+            (
+                vehicle.drag.any(),
+                "drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw",
+            ),
+            (vehicle.delay, f"rotor_delay: not carried: {late} commands {vehicle.delay:.4g} s late"),
+        ]
+    return tuple(line for applies, line in (*some, *TARGETS[to].limits(vehicle)) if applies)
+
+
+def _mujoco_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
+    late = (
+        f"rotor_delay: right for time steps of {_SHORTEST_TIMESTEP:g} s or longer; it needs MuJoCo 3.5 or newer: "
+        "older versions refuse `delay`, `nsample` and `interp`: remove them"
     )
+    lag = "rotor_lag: acts on the thrust and not on the rotor speed; the same for small changes"
+    return (vehicle.lag, lag), (vehicle.delay, late)
 
 
-def _mujoco_text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
-    """The MJCF. Controls 1 to 4 are the thrusts of the rotors [N]; the others have no effect."""
+def _mujoco(vehicle: RigidVehicle) -> dict[str, Any]:
+    """Controls 1 to 4 are the thrusts of the rotors [N]; the others have no effect."""
     names, directions = ("x_drag", "y_drag", *(f"{axis}_torque" for axis in AXES)), np.eye(6)[[0, 1, 3, 4, 5]]
     constants, slopes = (0.0, 0.0, *vehicle.torque), (*vehicle.drag, *vehicle.damping)
     rows = zip(names, directions, constants, slopes, strict=True)
-    passive = [row for row in rows if row[2] or row[3]]
     delayed = math.ceil(vehicle.delay / _SHORTEST_TIMESTEP) + 1
-    return _render("mujoco.xml.j2", vehicle, comments, passive=passive, delayed=delayed)
+    return {"passive": [row for row in rows if row[2] or row[3]], "delayed": delayed}
 
 
-def _rotorpy_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
-    return _that_apply(
-        (vehicle.rotor_inertia, _NO_ROTOR_INERTIA),
-        (vehicle.thrust_share, vehicle.curve("rotor speed = rotor_speed_max x sqrt({})")),
-        (vehicle.torque.any(), "offsets: not carried: RotorPy has no constant torque"),
-        (vehicle.damping.any(), "damping: not carried: RotorPy has no torque against the body rates"),
-        (vehicle.drag.any(), _DRAG_OF_ROTORS),
-        (vehicle.delay, f"rotor_delay: not carried: give commands {vehicle.delay:.4g} s late"),
-        (not vehicle.lag, f"rotor_lag: none was identified; tau_m is {_NO_LAG:g} s, because RotorPy needs one"),
-        (vehicle.gravity != _GRAVITY, f"gravity: RotorPy has {_GRAVITY:g} m/s^2, the airframe {vehicle.gravity:g}"),
+def _rotorpy_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
+    lag = f"rotor_lag: none was identified; tau_m is {_NO_LAG:g} s, because RotorPy needs one"
+    gravity = f"gravity: RotorPy has {_GRAVITY:g} m/s^2, the airframe {vehicle.gravity:g}"
+    return (not vehicle.lag, lag), (vehicle.gravity != _GRAVITY, gravity)
+
+
+def _sdf_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
+    slow = (
+        f"rotor inertia: the links of the rotors have it, and turn {_SLOWDOWN:g} times slower than the rotors, so "
+        "that their gyroscopic torque (alpha2, alpha5) is too small by this factor"
     )
+    gravity = f"gravity: the world's; the vehicle was identified with {vehicle.gravity:g} m/s^2"
+    return (True, gravity), (vehicle.rotor_inertia, slow)
 
 
-def _sdf_limits(vehicle: RigidVehicle) -> tuple[str, ...]:
-    return _that_apply(
-        (True, f"gravity: the world's; the vehicle was identified with {vehicle.gravity:g} m/s^2"),
-        (
-            vehicle.rotor_inertia,
-            f"rotor inertia: the links of the rotors have it, and turn {_SLOWDOWN:g} times slower than the rotors, so "
-            "that their gyroscopic torque (alpha2, alpha5) is too small by this factor",
-        ),
-        (vehicle.thrust_share, vehicle.curve("rotor speed = maxRotVelocity x sqrt({})")),
-        (vehicle.torque.any(), "offsets: not carried: SDF has no constant torque"),
-        (vehicle.damping.any(), "damping: not carried: SDF has no torque against the body rates of one axis"),
-        (vehicle.drag.any(), _DRAG_OF_ROTORS),
-        (vehicle.delay, f"rotor_delay: not carried: send commands {vehicle.delay:.4g} s late"),
-    )
-
-
-def _sdf_text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
-    """The SDF. Inertia and mass of all links together are the vehicle's."""
+def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:
+    """Inertia and mass of all links together are the vehicle's."""
 
     def steiner(place: np.ndarray) -> np.ndarray:
         """The inertia of a unit mass at a place about the origin [m^2]."""
@@ -174,27 +173,14 @@ def _sdf_text(vehicle: RigidVehicle, comments: Sequence[str]) -> str:
     mass = vehicle.mass - 4 * share
     center = -share * places.sum(axis=0) / mass
     rest = np.diag(vehicle.inertia) - 4 * rotor - mass * steiner(center)
-    links = {
-        "body": (mass, center, rest - share * sum(steiner(place) for place in places)),
-        "rotor": (share, np.zeros(3), rotor),
-    }
-    return _render("sdf.xml.j2", vehicle, comments, slowdown=_SLOWDOWN, **links)
-
-
-def _that_apply(*lines: tuple[object, str]) -> tuple[str, ...]:
-    return tuple(line for applies, line in lines if applies)
-
-
-def _render(template: str, vehicle: RigidVehicle, comments: Sequence[str], **values: Any) -> str:
-    sizes = {"radius": _ROTOR * vehicle.arm, "thickness": _FLAT * vehicle.arm, "lag": vehicle.lag or _NO_LAG}
-    return _templates().get_template(template).render(vehicle=vehicle, comments=comments, **sizes, **values)
+    body = mass, center, rest - share * sum(steiner(place) for place in places)
+    return {"body": body, "rotor": (share, np.zeros(3), rotor), "slowdown": _SLOWDOWN}
 
 
 @functools.cache
 def _templates() -> jinja2.Environment:
-    loader, undefined = jinja2.PackageLoader("jaxos4.export", "."), jinja2.StrictUndefined
-    made = jinja2.Environment(loader=loader, undefined=undefined, trim_blocks=True, lstrip_blocks=True)
-    made.keep_trailing_newline = True
+    made = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.loader, made.keep_trailing_newline = jinja2.PackageLoader("jaxos4.export", "."), True
     # An XML comment must not contain two hyphens in a row.
     made.filters["hyphens_apart"] = lambda line: re.sub("-(?=-)", "- ", line)
     made.globals |= {"number": lambda value: repr(float(value)), "numbers": _numbers, "zip": zip}
@@ -206,8 +192,9 @@ def _numbers(*values: float) -> str:
     return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
 
 
+_SPEED = "rotor speed = {} x sqrt({{}})"
 TARGETS: dict[str, Target] = {
-    "mujoco": Target("MJCF for MuJoCo", ".xml", _mujoco_text, _mujoco_limits),
-    "rotorpy": Target("parameters for RotorPy", ".py", functools.partial(_render, "rotorpy.py.j2"), _rotorpy_limits),
-    "sdf": Target("SDF model for Gazebo", ".sdf", _sdf_text, _sdf_limits),
+    "mujoco": Target("MJCF for MuJoCo", ".xml", _mujoco, "control = ctrlrange x ({})", _mujoco_limits),
+    "rotorpy": Target("parameters for RotorPy", ".py", lambda _: {}, _SPEED.format("rotor_speed_max"), _rotorpy_limits),
+    "sdf": Target("SDF model for Gazebo", ".sdf", _sdf, _SPEED.format("maxRotVelocity"), _sdf_limits),
 }

@@ -23,7 +23,7 @@ _VEHICLE = "flight"
 _SIGNIFICANT = 3.0
 # Parameters that no vehicle has below 0, although an estimate can be negative.
 _NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping", "x_drag", "y_drag")
-# Parameters without a place in a simulator's vehicle, and why.
+# Parameters without a place in a simulator's vehicle, and why. Notes on the rotors' inertia name alpha2 and alpha5.
 _NOT_EXPORTED = {
     ("roll_velocity", "pitch_velocity"): "no simulator has a moment proportional to the body velocity",
     ("roll_flapping", "pitch_flapping"): "no simulator has a moment proportional to the lateral specific force",
@@ -32,8 +32,6 @@ _NOT_EXPORTED = {
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
-# Each simulator's note on the rotors' inertia names these parameters.
-_GYROSCOPIC = ("alpha2", "alpha5")
 # The uncertainty is too large if so many draws for one sample are impossible.
 _MOST_DRAWS = 1000
 
@@ -64,9 +62,8 @@ class _File(msgspec.Struct):
     result: str
     parameters: dict[str, _Row]
     constants: dict[str, Any]
-    provenance: dict[str, Any]
-    airframe: dict[str, Any] | None | msgspec.UnsetType = msgspec.UNSET
-    covariance: list[list[float]] | None | msgspec.UnsetType = msgspec.UNSET
+    airframe: dict[str, Any] | None
+    covariance: list[list[float]] | None
     held: dict[str, _Held] = {}
     doubts: list[_Doubt] = []
 
@@ -135,51 +132,42 @@ class Identified(NamedTuple):
 def read_result(path: str | os.PathLike[str]) -> Identified:
     """Read a file that `jaxos4 estimate --out` wrote.
 
-    **Raises:** `InputError`, one line, if the file is no result, was written by an older version, has no estimate, or
-    describes an impossible vehicle; `OSError` if it cannot be read.
+    **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
+    `OSError` if it cannot be read.
     """
     try:
         return _identified(Path(path).name, msgspec.json.decode(Path(path).read_bytes(), type=_File))
     except msgspec.MsgspecError as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: not a result ({reason}); give a file of `jaxos4 estimate --out`.") from None
+        raise InputError(
+            f"{path}: not a result ({reason}); give a file of this version's `jaxos4 estimate --out`."
+        ) from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
 def _identified(name: str, file: _File) -> Identified:
-    if file.result not in NAMES:
-        raise InputError(
-            f"`result` {file.result[:40]}: is no result code of this version; run `jaxos4 estimate` again."
-        )
-    if file.airframe is msgspec.UNSET or file.covariance is msgspec.UNSET:
-        version = file.provenance.get("version", "an older version")
-        raise InputError(f"from jaxos4 {version}, without airframe and covariance; run `jaxos4 estimate` again.")
+    for key, value, known in (("result", file.result, NAMES), ("model", file.model, (*MODELS, _VEHICLE))):
+        if value not in known:
+            raise InputError(f"`{key}` {value[:40]}: must be one of {', '.join(known)}; run `jaxos4 estimate` again.")
     if not file.covariance or file.airframe is None:
         raise InputError(f"{file.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
     count = len(file.parameters)
-    if [len(row) for row in file.covariance] != count * [count]:
-        raise InputError(
-            f"`covariance`: must have one row and column for each of {count} parameters; run `jaxos4 estimate` again."
-        )
+    shape = [len(row) for row in file.covariance] == count * [count]
+    if not shape or any(row[i] < 0 for i, row in enumerate(file.covariance)):
+        raise InputError(f"`covariance`: is not one of {count} parameters; run `jaxos4 estimate` again.")
     airframe, covariance = airframe_from_table(file.airframe), np.array(file.covariance)
-    if (np.diagonal(covariance) < 0).any():
-        raise InputError("`covariance`: has a negative variance; run `jaxos4 estimate` again.")
     if file.model == _VEHICLE:
-        parts = _vehicle_parts(file, covariance)
-    elif file.model in MODELS:
-        parts = _flight_parts(file, airframe, covariance)
+        values, drawn, covariance, notes = _vehicle_parts(file, covariance)
     else:
-        raise InputError(f"`model` {file.model[:40]}: must be one of {', '.join((*MODELS, _VEHICLE))}.")
-    values, drawn, covariance, notes = parts
+        values, drawn, covariance, notes = _flight_parts(file, airframe, covariance)
     negative = [each for each in _NOT_NEGATIVE if values.get(each, 0.0) < 0]
     kept = [place for place, each in enumerate(drawn) if each not in negative]
     notes += [f"{each}: came out negative, which is impossible; it is 0 here" for each in negative]
     if not np.isfinite(airframe.max_rotor_speed):
         notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
-    source = f"{name} ({file.estimator}, {file.model} model, {file.result})"
     found = Identified(
-        source=source,
+        source=f"{name} ({file.estimator}, {file.model} model, {file.result})",
         result=file.result,
         airframe=airframe,
         values=_clipped(values),
@@ -189,9 +177,8 @@ def _identified(name: str, file: _File) -> Identified:
         notes=tuple(notes),
     )
     if found.vehicle.impossible:
-        raise InputError(
-            f"no vehicle is like this: {found.vehicle.impossible}; correct the airframe, or fly with more excitation."
-        )
+        why = found.vehicle.impossible
+        raise InputError(f"no vehicle is like this: {why}; correct the airframe, or fly with more excitation.")
     return found
 
 
@@ -210,11 +197,9 @@ def _flight_parts(file: _File, airframe: Airframe, covariance: np.ndarray) -> _P
     if not file.constants.keys() >= set(names) or tuple(file.parameters) != PARAMETER_NAMES:
         raise InputError("no moments of inertia were identified; fly with more excitation.")
     values = {name: msgspec.convert(file.constants[name], _Constant).estimate for name in names}
-    model = MODELS[file.model](airframe)
-    *inertia, rotor = values.values()
-    factor = float(model.gyroscopic_factor)
-    alpha = np.asarray(alpha_from_inertia(np.array(inertia), np.asarray(rotor * factor)))
-    spread = fit_inertia(model, alpha, covariance).covariance
+    model, (*inertia, rotor) = MODELS[file.model](airframe), values.values()
+    alpha = alpha_from_inertia(np.array(inertia), np.asarray(rotor * float(model.gyroscopic_factor)))
+    spread = fit_inertia(model, np.asarray(alpha), covariance).covariance
     if not np.isfinite(spread).all():
         raise InputError("no moments of inertia explain the estimate; fly with more excitation.")
     known = 4 if rotor > _SIGNIFICANT * np.sqrt(spread[3, 3]) else 3
@@ -248,7 +233,7 @@ def _vehicle_parts(file: _File, covariance: np.ndarray) -> _Parts:
             notes.append(f"{', '.join(some)}: {why}")
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
-    apart = tuple(itertools.chain(_GYROSCOPIC, *_NOT_EXPORTED))
+    apart = tuple(itertools.chain(("alpha2", "alpha5"), *_NOT_EXPORTED))
     fixed = [name for name in values.keys() - found.keys() if not name.startswith(apart)]
     if fixed:
         notes.append(f"do not vary in samples, because the flights do not identify them: {', '.join(sorted(fixed))}")
