@@ -10,6 +10,7 @@ from hypothesis import given, settings, strategies as st
 import jaxos4
 from jaxos4.flight import Stretches, fill_gaps
 from jaxos4.logs.sampling import average
+from jaxos4.recording import Recording
 from jaxos4.recording.pieces import averaged, cut
 from jaxos4.recording.usable import Stretch
 from jaxos4.shooting.padding import padded
@@ -76,13 +77,13 @@ def test_velocity_and_voltage_are_kept_if_every_stretch_has_them(field, have):
 
 
 def test_voltage_is_averaged_and_cut_with_the_samples():
-    flight = stretch(401, 0, voltage=True, dt=0.001)
+    flight = Recording.of(stretch(401, 0, voltage=True, dt=0.001))
     coarse = averaged(flight, 0.004)
     assert coarse.voltage is not None
     assert coarse.voltage.shape == coarse.time.shape
     expected = averaged_slowly(flight.time, flight.voltage[:, None], np.asarray(coarse.time), 0.004)[:, 0]
     np.testing.assert_allclose(coarse.voltage, expected, rtol=1e-9)
-    assert averaged(stretch(401, 0, dt=0.001), 0.004).voltage is None
+    assert averaged(flight._replace(voltage=None), 0.004).voltage is None
     part = cut(flight, Stretch(0.1, 0.2))
     np.testing.assert_array_equal(part.voltage, flight.voltage[100:201])
 
@@ -126,8 +127,6 @@ def test_flights_of_other_sample_times_are_refused():
     with pytest.raises(ValueError, match=r"`flights` must have one sample time, got 0.01, 0.02 s"):
         jaxos4.join([stretch(30, 0), stretch(30, 1, dt=0.02)], length=10)
     with pytest.raises(ValueError, match="`flights` must hold at least `length` = 40 samples"):
-        jaxos4.join([stretch(30, 0), stretch(39, 1)], length=40)
-    with pytest.raises(ValueError, match="`flights` must hold at least `length` = 40 samples"):
         jaxos4.join([], length=40)
 
 
@@ -165,16 +164,6 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     expected = averaged_slowly(t, channels, grid, dt)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(expected))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def test_a_sample_with_less_than_half_measured_is_missing():
-    t, omega, _, dt = rows(81, 4, 0)
-    y = np.ones((81, 1))
-    y[39:42] = np.nan  # a sample covers the rows 38 (half), 39, 40, 41, 42 (half): one of four was measured
-    y[59:61] = np.nan  # two of four
-    found = average(t, omega, y, dt)[2][:, 0]
-    assert np.flatnonzero(np.isnan(found)).tolist() == [10]
-    np.testing.assert_allclose(found[np.isfinite(found)], 1.0, rtol=1e-12)
 
 
 def test_vibration_above_the_new_rate_does_not_fold_down():

@@ -110,16 +110,14 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     """The frequency response from the angular acceleration that the rotors cause in the model to the measured one.
 
     The input is the model's p', q', r' from the rotor speeds, at rates of 0. The output is the difference of measured
-    rates over the sample time, less what the model says about these rates: damping, and moments of turning rotors. In
-    the input, they would bring the gyro's noise to both sides, and an axis that is hardly excited would seem to answer
-    clearly. Spectra are averaged over segments of 1 s that overlap by half (Welch 1967), in all stretches in which p, q
-    and r were measured. No simulation is involved, so that errors do not add up over time.
+    rates over the sample time, less what the model says about these rates: in the input, that would bring the gyro's
+    noise to both sides. Spectra are averaged over segments of 1 s that overlap by half (Welch 1967), in all stretches
+    in which p, q and r were measured.
 
-    **In closed loop** the response is biased where disturbances dominate. The flight controller answers a disturbance
-    by torque against it, and the vehicle then seems to answer torque too weakly, or in the other direction, with high
-    coherence. This happens at low frequencies, at which the controller is fast enough. Therefore `agreement` begins at
-    4 Hz. Gyro noise that the controller feeds back does the same at high frequencies. A fit of the same flight can have
-    the same bias: a ratio other than 1 shows that the model is wrong, a ratio of 1 does not show that it is right.
+    **In closed loop** the response is biased where disturbances dominate: at low frequencies the flight controller
+    answers a disturbance by torque against it, and at high ones it feeds back gyro noise. The vehicle then seems to
+    answer torque too weakly, with high coherence. Therefore `agreement` begins at 4 Hz. A fit of the same flight can
+    have the same bias: a ratio other than 1 shows that the model is wrong, a ratio of 1 does not show that it is right.
 
     **Arguments:** a problem, and the parameters of a fit.
 
@@ -135,9 +133,10 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
     if problem.flight.stretch is not None:
         usable &= np.diff(np.asarray(problem.flight.stretch)) == 0
     length = max(round(_SEGMENT / dt / 2) * 2, 8)
-    begins = _segments(usable, length)
-    axes = [response(caused[:, i], measured[:, i], begins, length, dt) for i in range(3)]
-    return FrequencyResponse(*axes)
+    # As many segments as fit into each usable run of samples, overlapping by half.
+    runs = np.flatnonzero(np.diff(np.concatenate([[0], usable.astype(np.int8), [0]]))).reshape(-1, 2).tolist()
+    begins = [at for begin, end in runs for at in range(begin, end - length + 1, length // 2)]
+    return FrequencyResponse(*(response(caused[:, i], measured[:, i], begins, length, dt) for i in range(3)))
 
 
 def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> Float[np.ndarray, "steps 3"]:
@@ -160,13 +159,6 @@ def _modelled(
     return jnp.stack(problem.model.angular_acceleration(middle, forcing, tuple(parameters)), axis=1)
 
 
-def _segments(usable: Bool[np.ndarray, " samples"], length: int) -> list[int]:
-    """Where segments begin: as many as fit into each usable run of samples, overlapping by half."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], usable.astype(np.int8), [0]])))
-    runs = edges.reshape(-1, 2).tolist()
-    return [at for begin, end in runs for at in range(begin, end - length + 1, length // 2)]
-
-
 def response(
     u: Float[np.ndarray, " samples"], y: Float[np.ndarray, " samples"], begins: Sequence[int], length: int, dt: float
 ) -> AxisResponse:
@@ -177,12 +169,11 @@ def response(
     from scipy.special import stdtrit  # slow to import
 
     window = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
-    chosen = slice(1, length // 2)  # neither the mean nor the Nyquist frequency
-    uu, yy, uy = np.zeros(length // 2 - 1), np.zeros(length // 2 - 1), np.zeros(length // 2 - 1, dtype=complex)
-    for at in begins:
-        parts = (x[at : at + length] for x in (u, y))
-        a, b = (np.fft.rfft(window * (part - part.mean()))[chosen] for part in parts)
-        uu, yy, uy = uu + np.abs(a) ** 2, yy + np.abs(b) ** 2, uy + a.conj() * b
+    rows = np.asarray(begins, dtype=int)[:, None] + np.arange(length)
+    parts = (x[rows] - x[rows].mean(axis=1, keepdims=True) for x in (u, y))
+    # Neither the mean nor the Nyquist frequency.
+    a, b = (np.fft.rfft(window * part)[:, 1 : length // 2] for part in parts)
+    uu, yy, uy = (x.sum(axis=0) for x in (np.abs(a) ** 2, np.abs(b) ** 2, a.conj() * b))
     averages = len(begins) / (1 + 2 * _OVERLAP**2)
     freedom = 2 * (averages - 1) if averages >= _FEWEST else math.nan
     with np.errstate(all="ignore"):
@@ -191,5 +182,4 @@ def response(
         error = np.sqrt((1 - coherence) / (coherence * freedom))
     half_width = float(stdtrit(freedom, 0.975)) * error
     frequency = np.arange(1, length // 2) / (length * dt)
-    gain, phase = np.abs(found), np.angle(found)
-    return AxisResponse(frequency, gain, phase, coherence, error, half_width, averages)
+    return AxisResponse(frequency, np.abs(found), np.angle(found), coherence, error, half_width, averages)

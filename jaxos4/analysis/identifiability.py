@@ -52,15 +52,15 @@ class Identifiability(eqx.Module):
 
     def reasons(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of one flight that is not identifiable, the reason."""
-        reasons = {}
-        for i in np.flatnonzero(~self.identifiable).tolist():
+
+        def reason(i: int) -> str:
             if not np.isfinite(self.std[i]):
-                reasons[names[i]] = "the trajectory is not finite, or the bracket is not valid"
-            elif not self.excited[i]:
-                reasons[names[i]] = "not excited"
-            else:
-                reasons[names[i]] = f"only together with {', '.join(names[j] for j in self._partners(i))}"
-        return reasons
+                return "the trajectory is not finite, or the bracket is not valid"
+            if not self.excited[i]:
+                return "not excited"
+            return f"only together with {', '.join(names[j] for j in self._partners(i))}"
+
+        return {names[i]: reason(i) for i in np.flatnonzero(~self.identifiable).tolist()}
 
     def notes(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of one flight that is not identifiable or below the noise floor, a note to the user."""
@@ -100,11 +100,11 @@ def identifiability(
 
 def identifiability_of(evaluation: Evaluation, bracket: Bracket) -> Identifiability:
     """`identifiability` where a flight was simulated already."""
-    problem, nominal, half_width = evaluation.problem, evaluation.nominal, np.asarray(bracket.half_width)
+    nominal, half_width = evaluation.nominal, np.asarray(bracket.half_width)
     valid = bool(((half_width > 0) & np.isfinite(half_width)).all())
     sound = valid and evaluation.sound
     if not evaluation.sound:
-        evaluation = evaluate(problem, as_float(nominal))
+        evaluation = evaluate(evaluation.problem, as_float(nominal))
     half_width = half_width if valid else np.ones_like(nominal)
     information = shared_information(evaluation.information, nominal.size)
     scaled = np.nan_to_num(information * half_width[:, None] * half_width, posinf=0.0, neginf=0.0)
@@ -113,5 +113,6 @@ def identifiability_of(evaluation: Evaluation, bracket: Bracket) -> Identifiabil
     with np.errstate(divide="ignore"):
         alone = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 0.0)), np.inf)
     std = np.sqrt(np.diagonal(inverse(information)))
-    std, alone = (x if sound else np.full_like(x, np.inf) for x in (std, alone))
+    if not sound:
+        std = alone = np.full_like(std, np.inf)
     return Identifiability(nominal, half_width, std, alone, np.maximum(eigenvalues, 0.0), directions)

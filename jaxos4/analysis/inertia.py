@@ -76,15 +76,16 @@ def fit_inertia(
     if model.parameter_names != PARAMETER_NAMES:
         raise ValueError("`model` must have the parameters alpha_1..8: give PublishedOS4 or CorrectedOS4.")
     alpha, covariance = np.asarray(alpha, dtype=float), np.asarray(covariance, dtype=float)
-    if alpha.shape[-1:] != (8,) or covariance.shape[-2:] != (8, 8):
-        raise ValueError(
-            f"`alpha`, `covariance` must end in the shapes (8,), (8, 8), got {alpha.shape}, {covariance.shape}."
-        )
+    shapes = alpha.shape, covariance.shape
+    if shapes[0][-1:] != (8,) or shapes[1][-2:] != (8, 8):
+        raise ValueError("`alpha`, `covariance` must end in the shapes (8,), (8, 8), got {}, {}.".format(*shapes))
     usable = np.asarray(np.isfinite(alpha).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
     factor, inertia = float(model.gyroscopic_factor), np.asarray(model.airframe.inertia, dtype=float)
     airframe = np.append(inertia, float(model.airframe.rotor_inertia))
     alpha = np.where(usable[..., None], alpha, _alphas(airframe * [1, 1, 1, factor]))
-    whiten = _whitening(np.where(usable[..., None, None], covariance, np.eye(8)))
+    # W with W C W^T = 1; directions without variance count as known to rounding errors.
+    scale, values, vectors = unit_eigen(np.where(usable[..., None, None], covariance, np.eye(8)))
+    whiten = np.swapaxes(vectors, -1, -2) / np.sqrt(values)[..., :, None] / scale[..., None, :]
     with np.errstate(all="ignore"):
         constants, curvature, residuals = _gauss_newton(alpha, whiten, inertia)
         spread = inverse(curvature)
@@ -130,12 +131,6 @@ def _gauss_newton(alpha: np.ndarray, whiten: np.ndarray, inertia: np.ndarray) ->
         gradient = np.swapaxes(slopes, -1, -2) @ residuals[..., None]
         constants = constants + (inverse(curvature) @ gradient)[..., 0]
     return constants, *linearised(constants)[1:]
-
-
-def _whitening(covariance: np.ndarray) -> np.ndarray:
-    """W with W C W^T = 1; directions without variance count as known to rounding errors."""
-    scale, values, vectors = unit_eigen(covariance)
-    return np.swapaxes(vectors, -1, -2) / np.sqrt(values)[..., :, None] / scale[..., None, :]
 
 
 class CenterOfMass(NamedTuple):

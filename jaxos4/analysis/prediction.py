@@ -85,16 +85,15 @@ def predictions(
     **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """
     flight = problem.flight
-    dt, ahead = float(flight.dt), _ahead(flight, horizons)
+    ahead, rates = _ahead(flight, horizons), np.asarray(flight.states)[:, RATES]
     start, initial = starts(flight, horizons)
-    rates = np.asarray(flight.states)[:, RATES]
     rate_problem = dataclasses.replace(problem, channels="rates", windows=1, initial_state=None, length=None)
     if disturbance is None:
         disturbance = Disturbances(np.zeros(rates.shape), np.ones(3))
     pushed, fading = as_float(disturbance.value[start]), as_float(disturbance.time_constant)
     begin = jnp.asarray(start), jnp.asarray(initial), pushed
     predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
-    return Predictions(start, ahead * dt, initial, predicted[:, ahead], rates[start[:, None] + ahead])
+    return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead], rates[start[:, None] + ahead])
 
 
 def starts(
@@ -157,22 +156,13 @@ def skill(predicted: Predictions) -> Skill:
     squares = np.square(np.clip(np.nan_to_num(errors, nan=FASTEST), -FASTEST, FASTEST))
     parts = np.array_split(np.arange(errors.shape[0]), min(_PARTS, errors.shape[0]))
 
-    def skill_of(kept: np.ndarray) -> np.ndarray:
-        reference = np.square(changes[kept]).sum(axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return 1 - squares[kept].sum(axis=0) / reference
-
-    everything, count = np.arange(errors.shape[0]), np.maximum(measured.sum(axis=0), 1)
-    without = np.stack([skill_of(np.setdiff1d(everything, part)) for part in parts])
-    with np.errstate(invalid="ignore"):
-        spread = np.sqrt((len(parts) - 1) * np.square(without - without.mean(axis=0)).mean(axis=0))
-    return Skill(
-        rmse=np.sqrt(squares.sum(axis=0) / count),
-        persistence=np.sqrt(np.square(changes).sum(axis=0) / count),
-        skill=skill_of(everything),
-        std=spread if len(parts) > 1 else np.full_like(spread, np.nan),
-        starts=errors.shape[0],
-    )
+    count, sums = np.maximum(measured.sum(axis=0), 1), np.stack([squares, np.square(changes)])
+    total = sums.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        without = [np.divide(*np.delete(sums, part, 1).sum(axis=1)) for part in parts]
+        spread = np.sqrt((len(parts) - 1) * np.var(without, axis=0)) if len(parts) > 1 else np.full(count.shape, np.nan)
+        rmse, persistence = np.sqrt(total / count)
+        return Skill(rmse, persistence, 1 - total[0] / total[1], spread, errors.shape[0])
 
 
 def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Disturbances:
@@ -180,13 +170,10 @@ def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoi
 
     The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r.
     """
-    rates = np.asarray(problem.flight.states)[:, RATES]
-    modelled = np.zeros(rates.shape)
-    modelled[:-1] = modelled_acceleration(problem, parameters)
+    rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
+    modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
     own = LogNoise(*(as_float(np.asarray(leaf)[:3]) for leaf in noise))
-    begins = np.arange(rates.shape[0]) == 0
-    if problem.flight.stretch is not None:
-        begins = np.diff(np.asarray(problem.flight.stretch), prepend=-1) != 0
+    begins = np.diff(np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch), prepend=-1) != 0
     value = _filtered(own, as_float(rates), as_float(modelled), jnp.asarray(begins), problem.flight.dt)
     return Disturbances(np.asarray(value), np.exp(np.asarray(own.time_constant)))
 

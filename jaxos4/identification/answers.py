@@ -9,7 +9,7 @@ from ..analysis.identifiability import identifiability_of
 from ..analysis.inertia import fit_inertia
 from ..bracket import is_identifiable
 from ..estimate import Estimate
-from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from ..models.abstract import PARAMETER_NAMES
 from ..models.corrected import CorrectedOS4
 from .fit import Fit
 from .prepare import Case
@@ -60,11 +60,8 @@ def _intervals(estimate: Estimate) -> tuple[Parameters, Parameters]:
 
 
 def _note(fit: Fit, i: int, half_width: float) -> str:
-    value, seed, bracket = (
-        float(np.asarray(fit.estimate.parameters)[i]),
-        fit.estimate.seed,
-        fit.problem.unknowns.bracket,
-    )
+    value, seed = float(np.asarray(fit.estimate.parameters)[i]), fit.estimate.seed
+    bracket = fit.problem.unknowns.bracket
     notes = ["below noise"] if abs(value) < half_width else []
     if not np.asarray(bracket.lower)[i] <= value <= np.asarray(bracket.upper)[i]:
         notes.append("outside its bracket")
@@ -74,13 +71,10 @@ def _note(fit: Fit, i: int, half_width: float) -> str:
 
 
 def rigid_body(case: Case, fit: Fit) -> RigidBody:
-    """The moments of inertia that explain the estimate best."""
-    model = fit.problem.model
-    return vehicle_constants(fit) if case.is_vehicle else flight_constants(model, fit.estimate)
-
-
-def flight_constants(model: AbstractModel, estimate: Estimate) -> RigidBody:
-    """Ix, Iy, Iz and J_R of the rigid body that explains the alphas of a flight best; none if not identifiable."""
+    """The moments of inertia that explain the estimate best; none of a flight if they are not identifiable."""
+    if case.is_vehicle:
+        return vehicle_constants(fit)
+    model, estimate = fit.problem.model, fit.estimate
     if model.parameter_names != PARAMETER_NAMES:
         return RigidBody()
     rigid = fit_inertia(model, estimate.parameters, estimate.covariance)

@@ -22,9 +22,8 @@ from ..results import RESULTS
 from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
 from ..shooting.filters import LogNoise
 from .jackknife import disagreement, parts_of
-from .noise_levels import evaluate_estimate, refine
+from .noise_levels import diagnose, evaluate_estimate, refine
 from .prepare import Case
-from .quality import diagnose
 from .results import COLOURED, Disturbance, HeldParameter, has_answer
 
 # Noise levels are computed at most this often before the last estimate.

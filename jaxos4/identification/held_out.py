@@ -16,8 +16,8 @@ from ..estimators import EquationError
 from ..shooting import ShootingProblem, padded
 from ..shooting.filters import LogNoise
 from .fit import Fit
+from .noise_levels import channel_fits, diagnose
 from .prepare import HeldOut
-from .quality import channel_fits, diagnose
 from .results import PredictionSkill, RateSkill, Validation, finite_or_none
 
 # Memory of the regression for comparison: the best on real flights.
@@ -42,7 +42,8 @@ def predict_held_out(fit: Fit, held_out: HeldOut) -> tuple[Predictions, Predicti
         return predicted, skill(predicted)
 
     predicted, own = scored(values, fit.noise)
-    _, regressed = scored(np.asarray(_regression(fit.problem, as_float(values), jnp.asarray(_is_held(fit)))), None)
+    held = jnp.asarray([name in fit.held for name in fit.problem.unknowns.names])
+    _, regressed = scored(np.asarray(_regression(fit.problem, as_float(values), held)), None)
     tables = (own.skill, own.std, own.rmse, own.persistence, regressed.skill)
     rates = {
         rate: RateSkill(*([finite_or_none(x) for x in table[:, i]] for table in tables)) for i, rate in enumerate("pqr")
@@ -61,10 +62,6 @@ def _of_one_recording(fitted: ShootingProblem, other: ShootingProblem, values: n
     known = dict(zip(fitted.unknowns.names, values.tolist(), strict=True))
     each = {name: [known[own] for own in known if own.rpartition("_")[0] == name] for name in other.unknowns.names}
     return np.array([known[name] if name in known else np.mean(each[name]) for name in other.unknowns.names])
-
-
-def _is_held(fit: Fit) -> np.ndarray:
-    return np.array([name in fit.held for name in fit.problem.unknowns.names])
 
 
 @quick_jit

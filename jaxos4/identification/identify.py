@@ -17,9 +17,9 @@ from ..recording.reading import Recording, as_recordings
 from ..results import result_names
 from .fit import Fit, fit_case
 from .judge import Judgement, judge
+from .noise_levels import channel_fits
 from .prepare import Case, prepare_flight
 from .problem import Intervals
-from .quality import channel_fits
 from .results import Identification, SampleTime, finite_or_none
 from .sample_time import fit_at_sample_times
 from .settings import FlightSettings, VehicleSettings, flight_settings, vehicle_settings

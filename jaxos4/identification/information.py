@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..analysis.identifiability import identifiability, identifiability_of
+from ..analysis.evaluation import evaluate
+from ..analysis.identifiability import identifiability_of
 from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
@@ -33,18 +34,14 @@ def assess(
     settings = {"channels": channels, "initial_state": initial_state, "window": window}
     problem = flight_problem(recording, model, where, **settings)
     fit = fit_flight(IBSS(), problem, progress=progress)
-    problem, estimate, fitted = fit.problem, fit.estimate, has_answer(fit.estimate)
-    if fit.evaluation is None:
-        known = identifiability(problem, where, estimate.parameters)
-    else:
-        known = identifiability_of(fit.evaluation, where)
+    known = identifiability_of(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
     names, notes = model.parameter_names, known.notes(model.parameter_names)
     std, alone, half_width, limit = map(np.asarray, (known.std, known.std_alone, known.half_width, known.noise_limit))
     finite = bool(np.isfinite(std).all())
     return FlightInformation(
         flight=recording.name,
-        fitted=fitted,
-        sigma=dict(zip(STATE_NAMES, problem.sigma.tolist(), strict=True)),
+        fitted=has_answer(fit.estimate),
+        sigma=dict(zip(STATE_NAMES, fit.problem.sigma.tolist(), strict=True)),
         parameters={
             name: ParameterInformation(
                 bound=finite_or_none(std[i]),

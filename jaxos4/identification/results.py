@@ -48,11 +48,6 @@ class ParameterEstimate(msgspec.Struct, frozen=True):
     note: str
     noise_limit: float | None | msgspec.UnsetType = msgspec.UNSET
 
-    @property
-    def identifiable(self) -> bool:
-        """Whether there is an estimate."""
-        return self.estimate is not None
-
 
 class Constant(msgspec.Struct, frozen=True):
     """A physical constant that follows from the parameters. `note`: what of the airframe must be right (vehicle)."""
@@ -131,7 +126,7 @@ class RateSkill(msgspec.Struct, frozen=True):
 class Disturbance(msgspec.Struct, frozen=True):
     """What acts on a channel besides the model, by filter error.
 
-    - `strength`: standard deviation of the disturbance, in `unit`. `time_constant`: of its correlation [s].
+    - `strength`: standard deviation, in `unit`. `time_constant`: of its correlation [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
     - `correlation`: the largest correlation of innovations up to 8 samples apart; near 0 if the noise is as modelled.
     """
@@ -245,8 +240,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     - `sample_times`: the moments of inertia at each sample time that was tried; empty if only one was.
     - `skill`: of predictions of measurements that were not fitted; `None` if there are none.
     - `predictions`: the predictions themselves; not in `to_dict`.
-    - `response`: the frequency response from modelled to measured angular acceleration, with the fitted data; not in
-      `to_dict`. `None` without an answer.
+    - `response`: the frequency response with the fitted data; not in `to_dict`. `None` without an answer.
     """
 
     estimator: str
@@ -300,10 +294,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         """
         others = _OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES
         fields = _fields(self, "rigid_body", "estimate", "problem", "is_vehicle", "predictions", "response", *others)
-        computed = {
-            "constants": self.rigid_body.to_dict(),
-            "airframe": airframe_table(self.problem.model.airframe),
-        }
+        computed = {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.problem.model.airframe)}
         return msgspec.to_builtins(fields | computed)
 
 

@@ -22,6 +22,7 @@ _GRAVITY = 9.81
 _PLAUSIBLE = (0.5, 2.0)  # [g], the median of the accelerometer in flight
 _ANOTHER = 0.1  # a hover speed that differs by this share is another one
 _CENTIMETRE = 0.01
+_OTHERWISE = "The log says otherwise:"
 
 
 class AirframeDraft(NamedTuple):
@@ -53,8 +54,7 @@ def airframe_draft(recording: Recording, source: str | None = None) -> AirframeD
     facts, airframe = recording.facts, None if source is None else load_airframe(source)
     found = stretches(recording, airframe, landed=facts.landed)
     parts = [cut(recording, part) for part in found if not part.reason]
-    signs = None if facts.too_slow else rotor_signs(parts)
-    hover = _hover(parts)
+    signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
     spins = facts.rotor_spins or (None if signs is None else signs.spins)
     if source is not None and airframe is not None:
         return AirframeDraft(_continued(recording, source, airframe, spins, hover), ())
@@ -119,9 +119,14 @@ def _continued(
 ) -> str:
     """A file that starts from another: added is what it lacks, and as comments what the log says otherwise."""
     facts = recording.facts
-    document = _preset(airframe) if source in PRESETS else tomlkit.parse(Path(source).read_text(encoding="utf-8"))
-    begin = tomlkit.dumps(document)
-    given = set(document)
+    if source in PRESETS:
+        document = tomlkit.document()
+        for name, value in vars(airframe).items():
+            if np.isfinite(value).all():
+                document.add(name, np.asarray(value).tolist())
+    else:
+        document = tomlkit.parse(Path(source).read_text(encoding="utf-8"))
+    begin, given = tomlkit.dumps(document), set(document)
     _head(document, f"What {Path(recording.name).name} adds.")
     before = tomlkit.dumps(document)
     if recording.commanded and not has_full_scale(airframe):
@@ -131,33 +136,21 @@ def _continued(
     elif hover is not None and abs(hover.speed / float(airframe.hover_speed) - 1) > _ANOTHER:
         thrust = float(airframe.mass * airframe.gravity) / (4 * hover.speed**2)
         name, value = ("hover_speed", hover.speed) if "hover_speed" in given else ("thrust_coefficient", thrust)
-        _otherwise(document, f"{name} = {_short(value)}  # {_how(hover)}")
+        _say(document, f"{_OTHERWISE} {name} = {_short(value)}  # {_how(hover)}")
     if spins is not None and "rotor_spins" not in given:
         _add_spins(document, recording, spins)
     elif facts.rotor_spins is not None and not np.array_equal(facts.rotor_spins, airframe.rotor_spins):
-        _otherwise(document, f"rotor_spins = {[int(spin) for spin in facts.rotor_spins]}")
+        _say(document, f"{_OTHERWISE} rotor_spins = {[int(spin) for spin in facts.rotor_spins]}")
     positions = facts.rotor_positions
     if positions is not None and np.abs(np.subtract(positions, airframe.rotor_positions)).max() > _CENTIMETRE:
-        _otherwise(document, f"rotor_positions = {_short(positions)}")
+        _say(document, f"{_OTHERWISE} rotor_positions = {_short(positions)}")
     text = tomlkit.dumps(document)
     return begin if text == before else text
-
-
-def _otherwise(document: TOMLDocument, line: str) -> None:
-    _say(document, f"The log says otherwise: {line}")
 
 
 def _add_spins(document: TOMLDocument, recording: Recording, spins: tuple[float, ...]) -> None:
     how = "settings of the autopilot" if recording.facts.rotor_spins else "as the vehicle yaws in this flight"
     _add(document, "rotor_spins", [int(spin) for spin in spins], f"1: counter-clockwise seen from above; {how}")
-
-
-def _preset(airframe: Airframe) -> TOMLDocument:
-    document = tomlkit.document()
-    for name, value in vars(airframe).items():
-        if np.isfinite(value).all():
-            document.add(name, np.asarray(value).tolist())
-    return document
 
 
 def _battery(recording: Recording) -> list[str]:
@@ -175,11 +168,10 @@ def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:
             "(this flight does not show which rotor is where)",
         )
     signed = [("x" if x > 0 else "-x", "y" if y > 0 else "-y") for x, y in zip(signs.forward, signs.left, strict=True)]
-    places = ", ".join(f"[{x}, {y}]" for x, y in signed)
     words = {"x": "front", "-x": "rear", "y": "left", "-y": "right"}
     names = ", ".join(f"{i + 1} {words[x]} {words[y]}" for i, (x, y) in enumerate(signed))
     return (
-        f"rotor_positions = [{places}]  # m: numbers for x (forward) and y (left)",
+        f"rotor_positions = [{', '.join(f'[{x}, {y}]' for x, y in signed)}]  # m: numbers for x (forward) and y (left)",
         f"(as the vehicle turns in this flight: {names})",
     )
 

@@ -4,7 +4,7 @@ The signs of that response also show where the rotors of an X are, and how they 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,18 +55,6 @@ class Excitation(NamedTuple):
     verdict: str
 
 
-class Opposite(NamedTuple):
-    """An axis about which the vehicle turns against the torque that the airframe gives to its rotors.
-
-    `wrong`, `right`: the largest correlation of torque and angular acceleration with the opposite sign, and with that
-    of the airframe.
-    """
-
-    axis: str
-    wrong: float
-    right: float
-
-
 class RotorSigns(NamedTuple):
     """The signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from above).
 
@@ -87,7 +75,7 @@ def excitation(
     if airframe is not None:
         mixer = np.asarray(airframe.mixer, dtype=float)[:3]
         torque = (recording.omega[:-1] ** 2 @ mixer.T).std(axis=0)
-    roll, pitch, yaw = (_excitation(recording, axis, float(torque[i])) for i, axis in enumerate(AXES))
+    roll, pitch, yaw = (_excitation(recording, i, float(torque[i])) for i in range(3))
     return roll, pitch, yaw
 
 
@@ -101,24 +89,22 @@ def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
     return float(np.median(second)) / 0.6745 / math.sqrt(6) if second.size else math.nan
 
 
-def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> list[Opposite]:
+def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> dict[str, float]:
     """The axes about which the vehicle turns against the torque that the airframe gives to its rotors.
 
-    Axes without clear motion and torque are not judged. The clocks of motors and gyro may be shifted.
+    For each, the correlation of torque and angular acceleration with the opposite sign. Axes without clear motion and
+    torque are not judged. The clocks of motors and gyro may be shifted.
 
     **Arguments:** usable stretches of flights, each of one vehicle.
     """
     _, found = _torque_correlations(pieces, airframe, _SHIFTED)
-    every = [Opposite(axis, -float(row.min()), float(row.max())) for axis, row in zip(AXES, found.T, strict=True)]
-    limits = _WRONG.values()
-    return [
-        each for each, (least, times) in zip(every, limits, strict=True) if each.wrong > max(least, times * each.right)
-    ]
+    ends = zip(_WRONG.items(), -found.min(axis=0), found.max(axis=0), strict=True)
+    return {axis: float(wrong) for (axis, (least, times)), wrong, right in ends if wrong > max(least, times * right)}
 
 
-def refused_note(axes: Sequence[Opposite]) -> str:
+def refused_note(axes: Mapping[str, float]) -> str:
     """The fault and the remedy, if the vehicle rolls or pitches against the torque; else empty."""
-    named = [each.axis for each in axes if each.axis != "yaw"]
+    named = [axis for axis in axes if axis != "yaw"]
     if not named:
         return ""
     verb = "answers" if len(named) == 1 else "answer"
@@ -129,17 +115,16 @@ def refused_note(axes: Sequence[Opposite]) -> str:
     )
 
 
-def yaw_doubt(axes: Sequence[Opposite]) -> tuple[str, str] | None:
+def yaw_doubt(axes: Mapping[str, float]) -> tuple[str, str] | None:
     """Cause and remedy, if the vehicle seems to yaw against the torque."""
-    for each in axes:
-        if each.axis == "yaw":
-            return (
-                "yaw answers the rotors with the opposite sign (torque and angular acceleration correlate by "
-                f"{-each.wrong:.2f})",
-                "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
-                "all four signs",
-            )
-    return None
+    if "yaw" not in axes:
+        return None
+    return (
+        "yaw answers the rotors with the opposite sign (torque and angular acceleration correlate by "
+        f"{-axes['yaw']:.2f})",
+        "the rotors may turn the other way than `rotor_spins` of the airframe say (props in or out): change "
+        "all four signs",
+    )
 
 
 def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
@@ -157,14 +142,12 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
     left = _clear_sign(found[:, roll, 0]) * _PAIRS[roll]
     forward = -_clear_sign(found[:, pitch, 1]) * _PAIRS[pitch]
     turn = _clear_sign(found[:, yaw, 2])
-    return RotorSigns(
-        tuple(forward.tolist()), tuple(left.tolist()), tuple((-turn * _PAIRS[yaw]).tolist()) if turn else None
-    )
+    spins = tuple((-turn * _PAIRS[yaw]).tolist()) if turn else None
+    return RotorSigns(tuple(forward.tolist()), tuple(left.tolist()), spins)
 
 
-def _excitation(recording: Recording, axis: str, torque: float) -> Excitation:
+def _excitation(recording: Recording, i: int, torque: float) -> Excitation:
     """The excitation of one axis. Without a measured rate, it is the slope of the angle."""
-    i = AXES.index(axis)
     rate, angle = recording.states[:, RATE_COLUMNS[i]], recording.states[:, _ANGLE_COLUMNS[i]]
     noise = gyro_noise(rate)
     if np.count_nonzero(np.isfinite(rate)) < 3:
@@ -177,7 +160,7 @@ def _excitation(recording: Recording, axis: str, torque: float) -> Excitation:
         verdict = "none"
     else:
         verdict = "good" if size >= _GOOD else "weak"
-    return Excitation(axis, torque, size, noise, verdict)
+    return Excitation(AXES[i], torque, size, noise, verdict)
 
 
 def motor_clock_note(pieces: Sequence[Recording], airframe: Airframe) -> str:
@@ -249,10 +232,8 @@ def _correlations(
 
 def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
     """The sign of correlations at several delays, if it is clear; 0 if not."""
-    if np.isnan(found).any():
-        return 0.0
     for sign in (1.0, -1.0):
-        if max(sign * found) > _OPPOSITE and max(sign * found) > _CLEAR * max(-sign * found):
+        if (sign * found).max() > max(_OPPOSITE, _CLEAR * (-sign * found).max()):
             return sign
     return 0.0
 
@@ -260,10 +241,8 @@ def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
 def _pair(found: np.ndarray) -> int | None:
     """The row of `_PAIRS` that turns the vehicle about an axis, if one of them does clearly."""
     sizes = np.abs(found).max(axis=0)
-    if np.isnan(sizes).any():
-        return None
     best = int(np.argmax(sizes))
-    alone = sizes[best] > _CLEAR * np.delete(sizes, best).max()
+    alone = sizes[best] > _CLEAR * np.delete(sizes, best).max()  # False for NaN
     return best if alone and _clear_sign(found[:, best]) else None
 
 

@@ -1,7 +1,6 @@
 """Pieces of recordings: cut, averaged to longer samples, joined, divided into measurements to fit and to predict."""
 
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 
@@ -16,16 +15,12 @@ _EQUAL_STEPS = 1e-6
 # Length of a block that is held out [s]: each part of a flight then has blocks of both kinds.
 _BLOCK = 5.0
 
-AnyFlight = TypeVar("AnyFlight", Flight, Recording)
 
-
-def cut(flight: AnyFlight, stretch: Stretch) -> AnyFlight:
+def cut(flight: Recording, stretch: Stretch) -> Recording:
     """The part of a flight from `stretch.begin` to `stretch.end`; its time stays as recorded.
 
     **Raises:** `InputError` if the part has fewer than two samples.
     """
-    if isinstance(flight, Flight):
-        return cut(Recording.of(flight), stretch).flight
     time, half = flight.time, flight.dt / 2
     inside = np.flatnonzero((time >= stretch.begin - half) & (time <= stretch.end + half))
     if inside.size < 2:
@@ -36,23 +31,21 @@ def cut(flight: AnyFlight, stretch: Stretch) -> AnyFlight:
     return flight.rows(slice(int(inside[0]), int(inside[-1]) + 1))
 
 
-def averaged(flight: AnyFlight, dt: float) -> AnyFlight:
+def averaged(flight: Recording, dt: float) -> Recording:
     """A flight averaged to samples of `dt` [s], see `average`; unchanged if its samples are not shorter."""
-    if isinstance(flight, Flight):
-        return averaged(Recording.of(flight), dt).flight
     if dt <= flight.dt * (1 + _EQUAL_STEPS):
         return flight
-    optional = {
-        name: np.reshape(values, (flight.time.size, -1))
-        for name in ("specific_force", "voltage")
-        if (values := getattr(flight, name)) is not None
-    }
-    time, omega, means = average(flight.time, flight.omega, np.hstack([flight.states, *optional.values()]), dt)
-    states, *others = np.split(means, np.cumsum([12, *(each.shape[1] for each in optional.values())])[:-1], axis=1)
-    found = dict(zip(optional, others, strict=True))
-    if "voltage" in found:
-        found["voltage"] = found["voltage"][:, 0]
-    return flight._replace(time=time, omega=omega, states=states, **found, body_velocity=None, stretch=None)
+    columns = [flight.channels] if flight.voltage is None else [flight.channels, flight.voltage[:, None]]
+    time, omega, means = average(flight.time, flight.omega, np.hstack(columns), dt)
+    return flight._replace(
+        time=time,
+        omega=omega,
+        states=means[:, :12],
+        specific_force=None if flight.specific_force is None else means[:, 12:15],
+        voltage=None if flight.voltage is None else means[:, 15],
+        body_velocity=None,
+        stretch=None,
+    )
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:
@@ -87,8 +80,7 @@ def joined(pieces: Sequence[Recording]) -> Recording:
     **Raises:** `ValueError` if the sample times differ.
     """
     steps = _check_steps(pieces)
-    channels = np.concatenate([piece.channels for piece in pieces])
-    states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
+    states, force = np.split(np.concatenate([piece.channels for piece in pieces]), [len(STATE_NAMES)], axis=1)
     sizes = [piece.time.size for piece in pieces]
     return Recording(
         time=steps[0] * np.arange(sum(sizes)),

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from ..airframe import Airframe
 from ..flight import Flight
@@ -117,7 +117,7 @@ def usable_stretches(flight: Flight | Recording, airframe: Airframe | None = Non
 def nothing_usable(every: Sequence[Stretch]) -> str:
     """Why none of these stretches of a flight can be used: the longest one, with its reason."""
     longest = max(every, key=lambda stretch: stretch.length)
-    no_flight = {_NAMES[_GROUND], _NAMES[_SHORT], _NAMES[_LOST]}
+    no_flight = [_NAMES[label] for label in (_GROUND, _SHORT, _LOST)]
     grounded = longest.reason == ON_GROUND and all(stretch.reason in no_flight for stretch in every)
     never = "the vehicle never flew" if grounded else "no part can be used"
     return f"{never} (from {longest.begin:.1f} s to {longest.end:.1f} s: {longest.reason})"
@@ -175,20 +175,17 @@ def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dic
         same = _LIMIT * largest
         if largest <= 0:
             continue
-        full, rest = np.asarray(speed >= _FULL * full_scale), np.asarray(speed <= same)
+        # Each sample that equals the one before or after it.
+        equal = np.abs(np.diff(speed)) <= same
+        steady = np.append(equal, False) | np.insert(equal, 0, False)
+        full, rest = speed >= _FULL * full_scale, speed <= same
         if largest > 1.3 * usual > 0:
-            full |= _steady(speed, same) & (speed >= largest - same)
+            full |= steady & (speed >= largest - same)
         if least < 0.5 * usual:
-            rest |= _steady(speed, same) & (speed <= least + same)
+            rest |= steady & (speed <= least + same)
         for where, lasting in zip((full, rest), found.values(), strict=True):
             lasting[:, i] = _lasting(where, MOMENT / dt)
     return found
-
-
-def _steady(speed: np.ndarray, same: float) -> np.ndarray:
-    """Whether each sample equals the one before or after it."""
-    equal = np.abs(np.diff(speed)) <= same
-    return np.append(equal, False) | np.insert(equal, 0, False)
 
 
 def _lost(states: np.ndarray, dt: float) -> np.ndarray:
@@ -205,7 +202,7 @@ def _crashed(
     rates: np.ndarray, force: np.ndarray | None, share: np.ndarray, ground: np.ndarray, dt: float
 ) -> np.ndarray:
     """The samples of a crash: from before an impact until the rotors stop, or the recording ends, soon after."""
-    out, impact = np.zeros(share.size, dtype=bool), np.zeros(share.size, dtype=bool)
+    out, impact = np.zeros((2, share.size), dtype=bool)
     if force is not None:
         impact = np.nan_to_num(np.linalg.norm(force, axis=1)) > _IMPACT_FORCE
     measured, rates = np.asarray(np.isfinite(rates).all(axis=1)), np.nan_to_num(rates)
@@ -222,22 +219,13 @@ def _crashed(
 
 
 def _resting(
-    omega: Float[np.ndarray, "samples 4"],
-    force: Float[np.ndarray, "samples 3"],
-    rates: Float[np.ndarray, "samples 3"],
-    airborne: Bool[np.ndarray, " samples"],
-    dt: float,
+    omega: np.ndarray, force: np.ndarray, rates: np.ndarray, airborne: np.ndarray, dt: float
 ) -> Bool[np.ndarray, " samples"]:
-    """Which samples are of a vehicle at rest, by its accelerometer.
+    """Which samples are of a vehicle at rest, by its accelerometer; judged are those that may be in flight.
 
     In flight the specific force along z is the thrust, divided by the mass. On the ground and in a hand it is that of
     gravity, whatever the rotors do. And a vehicle that lies on its side or back measures gravity across its rotors'
-    axes.
-
-    **Arguments:** rotor speeds or commands, specific force [m/s^2], body rates [rad/s], the samples that may be in
-    flight (only these are judged), and the step [s].
-
-    A window without changes of thrust proves nothing. Gaps of up to 5 s between windows at rest are at rest as well.
+    axes. A window without changes of thrust proves nothing.
     """
     size = omega.shape[0]
     length = max(round(_BIN / dt), 1)
@@ -247,32 +235,31 @@ def _resting(
     sensed = np.column_stack([omega.mean(axis=1) ** 2, force / _GRAVITY, np.abs(rates).max(axis=1)])
     sensed[~airborne] = np.nan
     means = sensed[: bins * length].reshape(bins, length, -1).mean(axis=1)  # NaN where a sample is
-    step = length * dt
-    found = _unfelt(means, step) | _tilted(means, step)
-    out = np.repeat(found, length)
-    return np.append(out, np.full(size - out.size, found[-1]))
+    step, weight = length * dt, np.linalg.norm(means[:, 1:4], axis=1)
+    # A vehicle lies on its side or back for at least a second.
+    with np.errstate(invalid="ignore"):
+        lies = (np.abs(weight - 1) < _ONE_G) & (means[:, 3] < _TILTED) & (means[:, 4] < _STILL)
+    found = _unfelt(means, step) | _lasting(lies, math.ceil(_SHORTEST_REST / step) - 1)
+    return found[np.minimum(np.arange(size) // length, bins - 1)]
 
 
 def _unfelt(means: np.ndarray, step: float) -> np.ndarray:
     """The bins of windows in which thrust changes, and the accelerometer does not."""
     smooth = np.column_stack([np.convolve(column, np.full(_SMOOTH, 1 / _SMOOTH), "same") for column in means.T])
     smooth[: _SMOOTH // 2] = smooth[-(_SMOOTH // 2) :] = np.nan
-    out, felt = np.zeros(means.shape[0], dtype=bool), np.zeros(means.shape[0], dtype=bool)
+    out, felt = np.zeros((2, means.shape[0]), dtype=bool)
     wide = max(round(_REST / step), 4)
     for begin in range(0, means.shape[0] - wide // 2, max(wide // 4, 1)):
         part = smooth[begin : begin + wide]
         part = part[np.isfinite(part[:, :4]).all(axis=1)]
         if part.shape[0] < wide // 2:
             continue
-        thrust, vertical = part[:, 0], part[:, 3]
-        size = np.linalg.norm(part[:, 1:4], axis=1)
-        mean = float(thrust.mean())
+        thrust, vertical, size = part[:, 0], part[:, 3], np.linalg.norm(part[:, 1:4], axis=1)
+        mean = thrust.mean()
         if mean <= 0 or thrust.std() < _VARIES * mean:
             continue
         deviation = thrust - mean
-        follows = (
-            float(deviation @ vertical) / float(deviation @ deviation) * mean / max(abs(float(vertical.mean())), 0.1)
-        )
+        follows = (deviation @ vertical) / (deviation @ deviation) * mean / max(abs(vertical.mean()), 0.1)
         gravity = abs(size.mean() - 1) < _ONE_G and size.std() < _STEADY
         (out if gravity and abs(follows) < _UNFELT else felt)[begin : begin + wide] = True
     known = np.flatnonzero(out)
@@ -280,14 +267,6 @@ def _unfelt(means: np.ndarray, step: float) -> np.ndarray:
         if 1 < following - one <= _FILLED / step and not felt[one + 1 : following].any():
             out[one:following] = True
     return out
-
-
-def _tilted(means: np.ndarray, step: float) -> np.ndarray:
-    """The bins of a vehicle that lies on its side or back, for at least a second."""
-    size = np.linalg.norm(means[:, 1:4], axis=1)
-    with np.errstate(invalid="ignore"):
-        lies = (np.abs(size - 1) < _ONE_G) & (means[:, 3] < _TILTED) & (means[:, 4] < _STILL)
-    return _lasting(np.asarray(lies), math.ceil(_SHORTEST_REST / step) - 1)
 
 
 def _reason(label: int, begin: int, end: int, saturations: dict[str, np.ndarray]) -> str:
