@@ -83,9 +83,7 @@ from .estimators import (
     Hybrid as Hybrid,
     JointEKF as JointEKF,
     OutputError as OutputError,
-    Profile as Profile,
     RecursiveLeastSquares as RecursiveLeastSquares,
-    profile_likelihood as profile_likelihood,
 )
 from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
 from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
@@ -99,9 +97,7 @@ from .identification import (
 )
 from .logs import read_flight as read_flight, read_log as read_log, write_flight as write_flight
 from .models.abstract import DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH, AbstractModel as AbstractModel
-from .models.corrected import CorrectedOS4 as CorrectedOS4
-from .models.inertial import InertialOS4 as InertialOS4
-from .models.published import PublishedOS4 as PublishedOS4
+from .models.os4 import CorrectedOS4 as CorrectedOS4, PublishedOS4 as PublishedOS4
 from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
 from .networks import NetworkEstimator as NetworkEstimator, TrainedNetwork as TrainedNetwork
 from .networks.file import load_network as load_network, save_network as save_network

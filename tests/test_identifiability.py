@@ -123,20 +123,6 @@ def test_the_scaled_informations_inverse_is_the_bound(model_class):
     assert np.all(found.std_alone <= found.std * (1 + 1e-9))
 
 
-@pytest.mark.parametrize("estimator", [jaxos4.IBSS(), jaxos4.OutputError()])
-def test_a_profile_is_the_parabola_of_the_bound(estimator):
-    problem = standard_problem(channels="rates", states=noisy_states(1, seed=3)[0])
-    bracket = jaxos4.Bracket.default(problem.model)
-    best = estimator(problem, bracket)
-    steps = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-    values = best.parameters[2] + steps * best.std[2]
-    profile = jaxos4.profile_likelihood(estimator, problem, bracket, "alpha3", values)
-    assert set(jaxos4.result_names(profile.estimates.result)) == {"successful"}
-    np.testing.assert_allclose(profile.deviance, steps**2, rtol=0.02, atol=2e-3)
-    with pytest.raises(ValueError, match="`name` must be one of alpha1"):
-        jaxos4.profile_likelihood(estimator, problem, bracket, "alpha9", values)
-
-
 def residual_noise(flights, correlation_time):
     """Errors of flights with Gauss-Markov noise, in standard deviations of the bound and of the robust covariance."""
     problem, noise = standard_problem(channels="rates"), jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, correlation_time)

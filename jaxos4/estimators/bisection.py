@@ -1,8 +1,7 @@
 """The parts of IBSS: a stage, the directions of a sweep, and the brackets along them.
 
 All steps are in standard deviations. The unknowns of a window are the shared ones, then its own initial state.
-Directions are in the opposite order: those of the initial state come first, so that a step along a parameter carries
-the initial states to where they fit best.
+Directions are in the opposite order, so that a step along a parameter carries the initial states to where they fit.
 """
 
 import functools
@@ -25,7 +24,12 @@ _STRIDE = 0.1  # the information that keeps the predicted steps along an unknown
 
 
 class Stage(NamedTuple):
-    """A stage of a problem, see `Stages`. `prior`: the information about unknowns of which the cost has no prior."""
+    """A stage of a problem, see `Stages`.
+
+    - `searched`: the unknowns that this stage can find. `limits`: of all unknowns.
+    - `evaluate`: the cost of its data with gradient and information. `misfit`: how large the residuals are, in sigma.
+    - `prior`: the information about unknowns of which the cost has no prior.
+    """
 
     problem: AbstractProblem
     last: Flag
@@ -82,8 +86,7 @@ class Lines(NamedTuple):
     - `predicted`: the predicted step to the minimum.
     - `lower`, `upper`: the bracket around it. `low`, `high`: the part of it that may hold the minimum.
     - `trial`: the step of the next shot.
-    - `last`, `slope`: the step of the last shot, and the slope there.
-    - `rate`: the slope's rate of change.
+    - `last`, `slope`, `rate`: the step of the last shot, the slope there, and the slope's rate of change.
     """
 
     predicted: PerDirection
@@ -119,8 +122,9 @@ class Lines(NamedTuple):
         secant = (slope - self.slope) / (self.trial - self.last)
         rate = jnp.where((secant > 0) & jnp.isfinite(secant), secant, self.rate)
         zero = self.trial - slope / rate
-        narrowed_there = ((zero <= low) & (low > self.lower)) | ((zero >= high) & (high < self.upper))
-        following = jnp.where(narrowed_there, (low + high) / 2, jnp.clip(zero, low, high))
+        # An end that no shot has moved yet may be tried itself.
+        outside = ((zero <= low) & (low > self.lower)) | ((zero >= high) & (high < self.upper))
+        following = jnp.where(outside, (low + high) / 2, jnp.clip(zero, low, high))
         return self._replace(low=low, high=high, trial=following, last=self.trial, slope=slope, rate=rate)
 
 

@@ -41,13 +41,12 @@ class State(NamedTuple):
 
     - `unknowns`, `curvature`: where it is, and the curvature of the cost there.
     - `spread`: the covariance of the unknowns, which sizes the first brackets of a stage.
-    - `error`: how far the last predictions were off, as a share of the longest step.
-    - `growth`: by how much each direction's bracket is wider than this error asks for.
+    - `error`: how far the last predictions were off, as a share of the longest step. `growth`: by how much each
+      direction's bracket is wider than this error asks for.
     - `trust`: the share of the longest predicted step that a sweep may go.
     - `sweep`: the number of the next sweep in its stage; -1 for the first shot, which is at the start.
     - `sweeps`, `rollouts`: how many sweeps bisected, and how many flights were simulated, in all stages.
-    - `done`: whether the stage ended by itself.
-    - `record`: the bracket of each parameter in each sweep.
+    - `done`: whether the stage ended by itself. `record`: the bracket of each parameter in each sweep.
     """
 
     unknowns: WindowUnknowns
@@ -63,8 +62,7 @@ class State(NamedTuple):
     record: Float[Array, "record 2 parameters"]
 
 
-# The narrowed brackets, the last shot's place and curvature, and the number of shots.
-Bisected = tuple[Lines, WindowUnknowns, Curvature, Count]
+Bisected = tuple[Lines, WindowUnknowns, Curvature, Count]  # what is left of the brackets, the last shot, their number
 
 
 class IBSS(AbstractEstimator):
@@ -74,8 +72,7 @@ class IBSS(AbstractEstimator):
     direction decides** which side of the trial holds the minimum, and so which part of the bracket is dropped. The
     quadratic model of the cost and the secant through the last slopes only **propose** where to shoot. A *sweep* is one
     iteration. A *stage* repeats sweeps on some of the data until the minimum is near; the last stage fits all of them.
-    If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
-    windows' slopes, initial states on their own window's.
+    Parameters are bisected on the sum of all windows' slopes, initial states on those of their own window.
 
     **Arguments:**
 
@@ -107,11 +104,10 @@ class IBSS(AbstractEstimator):
     def __check_init__(self):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
-        check_count("halvings", self.halvings, 2)
-        check_count("record", self.record, 0)
-        check_count("max_sweeps", self.max_sweeps, 1)
-        check_positive("tolerance", self.tolerance)
-        check_positive("reach", self.reach)
+        for name, least in (("halvings", 2), ("record", 0), ("max_sweeps", 1)):
+            check_count(name, getattr(self, name), least)
+        for name in ("tolerance", "reach"):
+            check_positive(name, getattr(self, name))
 
     @quick_jit
     def __call__(
@@ -126,8 +122,7 @@ class IBSS(AbstractEstimator):
 
         **Arguments:**
 
-        - `problem`: any likelihood: a `ShootingProblem`, or an `InnovationsProblem` for a vehicle in closed loop.
-        - `bracket`: where to look for the parameters, which may turn out to lie outside; by default the problem's own.
+        - `problem`, `bracket`: see `AbstractEstimator`. The parameters may turn out to lie outside of the bracket.
         - `start`: where the search begins, unless it is NaN; by default the problem's `starts`.
         - `spread`: the covariance of the parameters of `start`, which sizes the first brackets; by default that of the
           bracket, with its half-width as two standard deviations.
@@ -182,6 +177,7 @@ class IBSS(AbstractEstimator):
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem)))
         if spread is not None:
             known = np.s_[:, : spread.shape[0], : spread.shape[0]]
+            # What is skipped may have no finite spread.
             covariance = covariance.at[known].set(jnp.where(skip, covariance[known], spread))
         none = jnp.zeros((), dtype=int)
         shapes = jax.eval_shape(stages.evaluate, none, unknowns)
@@ -234,9 +230,9 @@ class IBSS(AbstractEstimator):
         longest, is_first = jnp.abs(predicted).max(), state.sweep == 0
         later = jnp.maximum(state.error * longest, stage.smallest_step) * state.growth
         half_width = jnp.where(is_first, _FIRST * opening, later)
+        # How far this sweep may go; before the first shot, which is at the start, nowhere.
         reach = jnp.where(is_first, opening, jnp.inf)
         reach = jnp.where(state.trust < 1, state.trust * longest, reach)
-        # Nothing is known before the first shot, which is at the start.
         reach = jnp.where(state.sweep < 0, 0.0, reach)
         if self.directions == "coordinate":  # each searched unknown has its turn
             rank, searched = jnp.cumsum(stage.searched) - 1, stage.searched
@@ -247,8 +243,7 @@ class IBSS(AbstractEstimator):
     def _bisect(self, stage: Stage, state: State, view: View, near: Flag, lines: Lines) -> Bisected:
         """4. Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
 
-        The last shot does not narrow brackets: it is at what the others found. No shot is left if the minimum is near,
-        or after the last sweep.
+        The last shot is at what the others found. There is none if the minimum is near, or after the last sweep.
         """
         over = near | (state.sweep >= self._most_sweeps(stage))
         shots = jnp.where(state.sweep < 0, 1, jnp.where(over, 0, self.halvings + 1))

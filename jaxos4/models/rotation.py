@@ -19,7 +19,7 @@ def attitude_rates(rates: Rates, attitude: Attitude) -> Attitude:
 
 def to_earth(attitude: Attitude, body: Vector) -> Vector:
     """A vector from the body's axes to the earth's: R_z(psi) R_y(theta) R_x(phi)."""
-    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = _sines_and_cosines(attitude)
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
     x, y, z = body
     y, z = y * cos_phi - z * sin_phi, y * sin_phi + z * cos_phi
     x, z = x * cos_theta + z * sin_theta, -x * sin_theta + z * cos_theta
@@ -28,7 +28,7 @@ def to_earth(attitude: Attitude, body: Vector) -> Vector:
 
 def to_body(attitude: Attitude, earth: Vector) -> Vector:
     """A vector from the earth's axes to the body's: the inverse of `to_earth`."""
-    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = _sines_and_cosines(attitude)
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
     x, y, z = earth
     x, y = x * cos_psi + y * sin_psi, -x * sin_psi + y * cos_psi
     x, z = x * cos_theta - z * sin_theta, x * sin_theta + z * cos_theta
@@ -45,5 +45,6 @@ def with_body_velocity(flight: Flight) -> Flight:
     return eqx.tree_at(lambda f: f.body_velocity, flight, jnp.stack(velocity, axis=1), is_leaf=lambda x: x is None)
 
 
-def _sines_and_cosines(attitude: Attitude) -> tuple[Samples, ...]:
+def sines_and_cosines(attitude: Attitude) -> tuple[Samples, ...]:
+    """The sine and the cosine of phi, theta and psi."""
     return (*sincos(attitude.phi), *sincos(attitude.theta), *sincos(attitude.psi))
