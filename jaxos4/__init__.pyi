@@ -33,7 +33,6 @@ from .airframe import (
     VOOS as VOOS,
     Airframe as Airframe,
     alpha_from_inertia as alpha_from_inertia,
-    inertia_from_alpha as inertia_from_alpha,
     load_airframe as load_airframe,
     plus_layout as plus_layout,
 )

@@ -75,10 +75,7 @@ def plus_layout(arm: float) -> list[tuple[float, float]]:
 
 
 def _preset(arm: float, mass: float, inertia: tuple[float, ...], b: float, d: float, rotor: float, **more: float):
-    layout = {"rotor_positions": plus_layout(arm), "rotor_spins": ALTERNATING_SPINS}
-    return Airframe(
-        mass=mass, inertia=inertia, thrust_coefficient=b, drag_coefficient=d, rotor_inertia=rotor, **layout, **more
-    )
+    return Airframe(mass, inertia, plus_layout(arm), ALTERNATING_SPINS, b, d, rotor, **more)
 
 
 # Table 1 of the paper is not available to us. These values are from public literature and code: the OS4 thesis, the
@@ -110,17 +107,6 @@ def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tup
         (ix - iy) / iz,
         1 / iz,
     )
-
-
-def inertia_from_alpha(alpha: Float[ArrayLike, "8"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Ix, Iy, Iz [kg m^2] and the gyroscopic constant: the inverse of `alpha_from_inertia`.
-
-    The inertias are the reciprocals of alpha3, alpha6 and alpha8, which a flight determines best. The constant is the
-    mean of the two that alpha2 and alpha5 imply. alpha1, alpha4 and alpha7 are not used; `jaxos4.fit_inertia` uses all.
-    """
-    a = jnp.asarray(alpha)
-    inertia = 1 / a[jnp.array([2, 5, 7])]
-    return inertia, (a[1] * inertia[0] + a[4] * inertia[1]) / 2
 
 
 def load_airframe(source: str | PathLike[str]) -> Airframe:

@@ -227,7 +227,8 @@ def fit_start(
     **Returns:** initial state, cost, whether the trajectory is sound, and number of rollouts.
     """
     start, rollouts = best_start(problem, parameters)
-    return start, *problem.shots(parameters, start), rollouts + 1
+    cost, sound = problem.shots(parameters, start)
+    return start, cost, sound, rollouts + 1
 
 
 def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[Array, " starts"], int]:

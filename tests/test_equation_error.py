@@ -295,14 +295,3 @@ def test_models_that_are_not_linear_are_refused(estimator):
     problem = jaxos4.ShootingProblem(lagging, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0])
     with pytest.raises(ValueError, match="linear in its parameters|no rotor lag"):
         estimator(problem)
-
-
-def test_a_batch_without_flights_gives_no_estimates():
-    problem = standard_problem(channels="rates")
-    states = jnp.zeros((0, *problem.flight.states.shape))
-
-    def identify(states):
-        flight = eqx.tree_at(lambda p: p.flight.states, problem, states)
-        return jaxos4.EquationError()(flight, jaxos4.Bracket.default(problem.model)).parameters
-
-    assert eqx.filter_vmap(identify)(states).shape == (0, 8)

@@ -19,8 +19,9 @@ from ..shooting.abstract import WindowUnknowns
 Flag = Bool[Array, ""]
 PerDirection = Float[Array, "windows n"]
 
-_ROUGH = 0.2  # the share of a step that counts along an unknown with a stride: its gradient is approximate
-_STRIDE = 0.1  # the information that keeps the predicted steps along an unknown with a stride short
+# An unknown with a stride, such as a level of noise, has an approximate gradient (see `Unknowns`).
+_ROUGH = 0.2  # the share of a step along it that counts
+_STRIDE = 0.1  # the information that keeps predicted steps along it short
 
 
 class Stage(NamedTuple):
@@ -85,8 +86,7 @@ class Lines(NamedTuple):
 
     - `predicted`: the predicted step to the minimum.
     - `lower`, `upper`: the bracket around it. `low`, `high`: the part of it that may hold the minimum.
-    - `trial`: the step of the next shot.
-    - `last`, `slope`, `rate`: the step of the last shot, the slope there, and the slope's rate of change.
+    - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope there, and its change.
     """
 
     predicted: PerDirection
@@ -101,10 +101,7 @@ class Lines(NamedTuple):
 
     @classmethod
     def around(cls, predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection):
-        """Brackets of some half-width around predicted steps, which go at most `below` backwards, `above` forwards.
-
-        The first trial is the middle, and the expected rate of change is that of unit information.
-        """
+        """Brackets around predicted steps. The first trials are their middles, the rates those of unit information."""
         predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
         lower = jnp.maximum(predicted - half_width, -below)
         upper = jnp.minimum(predicted + half_width, above)
@@ -114,8 +111,7 @@ class Lines(NamedTuple):
     def halved(self, slope: PerDirection) -> "Lines":
         """The lines after a shot at their trials: **the sign of the slope decides**, the secant proposes.
 
-        The next trial is the zero of a line through the last two slopes, at first with the expected rate of change. If
-        that lies outside of the remaining bracket, the next trial is the middle.
+        The next trial is the zero of a line through the last two slopes, or the middle if that is outside.
         """
         low = jnp.where(slope <= 0, self.trial, self.low)
         high = jnp.where(slope >= 0, self.trial, self.high)

@@ -31,8 +31,7 @@ _OPENING, _FIRST = 4.0, 0.05
 _SAFETY, _LEAST = 2.0, 0.01
 _GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose search ended at one of its ends, and of all together
 _CHANCE = 1.0  # a sweep that raises the cost by no more may have done so by chance
-# After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far. If
-# the share were back at 1 at once, every second sweep of a strongly nonlinear search would fail.
+# After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far.
 _RETREAT, _ADVANCE = 0.25, 1.4
 
 
@@ -78,13 +77,11 @@ class IBSS(AbstractEstimator):
 
     - `directions`: `"whitened"`: the columns of L^-T, with L L^T the Fisher information at the current estimate; the
       cost is nearly separable along them, so a sweep bisects all together. The rates are fitted first, then all
-      channels. `"coordinate"`: the unknowns themselves, one in each sweep, against all of the problem's channels, in
-      the manner of the paper; good on the rates, slow on more channels.
+      channels. `"coordinate"`: the unknowns, one in each sweep, on all channels at once: good on the rates only.
     - `halvings`: the shots of a sweep that narrow the brackets.
     - `max_sweeps`: the most sweeps of each stage; along coordinates, for each of them.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
-      direction. The standard deviation follows from the actual residuals, so the fit of noise-free data ends at
-      rounding errors.
+      direction. They follow from the actual residuals, so the fit of noise-free data ends at rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     - `record`: how many sweeps' brackets the estimate keeps, to show how the search went.
     """
@@ -116,7 +113,6 @@ class IBSS(AbstractEstimator):
         bracket: Bracket | None = None,
         *,
         start: Float[Array, " unknowns"] | None = None,
-        spread: Float[Array, "known known"] | None = None,
     ) -> Estimate:
         """Identifies one flight.
 
@@ -124,12 +120,10 @@ class IBSS(AbstractEstimator):
 
         - `problem`, `bracket`: see `AbstractEstimator`. The parameters may turn out to lie outside of the bracket.
         - `start`: where the search begins, unless it is NaN; by default the problem's `starts`.
-        - `spread`: the covariance of the parameters of `start`, which sizes the first brackets; by default that of the
-          bracket, with its half-width as two standard deviations.
 
         **Raises:** `ValueError` for a bracket or a start of another length than the unknowns.
         """
-        return in_blocks(self.search, problem.within(bracket), start, spread)
+        return in_blocks(self.search, problem.within(bracket), start)
 
     def search(
         self,
@@ -145,6 +139,8 @@ class IBSS(AbstractEstimator):
 
         **Arguments:** as of a call, and
 
+        - `spread`: the covariance of the parameters of `start`, which sizes the first brackets; by default that of the
+          bracket, with its half-width as two standard deviations.
         - `initial_state`: where the search for a free initial state begins; by default the first measurements.
         - `cascade`: whether to go through all stages. A `start` that is close needs the last one only.
         - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
@@ -204,7 +200,7 @@ class IBSS(AbstractEstimator):
         return self._judge(stage, state, view, near, found)
 
     def terminate(self, stage: Stage, state: State) -> Flag:
-        """Whether the stage has ended. After its last sweep, it looks around once more, whether the minimum is near."""
+        """Whether the stage has ended. After its last sweep it looks once more whether the minimum is near."""
         return state.done | (state.sweep > self._most_sweeps(stage))
 
     def _look_around(self, stage: Stage, state: State) -> View:
@@ -276,12 +272,12 @@ class IBSS(AbstractEstimator):
         off = _SAFETY * jnp.abs(steps - lines.predicted).max()
         at_end = (steps == lines.lower) | (steps == lines.upper)
         growth = jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0)
-        known = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(view.basis)
+        covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(view.basis)
         searched, counts = stage.searched & stage.searched[:, None] & ~first, ~first & (shots > 0)
         return State(
             unknowns=kept,
             curvature=there,
-            spread=jnp.where(searched, known, state.spread),
+            spread=jnp.where(searched, covariance, state.spread),
             error=jnp.clip(off / jnp.maximum(jnp.abs(steps).max(), stage.smallest_step), _LEAST, 1.0),
             growth=jnp.where(bisected, growth, state.growth),
             trust=jnp.where(failed, state.trust * _RETREAT, jnp.minimum(state.trust * _ADVANCE, 1.0)),

@@ -6,7 +6,6 @@ from .abstract import (
     AbstractModel as AbstractModel,
 )
 from .os4 import CorrectedOS4 as CorrectedOS4, PublishedOS4 as PublishedOS4
-from .rotation import with_body_velocity as with_body_velocity
 from .terms import TERMS as TERMS, Term as Term, TermParameter as TermParameter, default_terms as default_terms
 from .vehicle import FlightModel as FlightModel
 

@@ -173,18 +173,10 @@ def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[
     return add
 
 
-def _above_hover(rates: Rates, forcing: Forcing) -> tuple[Samples, Samples]:
-    return forcing.thrust - _HOVER, forcing.thrust - _HOVER
-
-
-def _sideways(rates: Rates, forcing: Forcing) -> tuple[Samples, Samples]:
-    vx, vy, _ = required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
-    return vy, vx
-
-
-def _pushed(rates: Rates, forcing: Forcing) -> tuple[Samples, Samples]:
-    ax, ay = required(forcing.lateral, _missing(LATERAL_FORCE, "specific_force"))
-    return ay, ax
+def _swapped(vector: tuple[Samples, ...] | None, need: str, field: str) -> tuple[Samples, Samples]:
+    """Along x the vehicle pitches, along y it rolls."""
+    x, y, *_ = _measured(vector, need, field)
+    return y, x
 
 
 def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
@@ -193,7 +185,7 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
 
 
 def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpeeds:
-    voltage = required(grid.voltage, _missing(VOLTAGE, "voltage"))
+    voltage = _measured(grid.voltage, VOLTAGE, "voltage")
     return omega * (voltage ** values["voltage_exponent"])[:, None]
 
 
@@ -203,25 +195,15 @@ def _bend_thrust(squares: SquaredSpeeds, values: Values, speeds: Speeds, airfram
     return SquaredSpeeds(mean, curve * squares.begin + (1 - curve) * full * speeds.begin)
 
 
-def _scale_thrust(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    x, y, z = force
-    return x, y, values["thrust_gain"] * z
-
-
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    vx, vy, _ = required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
+    vx, vy, _ = _measured(forcing.velocity, BODY_VELOCITY, "body_velocity")
     x, y, z = force
     return x - values["x_drag"] * vx, y - values["y_drag"] * vy, z
 
 
 def _add_inflow(force: Vector, values: Values, forcing: Forcing) -> Vector:
     x, y, z = force
-    return x, y, z - values["z_drag"] * required(forcing.velocity, _missing(AXIAL_VELOCITY, "body_velocity"))[2]
-
-
-def _add_gyro_bias(rates: Rates, values: Values) -> Rates:
-    p, q, r = rates
-    return Rates(p + values["p_bias"], q + values["q_bias"], r + values["r_bias"])
+    return x, y, z - values["z_drag"] * _measured(forcing.velocity, AXIAL_VELOCITY, "body_velocity")[2]
 
 
 def _add_force_bias(force: Vector, values: Values) -> Vector:
@@ -241,7 +223,7 @@ TERMS: dict[str, Term] = {
         # The bracket is an offset of 10 % of the arm.
         tuple(TermParameter(f"{x}_thrust", "rad/m", _authority(i, _HOVER)) for i, x in enumerate(_AXES[:2])),
         by_default=lambda available: True,
-        angular_acceleration=_torque("thrust", _above_hover),
+        angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - _HOVER,) * 2),
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
@@ -254,7 +236,9 @@ TERMS: dict[str, Term] = {
         tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(_AXES[:2])),
         needs=frozenset({BODY_VELOCITY}),
         by_default=lambda available: True,
-        angular_acceleration=_torque("velocity", _sideways),
+        angular_acceleration=_torque(
+            "velocity", lambda rates, forcing: _swapped(forcing.velocity, BODY_VELOCITY, "body_velocity")
+        ),
     ),
     "flapping": Term(
         "a moment proportional to the measured lateral specific force: roll_flapping, pitch_flapping [rad/m]",
@@ -262,7 +246,9 @@ TERMS: dict[str, Term] = {
         needs=frozenset({LATERAL_FORCE}),
         # The drag of the rotors is proportional to the body velocity: the force replaces a missing velocity.
         by_default=lambda available: BODY_VELOCITY not in available,
-        angular_acceleration=_torque("flapping", _pushed),
+        angular_acceleration=_torque(
+            "flapping", lambda rates, forcing: _swapped(forcing.lateral, LATERAL_FORCE, "specific_force")
+        ),
     ),
     "voltage": Term(
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
@@ -273,10 +259,8 @@ TERMS: dict[str, Term] = {
     ),
     "lag": Term(
         "rotors follow their commands as first-order systems: rotor_lag [s]",
-        (
-            # Small vehicles have 0.02 to 0.1 s.
-            TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-_EARLY, _INF, _LATE, _CLOCKS))),
-        ),
+        # Small vehicles have 0.02 to 0.1 s.
+        (TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-_EARLY, _INF, _LATE, _CLOCKS))),),
         by_default=lambda available: COMMANDS in available,
         speed=lambda speeds, values, grid: lagged(speeds.begin, values["rotor_lag"], grid),
     ),
@@ -314,7 +298,7 @@ TERMS: dict[str, Term] = {
         needs=frozenset({VERTICAL_FORCE}),
         by_default=lambda available: True,
         force_axes=(2,),
-        specific_force=_scale_thrust,
+        specific_force=lambda force, values, forcing: (force[0], force[1], values["thrust_gain"] * force[2]),
         accelerometer=_add_force_bias,
     ),
     "inflow": Term(
@@ -335,7 +319,7 @@ TERMS: dict[str, Term] = {
     "gyro_bias": Term(
         "rates are measured with an offset, of each recording: p_bias, q_bias, r_bias [rad/s]",
         tuple(TermParameter(f"{rate}_bias", "rad/s", 0.1, each_recording=True) for rate in "pqr"),
-        gyro=_add_gyro_bias,
+        gyro=lambda rates, values: Rates(*(a + values[f"{rate}_bias"] for a, rate in zip(rates, "pqr", strict=True))),
     ),
 }
 
@@ -357,6 +341,6 @@ def required(value: T | None, message: str) -> T:
     return value
 
 
-def _missing(need: str, field: str) -> str:
+def _measured(value: T | None, need: str, field: str) -> T:
     names = ", ".join(name for name, term in TERMS.items() if need in term.needs)
-    return f"`terms`: {names} need `Flight.{field}`, which this flight does not have; leave them out."
+    return required(value, f"`terms`: {names} need `Flight.{field}`, which this flight does not have; leave them out.")
