@@ -33,7 +33,6 @@ from .airframe import (
     VOOS as VOOS,
     Airframe as Airframe,
     alpha_from_inertia as alpha_from_inertia,
-    inertia_from_alpha as inertia_from_alpha,
     load_airframe as load_airframe,
     plus_layout as plus_layout,
 )
@@ -99,9 +98,7 @@ from .identification import (
 )
 from .logs import read_flight as read_flight, read_log as read_log, write_flight as write_flight
 from .models.abstract import DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH, AbstractModel as AbstractModel
-from .models.corrected import CorrectedOS4 as CorrectedOS4
-from .models.inertial import InertialOS4 as InertialOS4
-from .models.published import PublishedOS4 as PublishedOS4
+from .models.os4 import CorrectedOS4 as CorrectedOS4, PublishedOS4 as PublishedOS4
 from .models.vehicle import TERMS as TERMS, FlightModel as FlightModel
 from .networks import NetworkEstimator as NetworkEstimator, TrainedNetwork as TrainedNetwork
 from .networks.file import load_network as load_network, save_network as save_network

@@ -74,35 +74,15 @@ def plus_layout(arm: float) -> list[tuple[float, float]]:
     return [(arm, 0.0), (0.0, -arm), (-arm, 0.0), (0.0, arm)]
 
 
-# Table 1 of the paper is not available to us. These values are from public literature and code.
-OS4 = Airframe(  # the values of the OS4 thesis
-    mass=0.650,
-    inertia=(7.5e-3, 7.5e-3, 1.3e-2),
-    rotor_positions=plus_layout(0.23),
-    rotor_spins=ALTERNATING_SPINS,
-    thrust_coefficient=3.13e-5,
-    drag_coefficient=7.5e-7,
-    rotor_inertia=6e-5,
-)
-OS4_SIMULATOR = Airframe(  # the values of the OS4 simulator that its authors published
-    mass=0.53,
-    inertia=(6.228e-3, 6.228e-3, 1.121e-2),
-    rotor_positions=plus_layout(0.232),
-    rotor_spins=ALTERNATING_SPINS,
-    thrust_coefficient=3.13e-5,
-    drag_coefficient=7.5e-7,
-    rotor_inertia=6.01e-5,
-    gravity=9.806,
-)
-VOOS = Airframe(  # the quadrotor of H. Voos
-    mass=0.5,
-    inertia=(4.85e-3, 4.85e-3, 8.81e-3),
-    rotor_positions=plus_layout(0.2),
-    rotor_spins=ALTERNATING_SPINS,
-    thrust_coefficient=2.92e-6,
-    drag_coefficient=1.12e-7,
-    rotor_inertia=3.36e-5,
-)
+def _preset(arm: float, mass: float, inertia: tuple[float, ...], b: float, d: float, rotor: float, **more: float):
+    return Airframe(mass, inertia, plus_layout(arm), ALTERNATING_SPINS, b, d, rotor, **more)
+
+
+# Table 1 of the paper is not available to us. These values are from public literature and code: the OS4 thesis, the
+# simulator that its authors published, and the quadrotor of H. Voos.
+OS4 = _preset(0.23, 0.650, (7.5e-3, 7.5e-3, 1.3e-2), 3.13e-5, 7.5e-7, 6e-5)
+OS4_SIMULATOR = _preset(0.232, 0.53, (6.228e-3, 6.228e-3, 1.121e-2), 3.13e-5, 7.5e-7, 6.01e-5, gravity=9.806)
+VOOS = _preset(0.2, 0.5, (4.85e-3, 4.85e-3, 8.81e-3), 2.92e-6, 1.12e-7, 3.36e-5)
 PRESETS = {"os4": OS4, "os4-simulator": OS4_SIMULATOR, "voos": VOOS}
 
 
@@ -127,17 +107,6 @@ def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tup
         (ix - iy) / iz,
         1 / iz,
     )
-
-
-def inertia_from_alpha(alpha: Float[ArrayLike, "8"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Ix, Iy, Iz [kg m^2] and the gyroscopic constant: the inverse of `alpha_from_inertia`.
-
-    The inertias are the reciprocals of alpha3, alpha6 and alpha8, which a flight determines best. The constant is the
-    mean of the two that alpha2 and alpha5 imply. alpha1, alpha4 and alpha7 are not used; `jaxos4.fit_inertia` uses all.
-    """
-    a = jnp.asarray(alpha)
-    inertia = 1 / a[jnp.array([2, 5, 7])]
-    return inertia, (a[1] * inertia[0] + a[4] * inertia[1]) / 2
 
 
 def load_airframe(source: str | PathLike[str]) -> Airframe:

@@ -99,12 +99,9 @@ class Estimate(eqx.Module):
             each = 1 - (1 - level) / self.parameters.shape[-1] if simultaneous else level
             return _deviations(jnp.asarray(each, dtype=float)) * self.std
         knots, quantile = _deviations(self.calibration.levels), _deviations(jnp.asarray(level, dtype=float))
-        at = functools.partial(jnp.interp, quantile)
-        if simultaneous:
-            factor = jnp.vectorize(at, signature="(l),(l)->()")(knots, self.calibration.simultaneous)
-            return factor[..., None] * self.std
-        each_parameter = jax.vmap(at, in_axes=(None, 1))
-        return jnp.vectorize(each_parameter, signature="(l),(l,p)->(p)")(knots, self.calibration.factors) * self.std
+        factors = self.calibration.simultaneous[..., None] if simultaneous else self.calibration.factors
+        each_parameter = jax.vmap(functools.partial(jnp.interp, quantile), in_axes=(None, 1))
+        return jnp.vectorize(each_parameter, signature="(l),(l,p)->(p)")(knots, factors) * self.std
 
 
 def _deviations(level: Float[Array, "*levels"]) -> Float[Array, "*levels"]:
@@ -236,20 +233,16 @@ def fit_start(
 
 
 def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[Array, " starts"], int]:
-    """The initial state that `fit_start` finds, without its cost.
-
-    A free initial state takes a few Gauss-Newton steps from the first measurements, with their errors as its prior.
-
-    **Returns:** initial state, and number of rollouts.
-    """
+    """`fit_start` without the cost: a free initial state takes a few Gauss-Newton steps from the first measurements."""
     first, off = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
     if not free:
         return first, 0
+    # The errors of the first measurements are the prior.
+    known = 1 / jnp.square(problem.split(off))
 
     def improve(start: Float[Array, " starts"], _) -> tuple[Float[Array, " starts"], None]:
         _, gradient, information, _ = problem.curvatures(parameters, start)
-        known = 1 / jnp.square(problem.split(off))
         covariance = jax.vmap(invert)(information[:, count:, count:] + jax.vmap(jnp.diag)(known))
         slope = gradient[:, count:] + known * problem.split(start - first)
         return start - (covariance * slope[:, None, :]).sum(axis=-1).ravel(), None

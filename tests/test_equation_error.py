@@ -290,19 +290,8 @@ def test_a_truth_far_from_the_bracket_is_reported(estimator):
 
 @BOTH
 def test_models_that_are_not_linear_are_refused(estimator):
-    problem = standard_problem(duration=0.1)
-    inertial = jaxos4.InertialOS4(problem.model)
-    problem = eqx.tree_at(lambda p: p.model, problem, inertial)
-    with pytest.raises(ValueError, match="linear in its parameters"):
-        estimator(problem, jaxos4.Bracket.default(inertial))
-
-
-def test_a_batch_without_flights_gives_no_estimates():
-    problem = standard_problem(channels="rates")
-    states = jnp.zeros((0, *problem.flight.states.shape))
-
-    def identify(states):
-        flight = eqx.tree_at(lambda p: p.flight.states, problem, states)
-        return jaxos4.EquationError()(flight, jaxos4.Bracket.default(problem.model)).parameters
-
-    assert eqx.filter_vmap(identify)(states).shape == (0, 8)
+    flight = standard_flight(duration=0.1)
+    lagging = jaxos4.FlightModel(terms=("lag",))
+    problem = jaxos4.ShootingProblem(lagging, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0])
+    with pytest.raises(ValueError, match="linear in its parameters|no rotor lag"):
+        estimator(problem)

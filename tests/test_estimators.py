@@ -192,7 +192,6 @@ def test_the_registry_makes_every_estimator_and_names_misuse():
         (jaxos4.OutputError, "max_steps", [0, 2.5, "x", True, None], "must be an integer of at least 1"),
         (jaxos4.IBSS, "max_sweeps", [2**70], "must be at most 2147483647"),
         (jaxos4.AntColony, "max_sweeps", [0], "must be an integer of at least 1"),
-        (jaxos4.AntColony, "seed", [-1], "must be an integer of at least 0"),
         (jaxos4.FilterError, "tolerance", [0.0, np.nan], "must be positive"),
         (jaxos4.FilterError, "max_steps", [0], "must be an integer of at least 1"),
         (jaxos4.EquationError, "memory", [-0.1, 1.5, np.nan], r"must lie in \[0, 1\]"),

@@ -306,25 +306,6 @@ def test_no_trajectory_runs_away_in_a_long_gap():
     assert all(np.isfinite(leaf).all() for leaf in found)
 
 
-@pytest.mark.usefixtures("optimised")
-def test_a_lane_that_fails_changes_no_other():
-    problem, *arrays = lanes(noisy_states(LANES, seed=50))
-    states, omega, *ends = (np.array(x) for x in arrays)
-    omega[1, 100, 0], states[2, 50], omega[3, 500] = np.nan, np.inf, np.nan
-    broken = identify(FilterError(), problem, jnp.asarray(states), jnp.asarray(omega), *arrays[2:])
-    assert names(broken)[:4].tolist() == ["successful", *["nonfinite_trajectory"] * 2, "successful"]
-    others = np.delete(np.arange(LANES), [1, 2])  # lane 3 is one: the last row of rotor speeds drives nothing
-    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(noisy()), strict=True):
-        np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
-    # A search of the innovations themselves says so too.
-    for lane in (1, 2):
-        data = eqx.tree_at(lambda p: (p.flight.states, p.flight.omega), problem, (states[lane], omega[lane]))
-        bracket = jaxos4.Bracket(*(end[lane] for end in ends))
-        found = FilterError()(InnovationsProblem(jax.tree.map(jnp.asarray, data)), bracket)
-        assert names(found) == "nonfinite_trajectory"
-        assert np.isfinite(found.parameters).all()
-
-
 @pytest.mark.parametrize("samples", [2, 12])
 def test_a_flight_too_short_to_say_anything_leaves_the_bracket(samples):
     duration = (samples - 1) * DT

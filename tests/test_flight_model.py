@@ -175,7 +175,7 @@ def test_without_terms_it_is_the_corrected_model():
     np.testing.assert_array_equal(model.alpha, plain.alpha)
     np.testing.assert_array_equal(model.half_width, plain.half_width)
     assert model.parameters == plain.parameters
-    assert (model.is_linear, model.forcing_parameters, model.force_axes, model.observes_states) == (True, (), (), True)
+    assert (model.forcing_parameters, model.force_axes, model.observes_states) == ((), (), True)
     for method in ("euler", "rk4"):
         flights = [jaxos4.simulate(m, plain.alpha, omega, dt=0.01, method=method).states for m in (model, plain)]
         np.testing.assert_allclose(*flights, rtol=1e-11, atol=1e-12)
@@ -266,7 +266,6 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
         assert np.all(np.isfinite(half_width) & (half_width > 0) & np.isfinite(center))
         chain = {*NAMES["motor"], "rotor_delay", "voltage_exponent", "battery_fade"} & set(names)
         assert {names[i] for i in model.forcing_parameters} == chain
-        assert model.is_linear == (not chain)
     # The order is that of TERMS, in whatever order they were given, and within a term recording by recording.
     assert jaxos4.FlightModel(terms=("lag", "offset")).parameter_names[8:] == (*NAMES["offset"], "rotor_lag")
     two = jaxos4.FlightModel(terms=("offset",), recordings=(0, 1)).parameter_names[8:]

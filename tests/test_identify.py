@@ -100,7 +100,7 @@ OF_FLIGHT, OF_VEHICLE = jaxos4.FlightSettings, jaxos4.VehicleSettings
         (MODEL, {"settings": OF_FLIGHT(initial_state="guessed")}, "`initial_state`: must be free or known"),
         (MODEL, {"settings": OF_FLIGHT(channels="some")}, "`channels`: must be one of rates"),
         (MODEL, {"settings": OF_VEHICLE()}, "`settings`: must be FlightSettings for a model"),
-        (jaxos4.InertialOS4(MODEL), {}, "`subject`: must be a model in alpha_1..8"),
+        (jaxos4.FlightModel(), {}, "`subject`: must be a model in alpha_1..8"),
         (AIRFRAME, {"settings": OF_FLIGHT()}, "`settings`: must be VehicleSettings for an airframe"),
         (AIRFRAME, {"estimator": jaxos4.JointEKF()}, "`estimator` kalman: is biased by a controller"),
         (AIRFRAME, {"network": "none.net"}, "`network`: a vehicle's network is trained for its own flights"),

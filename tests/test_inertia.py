@@ -1,16 +1,13 @@
 """The constants of a rigid body: fitted to alphas, and estimated instead of them."""
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
 import scipy.stats
-from helpers import DT, noisy_states, standard_flight, standard_problem
+from helpers import standard_problem
 
 import jaxos4
-from jaxos4.estimators.newton import OutputError
 
 MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
 
@@ -83,41 +80,6 @@ def test_alphas_of_no_rigid_body_are_seen():
 
 
 @pytest.mark.parametrize("model_class", MODELS)
-def test_a_model_in_constants_flies_as_the_one_in_alphas(model_class):
-    model = model_class(jaxos4.OS4)
-    inertial = jaxos4.InertialOS4(model)
-    flight = standard_flight(model_class)
-    ours = jaxos4.simulate(inertial, inertial.alpha, flight.omega, dt=DT)
-    np.testing.assert_allclose(ours.states, flight.states, rtol=1e-12, atol=1e-12)
-    assert inertial.parameter_names == ("Ix", "Iy", "Iz", "J_R")
-    other = jaxos4.simulate(inertial, inertial.alpha * 1.01, flight.omega, dt=DT)
-    assert np.abs(other.states - flight.states).max() > 1e-3
-
-
-@eqx.filter_jit
-def identify(estimator, problem, states):
-    bracket = jaxos4.Bracket.around(1.1 * problem.model.alpha, problem.model.half_width)
-    return jax.vmap(lambda s: estimator(eqx.tree_at(lambda p: p.flight.states, problem, s), bracket))(states)
-
-
-@pytest.mark.parametrize("estimator", [jaxos4.IBSS(), OutputError()])
-def test_constants_are_estimated_directly_and_know_more_than_alphas(estimator):
-    flights, problem = 64, standard_problem(jaxos4.CorrectedOS4, "rates")
-    arguments = {"sigma": problem.sigma, "initial_state": problem.initial_state, "channels": "rates"}
-    inertial = jaxos4.ShootingProblem(jaxos4.InertialOS4(problem.model), problem.flight, **arguments)
-    found = identify(estimator, inertial, noisy_states(flights, jaxos4.CorrectedOS4))
-    assert set(jaxos4.result_names(found.result)) == {"successful"}
-    errors = (found.parameters - constants()) / found.std
-    assert np.all(np.abs(np.sqrt((errors**2).mean(axis=0)) - 1) < 4 / np.sqrt(2 * flights))
-    covariance = bound_of(jaxos4.CorrectedOS4, "rates")
-    from_alphas = jaxos4.fit_inertia(problem.model, problem.model.alpha, covariance)
-    # Both ways use the same information, to first order.
-    np.testing.assert_allclose(np.median(found.std, axis=0), from_alphas.std, rtol=0.02)
-    alone = np.sqrt(np.diagonal(covariance))[[2, 5, 7]]
-    assert np.all(np.median(found.std, axis=0)[:3] < alone * constants()[:3] ** 2)
-
-
-@pytest.mark.parametrize("model_class", MODELS)
 def test_alphas_far_from_the_airframe_or_without_an_error_give_a_fit_or_say_that_there_is_none(model_class):
     model, covariance = model_class(jaxos4.OS4), bound_of(model_class)
     for alpha in (model.alpha.at[2].set(0.0), jnp.full(8, jnp.nan), -model.alpha):
@@ -131,8 +93,3 @@ def test_alphas_far_from_the_airframe_or_without_an_error_give_a_fit_or_say_that
         assert fit.p_value == 0
     with pytest.raises(ValueError, match=r"shapes \(8,\), \(8, 8\), got \(4,\)"):
         jaxos4.fit_inertia(model, model.alpha[:4], covariance[:4, :4])
-
-
-def test_constants_stand_above_a_model_in_alphas_alone():
-    with pytest.raises(ValueError, match="must have the parameters alpha_1..8"):
-        jaxos4.InertialOS4(jaxos4.InertialOS4(jaxos4.CorrectedOS4()))

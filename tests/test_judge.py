@@ -12,7 +12,7 @@ from jaxos4.airframe import OS4
 from jaxos4.identification.jackknife import disagreement, parts_of
 from jaxos4.identification.judge import doubts_of, overwhelmed, vibration
 from jaxos4.identification.results import Constant, Disturbance, ParameterEstimate, PredictionSkill, RateSkill
-from jaxos4.models.corrected import CorrectedOS4
+from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import read_recording
 
 AIRFRAME = Path(__file__).parents[1] / "experiments" / "real_flight" / "crazyflie.toml"

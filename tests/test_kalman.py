@@ -197,11 +197,3 @@ def test_agrees_with_shooting():
     assert np.abs((wide.parameters - shot.parameters) / shot.std).max() < 0.02
     np.testing.assert_allclose(wide.std, shot.std, rtol=0.02)
     np.testing.assert_allclose(wide.cost, shot.cost, rtol=1e-5)
-
-
-def test_what_was_not_measured_stays_as_uncertain_as_the_bracket_with_a_free_start():
-    problem = standard_problem(channels="rates", free=True, states=jnp.full((101, 12), jnp.nan), duration=1.0)
-    bracket = jaxos4.Bracket.default(PUBLISHED())
-    estimate = JointEKF()(problem, bracket)
-    np.testing.assert_allclose(estimate.parameters, bracket.center)
-    np.testing.assert_allclose(estimate.std, HALF)

@@ -8,20 +8,12 @@ import pytest
 from helpers import noisy_states, standard_flight, standard_problem
 
 import jaxos4
+from jaxos4 import estimators
 from jaxos4.shooting import InnovationsProblem
 
 HELD = {"alpha2": 0.0079, "alpha7": 0.01}
 PLACES = [1, 6]
-ESTIMATORS = {
-    "ibss": jaxos4.IBSS(),
-    "output-error": jaxos4.OutputError(),
-    "filter-error": jaxos4.FilterError(),
-    "equation-error": jaxos4.EquationError(),
-    "rls": jaxos4.RecursiveLeastSquares(),
-    "kalman": jaxos4.JointEKF(),
-    "svsf": jaxos4.SVSF(),
-    "ant-colony": jaxos4.AntColony(),
-}
+ESTIMATORS = {name: kind() for name, kind in estimators.ESTIMATORS.items() if not kind.needs_network}
 # Their covariance is the inverse of an information.
 LIKELIHOODS = ("ibss", "output-error", "filter-error", "kalman", "ant-colony")
 

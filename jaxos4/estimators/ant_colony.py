@@ -53,9 +53,8 @@ class AntColony(AbstractEstimator):
     - `tolerance`: the search ends once the worst point of the archive costs at most this much more than the best one.
       The cost is the negative logarithm of a likelihood: an error of one standard deviation costs 0.5.
     - `max_sweeps`: the search ends after this many sweeps at the latest.
-    - `seed`: of the random numbers, which are the same for each flight.
 
-    **Raises:** `ValueError` for a setting out of range.
+    All flights have the same random numbers.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -69,13 +68,11 @@ class AntColony(AbstractEstimator):
     xi: Scalar = eqx.field(converter=as_float, default=0.85)
     tolerance: Scalar = eqx.field(converter=as_float, default=1e-3)
     max_sweeps: Count = eqx.field(converter=as_int, default=5000)
-    seed: Count = eqx.field(converter=as_int, default=0)
 
     def __check_init__(self):
         check_count("archive", self.archive, 2)
         check_count("ants", self.ants, 1)
         check_count("max_sweeps", self.max_sweeps, 1)
-        check_count("seed", self.seed, 0)
         for name in ("q", "xi", "tolerance"):
             check_positive(name, getattr(self, name), finite=True)
 
@@ -108,16 +105,14 @@ class AntColony(AbstractEstimator):
             points, costs = jnp.concatenate([colony.points, new]), jnp.concatenate([colony.costs, shoot(new)])
             return _Colony(*self._best(points, costs), colony.sweeps + 1)
 
-        key, begin = jax.random.split(jax.random.key(self.seed))
+        key, begin = jax.random.split(jax.random.key(0))
         points = jax.random.uniform(begin, (self.archive, unknowns), minval=-1, maxval=1, dtype=float).at[0].set(0.0)
         colony = _Colony(*self._best(points, shoot(points)), jnp.zeros((), dtype=int))
         colony = jax.lax.while_loop(lambda c: ~self._settled(c.costs) & (c.sweeps < self.max_sweeps), sweep, colony)
         parameters, initial_state = split(colony.points[0])
         curvature = problem.curvatures(parameters, initial_state)
-        answer, rollouts = (
-            problem.join(parameters, initial_state),
-            self.archive + self.ants * colony.sweeps + 1 + unknowns,
-        )
+        answer = problem.join(parameters, initial_state)
+        rollouts = self.archive + self.ants * colony.sweeps + 1 + unknowns
         return estimate_at(problem, answer, curvature, rollouts, colony.sweeps, done=self._settled(colony.costs))
 
     def _best(self, points: Float[Array, "tried unknowns"], costs: Float[Array, " tried"]) -> tuple[Points, Costs]:

@@ -1,8 +1,7 @@
 """The parts of IBSS: a stage, the directions of a sweep, and the brackets along them.
 
 All steps are in standard deviations. The unknowns of a window are the shared ones, then its own initial state.
-Directions are in the opposite order: those of the initial state come first, so that a step along a parameter carries
-the initial states to where they fit best.
+Directions are in the opposite order, so that a step along a parameter carries the initial states to where they fit.
 """
 
 import functools
@@ -20,12 +19,18 @@ from ..shooting.abstract import WindowUnknowns
 Flag = Bool[Array, ""]
 PerDirection = Float[Array, "windows n"]
 
-_ROUGH = 0.2  # the share of a step that counts along an unknown with a stride: its gradient is approximate
-_STRIDE = 0.1  # the information that keeps the predicted steps along an unknown with a stride short
+# An unknown with a stride, such as a level of noise, has an approximate gradient (see `Unknowns`).
+_ROUGH = 0.2  # the share of a step along it that counts
+_STRIDE = 0.1  # the information that keeps predicted steps along it short
 
 
 class Stage(NamedTuple):
-    """A stage of a problem, see `Stages`. `prior`: the information about unknowns of which the cost has no prior."""
+    """A stage of a problem, see `Stages`.
+
+    - `searched`: the unknowns that this stage can find. `limits`: of all unknowns.
+    - `evaluate`: the cost of its data with gradient and information. `misfit`: how large the residuals are, in sigma.
+    - `prior`: the information about unknowns of which the cost has no prior.
+    """
 
     problem: AbstractProblem
     last: Flag
@@ -81,9 +86,7 @@ class Lines(NamedTuple):
 
     - `predicted`: the predicted step to the minimum.
     - `lower`, `upper`: the bracket around it. `low`, `high`: the part of it that may hold the minimum.
-    - `trial`: the step of the next shot.
-    - `last`, `slope`: the step of the last shot, and the slope there.
-    - `rate`: the slope's rate of change.
+    - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope there, and its change.
     """
 
     predicted: PerDirection
@@ -98,10 +101,7 @@ class Lines(NamedTuple):
 
     @classmethod
     def around(cls, predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection):
-        """Brackets of some half-width around predicted steps, which go at most `below` backwards, `above` forwards.
-
-        The first trial is the middle, and the expected rate of change is that of unit information.
-        """
+        """Brackets around predicted steps. The first trials are their middles, the rates those of unit information."""
         predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
         lower = jnp.maximum(predicted - half_width, -below)
         upper = jnp.minimum(predicted + half_width, above)
@@ -111,16 +111,16 @@ class Lines(NamedTuple):
     def halved(self, slope: PerDirection) -> "Lines":
         """The lines after a shot at their trials: **the sign of the slope decides**, the secant proposes.
 
-        The next trial is the zero of a line through the last two slopes, at first with the expected rate of change. If
-        that lies outside of the remaining bracket, the next trial is the middle.
+        The next trial is the zero of a line through the last two slopes, or the middle if that is outside.
         """
         low = jnp.where(slope <= 0, self.trial, self.low)
         high = jnp.where(slope >= 0, self.trial, self.high)
         secant = (slope - self.slope) / (self.trial - self.last)
         rate = jnp.where((secant > 0) & jnp.isfinite(secant), secant, self.rate)
         zero = self.trial - slope / rate
-        narrowed_there = ((zero <= low) & (low > self.lower)) | ((zero >= high) & (high < self.upper))
-        following = jnp.where(narrowed_there, (low + high) / 2, jnp.clip(zero, low, high))
+        # An end that no shot has moved yet may be tried itself.
+        outside = ((zero <= low) & (low > self.lower)) | ((zero >= high) & (high < self.upper))
+        following = jnp.where(outside, (low + high) / 2, jnp.clip(zero, low, high))
         return self._replace(low=low, high=high, trial=following, last=self.trial, slope=slope, rate=rate)
 
 

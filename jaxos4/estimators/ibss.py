@@ -31,8 +31,7 @@ _OPENING, _FIRST = 4.0, 0.05
 _SAFETY, _LEAST = 2.0, 0.01
 _GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose search ended at one of its ends, and of all together
 _CHANCE = 1.0  # a sweep that raises the cost by no more may have done so by chance
-# After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far. If
-# the share were back at 1 at once, every second sweep of a strongly nonlinear search would fail.
+# After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far.
 _RETREAT, _ADVANCE = 0.25, 1.4
 
 
@@ -41,13 +40,12 @@ class State(NamedTuple):
 
     - `unknowns`, `curvature`: where it is, and the curvature of the cost there.
     - `spread`: the covariance of the unknowns, which sizes the first brackets of a stage.
-    - `error`: how far the last predictions were off, as a share of the longest step.
-    - `growth`: by how much each direction's bracket is wider than this error asks for.
+    - `error`: how far the last predictions were off, as a share of the longest step. `growth`: by how much each
+      direction's bracket is wider than this error asks for.
     - `trust`: the share of the longest predicted step that a sweep may go.
     - `sweep`: the number of the next sweep in its stage; -1 for the first shot, which is at the start.
     - `sweeps`, `rollouts`: how many sweeps bisected, and how many flights were simulated, in all stages.
-    - `done`: whether the stage ended by itself.
-    - `record`: the bracket of each parameter in each sweep.
+    - `done`: whether the stage ended by itself. `record`: the bracket of each parameter in each sweep.
     """
 
     unknowns: WindowUnknowns
@@ -63,8 +61,7 @@ class State(NamedTuple):
     record: Float[Array, "record 2 parameters"]
 
 
-# The narrowed brackets, the last shot's place and curvature, and the number of shots.
-Bisected = tuple[Lines, WindowUnknowns, Curvature, Count]
+Bisected = tuple[Lines, WindowUnknowns, Curvature, Count]  # what is left of the brackets, the last shot, their number
 
 
 class IBSS(AbstractEstimator):
@@ -74,20 +71,17 @@ class IBSS(AbstractEstimator):
     direction decides** which side of the trial holds the minimum, and so which part of the bracket is dropped. The
     quadratic model of the cost and the secant through the last slopes only **propose** where to shoot. A *sweep* is one
     iteration. A *stage* repeats sweeps on some of the data until the minimum is near; the last stage fits all of them.
-    If the flight is cut into windows, each window has its own initial state. Parameters are bisected on the sum of the
-    windows' slopes, initial states on their own window's.
+    Parameters are bisected on the sum of all windows' slopes, initial states on those of their own window.
 
     **Arguments:**
 
     - `directions`: `"whitened"`: the columns of L^-T, with L L^T the Fisher information at the current estimate; the
       cost is nearly separable along them, so a sweep bisects all together. The rates are fitted first, then all
-      channels. `"coordinate"`: the unknowns themselves, one in each sweep, against all of the problem's channels, in
-      the manner of the paper; good on the rates, slow on more channels.
+      channels. `"coordinate"`: the unknowns, one in each sweep, on all channels at once: good on the rates only.
     - `halvings`: the shots of a sweep that narrow the brackets.
     - `max_sweeps`: the most sweeps of each stage; along coordinates, for each of them.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
-      direction. The standard deviation follows from the actual residuals, so the fit of noise-free data ends at
-      rounding errors.
+      direction. They follow from the actual residuals, so the fit of noise-free data ends at rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
     - `record`: how many sweeps' brackets the estimate keeps, to show how the search went.
     """
@@ -107,11 +101,10 @@ class IBSS(AbstractEstimator):
     def __check_init__(self):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
-        check_count("halvings", self.halvings, 2)
-        check_count("record", self.record, 0)
-        check_count("max_sweeps", self.max_sweeps, 1)
-        check_positive("tolerance", self.tolerance)
-        check_positive("reach", self.reach)
+        for name, least in (("halvings", 2), ("record", 0), ("max_sweeps", 1)):
+            check_count(name, getattr(self, name), least)
+        for name in ("tolerance", "reach"):
+            check_positive(name, getattr(self, name))
 
     @quick_jit
     def __call__(
@@ -120,21 +113,17 @@ class IBSS(AbstractEstimator):
         bracket: Bracket | None = None,
         *,
         start: Float[Array, " unknowns"] | None = None,
-        spread: Float[Array, "known known"] | None = None,
     ) -> Estimate:
         """Identifies one flight.
 
         **Arguments:**
 
-        - `problem`: any likelihood: a `ShootingProblem`, or an `InnovationsProblem` for a vehicle in closed loop.
-        - `bracket`: where to look for the parameters, which may turn out to lie outside; by default the problem's own.
+        - `problem`, `bracket`: see `AbstractEstimator`. The parameters may turn out to lie outside of the bracket.
         - `start`: where the search begins, unless it is NaN; by default the problem's `starts`.
-        - `spread`: the covariance of the parameters of `start`, which sizes the first brackets; by default that of the
-          bracket, with its half-width as two standard deviations.
 
         **Raises:** `ValueError` for a bracket or a start of another length than the unknowns.
         """
-        return in_blocks(self.search, problem.within(bracket), start, spread)
+        return in_blocks(self.search, problem.within(bracket), start)
 
     def search(
         self,
@@ -150,6 +139,8 @@ class IBSS(AbstractEstimator):
 
         **Arguments:** as of a call, and
 
+        - `spread`: the covariance of the parameters of `start`, which sizes the first brackets; by default that of the
+          bracket, with its half-width as two standard deviations.
         - `initial_state`: where the search for a free initial state begins; by default the first measurements.
         - `cascade`: whether to go through all stages. A `start` that is close needs the last one only.
         - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
@@ -182,6 +173,7 @@ class IBSS(AbstractEstimator):
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem)))
         if spread is not None:
             known = np.s_[:, : spread.shape[0], : spread.shape[0]]
+            # What is skipped may have no finite spread.
             covariance = covariance.at[known].set(jnp.where(skip, covariance[known], spread))
         none = jnp.zeros((), dtype=int)
         shapes = jax.eval_shape(stages.evaluate, none, unknowns)
@@ -208,7 +200,7 @@ class IBSS(AbstractEstimator):
         return self._judge(stage, state, view, near, found)
 
     def terminate(self, stage: Stage, state: State) -> Flag:
-        """Whether the stage has ended. After its last sweep, it looks around once more, whether the minimum is near."""
+        """Whether the stage has ended. After its last sweep it looks once more whether the minimum is near."""
         return state.done | (state.sweep > self._most_sweeps(stage))
 
     def _look_around(self, stage: Stage, state: State) -> View:
@@ -234,9 +226,9 @@ class IBSS(AbstractEstimator):
         longest, is_first = jnp.abs(predicted).max(), state.sweep == 0
         later = jnp.maximum(state.error * longest, stage.smallest_step) * state.growth
         half_width = jnp.where(is_first, _FIRST * opening, later)
+        # How far this sweep may go; before the first shot, which is at the start, nowhere.
         reach = jnp.where(is_first, opening, jnp.inf)
         reach = jnp.where(state.trust < 1, state.trust * longest, reach)
-        # Nothing is known before the first shot, which is at the start.
         reach = jnp.where(state.sweep < 0, 0.0, reach)
         if self.directions == "coordinate":  # each searched unknown has its turn
             rank, searched = jnp.cumsum(stage.searched) - 1, stage.searched
@@ -247,8 +239,7 @@ class IBSS(AbstractEstimator):
     def _bisect(self, stage: Stage, state: State, view: View, near: Flag, lines: Lines) -> Bisected:
         """4. Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
 
-        The last shot does not narrow brackets: it is at what the others found. No shot is left if the minimum is near,
-        or after the last sweep.
+        The last shot is at what the others found. There is none if the minimum is near, or after the last sweep.
         """
         over = near | (state.sweep >= self._most_sweeps(stage))
         shots = jnp.where(state.sweep < 0, 1, jnp.where(over, 0, self.halvings + 1))
@@ -281,12 +272,12 @@ class IBSS(AbstractEstimator):
         off = _SAFETY * jnp.abs(steps - lines.predicted).max()
         at_end = (steps == lines.lower) | (steps == lines.upper)
         growth = jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0)
-        known = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(view.basis)
+        covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(view.basis)
         searched, counts = stage.searched & stage.searched[:, None] & ~first, ~first & (shots > 0)
         return State(
             unknowns=kept,
             curvature=there,
-            spread=jnp.where(searched, known, state.spread),
+            spread=jnp.where(searched, covariance, state.spread),
             error=jnp.clip(off / jnp.maximum(jnp.abs(steps).max(), stage.smallest_step), _LEAST, 1.0),
             growth=jnp.where(bisected, growth, state.growth),
             trust=jnp.where(failed, state.trust * _RETREAT, jnp.minimum(state.trust * _ADVANCE, 1.0)),

@@ -53,7 +53,7 @@ class Regression(NamedTuple):
     def of(cls, problem: ShootingProblem, memory: Scalar, bridge: Count, forgetting: Scalar) -> "Regression":
         """The regression of a flight's body rates. Parameters in which it is not linear stay at their center."""
         unknowns, rates = problem.unknowns.usable, problem.restrict("rates")
-        linear = np.array([each.linear and not each.in_forcing for each in problem.model.parameters])
+        linear = np.array([not each.in_forcing for each in problem.model.parameters])
         anchored = problem.initial_state is not None
         anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
         half_width, measured = jnp.where(linear, unknowns.width, 0.0), rates.measured()[:, :3]
@@ -210,10 +210,10 @@ def check_linear(problem: ShootingProblem) -> None:
     """
     mask, parameters = problem.unknowns.free, problem.model.parameters
     free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
-    if any(not each.linear or each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):
+    if any(each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):
         raise ValueError(
             "`problem.model` must have rate equations that are linear in its parameters for a regression: hold the "
-            "others, or identify alpha1..8 and then call `fit_inertia`, or use an estimator that shoots."
+            "others, or use an estimator that shoots."
         )
 
 

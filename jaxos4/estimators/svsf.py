@@ -65,22 +65,17 @@ class SVSF(AbstractEstimator):
 
     - `gamma`: how much of its size an error outside the boundary layer keeps from sample to sample, 0 <= gamma < 1.
     - `rates_layer`: boundary layer of the rates, in multiples of the problem's sigma.
-    - `parameter_layer`: boundary layer of the parameters, in multiples of the noise of w from one sample. A layer in
-      half-widths would need another width for each noise level.
-    - `damping`: of the pseudo-inverse, in multiples of a parameter's root mean square influence. Phi12 passes through 0
-      with the torques and the rates, and maps 3 errors onto more parameters: without damping w is mostly noise.
+    - `parameter_layer`: boundary layer of the parameters, in multiples of the noise of w from one sample.
+    - `damping`: of the pseudo-inverse, in multiples of a parameter's root mean square influence. Phi12 maps 3 errors
+      onto more parameters, and passes through 0: without damping w is mostly noise.
     - `equilibration`: the pseudo-inverse has least norm in half-widths, multiplied by up to this factor for parameters
       with less influence than the greatest. With 1, the gyroscopic terms hardly move.
     - `passes`: number of passes over the flight. Each begins with the parameters of the pass before (iterative SVSF).
     - `memory`: whether Phi12 is the derivative of a prediction through all corrections before it (`True`), or of one
-      step alone, as in Habibi's paper. The errors of one step are small compared with the noise; their sum
-      is not.
-
-    The defaults were tuned on simulated flights; `docs/measured.md` has the errors.
+      step alone, as in Habibi's paper, whose errors are small compared with the noise.
 
     The answer is the mean of the parameters over the second half of the last pass; `history` holds the parameters of
-    that pass. Only the body rates are used. A free initial state is not filtered for: each pass begins from the first
-    measurements, and the returned state is fitted to the parameters at the end.
+    that pass. Only the body rates are used. A free initial state is fitted to the parameters at the end.
 
     The method gives no covariance. Ours follows the errors through the slope of each correction, from the bracket's
     half-widths on (in the manner of Gadsden and Habibi 2010). It ignores that all passes see the same noise: only its

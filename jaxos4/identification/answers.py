@@ -10,7 +10,7 @@ from ..analysis.inertia import fit_inertia
 from ..bracket import is_identifiable
 from ..estimate import Estimate
 from ..models.abstract import PARAMETER_NAMES
-from ..models.corrected import CorrectedOS4
+from ..models.os4 import CorrectedOS4
 from .fit import Fit
 from .prepare import Case
 from .results import Constant, ParameterEstimate, RigidBody, finite_or_none

@@ -67,7 +67,7 @@ def _of_one_recording(fitted: ShootingProblem, other: ShootingProblem, values: n
 @quick_jit
 def _regression(problem: ShootingProblem, values: Array, held: Array) -> Array:
     """The parameters by regression; held ones, and those that it cannot estimate, have the values of the fit."""
-    linear = np.array([each.linear and not each.in_forcing for each in problem.model.parameters])
+    linear = np.array([not each.in_forcing for each in problem.model.parameters])
     own = jnp.where(linear & ~held, problem.unknowns.center, values)
     unknowns = dataclasses.replace(problem.unknowns, center=own, free=linear & ~held)
     return EquationError(memory=_MEMORY).solution(dataclasses.replace(problem, unknowns=unknowns))

@@ -11,7 +11,7 @@ from ..analysis.frequency_response import FrequencyResponse, frequency_response
 from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import Predictions
 from ..models.abstract import AbstractModel, Parameter
-from ..models.corrected import CorrectedOS4
+from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
 from .answers import INVERSE, parameter_table, rigid_body
 from .fit import Fit

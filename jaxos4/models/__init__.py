@@ -5,10 +5,7 @@ from .abstract import (
     PARAMETER_NAMES as PARAMETER_NAMES,
     AbstractModel as AbstractModel,
 )
-from .corrected import CorrectedOS4 as CorrectedOS4
-from .inertial import InertialOS4 as InertialOS4
-from .published import PublishedOS4 as PublishedOS4
-from .rotation import with_body_velocity as with_body_velocity
+from .os4 import CorrectedOS4 as CorrectedOS4, PublishedOS4 as PublishedOS4
 from .terms import TERMS as TERMS, Term as Term, TermParameter as TermParameter, default_terms as default_terms
 from .vehicle import FlightModel as FlightModel
 

@@ -11,16 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, Scalar, StateVector
-from ..airframe import OS4, Airframe, alpha_from_inertia
+from ..airframe import Airframe
 from ..flight import Inputs
-from .rotation import attitude_rates
-from .state import CASCADE_ORDER, Attitude, Forcing, Rates, State, Translation, stack, unstack
+from .state import CASCADE_ORDER, Forcing, Rates, State, stack, unstack
 
 PARAMETER_NAMES = tuple(f"alpha{i}" for i in range(1, 9))
 
 # Half the width of a bracket around alpha_1..8 of the OS4: our choice, 45 % of alpha3, alpha6 and alpha8.
 DEFAULT_HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
-
 
 Contradiction = Callable[[float, float], tuple[str, str] | None]
 
@@ -28,8 +26,7 @@ Contradiction = Callable[[float, float], tuple[str, str] | None]
 class Parameter(NamedTuple):
     """One unknown of a model.
 
-    - `in_forcing`: whether the forcing depends on the parameter.
-    - `linear`: whether the rate equations are linear in the parameter if the forcing does not depend on it.
+    - `in_forcing`: whether the forcing depends on the parameter. If not, the rate equations are linear in it.
     - `nonnegative`: whether physics forbids a negative value.
     - `scales_torque`: whether torque exceeds that of the airframe by this factor.
     - `contradiction`: from a value and its error, why physics or the airframe forbids it, and what to do; `None` if
@@ -39,7 +36,6 @@ class Parameter(NamedTuple):
     name: str
     unit: str
     in_forcing: bool = False
-    linear: bool = True
     nonnegative: bool = False
     scales_torque: bool = False
     contradiction: Contradiction | None = None
@@ -114,11 +110,6 @@ class AbstractModel(eqx.Module):
         """The positions of the parameters on which the forcing depends."""
         return tuple(i for i, parameter in enumerate(self.parameters) if parameter.in_forcing)
 
-    @property
-    def is_linear(self) -> bool:
-        """Whether the rate equations are linear in all parameters: regression needs this."""
-        return all(parameter.linear and not parameter.in_forcing for parameter in self.parameters)
-
     def derivative(self, state: StateVector, omega: Float[Array, "4"], parameters: Parameters) -> StateVector:
         """dX/dt in the paper's order, Eq. (14), in SI units.
 
@@ -128,68 +119,3 @@ class AbstractModel(eqx.Module):
         forcing = jax.tree.map(lambda leaf: leaf[0], rows)
         derivative = stack(self.cascade(unstack(state[CASCADE_ORDER]), forcing, parameters))
         return jnp.zeros_like(derivative).at[CASCADE_ORDER].set(derivative)
-
-
-class AbstractOS4(AbstractModel):
-    """The common part of the two OS4 models: their parameters are alpha_1..8, and their sensors show the states."""
-
-    @property
-    @abc.abstractmethod
-    def gyroscopic_unit(self) -> str:
-        """The unit of alpha2 and alpha5."""
-
-    @abc.abstractmethod
-    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
-        """x'', y'', z'' [m/s^2]."""
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """alpha_1..8."""
-        ratio, gyroscopic, inverse_inertia = "1", self.gyroscopic_unit, "1/(kg m^2)"
-        units = (ratio, gyroscopic, inverse_inertia) * 2 + (ratio, inverse_inertia)
-        return tuple(map(Parameter, PARAMETER_NAMES, units))
-
-    @property
-    def alpha(self) -> Float[Array, "8"]:
-        """alpha_1..8 by the definitions below Eq. (13)."""
-        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
-
-    @property
-    def half_width(self) -> Float[Array, "8"]:
-        """`DEFAULT_HALF_WIDTH`, with the widths of alpha3, alpha6 and alpha8 scaled to the airframe's inertia."""
-        os4, own = (alpha_from_inertia(airframe.inertia, jnp.zeros(())) for airframe in (OS4, self.airframe))
-        scaled = np.isin(np.arange(8), (2, 5, 7))
-        return jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0) * DEFAULT_HALF_WIDTH
-
-    @property
-    def force_axes(self) -> tuple[int, ...]:
-        """None: the OS4 has no accelerometer."""
-        return ()
-
-    @property
-    def observes_states(self) -> bool:
-        """True."""
-        return True
-
-    def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """Torques and thrust by Eqs. (10)-(13), and the residual speed Omega_r = sum s_i omega_i."""
-        del parameters
-        omega, airframe = inputs.omega, self.airframe
-        roll, pitch, yaw, thrust = (jnp.square(omega) @ airframe.mixer.T).T
-        return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
-
-    def cascade(self, state: State, forcing: Forcing, parameters) -> State:
-        """See `AbstractModel`."""
-        rates = self.angular_acceleration(state.rates, forcing, parameters)
-        if state.attitude is None:
-            return State(rates)
-        attitude, t = attitude_rates(state.rates, state.attitude), state.translation
-        if t is None:
-            return State(rates, attitude)
-        ax, ay, az = self.acceleration(state.attitude, forcing)
-        return State(rates, attitude, Translation(t.vx, ax, t.vy, ay, t.vz, az))
-
-    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
-        """The states in cascade order."""
-        del forcing, parameters
-        return tuple(jax.tree.leaves(state))

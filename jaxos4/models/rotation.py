@@ -1,10 +1,5 @@
 """Rotations between the body's axes and the earth's, and the kinematics of the Euler angles."""
 
-import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
-
-from ..flight import STATE_NAMES, Flight, fill_gaps
 from ..trigonometry import sincos
 from .state import Attitude, Rates, Samples, Vector
 
@@ -19,7 +14,7 @@ def attitude_rates(rates: Rates, attitude: Attitude) -> Attitude:
 
 def to_earth(attitude: Attitude, body: Vector) -> Vector:
     """A vector from the body's axes to the earth's: R_z(psi) R_y(theta) R_x(phi)."""
-    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = _sines_and_cosines(attitude)
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
     x, y, z = body
     y, z = y * cos_phi - z * sin_phi, y * sin_phi + z * cos_phi
     x, z = x * cos_theta + z * sin_theta, -x * sin_theta + z * cos_theta
@@ -28,22 +23,13 @@ def to_earth(attitude: Attitude, body: Vector) -> Vector:
 
 def to_body(attitude: Attitude, earth: Vector) -> Vector:
     """A vector from the earth's axes to the body's: the inverse of `to_earth`."""
-    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = _sines_and_cosines(attitude)
+    sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
     x, y, z = earth
     x, y = x * cos_psi + y * sin_psi, -x * sin_psi + y * cos_psi
     x, z = x * cos_theta - z * sin_theta, x * sin_theta + z * cos_theta
     return x, y * cos_phi + z * sin_phi, -y * sin_phi + z * cos_phi
 
 
-def with_body_velocity(flight: Flight) -> Flight:
-    """Add `body_velocity` to a flight that measured velocity and attitude. Other flights are returned unchanged."""
-    columns = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "vx", "vy", "vz")]
-    if np.isnan(np.asarray(flight.states)[:, columns]).all(axis=0).any():
-        return flight
-    *angles, vx, vy, vz = fill_gaps(flight.states[:, columns]).T
-    velocity = to_body(Attitude(*angles), (vx, vy, vz))
-    return eqx.tree_at(lambda f: f.body_velocity, flight, jnp.stack(velocity, axis=1), is_leaf=lambda x: x is None)
-
-
-def _sines_and_cosines(attitude: Attitude) -> tuple[Samples, ...]:
+def sines_and_cosines(attitude: Attitude) -> tuple[Samples, ...]:
+    """The sine and the cosine of phi, theta and psi."""
     return (*sincos(attitude.phi), *sincos(attitude.theta), *sincos(attitude.psi))

@@ -16,7 +16,7 @@ from .._custom_types import RotorSpeeds, Scalar
 from ..airframe import Airframe
 from .abstract import Contradiction
 from .rotors import Grid, Motor, Speeds, delayed, driven
-from .state import Forcing, Rates, Vector
+from .state import Forcing, Rates, Samples, Vector
 
 # What a term can need from the logs or from the airframe.
 COMMANDS = "commands"
@@ -36,8 +36,8 @@ _EARLY = 0.002
 # A thrust gain beyond this factor, or its reciprocal, is no error of a scale or of a propeller's table. An
 # accelerometer that follows less than the second number does not measure the thrust.
 _FAR_GAIN, _DEAD = 2.0, 0.2
-# A thrust curve beyond these is no propeller's. No levelled accelerometer has twice this bias [m/s^2].
-_CURVES, _BIAS = (0.0, 1.2), 0.3
+# A thrust curve beyond this is no propeller's. No levelled accelerometer has twice this bias [m/s^2].
+_STEEPEST, _BIAS = 1.2, 0.3
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 # The yaw torque of the rotors as a share of their roll torque.
 _YAW = 0.2
@@ -139,68 +139,44 @@ def _reaction(airframe: Airframe) -> Scalar:
     return jnp.asarray(airframe.rotor_inertia) / jnp.asarray(airframe.inertia)[2]
 
 
-def _contradicts_lag(lag: float, error: float) -> tuple[str, str] | None:
-    if lag + error >= -_EARLY:
-        return None
-    remedy = "if the log holds measured rotor speeds, name the columns omega1..4; else check the time stamps"
-    return "s is negative: rotors cannot answer before their command", remedy
+def _limits(*limits: tuple[float, float, str, str]) -> Contradiction:
+    """The cause and the remedy of the first limit (least, most, cause, remedy) broken by more than the error."""
+
+    def contradiction(value: float, error: float) -> tuple[str, str] | None:
+        broken = ((why, so) for least, most, why, so in limits if value + error < least or value - error > most)
+        return next(broken, None)
+
+    return contradiction
 
 
-def _contradicts_thrust(gain: float, error: float) -> tuple[str, str] | None:
-    verdicts = (
-        (gain + error < 0, "answers thrust with the opposite sign", "its z axis points down: change its sign"),
-        (gain + error < _DEAD, "does not follow the thrust", "check that it is switched on and in m/s^2"),
-        (gain - error > _FAR_GAIN, "shows more thrust than the airframe has", _SCALES),
-        (gain + error < 1 / _FAR_GAIN, "shows less thrust than the airframe has", _SCALES),
-    )
-    return next(((f"(the accelerometer {cause})", remedy) for is_so, cause, remedy in verdicts if is_so), None)
+_INF, _LATE = float("inf"), "s is negative: rotors cannot answer before their command"
+_CLOCKS = "if the log holds measured rotor speeds, name the columns omega1..4; else check the time stamps"
+_GAINS = (
+    (0.0, _INF, "(the accelerometer answers thrust with the opposite sign)", "its z axis points down: change its sign"),
+    (_DEAD, _INF, "(the accelerometer does not follow the thrust)", "check that it is switched on and in m/s^2"),
+    (-_INF, _FAR_GAIN, "(the accelerometer shows more thrust than the airframe has)", _SCALES),
+    (1 / _FAR_GAIN, _INF, "(the accelerometer shows less thrust than the airframe has)", _SCALES),
+)
+_BENT = f"is outside of 0 (linear) to {_STEEPEST:g}: the thrust of no propeller grows so with its speed"
+_CLIMB = "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`"
+_OFF = f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so that the thrust is not the weight"
+_LEVEL = _limits((-2 * _BIAS, 2 * _BIAS, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
 
 
-def _contradicts_curve(curve: float, error: float) -> tuple[str, str] | None:
-    low, high = _CURVES
-    if low <= curve + error and curve - error <= high:
-        return None
-    return (
-        f"is outside of {low:g} (linear) to {high:g}: the thrust of no propeller grows so with its speed",
-        "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`",
-    )
+def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[[Rates, Values, Rates, Forcing], Rates]:
+    """Adds to each axis its parameter of this name times a number; there is none for an axis without a parameter."""
+
+    def add(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
+        axes = zip(_AXES, total, (*per_unit(rates, forcing), None), strict=False)
+        return Rates(*(old if x is None else old + values[f"{axis}_{name}"] * x for axis, old, x in axes))
+
+    return add
 
 
-def _contradicts_bias(bias: float, error: float) -> tuple[str, str] | None:
-    if abs(bias) - error <= 2 * _BIAS:
-        return None
-    return (
-        f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so that the thrust is not the weight",
-        "correct `mass` or `gravity`, or calibrate the accelerometer",
-    )
-
-
-def _add_offset(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-    p, q, r = total
-    return Rates(p + values["roll_offset"], q + values["pitch_offset"], r + values["yaw_offset"])
-
-
-def _add_damping(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-    return Rates(
-        total.p - values["roll_damping"] * rates.p,
-        total.q - values["pitch_damping"] * rates.q,
-        total.r - values["yaw_damping"] * rates.r,
-    )
-
-
-def _add_center_of_mass(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-    thrust = forcing.thrust - _HOVER
-    return Rates(total.p + values["roll_thrust"] * thrust, total.q + values["pitch_thrust"] * thrust, total.r)
-
-
-def _add_velocity(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-    vx, vy, _ = required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
-    return Rates(total.p + values["roll_velocity"] * vy, total.q + values["pitch_velocity"] * vx, total.r)
-
-
-def _add_flapping(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-    ax, ay = required(forcing.lateral, _missing(LATERAL_FORCE, "specific_force"))
-    return Rates(total.p + values["roll_flapping"] * ay, total.q + values["pitch_flapping"] * ax, total.r)
+def _swapped(vector: tuple[Samples, ...] | None, need: str, field: str) -> tuple[Samples, Samples]:
+    """Along x the vehicle pitches, along y it rolls."""
+    x, y, *_ = _measured(vector, need, field)
+    return y, x
 
 
 def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
@@ -209,7 +185,7 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
 
 
 def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpeeds:
-    voltage = required(grid.voltage, _missing(VOLTAGE, "voltage"))
+    voltage = _measured(grid.voltage, VOLTAGE, "voltage")
     return omega * (voltage ** values["voltage_exponent"])[:, None]
 
 
@@ -219,25 +195,15 @@ def _drive(speeds: Speeds, values: Values, grid: Grid, airframe: Airframe) -> Sp
     return driven(speeds.begin, motor, grid)
 
 
-def _scale_thrust(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    x, y, z = force
-    return x, y, values["thrust_gain"] * z
-
-
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    vx, vy, _ = required(forcing.velocity, _missing(BODY_VELOCITY, "body_velocity"))
+    vx, vy, _ = _measured(forcing.velocity, BODY_VELOCITY, "body_velocity")
     x, y, z = force
     return x - values["x_drag"] * vx, y - values["y_drag"] * vy, z
 
 
 def _add_inflow(force: Vector, values: Values, forcing: Forcing) -> Vector:
     x, y, z = force
-    return x, y, z - values["z_drag"] * required(forcing.velocity, _missing(AXIAL_VELOCITY, "body_velocity"))[2]
-
-
-def _add_gyro_bias(rates: Rates, values: Values) -> Rates:
-    p, q, r = rates
-    return Rates(p + values["p_bias"], q + values["q_bias"], r + values["r_bias"])
+    return x, y, z - values["z_drag"] * _measured(forcing.velocity, AXIAL_VELOCITY, "body_velocity")[2]
 
 
 def _add_force_bias(force: Vector, values: Values) -> Vector:
@@ -245,32 +211,37 @@ def _add_force_bias(force: Vector, values: Values) -> Vector:
     return x, y, z
 
 
+# Small vehicles have 0.02 to 0.1 s.
+_LAG = TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-_EARLY, _INF, _LATE, _CLOCKS)))
+
 TERMS: dict[str, Term] = {
     "offset": Term(
         "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
         tuple(TermParameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(_AXES)),
         by_default=lambda available: True,
-        angular_acceleration=_add_offset,
+        angular_acceleration=_torque("offset", lambda rates, forcing: (1.0, 1.0, 1.0)),
     ),
     "center_of_mass": Term(
         "a torque proportional to thrust above hover, from an offset centre of mass: roll_thrust, pitch_thrust [rad/m]",
         # The bracket is an offset of 10 % of the arm.
         tuple(TermParameter(f"{x}_thrust", "rad/m", _authority(i, _HOVER)) for i, x in enumerate(_AXES[:2])),
         by_default=lambda available: True,
-        angular_acceleration=_add_center_of_mass,
+        angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - _HOVER,) * 2),
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
         tuple(TermParameter(f"{x}_damping", "1/s", y, nonnegative=True) for x, y in zip(_AXES, _DAMPING, strict=True)),
         by_default=lambda available: True,
-        angular_acceleration=_add_damping,
+        angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
     ),
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
         tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(_AXES[:2])),
         needs=frozenset({BODY_VELOCITY}),
         by_default=lambda available: True,
-        angular_acceleration=_add_velocity,
+        angular_acceleration=_torque(
+            "velocity", lambda rates, forcing: _swapped(forcing.velocity, BODY_VELOCITY, "body_velocity")
+        ),
     ),
     "flapping": Term(
         "a moment proportional to the measured lateral specific force: roll_flapping, pitch_flapping [rad/m]",
@@ -278,7 +249,9 @@ TERMS: dict[str, Term] = {
         needs=frozenset({LATERAL_FORCE}),
         # The drag of the rotors is proportional to the body velocity: the force replaces a missing velocity.
         by_default=lambda available: BODY_VELOCITY not in available,
-        angular_acceleration=_add_flapping,
+        angular_acceleration=_torque(
+            "flapping", lambda rates, forcing: _swapped(forcing.lateral, LATERAL_FORCE, "specific_force")
+        ),
     ),
     "voltage": Term(
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
@@ -298,9 +271,10 @@ TERMS: dict[str, Term] = {
     "motor": Term(
         "motors follow their commands under the load of the propellers: rotor_lag [s], thrust_curve, motor_braking",
         (
-            # Small vehicles have 0.02 to 0.1 s.
-            TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_contradicts_lag),
-            TermParameter("thrust_curve", "1", 0.25, center=0.85, contradiction=_contradicts_curve),
+            _LAG,
+            TermParameter(
+                "thrust_curve", "1", 0.25, center=0.85, contradiction=_limits((0.0, _STEEPEST, _BENT, _CLIMB))
+            ),
             TermParameter("motor_braking", "1", 0.5, center=0.5, nonnegative=True),
         ),
         # A measured specific force tells the propellers' load from their thrust.
@@ -310,7 +284,7 @@ TERMS: dict[str, Term] = {
     ),
     "lag": Term(
         "rotors follow their commands as first-order systems: rotor_lag [s], where no load is known",
-        (TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_contradicts_lag),),
+        (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
         speed=lambda speeds, values, grid, airframe: driven(speeds.begin, Motor(values["rotor_lag"]), grid),
     ),
@@ -330,19 +304,17 @@ TERMS: dict[str, Term] = {
     "accelerometer": Term(
         "specific force is measured: thrust_gain, and ax_bias, ay_bias, az_bias [m/s^2] along the predicted axes",
         (
-            TermParameter("thrust_gain", "1", 0.5, center=1.0, scales_torque=True, contradiction=_contradicts_thrust),
+            TermParameter("thrust_gain", "1", 0.5, center=1.0, scales_torque=True, contradiction=_limits(*_GAINS)),
             # A sensor that was levelled before take-off has a smaller bias.
             *(
-                TermParameter(
-                    name, "m/s^2", _BIAS, force_axis=axis, contradiction=_contradicts_bias if axis == 2 else None
-                )
+                TermParameter(name, "m/s^2", _BIAS, force_axis=axis, contradiction=_LEVEL if axis == 2 else None)
                 for axis, name in enumerate(_FORCE_BIASES)
             ),
         ),
         needs=frozenset({VERTICAL_FORCE}),
         by_default=lambda available: True,
         force_axes=(2,),
-        specific_force=_scale_thrust,
+        specific_force=lambda force, values, forcing: (force[0], force[1], values["thrust_gain"] * force[2]),
         accelerometer=_add_force_bias,
     ),
     "inflow": Term(
@@ -363,7 +335,7 @@ TERMS: dict[str, Term] = {
     "gyro_bias": Term(
         "rates are measured with an offset, of each recording: p_bias, q_bias, r_bias [rad/s]",
         tuple(TermParameter(f"{rate}_bias", "rad/s", 0.1, each_recording=True) for rate in "pqr"),
-        gyro=_add_gyro_bias,
+        gyro=lambda rates, values: Rates(*(a + values[f"{rate}_bias"] for a, rate in zip(rates, "pqr", strict=True))),
     ),
 }
 
@@ -385,6 +357,6 @@ def required(value: T | None, message: str) -> T:
     return value
 
 
-def _missing(need: str, field: str) -> str:
+def _measured(value: T | None, need: str, field: str) -> T:
     names = ", ".join(name for name, term in TERMS.items() if need in term.needs)
-    return f"`terms`: {names} need `Flight.{field}`, which this flight does not have; leave them out."
+    return required(value, f"`terms`: {names} need `Flight.{field}`, which this flight does not have; leave them out.")

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +12,7 @@ from .._custom_types import Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
-from .corrected import CorrectedOS4
+from .os4 import CorrectedOS4
 from .rotation import attitude_rates, to_body, to_earth
 from .rotors import Grid, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector
@@ -34,6 +33,9 @@ from .terms import (
 )
 
 DEFAULT_TERMS = default_terms(frozenset({COMMANDS}))
+
+Row = tuple[Term, TermParameter, Parameter]
+"""A row of the table of parameters: a term, the parameter in it, and the parameter of the model."""
 
 
 class FlightModel(AbstractModel):
@@ -103,7 +105,7 @@ class FlightModel(AbstractModel):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """alpha_1..8, then the parameters of the terms in the order of `TERMS`."""
-        return (*self._rigid_body.parameters, *(row.parameter for row in self._table))
+        return (*self._rigid_body.parameters, *(parameter for *_, parameter in self._table))
 
     @property
     def alpha(self) -> Parameters:
@@ -207,12 +209,12 @@ class FlightModel(AbstractModel):
         return tuple(term for name, term in TERMS.items() if name in self.terms)
 
     @property
-    def _table(self) -> "tuple[_Row, ...]":
+    def _table(self) -> tuple[Row, ...]:
         return _table(self._terms, self.force_axes, max(self.recordings) + 1)
 
     def _of_terms(self, constant: Callable[[TermParameter], Constant]) -> Parameters:
         """A constant of each row of the table, for this airframe."""
-        constants = [constant(row.source) for row in self._table]
+        constants = [constant(source) for _, source, _ in self._table]
         values = {c: as_float(c(self.airframe) if callable(c) else c) for c in set(constants)}
         return jnp.stack([values[c] for c in constants]) if constants else jnp.zeros(0)
 
@@ -226,17 +228,16 @@ class FlightModel(AbstractModel):
     def _values(self, term: Term, parameters, forcing: Forcing | None) -> Values:
         """The values of a term's parameters by name: for each sample those of its recording."""
         found: dict[str, list[Scalar]] = {}
-        for place, row in enumerate(self._table, start=len(PARAMETER_NAMES)):
-            if row.term is term:
-                found.setdefault(row.source.name, []).append(parameters[place])
-        if forcing is None or len(forcing.recording) < 2:
-            return {name: values[0] for name, values in found.items()}
-        return {
-            name: values[0]
-            if len(values) == 1
-            else sum((share * x for share, x in zip(forcing.recording, values, strict=True)), as_float(0.0))
-            for name, values in found.items()
-        }
+        for place, (owner, source, _) in enumerate(self._table, start=len(PARAMETER_NAMES)):
+            if owner is term:
+                found.setdefault(source.name, []).append(parameters[place])
+        shares = forcing.recording if forcing else ()
+
+        def of_recording(values: list[Scalar]) -> Samples:
+            own = (share * value for share, value in zip(shares, values, strict=True))
+            return sum(own, as_float(0.0)) if len(values) > 1 else values[0]
+
+        return {name: of_recording(values) for name, values in found.items()}
 
     def _needs(self, need: str) -> bool:
         return any(need in term.needs for term in self._terms)
@@ -249,34 +250,15 @@ class FlightModel(AbstractModel):
         return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
 
 
-class _Row(NamedTuple):
-    """A row of the table of parameters. `recording`: if each recording has its own value."""
-
-    term: Term
-    source: TermParameter
-    recording: int | None
-
-    @property
-    def parameter(self) -> Parameter:
-        """The name counts recordings from 1."""
-        name = self.source.name if self.recording is None else f"{self.source.name}_{self.recording + 1}"
-        source = self.source
-        return Parameter(
-            name,
-            source.unit,
-            in_forcing=self.term.in_forcing,
-            nonnegative=source.nonnegative,
-            scales_torque=source.scales_torque,
-            contradiction=source.contradiction,
-        )
-
-
 @functools.cache
-def _table(terms: tuple[Term, ...], force_axes: tuple[int, ...], recordings: int) -> tuple[_Row, ...]:
-    """The parameters term by term, and within a term recording by recording."""
-    rows, numbers = [], (None,) if recordings == 1 else range(recordings)
+def _table(terms: tuple[Term, ...], force_axes: tuple[int, ...], recordings: int) -> tuple[Row, ...]:
+    """The parameters term by term, and within a term recording by recording; names count recordings from 1."""
+    rows, numbers = [], [""] if recordings == 1 else [f"_{i + 1}" for i in range(recordings)]
     for term in terms:
         sources = [source for source in term.parameters if source.force_axis in (None, *force_axes)]
-        rows += [_Row(term, source, None) for source in sources if not source.each_recording]
-        rows += [_Row(term, source, number) for number in numbers for source in sources if source.each_recording]
+        named = [(source, "") for source in sources if not source.each_recording]
+        named += [(source, number) for number in numbers for source in sources if source.each_recording]
+        for source, number in named:
+            copied = (source.nonnegative, source.scales_torque, source.contradiction)
+            rows.append((term, source, Parameter(source.name + number, source.unit, term.in_forcing, *copied)))
     return tuple(rows)

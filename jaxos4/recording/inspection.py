@@ -11,7 +11,7 @@ from ..analysis.identifiability import identifiability
 from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES
 from ..logs import log_format
-from ..models.corrected import CorrectedOS4
+from ..models.os4 import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem
 from .motion import RATE_COLUMNS, WEAK, excitation, motor_clock_note, opposite_axes, refused_note, yaw_doubt

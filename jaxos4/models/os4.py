@@ -1,0 +1,169 @@
+"""The two models of the OS4: as the paper prints it, and the same as a rigid body.
+
+The paper's equations are here:
+
+- Eqs. (1)-(3), (7)-(9): `PublishedOS4`, rates and translation.
+- Eqs. (4)-(6): attitude, `rotation.attitude_rates`.
+- Eqs. (10)-(13): torques and thrust, `Airframe.mixer`; the definitions of alpha below them, `alpha_from_inertia`.
+- Eq. (14): the order of the state, `STATE_NAMES`.
+"""
+
+import abc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._custom_types import Scalar, as_float
+from ..airframe import OS4, Airframe, alpha_from_inertia
+from ..flight import Inputs
+from .abstract import DEFAULT_HALF_WIDTH, PARAMETER_NAMES, AbstractModel, Parameter
+from .rotation import attitude_rates, sines_and_cosines
+from .state import Attitude, Forcing, Rates, State, Translation
+
+
+class AbstractOS4(AbstractModel):
+    """The common part of the two OS4 models: their parameters are alpha_1..8, and their sensors show the states."""
+
+    @property
+    @abc.abstractmethod
+    def gyroscopic_unit(self) -> str:
+        """The unit of alpha2 and alpha5."""
+
+    @abc.abstractmethod
+    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+        """x'', y'', z'' [m/s^2]."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """alpha_1..8."""
+        ratio, gyroscopic, inverse_inertia = "1", self.gyroscopic_unit, "1/(kg m^2)"
+        units = (ratio, gyroscopic, inverse_inertia) * 2 + (ratio, inverse_inertia)
+        return tuple(map(Parameter, PARAMETER_NAMES, units))
+
+    @property
+    def alpha(self) -> Float[Array, "8"]:
+        """alpha_1..8 by the definitions below Eq. (13)."""
+        return alpha_from_inertia(self.airframe.inertia, self.airframe.rotor_inertia * self.gyroscopic_factor)
+
+    @property
+    def half_width(self) -> Float[Array, "8"]:
+        """`DEFAULT_HALF_WIDTH`, with the widths of alpha3, alpha6 and alpha8 scaled to the airframe's inertia."""
+        os4, own = (alpha_from_inertia(airframe.inertia, jnp.zeros(())) for airframe in (OS4, self.airframe))
+        scaled = np.isin(np.arange(8), (2, 5, 7))
+        return jnp.where(scaled, own / jnp.where(scaled, os4, 1.0), 1.0) * DEFAULT_HALF_WIDTH
+
+    @property
+    def force_axes(self) -> tuple[int, ...]:
+        """None: the OS4 has no accelerometer."""
+        return ()
+
+    @property
+    def observes_states(self) -> bool:
+        """True."""
+        return True
+
+    def forcing(self, inputs: Inputs, parameters) -> Forcing:
+        """Torques and thrust by Eqs. (10)-(13), and the residual speed Omega_r = sum s_i omega_i."""
+        del parameters
+        omega, airframe = inputs.omega, self.airframe
+        roll, pitch, yaw, thrust = (jnp.square(omega) @ airframe.mixer.T).T
+        return Forcing(roll, pitch, yaw, thrust / airframe.mass, omega @ jnp.asarray(airframe.rotor_spins))
+
+    def cascade(self, state: State, forcing: Forcing, parameters) -> State:
+        """See `AbstractModel`."""
+        rates = self.angular_acceleration(state.rates, forcing, parameters)
+        if state.attitude is None:
+            return State(rates)
+        attitude, t = attitude_rates(state.rates, state.attitude), state.translation
+        if t is None:
+            return State(rates, attitude)
+        ax, ay, az = self.acceleration(state.attitude, forcing)
+        return State(rates, attitude, Translation(t.vx, ax, t.vy, ay, t.vz, az))
+
+    def observe(self, state: State, forcing: Forcing, parameters) -> tuple[Scalar, ...]:
+        """The states in cascade order."""
+        del forcing, parameters
+        return tuple(jax.tree.leaves(state))
+
+
+class PublishedOS4(AbstractOS4):
+    """The model exactly as the paper prints it: Eqs. (1)-(13), kept as a benchmark.
+
+    It departs from the physics of a rigid body, which is `CorrectedOS4`, in three places:
+
+    - The gyroscopic terms lack the rotor speed: alpha2 = J_R d / Ix multiplies q alone, in 1/s.
+    - Eq. (2) has alpha5 r; physics has alpha5 p.
+    - Eqs. (7)-(9) mix two earth frames.
+    """
+
+    airframe: Airframe = OS4
+
+    @property
+    def gyroscopic_factor(self) -> Scalar:
+        """The drag coefficient d: the paper prints alpha2 = J_R d / Ix."""
+        return as_float(self.airframe.drag_coefficient)
+
+    @property
+    def gyroscopic_unit(self) -> str:
+        """The unit that Eqs. (1)-(2) need."""
+        return "1/s"
+
+    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
+        """p', q', r' [rad/s^2]: Eqs. (1)-(3)."""
+        p, q, r = rates
+        a1, a2, a3, a4, a5, a6, a7, a8 = parameters
+        return Rates(
+            q * r * a1 - a2 * q + a3 * forcing.roll,
+            p * r * a4 + r * a5 + a6 * forcing.pitch,
+            p * q * a7 + a8 * forcing.yaw,
+        )
+
+    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+        """x'', y'', z'' [m/s^2]: Eqs. (7)-(9)."""
+        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
+        return (
+            (sin_phi * cos_psi - sin_psi * sin_theta * cos_phi) * forcing.thrust,
+            (-sin_psi * sin_phi - sin_theta * cos_phi * cos_psi) * forcing.thrust,
+            cos_theta * cos_phi * forcing.thrust - self.airframe.gravity,
+        )
+
+
+class CorrectedOS4(AbstractOS4):
+    """The published model with the equations of a rigid body: x forward, y left, z up.
+
+    alpha2 = J_R / Ix and alpha5 = J_R / Iy have no unit. They multiply Omega_r q and Omega_r p, so a flight excites
+    them. The model does not include the reaction of accelerating rotors, -J_R Omega_r' / Iz in yaw.
+    """
+
+    airframe: Airframe = OS4
+
+    @property
+    def gyroscopic_factor(self) -> Scalar:
+        """1: alpha2 = J_R / Ix."""
+        return jnp.asarray(1.0)
+
+    @property
+    def gyroscopic_unit(self) -> str:
+        """None: alpha2 and alpha5 are ratios of inertias."""
+        return "1"
+
+    def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
+        """Euler's equations with the gyroscopic torque -omega x (0, 0, J_R Omega_r)."""
+        p, q, r = rates
+        a1, a2, a3, a4, a5, a6, a7, a8 = parameters
+        return Rates(
+            q * r * a1 - a2 * forcing.residual_speed * q + a3 * forcing.roll,
+            p * r * a4 + a5 * forcing.residual_speed * p + a6 * forcing.pitch,
+            p * q * a7 + a8 * forcing.yaw,
+        )
+
+    def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
+        """The thrust along the body's z axis, rotated into the earth frame, and gravity."""
+        sin_phi, cos_phi, sin_theta, cos_theta, sin_psi, cos_psi = sines_and_cosines(attitude)
+        return (
+            (cos_psi * sin_theta * cos_phi + sin_psi * sin_phi) * forcing.thrust,
+            (sin_psi * sin_theta * cos_phi - cos_psi * sin_phi) * forcing.thrust,
+            cos_theta * cos_phi * forcing.thrust - self.airframe.gravity,
+        )
