@@ -158,7 +158,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def __post_init__(self):
         for axis in AXES:
             values = getattr(self, axis)
-            choices = [*_CHOICES.get(axis, values), *(self.input if axis == "excitations" else ())]
+            more = self.input if axis == "excitations" else ()
+            choices = [*(_CHOICES[axis] if axis in _CHOICES else values), *more]
             if not values:
                 raise InputError(f"`{axis}` is empty; give at least one value.")
             if len(set(values)) < len(values):
@@ -230,7 +231,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         kind = ESTIMATORS[scenario.estimator]
         channels = self.seed_channels(scenario) if kind.shoots else scenario.seen
         same = (getattr(scenario, name) for name in Job._fields[:-1])
-        return Job(*same, channels) if kind.needs_network else None
+        return Job._make([*same, channels]) if kind.needs_network else None
 
     def seed_channels(self, scenario: Scenario) -> str:
         """The channels that a hybrid's network looks at: it only says where to shoot."""
