@@ -36,7 +36,7 @@ def copy(whole, tmp_path):
 
 def logged(out: pathlib.Path) -> list[int]:
     study = load_study(out.parent / "spec.toml")
-    return [entry["cell"] for entry in Store(out, study, "", "").read_log() if "cell" in entry]
+    return [entry["cell"] for entry in Store(out, study, "").read_log() if "cell" in entry]
 
 
 def test_a_study_is_the_same_after_any_number_of_kills_and_on_any_number_of_devices(whole, tmp_path):

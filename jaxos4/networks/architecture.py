@@ -4,7 +4,7 @@ import functools
 import itertools
 import math
 import statistics
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -119,33 +119,26 @@ class Regressor(eqx.Module):
         return NetworkOutput(u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM))
 
 
-def first_regressor(
-    linear_map: Float[Array, "unknowns features"], approximator: str, *, width: int, depth: int, key: Key
-) -> Regressor:
+def first_regressor(linear_map: Float[Array, "unknowns features"], key: Key, shape: dict[str, Any]) -> Regressor:
     """A `Regressor` with the distribution of Equinox's first weights: uniform within 1 / sqrt(inputs).
 
-    All random numbers come from one draw: a draw for each array would take XLA five seconds to compile.
+    All random numbers come from one draw: a draw for each array would take XLA five seconds to compile. All arrays
+    outside the layers begin at 0, except the linear map.
     """
 
     def arrays(regressor: Regressor) -> list:
         nodes = jax.tree.leaves(regressor, is_leaf=lambda x: isinstance(x, eqx.nn.Linear))
         return [x for node in nodes if isinstance(node, eqx.nn.Linear) for x in (node.weight, node.bias)]
 
-    def zero(leaf):
-        return jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
-
-    # All arrays outside the layers begin at 0, except the linear map.
-    make = functools.partial(Regressor, linear_map, approximator, width=width, depth=depth)
-    blank = jax.tree.map(zero, eqx.filter_eval_shape(make, key=key))
+    abstract = eqx.filter_eval_shape(functools.partial(Regressor, linear_map, **shape), key=key)
+    blank = jax.tree.map(lambda x: jnp.zeros_like(x) if isinstance(x, jax.ShapeDtypeStruct) else x, abstract)
     shapes = [array.shape for array in arrays(blank)]
-    limits = [1 / math.sqrt(weight[1]) for weight in shapes[::2] for _ in ("weight", "bias")]
+    limits = np.repeat([1 / math.sqrt(weight[1]) for weight in shapes[::2]], 2).tolist()
     ends = np.cumsum([math.prod(shape) for shape in shapes])
     keys = jax.random.split(key, -(-int(ends[-1]) // _DRAWN))
     drawn = jax.lax.map(lambda k: jax.random.uniform(k, (_DRAWN,), minval=-1, maxval=1, dtype=float), keys).ravel()
-    values = [
-        limit * part.reshape(shape)
-        for limit, part, shape in zip(limits, jnp.split(drawn[: ends[-1]], ends[:-1]), shapes, strict=True)
-    ]
+    parts = zip(limits, jnp.split(drawn[: ends[-1]], ends[:-1]), shapes, strict=True)
+    values = [limit * part.reshape(shape) for limit, part, shape in parts]
     return eqx.tree_at(lambda r: [r.skip, *arrays(r)], blank, [linear_map, *values])
 
 

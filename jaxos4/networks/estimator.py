@@ -3,6 +3,7 @@
 The paper does not describe its network; architecture, features and training are our choice.
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from ..results import RESULTS
 from ..shooting import ShootingProblem, Unknowns, in_blocks
 from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_scales
 from .features import FEATURES, Coordinates, Features
-from .training import calibrate, train, training_bar, untrained
+from .training import calibrate, train, untrained
 
 APPROXIMATORS = ("mlp", "cmac")
 
@@ -32,6 +33,22 @@ _MOST_FEATURES = 6000
 _MOST_STEPS = 1_000_000
 _LARGEST_INFLATION = 2.0  # if missing samples enlarge a standard deviation by more, the problem is another one
 _SAME = 1e-6  # relative tolerance of equal numbers: files round them
+
+# What must be equal in training and in use: kinds, with the words that name them, and numbers.
+_KINDS: dict[str, Callable[[ShootingProblem], Any]] = {
+    "for {}": lambda problem: type(problem.model).__name__,
+    "for the parameters {}": lambda problem: ", ".join(problem.model.parameter_names),
+    "with the method {}": lambda problem: repr(problem.method),
+    "for {} samples": lambda problem: problem.flight.omega.shape[0],
+    "for {} windows": lambda problem: problem.windows,
+    "for an initial state that is {}": lambda problem: "free" if problem.initial_state is None else "known",
+}
+_QUANTITIES: dict[str, Callable[[ShootingProblem], Any]] = {
+    "airframe": lambda problem: problem.model.airframe,
+    "model": lambda problem: eqx.tree_at(lambda m: m.airframe, problem.model, None),
+    "sample time": lambda problem: problem.flight.dt,
+    "series of rotor speeds": lambda problem: problem.flight.omega,
+}
 
 
 class NetworkEstimator(eqx.Module):
@@ -98,11 +115,11 @@ class NetworkEstimator(eqx.Module):
         self._check(problem, bracket)
         scales = np.asarray(self.noise, float)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
-        scaling, regressor = untrained(features, scales, key, self.approximator, self.width, self.depth)
+        shape = {"approximator": self.approximator, "width": self.width, "depth": self.depth}
+        scaling, regressor = untrained(features, scales, key, shape)
         pace: dict[str, Any] = {"batch": self.batch, "steps": self.steps, "patience": self.patience}
-        pace["learning_rate"] = self.learning_rate
-        with training_bar(self.steps, shown=progress) as report:
-            regressor, history = train(regressor, scaling, features, scales, **pace, key=key, progress=report)
+        pace |= {"learning_rate": self.learning_rate, "progress": progress}
+        regressor, history = train(regressor, scaling, features, scales, **pace, key=key)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
@@ -128,10 +145,9 @@ def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: 
 class TrainedNetwork(AbstractEstimator):
     """A network that identifies flights of the inputs that it was trained for. Made by `NetworkEstimator.fit`.
 
-    Its intervals contain the truth in the share of flights that their level gives, even if the network is bad. They
+    Its intervals contain the truth in the share of flights that their level gives, even if the network is bad: they
     are calibrated on simulated flights that training did not use (split-conformal prediction). The share is an average
-    over flights that do not diverge, with parameters and initial states uniform in the bracket of training. It is exact
-    at nine noise scales and interpolated between them.
+    over flights that do not diverge, with parameters and initial states uniform in the bracket of training.
     """
 
     looks_at: ClassVar[str] = "rates"
@@ -187,8 +203,7 @@ class TrainedNetwork(AbstractEstimator):
 
     def _compare(self, problem: ShootingProblem) -> Estimate | str:
         """The estimate, or how the problem differs from that of training. One program computes both."""
-        kind = self._other_kind(problem)
-        if kind is not None:
+        if (kind := self._other_kind(problem)) is not None:
             return kind
         estimate, differences = self._identify(problem.restrict(self.channels))
         for what, differs in differences.items():
@@ -198,59 +213,33 @@ class TrainedNetwork(AbstractEstimator):
 
     def _other_kind(self, problem: ShootingProblem) -> str | None:
         """The difference in words as `mismatch` gives it, but not of numbers."""
+        own = self.problem
         if CHANNELS[self.channels] > problem.size:
             return f"it looks at {self.channels!r} channels, and the problem has {problem.channels!r}"
-        trained, given = (
-            {
-                "for {}": type(one.model).__name__,
-                "for the parameters {}": ", ".join(one.model.parameter_names),
-                "with the method {}": repr(one.method),
-                "for {} samples": one.flight.omega.shape[0],
-                "for {} windows": one.windows,
-            }
-            for one in (self.problem, problem)
-        )
-        for what, value in trained.items():
-            if value != given[what]:
-                return f"it was trained {what.format(value)}, not {given[what]}"
-        own = self.problem
-        if (problem.initial_state is None) != (own.initial_state is None):
-            return "it was trained for an initial state that is " + ("free" if own.initial_state is None else "known")
+        for words, kind in _KINDS.items():
+            if kind(problem) != kind(own):
+                return f"it was trained {words.format(kind(own))}, not {kind(problem)}"
         if not isinstance(problem.flight.states, Tracer):
             absent, not_needed = (np.isnan(np.asarray(p.flight.states)) for p in (problem, own))
             looked_at = [i for i in CASCADE_ORDER[: own.size] if not not_needed[:, i].all()]
-            missing = [STATE_NAMES[i] for i in looked_at if absent[:, i].all()]
-            if missing:
+            if missing := [STATE_NAMES[i] for i in looked_at if absent[:, i].all()]:
                 return f"it looks at {', '.join(missing)}, which this flight did not measure"
         return None
 
     def _differences(self, problem: ShootingProblem) -> dict[str, Bool[Array, ""]]:
         """For each quantity, whether its numbers differ from those of training."""
-        own, size = self.problem, CHANNELS[self.channels]
+        own, coordinates, size = self.problem, self.features.coordinates, CHANNELS[self.channels]
 
-        def differ(a, b, tolerance) -> Bool[Array, ""]:
-            a, b = as_float(a), as_float(b)
-            return ~((a == b) | (jnp.abs(a - b) <= tolerance)).all()
+        def differ(quantity: Callable[[ShootingProblem], Any]) -> Bool[Array, ""]:
+            pairs = zip(*(map(as_float, jax.tree.leaves(quantity(p))) for p in (problem, own)), strict=True)
+            same = [((a == b) | (jnp.abs(a - b) <= _SAME * jnp.abs(b).max())).all() for a, b in pairs]
+            return ~jnp.asarray(same, bool).all()
 
-        fastest = jnp.abs(own.flight.omega).max()
-
-        def differ_in(constants, own_constants) -> Bool[Array, ""]:
-            pairs = zip(jax.tree.leaves(constants), jax.tree.leaves(own_constants), strict=True)
-            each = [differ(a, b, _SAME * jnp.abs(b).max()) for a, b in pairs]
-            return jnp.asarray(each, bool).any()
-
-        rest, own_rest = (eqx.tree_at(lambda m: m.airframe, model, None) for model in (problem.model, own.model))
-        width = self.features.coordinates.width[len(own.model.parameter_names) :]
+        width = coordinates.width[len(own.model.parameter_names) :]
         first_state, off = (problem.split(x)[:, :size].ravel() for x in problem.first_state())
-        own_start = self.features.coordinates.first_state
-        allowed = 1.5 * width + off if width.size else _SAME * (1 + jnp.abs(own_start))
-        return {
-            "airframe": differ_in(problem.model.airframe, own.model.airframe),
-            "model": differ_in(rest, own_rest),
-            "sample time": differ(problem.flight.dt, own.flight.dt, _SAME * own.flight.dt),
-            "series of rotor speeds": differ(problem.flight.omega, own.flight.omega, _SAME * fastest),
-            "start": ~(jnp.abs(first_state - own_start) <= allowed).all(),
-        }
+        allowed = 1.5 * width + off if width.size else _SAME * (1 + jnp.abs(coordinates.first_state))
+        start = ~(jnp.abs(first_state - coordinates.first_state) <= allowed).all()
+        return {what: differ(quantity) for what, quantity in _QUANTITIES.items()} | {"start": start}
 
     @quick_jit
     def _identify(self, problem: ShootingProblem) -> tuple[Estimate, dict[str, Bool[Array, ""]]]:
@@ -262,13 +251,13 @@ class TrainedNetwork(AbstractEstimator):
         order = CASCADE_ORDER[: CHANNELS[self.channels]]
         scale = (problem.sigma[order] / self.problem.sigma[order]).max()  # of the noise, in multiples of the training's
         within = jnp.clip(scale, *self.settings.noise)
-        features = self.features(problem)
-        finite = jnp.isfinite(features.values).all()
-        output = self.regressor(jnp.where(finite, features.values, 0.0), within, self.scaling)
+        values, inflation = self.features(problem)
+        finite = jnp.isfinite(values).all()
+        output = self.regressor(jnp.where(finite, values, 0.0), within, self.scaling)
         parameters, initial_state = coordinates.split(output.u, count)
 
         rms, correlation, factors, simultaneous = self.errors.at(within)
-        std = jnp.exp(output.log_spread[:count]) * self.scaling.bound(within)[:count] * rms * features.inflation
+        std = jnp.exp(output.log_spread[:count]) * self.scaling.bound(within)[:count] * rms * inflation
         deviations = std * coordinates.width[:count]
         parameters, correlation = _given_held(problem.unknowns, parameters, deviations, correlation)
         shot = problem.shots(parameters, initial_state)
@@ -278,7 +267,7 @@ class TrainedNetwork(AbstractEstimator):
 
         differences = self._differences(problem)
         other = jnp.stack(list(differences.values())).any()
-        other |= (features.inflation > _LARGEST_INFLATION).any() | (scale > self.settings.noise[1] * (1 + _SAME))
+        other |= (inflation > _LARGEST_INFLATION).any() | (scale > self.settings.noise[1] * (1 + _SAME))
         result = RESULTS.where(outside.any(), RESULTS.at_bound, RESULTS.successful)
         result = RESULTS.where(unidentifiable.any(), RESULTS.unidentifiable, result)
         sound = finite & shot.sound & jnp.isfinite(parameters).all()
@@ -300,11 +289,8 @@ class TrainedNetwork(AbstractEstimator):
 
 
 def _given_held(
-    unknowns: Unknowns,
-    parameters: Parameters,
-    deviations: Parameters,
-    correlation: Float[Array, "parameters parameters"],
-) -> tuple[Parameters, Float[Array, "parameters parameters"]]:
+    unknowns: Unknowns, parameters: Parameters, deviations: Parameters, correlation: Float[Array, "count count"]
+) -> tuple[Parameters, Float[Array, "count count"]]:
     """The mean and the correlations of a Gaussian answer if the held parameters are known."""
     free, held = unknowns.free, ~unknowns.free
     among_held = jnp.where(held[:, None] & held, correlation, jnp.eye(free.size))

@@ -24,7 +24,6 @@ from ..shooting import FASTEST, ShootingProblem
 CHUNK = 1000
 """Flights that are simulated at once. All chunks share one compiled program."""
 
-
 Purpose = enum.IntEnum("Purpose", "WEIGHTS LINEAR_MAP VALIDATION STEPS CALIBRATION FLIGHTS", start=0)
 """Purposes of random numbers. Numbers are drawn from a key and a place; each purpose has its own places."""
 
@@ -32,13 +31,6 @@ Purpose = enum.IntEnum("Purpose", "WEIGHTS LINEAR_MAP VALIDATION STEPS CALIBRATI
 def place_of(purpose: Purpose, number: Int[np.ndarray, "*numbers"] | int) -> Int[np.ndarray, "*numbers"]:
     """The place of a number, or of each number."""
     return np.asarray(len(Purpose) * np.asarray(number) + int(purpose))
-
-
-class FlightFeatures(NamedTuple):
-    """The features of a flight, and the factor by which missing samples enlarge each standard deviation."""
-
-    values: Float[Array, " features"]
-    inflation: Parameters
 
 
 class Coordinates(eqx.Module):
@@ -110,22 +102,22 @@ class Features(eqx.Module):
         """The number of features."""
         return self.reference.size if self.noise_factor is None else self.noise_factor.shape[0]
 
-    def __call__(self, problem: ShootingProblem) -> FlightFeatures:
-        """Features of a measured flight; NaN if its numbers are not finite.
+    def __call__(self, problem: ShootingProblem) -> tuple[Float[Array, " features"], Parameters]:
+        """Features of a measured flight, and the factor by which missing samples enlarge each standard deviation.
 
-        Samples that were measured in training may be missing. That costs the score precision; raw features need all.
+        Features are NaN if the flight's numbers are not finite. Raw features need all samples of training.
         """
         needed, measured = _measured(self.problem), _measured(problem)
         mismatch = jnp.where(needed, self._weighted(problem, problem.measured()), 0.0)
         parameters = len(self.problem.model.parameter_names)
         if self.jacobian is None or self.noise_factor is None:
             inflation = jnp.where((needed & ~measured).any(), jnp.inf, jnp.ones(parameters))
-            return FlightFeatures(mismatch.ravel(), inflation)
+            return mismatch.ravel(), inflation
         jacobian = jnp.where(measured[:, :, None], self.jacobian, 0.0)
         noise_factor = _noise_factor(jacobian)
         step = noise_factor @ (noise_factor.T @ jnp.einsum("tcu,tc->u", jacobian, mismatch))
         inflation = jnp.linalg.norm(noise_factor, axis=1) / jnp.linalg.norm(self.noise_factor, axis=1)
-        return FlightFeatures(step, inflation[:parameters])
+        return step, inflation[:parameters]
 
     def simulated(self, u: Float[Array, " unknowns"]) -> Float[Array, " features"]:
         """Features of the flight at `u` without noise; NaN if the flight diverges."""

@@ -91,9 +91,11 @@ def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     if header["format"] != _FORMAT:
         raise InputError(f"{path}: trained by another version of jaxos4; train it again with `jaxos4 train`.")
     for name, value in arrays.items():
-        valid = value.dtype.kind in "fui" and (name == "states" or not np.isnan(value).any())
-        if name != "header" and not valid:
-            raise ValueError(f"{name} holds no numbers, or NaN")
+        may_be_nan, of_network = name in ("header", "states"), name.startswith("network")
+        if name != "header" and value.dtype.kind not in "fui":
+            raise ValueError(f"{name} holds no numbers")
+        if not may_be_nan and not (np.isfinite(value) if of_network else ~np.isnan(value)).all():
+            raise ValueError(f"{name} is not finite")
     settings = NetworkEstimator(**header["settings"] | {"noise": tuple(header["settings"]["noise"])})
     airframe = Airframe(**{f.name: arrays[f"airframe.{f.name}"] for f in dataclasses.fields(Airframe)})
     problem = ShootingProblem(
@@ -111,12 +113,9 @@ def _restore(path: object, arrays: dict[str, np.ndarray]) -> TrainedNetwork:
     def fill(place: tuple, leaf: Any) -> Any:
         if not isinstance(leaf, jax.ShapeDtypeStruct):
             return leaf
-        name = _name(place)
-        value = arrays[name]
+        value = arrays[_name(place)]
         if value.shape != leaf.shape:
-            raise ValueError(f"{name} has shape {value.shape}, expected {leaf.shape}")
-        if not np.isfinite(value).all():
-            raise ValueError(f"{name} is not finite")
+            raise ValueError(f"{_name(place)} has shape {value.shape}, expected {leaf.shape}")
         return as_float(value) if jnp.issubdtype(leaf.dtype, jnp.floating) else jnp.asarray(value, leaf.dtype)
 
     network = jax.tree_util.tree_map_with_path(fill, blank)

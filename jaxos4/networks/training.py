@@ -1,9 +1,7 @@
 """The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals."""
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -23,9 +21,6 @@ if TYPE_CHECKING:
 CHECK = 250
 """Steps between two evaluations of the validation loss."""
 
-Progress = Callable[[int, float], None]
-"""Called at every check with the steps done and the validation loss."""
-
 _VALIDATION = 2  # chunks of the validation
 _USES = 4  # how often training uses a simulated flight, each time with new noise
 _IMPROVEMENT = 1e-4  # a loss is an improvement if it is lower by this share
@@ -41,23 +36,17 @@ _PER_FEATURE, _RIDGE = 4, 1e-6
 
 
 def untrained(
-    features: Features, scales: Float[np.ndarray, "2"], key: Key, approximator: str, width: int, depth: int
+    features: Features, scales: Float[np.ndarray, "2"], key: Key, shape: dict[str, Any]
 ) -> tuple[Scaling, Regressor]:
     """Scaling and regressor before training, with a linear map that is fitted to simulated flights."""
     count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
     chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)
-    return _untrained(features, chunks, scales, key, approximator, width, depth)
+    return _untrained(features, chunks, scales, key, shape)
 
 
 @quick_jit
 def _untrained(
-    features: Features,
-    chunks: list[Pair],
-    scales: Float[Numeric, "2"],
-    key: Key,
-    approximator: str,
-    width: int,
-    depth: int,
+    features: Features, chunks: list[Pair], scales: Float[Numeric, "2"], key: Key, shape: dict[str, Any]
 ) -> tuple[Scaling, Regressor]:
     samples = jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
     # The score's own derivatives give the bound.
@@ -76,7 +65,7 @@ def _untrained(
     linear_map = jnp.linalg.solve(inputs.T @ inputs + ridge * jnp.eye(features.size), inputs.T @ targets).T
     scaling = Scaling(sizes, unit, jnp.minimum(10 * unit, 1.0), jnp.maximum(jnp.abs(jnp.log(scales)).max(), 1.0))
     key = jax.random.fold_in(key, place_of(Purpose.WEIGHTS, 0))
-    return scaling, first_regressor(linear_map, approximator, width=width, depth=depth, key=key)
+    return scaling, first_regressor(linear_map, key, shape)
 
 
 def train(
@@ -90,11 +79,12 @@ def train(
     learning_rate: float,
     patience: int,
     key: Key,
-    progress: Progress,
+    progress: bool,
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
 
-    Between two checks, training simulates new flights. Each step takes some of them, with new noise.
+    Between two checks, training simulates new flights. Each step takes some of them, with new noise. `progress`:
+    whether to show a bar on the error output, if that is a terminal.
 
     **Returns:** the regressor as it was at the check with the best validation loss, and the losses of training and
     validation at every check.
@@ -103,38 +93,42 @@ def train(
     """
     held_out = draw_chunks(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION)
     held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
-    _check_trainable(held_out, regressor)
+    flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
+    if not flyable > _FLYABLE:
+        what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
+        raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
-    given, held_out, data = regressor, _single(held_out), _single((scaling, features, scales))
-    regressor = _single(regressor)
+    regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
+    import rich.console
+    import rich.progress
+
     state, rates = _first_state(regressor), _learning_rates(learning_rate, steps)
     flown = batch * CHECK // _USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
-    for number, first in enumerate(range(0, steps, CHECK)):
-        place = number * math.ceil(flown / CHUNK)
-        flights = draw_chunks(features, flown, key=key, purpose=Purpose.FLIGHTS, first=place)
-        count = min(CHECK, steps - first)
-        places = place_of(Purpose.STEPS, first + np.arange(CHECK))
-        rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
-        regressor, state, *losses = _advance(
-            regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
-        )
-        history.append([float(value) for value in losses])
-        value, current = history[-1]
-        if not np.less(history[-1], _DIVERGED).all():
-            raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
-        progress(first + count, current)
-        without_improvement += 1
-        if current < lowest - _IMPROVEMENT * abs(current):
-            best, lowest, without_improvement = regressor, current, 0
-        if without_improvement >= patience:
-            break
-    best = jax.tree.map(
-        lambda leaf, like: jnp.asarray(np.asarray(leaf, like.dtype)) if eqx.is_inexact_array(like) else like,
-        best,
-        given,
-    )
-    return best, np.asarray(history)
+    console = rich.console.Console(stderr=True)
+    with rich.progress.Progress(console=console, transient=True, disable=not (progress and console.is_terminal)) as bar:
+        task = bar.add_task("training the network", total=steps)
+        for number, first in enumerate(range(0, steps, CHECK)):
+            place = number * math.ceil(flown / CHUNK)
+            flights = draw_chunks(features, flown, key=key, purpose=Purpose.FLIGHTS, first=place)
+            count = min(CHECK, steps - first)
+            places = place_of(Purpose.STEPS, first + np.arange(CHECK))
+            rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
+            regressor, state, *losses = _advance(
+                regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
+            )
+            history.append([float(value) for value in losses])
+            value, current = history[-1]
+            if not np.less(history[-1], _DIVERGED).all():
+                raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
+            bar.update(task, completed=first + count, description=f"training the network, loss {current:.4g}")
+            without_improvement += 1
+            if current < lowest - _IMPROVEMENT * abs(current):
+                best, lowest, without_improvement = regressor, current, 0
+            if without_improvement >= patience:
+                break
+    whole = jax.tree.map(lambda x: as_float(np.asarray(x)) if eqx.is_inexact_array_like(x) else x, best)
+    return whole, np.asarray(history)
 
 
 @quick_jit
@@ -204,26 +198,8 @@ def _single(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32) if eqx.is_inexact_array_like(leaf) else leaf, tree)
 
 
-def _check_trainable(held_out: list[Pair], regressor: Regressor) -> None:
-    flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
-    if not flyable > _FLYABLE:
-        what = f"only {100 * flyable:.2g} % of the flights simulated in the bracket can be flown to their end"
-        raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
-    weights = jax.tree.leaves(eqx.filter(regressor, eqx.is_inexact_array))
-    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in weights):
-        raise TrainingError(
-            "the network's first weights are not finite, because the flight at the bracket's center diverges or too "
-            "few samples were measured: move the bracket, or use a longer flight."
-        )
-
-
 def calibrate(
-    regressor: Regressor,
-    scaling: Scaling,
-    features: Features,
-    scales: Float[Array, " scales"],
-    count: int,
-    key: Key,
+    regressor: Regressor, scaling: Scaling, features: Features, scales: Float[Array, " scales"], count: int, key: Key
 ) -> ErrorTable:
     """Measures a network's errors on `count` new simulated flights, with new noise at each noise scale.
 
@@ -235,8 +211,16 @@ def calibrate(
     flights = draw_chunks(features, count, key=key, purpose=purpose, uniform=True)
     for number, scale in enumerate(np.asarray(scales)):
         chunks = noisy_chunks(features, flights, np.stack([scale, scale]), key, purpose, 1 + number)
-        errors = [_standardised(regressor, scaling, chunk, scale) for chunk in chunks]
-        tables.append(_table(np.concatenate(errors)[:, :parameters]))
+        error = np.concatenate([_standardised(regressor, scaling, chunk, scale) for chunk in chunks])[:, :parameters]
+        error = error[np.isfinite(error).all(axis=1)]
+        rank = np.ceil((len(error) + 1) * LEVELS).astype(int) - 1
+        if rank[-1] >= len(error):
+            raise TrainingError("too few of the held-out flights can be flown to calibrate: narrow the bracket.")
+        moments = error.T @ error / len(error)
+        rms = np.sqrt(np.diagonal(moments))
+        relative = np.abs(error) / rms
+        quantiles = np.sort(np.column_stack([relative, relative.max(axis=1)]), axis=0)[rank]
+        tables.append((rms, moments / np.outer(rms, rms), quantiles[:, :-1], quantiles[:, -1]))
     return ErrorTable(scales, *(as_float(np.stack(column)) for column in zip(*tables, strict=True)))
 
 
@@ -247,31 +231,3 @@ def _standardised(
     """Errors in units of the standard deviation that the network gives, at one noise scale."""
     output = jax.vmap(regressor, in_axes=(0, None, None))(pairs.features, scale, scaling)
     return (output.u - pairs.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
-
-
-def _table(error: Float[np.ndarray, "flights parameters"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """`rms`, `correlation`, `factors` and `simultaneous` of an `ErrorTable` at one noise scale."""
-    error = error[np.isfinite(error).all(axis=1)]
-    flown = len(error)
-    rank = np.ceil((flown + 1) * LEVELS).astype(int) - 1
-    if rank[-1] >= flown:
-        raise TrainingError("too few of the held-out flights can be flown to calibrate: narrow the bracket.")
-    moments = error.T @ error / flown
-    rms = np.sqrt(np.diagonal(moments))
-    relative = np.abs(error) / rms
-    quantiles = np.sort(np.column_stack([relative, relative.max(axis=1)]), axis=0)[rank]
-    return rms, moments / np.outer(rms, rms), quantiles[:, :-1], quantiles[:, -1]
-
-
-@contextlib.contextmanager
-def training_bar(steps: int, *, shown: bool) -> Iterator[Progress]:
-    """Shows a bar on the error output while the block runs, if that is a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    name, loss = TextColumn("training the network"), TextColumn("loss {task.fields[loss]}")
-    console = Console(stderr=True)
-    columns = (name, BarColumn(), loss, TimeElapsedColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=console, transient=True, disable=not (shown and console.is_terminal)) as bar:
-        task = bar.add_task("", total=steps, loss="-")
-        yield lambda done, loss: bar.update(task, completed=done, loss=f"{loss:.4g}")

@@ -52,6 +52,9 @@ _FEW_FLIGHTS = 2000
 _LARGEST_OFFSET = 0.8
 
 
+Lanes = Float[Array, "lanes samples 12"]
+
+
 class Fleet(NamedTuple):
     """Model, bracket and inputs of a scenario. They are the same for all noises."""
 
@@ -65,8 +68,8 @@ class Flights(NamedTuple):
     """Flights of a cell: true parameters, true states and measured states."""
 
     truth: Float[Array, "lanes parameters"]
-    exact: Float[Array, "lanes samples 12"]
-    measured: Float[Array, "lanes samples 12"]
+    exact: Lanes
+    measured: Lanes
 
 
 def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
@@ -149,9 +152,8 @@ def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "la
     """The Cramer-Rao standard deviations of each flight, at the noise of a problem."""
 
     def one(states: States, parameters: Parameters) -> Parameters:
-        problem = problem_of(blank, states)
         start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
-        return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem, parameters, start)))
+        return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem_of(blank, states), parameters, start)))
 
     return jax.vmap(one)(flights.exact, flights.truth)
 
@@ -199,12 +201,7 @@ def programs_of(study: Study, scenario: Scenario) -> list[tuple]:
 
 
 def _answers(
-    study: Study,
-    cell: Cell,
-    fleet: Fleet,
-    blank: ShootingProblem,
-    states: Float[Array, "lanes samples 12"],
-    network: TrainedNetwork | None,
+    study: Study, cell: Cell, fleet: Fleet, blank: ShootingProblem, states: Lanes, network: TrainedNetwork | None
 ) -> dict[str, Any]:
     """The attributes in `_KEPT` of each flight's estimate, and its `half_width` at `LEVELS`, by name."""
     few = math.prod(study.shape[:-1]) * study.flights <= _FEW_FLIGHTS
@@ -226,7 +223,7 @@ def _answers(
 
 
 def _identify(
-    estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"]
+    estimator: AbstractEstimator, blank: ShootingProblem, bracket: Bracket, states: Lanes
 ) -> tuple[dict[str, Any], Seed]:
     """The results as in `_answers`, and for each answer the seed of a search."""
 
@@ -237,9 +234,7 @@ def _identify(
     return jax.vmap(one)(states)
 
 
-def _search(
-    ibss: IBSS, blank: ShootingProblem, bracket: Bracket, states: Float[Array, "lanes samples 12"], seeds: Seed
-) -> dict[str, Any]:
+def _search(ibss: IBSS, blank: ShootingProblem, bracket: Bracket, states: Lanes, seeds: Seed) -> dict[str, Any]:
     """The results as in `_answers`, of a search near the seeds. Its sweeps are recorded."""
     ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
 
@@ -273,11 +268,8 @@ def _results(
     results = {
         "truth": truth,
         "estimate": kept("parameters"),
-        "std": kept("std"),
-        "half_width": kept("half_width"),
+        **{name: kept(name) for name in ("std", "half_width", "initial_state", "cost")},
         "bound": bound,
-        "initial_state": kept("initial_state"),
-        "cost": kept("cost"),
         "rollouts": found["rollouts"].astype(np.int32),
         "result": np.array([OUTCOMES.index(name) for name in result_names(found["result"])], np.int8),
         "hit": hit.astype(np.int8),

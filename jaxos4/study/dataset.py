@@ -16,7 +16,6 @@ import xarray as xr
 from ..errors import InputError
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
-from ..models.abstract import AbstractModel
 from ..networks import CHECK
 from .cell import LEVELS, OUTCOMES, fleet_of, fly, fly_again
 from .metrics import SCENARIO
@@ -35,20 +34,20 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "cost": ((), "f8", "1", "1/2 |W (y - x)|^2 at the estimate, of the channels `seen`"),
     "hit": ((), "i1", "1", "whether the hybrid's seed bracket held the truth; -1 for other estimators"),
 }
-_AXES_ATTRIBUTES = {
-    "model": ("equations that are fitted, and flown", "1"),
-    "airframe": ("airframe that is flown", "1"),
-    "excitation": ("rotor speeds that are flown", "1"),
-    "duration": ("length of a flight", "s"),
-    "method": ("how true flights are simulated", "1"),
-    "noise": ("kind of sensor noise", "1"),
-    "scale": ("noise in multiples of the standard sensors'", "1"),
-    "width": ("bracket in multiples of the default half-width", "1"),
-    "channels": ("what was measured", "1"),
-    "estimator": ("estimator", "1"),
-    "flight": ("number of the flight: the same draws in all scenarios", "1"),
-    "parameter": ("parameter", "1"),
-    "level": ("share of intervals that should hold the truth", "1"),
+_AXES = {
+    "model": "equations that are fitted, and flown",
+    "airframe": "airframe that is flown",
+    "excitation": "rotor speeds that are flown",
+    "duration": "length of a flight",
+    "method": "how true flights are simulated",
+    "noise": "kind of sensor noise",
+    "scale": "noise in multiples of the standard sensors'",
+    "width": "bracket in multiples of the default half-width",
+    "channels": "what was measured",
+    "estimator": "estimator",
+    "flight": "number of the flight: the same draws in all scenarios",
+    "parameter": "parameter",
+    "level": "share of intervals that should hold the truth",
 }
 
 
@@ -59,8 +58,7 @@ def assemble(store: Store) -> xr.Dataset:
     networks' training. Raises `InputError` if a cell's file is damaged.
     """
     study = store.study
-    model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
-    coordinates = _coordinates(study, model)
+    coordinates = _coordinates(study)
     sizes = {name: len(values) for name, (_, values, _) in coordinates.items()}
     arrays = {
         name: np.full([sizes[dim] for dim in _dims(name)], np.nan if kind == "f8" else -1, kind)
@@ -90,12 +88,9 @@ def assemble(store: Store) -> xr.Dataset:
         except (KeyError, ValueError):
             path = store.cell_file(cell.number)
             raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
-    variables = {
-        name: (_dims(name), arrays[name], _named(long_name, unit))
-        for name, (_, _, unit, long_name) in _VARIABLES.items()
-    }
-    codes = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
-    variables["result"][-1].update(codes)
+    named = {name: _named(long_name, unit) for name, (_, _, unit, long_name) in _VARIABLES.items()}
+    named["result"] |= {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
+    variables = {name: (_dims(name), arrays[name], attributes) for name, attributes in named.items()}
     command = {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)}
     variables |= _brackets(study) | _example(store) | _training(store)
     return xr.Dataset(variables, coords=coordinates, attrs=provenance(study, store.device) | command)
@@ -115,10 +110,12 @@ def save_dataset(dataset: xr.Dataset, directory: Path) -> None:
     write_file(directory / RESULTS_FILE, data)
 
 
-def _coordinates(study: Study, model: AbstractModel) -> dict[str, tuple]:
+def _coordinates(study: Study) -> dict[str, tuple]:
+    model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
     values = {dim: list(getattr(study, axis)) for dim, axis in zip(SCENARIO, AXES, strict=True)}
     values |= {"flight": np.arange(study.flights), "parameter": list(model.parameter_names), "level": list(LEVELS)}
-    coordinates = {dim: (dim, values[dim], _named(*attributes)) for dim, attributes in _AXES_ATTRIBUTES.items()}
+    units = {"duration": "s"}
+    coordinates = {dim: (dim, values[dim], _named(name, units.get(dim, "1"))) for dim, name in _AXES.items()}
     return coordinates | {"unit": ("parameter", list(model.parameter_units), _named("unit of the parameter", "1"))}
 
 
@@ -157,16 +154,15 @@ def _example(store: Store) -> dict[str, tuple]:
     study = store.study
     scale = min(study.scales, key=lambda s: abs(math.log(s)) if s > 0 else math.inf)
     first = study.cell(0).scenario._replace(scale=scale)
-    found = {}
-    for cell in study.cells():
-        if cell.first == 0 and cell.scenario._replace(estimator=first.estimator) == first:
-            results = store.read(cell.number)
-            if results is not None and "failed" not in results:
-                found[cell.scenario.estimator] = results
+    numbers = {
+        cell.scenario.estimator: cell.number
+        for cell in study.cells()
+        if cell.first == 0 and cell.scenario._replace(estimator=first.estimator) == first
+    }
+    found = {name: results for name, number in numbers.items() if "true" in (results := store.read(number) or {})}
     if not found:
         return {}
-    some = next(iter(found.values()))
-    true, measured = some["true"], some["measured"]
+    true, measured = (next(iter(found.values()))[name] for name in ("true", "measured"))
     simulated = np.full((len(study.estimators), *true.shape), np.nan)
     for name, results in found.items():
         simulated[study.estimators.index(name)] = fly_again(study, first, results)

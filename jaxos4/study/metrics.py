@@ -105,10 +105,7 @@ def coverage(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def mean_coverage(dataset: xr.Dataset) -> xr.Dataset:
-    """`coverage` averaged over the parameters, with the interval of one draw for each flight.
-
-    Errors of one flight's parameters are correlated, so that this interval is conservative.
-    """
+    """`coverage` averaged over the parameters, with the interval of one draw for each flight: a conservative one."""
     each = coverage(dataset)
     return _wilson("coverage", each["coverage"].mean("parameter"), each["count"].min("parameter"))
 
@@ -125,10 +122,7 @@ def mean_rollouts(dataset: xr.Dataset) -> xr.DataArray:
 
 
 def accuracy(dataset: xr.Dataset) -> xr.DataArray:
-    """One number for all parameters: the geometric mean of RMSE / the smallest bound of any estimator.
-
-    Unlike `efficiency`, this counts against an estimator that looks at few channels.
-    """
+    """One number for all parameters: the geometric mean of RMSE / the smallest bound of any estimator."""
     least = dataset["bound"].min("estimator")
     ratio = _rms(error(dataset) / least.where(least > 0))
     logarithm = xr.apply_ufunc(np.log, ratio.where(ratio > 0))

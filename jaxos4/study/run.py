@@ -7,6 +7,7 @@ repeats its tasks.
 import concurrent.futures
 import contextlib
 import ctypes
+import dataclasses
 import functools
 import io
 import itertools
@@ -18,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import msgspec
 import numpy as np
 import xarray as xr
 
@@ -32,8 +32,8 @@ from .store import Store, check_store, open_store
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# A trained network, or a message that says why there is none; `None` for an estimator without a network.
-Trained = TrainedNetwork | str | None
+# The bytes of a network's file, or a message that says why there is none; `None` for an estimator without a network.
+Trained = bytes | str | None
 
 # Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
@@ -53,11 +53,9 @@ class Step(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The remaining work of an estimator.
+    """The remaining work of an estimator: programs to be compiled, networks to be trained.
 
-    - `programs`, `networks`: how many are to be compiled, and to be trained.
-    - `seconds`: for the cells on this process's devices, without the training of networks, from the mean time of this
-      estimator's finished cells; `None` if none is finished.
+    `seconds`: of the cells on this process's devices, from the mean time of this estimator's finished cells, or `None`.
     """
 
     estimator: str
@@ -103,12 +101,12 @@ def plan(study: Study, directory: Path) -> list[Plan]:
     return rows
 
 
+@dataclasses.dataclass
 class _Program:
     """A program: the devices that run it, and the waiting cells that end with it."""
 
-    def __init__(self) -> None:
-        self.devices: set[Any] = set()
-        self.waiting: deque[Cell] = deque()
+    devices: set[Any] = dataclasses.field(default_factory=set)
+    waiting: deque[Cell] = dataclasses.field(default_factory=deque)
 
 
 def run_here(store: Store) -> Iterator[Step]:
@@ -176,17 +174,16 @@ def _give_memory_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _train(store: Store, job: Job, device: Any) -> Trained:
-    """The network, read from its file as in a resumed run; or a message that says why there is none."""
+def _train(store: Store, job: Job, device: Any) -> bytes | str:
+    """`train` on a device, or the file of an earlier run."""
     begin, number = time.perf_counter(), store.study.jobs()[job]
-    with jax.default_device(device):
-        if (network := store.read_network(number)) is not None:
-            return network
-        data = train(store.study, job)
+    if store.read_network(number) is None:
+        with jax.default_device(device):
+            data = train(store.study, job)
         if isinstance(data, str):
             return data
         store.write_network(number, data, seconds=round(time.perf_counter() - begin, 3))
-        return store.read_network(number)
+    return store.network_file(number).read_bytes()
 
 
 def train(study: Study, job: Job) -> bytes | str:
@@ -211,7 +208,7 @@ def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> t
         if isinstance(network, str):
             raise TrainingError(network)
         with jax.default_device(device):
-            results = run_cell(study, cell, network)
+            results = run_cell(study, cell, None if network is None else _loaded(network, study.double))
     except FAILURES as error:
         if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
             remedy = "free some and run the study again, or start another study with a smaller `batch`"
@@ -238,66 +235,53 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
     """
     from distributed import as_completed
 
-    study, waiting = store.study, deque(store.missing())
-    specification, numbers = msgspec.json.encode(study).decode(), {None: None} | study.jobs()
+    study, waiting, numbers = store.study, deque(map(store.study.cell, store.missing())), store.study.jobs()
     done = study.count - len(waiting)
-    networks: dict[int | None, Any] = {None: None}
-    running: dict[Future, tuple[int, int | None]] = {}
+    networks: dict[Job | None, Any] = {None: None}
+    running: dict[Future, tuple[Cell, Job | None]] = {}
     finished = as_completed(loop=client.loop, raise_errors=False)
     threads: Any = client.nthreads
     if waiting and not threads():
         raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
 
-    def network_of(number: int) -> Any:
-        if store.read_network(number) is None:
-            return client.submit(remote_training, specification, number, retries=_RETRIES, pure=False)
+    def network_of(job: Job) -> Any:
+        if store.read_network(numbers[job]) is None:
+            return client.submit(train, study, job, retries=_RETRIES, pure=False)
         # Read here, and not on a worker, because it may be damaged. As a task: data of a lost worker are lost with it.
-        return client.submit(bytes, store.network_file(number).read_bytes(), pure=False)
+        return client.submit(bytes, store.network_file(numbers[job]).read_bytes(), pure=False)
 
     def submit() -> None:
         room = _AHEAD * max(sum(threads().values()), 1) - len(running)
         for _ in range(min(room, len(waiting))):
-            index = waiting.popleft()
-            number = numbers[study.job(study.cell(index).scenario)]
-            if number is not None and number not in networks:
-                networks[number] = network_of(number)
-            future = client.submit(remote_cell, specification, index, networks[number], retries=_RETRIES, pure=False)
-            running[future] = index, number
+            cell = waiting.popleft()
+            job = study.job(cell.scenario)
+            if job is not None and job not in networks:
+                networks[job] = network_of(job)
+            future = client.submit(compute, study, cell, networks[job], retries=_RETRIES, pure=False)
+            running[future] = cell, job
             finished.add(future)
 
     submit()
     while running:
         future = next(finished)
-        index, number = running.pop(future)
+        cell, job = running.pop(future)
         try:
             data, seconds = future.result()
-            trained = None if number is None or store.network_file(number).exists() else networks[number].result()
+            trained = None if job is None or store.network_file(numbers[job]).exists() else networks[job].result()
         except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
             what = " ".join(str(error).split())[:300] or type(error).__name__
-            raise InputError(f"cell {index}: lost by the cluster ({what}); run the study again to resume.") from None
-        if number is not None and isinstance(trained, bytes):
-            store.write_network(number, trained)
-        store.write_cell(index, data, seconds)
+            lost = f"cell {cell.number}: lost by the cluster ({what})"
+            raise InputError(f"{lost}; run the study again to resume.") from None
+        if job is not None and isinstance(trained, bytes):
+            store.write_network(numbers[job], trained)
+        store.write_cell(cell.number, data, seconds)
         done += 1
-        yield Step(done, label_of(study, study.cell(index)))
+        yield Step(done, label_of(study, cell))
         submit()
     yield Step(done, "")
 
 
-def remote_training(specification: str, number: int) -> bytes | str:
-    """`train` on a worker. `number`: the place in `Study.jobs`."""
-    study = msgspec.json.decode(specification, type=Study)
-    return train(study, list(study.jobs())[number])
-
-
-def remote_cell(specification: str, index: int, network: bytes | str | None) -> tuple[bytes, float]:
-    """`compute` on a worker."""
-    study = msgspec.json.decode(specification, type=Study)
-    trained = _loaded(network, study.double) if isinstance(network, bytes) else network
-    return compute(study, study.cell(index), trained)
-
-
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=8)
 def _loaded(network: bytes, double: bool) -> TrainedNetwork:
     with jax.enable_x64(double):
         return load_network(io.BytesIO(network))
@@ -311,16 +295,12 @@ def carry_out(
     run: Callable[[Store], Iterator[Step]] = run_here,
     progress: Callable[[Step], None] = lambda step: None,
 ) -> xr.Dataset:
-    """Runs the missing cells of a study and writes its Dataset.
-
-    **Arguments:**
+    """Runs the missing cells of a study and writes its Dataset. Raises what `open_store` and `run` raise.
 
     - `out`: the study's folder; a new one, or one that the same study wrote.
     - `device`: what computes, in words, for the provenance.
     - `run`: `run_here`, or `run_on_cluster` with its client.
     - `progress`: is called after each step.
-
-    **Raises:** what `open_store` and `run` raise.
     """
     with open_store(out, study, device) as store:
         for step in run(store):

@@ -115,11 +115,10 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     - `models`, `excitations`, `channels`, `estimators`: names as on the command line.
     - `airframes`: names of presets, or of tables `[airframe.NAME]` with the keys of an airframe file.
-    - `input`: rotor speeds of each sample, by a name that `excitations` can use. In the file: a table of paths of CSV
-      files with `t` and `omega1..4`, as `jaxos4 design` writes them, relative to the folder of the specification.
+    - `input`: more excitations: rotor speeds of each sample, by name. In the file: a table of paths of CSV files with
+      `t` and `omega1..4`, as `jaxos4 design` writes them, relative to the folder of the specification.
     - `durations` [s], at a sample time of `dt` [s].
-    - `methods`: the integration method of true flights; estimators simulate by `fit_method`. If both are the same, the
-      model has no discretisation error (the inverse crime).
+    - `methods`: the integration method of true flights; estimators simulate by `fit_method`.
     - `noises`, `scales`: kinds of noise, and multiples of the standard sensors'. At scale 0 flights are exact, and
       estimators assume the noise of scale 1.
     - `widths`: widths of the brackets, in multiples of the model's default half-width.
@@ -128,8 +127,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
       around the airframe's.
     - `initial_state`: `"known"`, or `"free"`: estimated too.
     - `flights`, `seed`: number of flights of a scenario, and the random seed.
-    - `batch`: flights of a cell, identified at once by one device: as many as fit in memory, thousands for a GPU. The
-      last digits of results depend on it.
+    - `batch`: flights of a cell, identified at once by one device. The last digits of results depend on it.
     - `precision`: `"float64"` or `"float32"`.
     - `network`: how networks are trained; a table.
     """
@@ -160,23 +158,23 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def __post_init__(self):
         for axis in AXES:
             values = getattr(self, axis)
+            more = self.input if axis == "excitations" else ()
+            choices = [*(_CHOICES[axis] if axis in _CHOICES else values), *more]
             if not values:
                 raise InputError(f"`{axis}` is empty; give at least one value.")
             if len(set(values)) < len(values):
                 raise InputError(f"`{axis}` names a value twice: {', '.join(map(str, values))}; remove one.")
-            for value in values if axis in _CHOICES else ():
-                choices = [*_CHOICES[axis], *(self.input if axis == "excitations" else ())]
+            for value in values:
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise InputError(f"`{axis}` must be finite numbers, got {value}; correct it.")
                 if value not in choices:
                     raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(choices)}.")
-            if any(isinstance(value, float) and not math.isfinite(value) for value in values):
-                raise InputError(f"`{axis}` must be finite numbers, got {', '.join(map(str, values))}; correct them.")
         if not math.isfinite(self.dt):
             raise InputError(f"`dt` must be finite, got {self.dt}; give the sample time in seconds.")
-        if not self.title.isprintable():
-            raise InputError("`title` has a line break or another control character; remove it.")
+        for key, text in (("title", self.title), *(("airframe", name) for name in self.airframe)):
+            if not text.isprintable():
+                raise InputError(f"`{key}` has a line break or another control character; remove it.")
         for name, table in self.airframe.items():
-            if not (name.isprintable() and name.strip()):
-                raise InputError(f"[airframe.{name[:60]!r}]: its name is empty or not printable; rename it.")
             if name not in self.airframes:
                 raise InputError(f"[airframe.{name}] is not flown; name it in `airframes`, or remove it.")
             if not all(math.isfinite(value) for value in table.values() if isinstance(value, float)):
@@ -185,8 +183,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             self.vehicle(name)
         for duration in self.durations:
             if not 2 <= duration / self.dt <= _MOST_SAMPLES:
-                limits = f"2 to {_MOST_SAMPLES} samples"
-                raise InputError(f"`durations`: {duration:g} s at `dt` {self.dt:g} s is not {limits}; change one.")
+                got = f"{duration:g} s at `dt` {self.dt:g} s"
+                raise InputError(f"`durations`: {got} is not 2 to {_MOST_SAMPLES} samples; change one.")
         if self.count > _MOST_CELLS:
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
         if (estimates := math.prod(self.shape) * self.flights) > _MOST_ESTIMATES:
@@ -231,10 +229,9 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def job(self, scenario: Scenario) -> Job | None:
         """The network that a scenario's estimator needs; `None` if it needs none."""
         kind = ESTIMATORS[scenario.estimator]
-        if not kind.needs_network:
-            return None
         channels = self.seed_channels(scenario) if kind.shoots else scenario.seen
-        return Job(scenario.model, scenario.airframe, scenario.excitation, scenario.duration, scenario.width, channels)
+        same = (getattr(scenario, name) for name in Job._fields[:-1])
+        return Job._make([*same, channels]) if kind.needs_network else None
 
     def seed_channels(self, scenario: Scenario) -> str:
         """The channels that a hybrid's network looks at: it only says where to shoot."""

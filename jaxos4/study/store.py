@@ -36,7 +36,6 @@ class Store:
     directory: Path
     study: Study
     device: str
-    version: str
 
     def cell_file(self, index: int) -> Path:
         """The file of a cell."""
@@ -66,17 +65,16 @@ class Store:
     def write_cell(self, index: int, data: bytes, seconds: float) -> None:
         """Writes the file of a cell, and an entry of the log with the seconds that it took."""
         write_file(self.cell_file(index), data)
-        self.log(cell=index, seconds=seconds)
+        self._log(cell=index, seconds=seconds)
 
     def write_network(self, number: int, data: bytes, **entry: Any) -> None:
         """Writes the file of a network, and an entry of the log."""
         write_file(self.network_file(number), data)
-        self.log(network=number, **entry)
+        self._log(network=number, **entry)
 
-    def log(self, **entry: Any) -> None:
-        """Adds an entry to the log."""
+    def _log(self, **entry: Any) -> None:
         with open(self.directory / _LOG, "a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
+            file.write("\n" + json.dumps(entry))  # after the end of a line that a kill or a full disk cut
 
     def read_log(self) -> list[dict[str, Any]]:
         """The entries of the log in their order, without lines that a kill cut."""
@@ -103,87 +101,60 @@ class Store:
 def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
     """Opens the folder of a study, new or to be resumed, and locks it until the block ends.
 
-    **Arguments:**
-
-    - `device`: the devices that compute, in words; a resumed study keeps those of its first run.
+    `device`: the devices that compute, in words; a resumed study keeps those of its first run.
 
     **Raises:** `InputError` if the folder holds another study (with what differs), other files, or a study that another
     run is computing; `OSError` if it cannot be written to.
     """
-    _check_folder(directory)
+    check_store(directory, study)
     directory.mkdir(parents=True, exist_ok=True)
-    lock = filelock.FileLock(directory / _LOCK, timeout=0)
     try:
-        lock.acquire()
+        with filelock.FileLock(directory / _LOCK, timeout=0):
+            store = check_store(directory, study, device)
+            if not (directory / _SPECIFICATION).exists():
+                header = {"version": importlib.metadata.version("jaxos4"), "device": device, "study": study}
+                data = msgspec.json.format(msgspec.json.encode(header), indent=2)
+                write_file(directory / _SPECIFICATION, data + b"\n")
+            for folder in (directory, directory / "cells", directory / "networks"):
+                folder.mkdir(exist_ok=True)
+                for unfinished in folder.glob(_UNFINISHED):
+                    unfinished.unlink(missing_ok=True)
+            yield store
     except filelock.Timeout:
         remedy = "wait for its end, or give another folder"
         raise InputError(f"{directory}: another run is at work on this study; {remedy}.") from None
-    try:
-        store = check_store(directory, study, device)
-        if not (directory / _SPECIFICATION).exists():
-            header = {"version": store.version, "device": device, "study": study}
-            write_file(directory / _SPECIFICATION, msgspec.json.format(msgspec.json.encode(header), indent=2) + b"\n")
-        for folder in (directory, directory / "cells", directory / "networks"):
-            folder.mkdir(exist_ok=True)
-            for unfinished in folder.glob(_UNFINISHED):
-                unfinished.unlink(missing_ok=True)
-        log = directory / _LOG
-        if log.exists() and not log.read_bytes().endswith(b"\n"):  # a kill or a full disk cut a line
-            with open(log, "ab") as file:
-                file.write(b"\n")
-        yield store
-    finally:
-        lock.release()
 
 
 def read_store(directory: Path) -> Store:
     """Opens the folder of a study to read. Raises `InputError` if it holds no study, or one of another version."""
-    path = directory / _SPECIFICATION
-    ours = importlib.metadata.version("jaxos4")
+    path, ours = directory / _SPECIFICATION, importlib.metadata.version("jaxos4")
     try:
-        data = path.read_bytes()
-        version = msgspec.json.decode(data, type=_Version).version
-        if version != ours:
-            raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {ours}; give another folder.")
-        header = msgspec.json.decode(data, type=_Header)
+        header = msgspec.json.decode(path.read_bytes())
+        if (version := header["version"]) == ours:
+            return Store(directory, msgspec.convert(header["study"], Study), header["device"])
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.") from None
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except (*BROKEN, msgspec.MsgspecError) as error:
         what = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not the specification of a study ({what}); give another folder.") from None
-    return Store(directory, header.study, header.device, header.version)
-
-
-class _Version(msgspec.Struct):
-    version: str
-
-
-class _Header(_Version):
-    device: str
-    study: Study
+    raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {ours}; give another folder.")
 
 
 def check_store(directory: Path, study: Study, device: str = "") -> Store:
     """The folder of a study as a run would find it; nothing is written. Raises `InputError` as `open_store` does."""
-    _check_folder(directory)
+    if directory.exists() and not directory.is_dir():
+        raise InputError(f"{directory}: is a file; give a folder for the study.")
     if not (directory / _SPECIFICATION).exists():
-        return Store(directory, study, device, importlib.metadata.version("jaxos4"))
+        names = {path.name for path in directory.glob("*")} - {path.name for path in directory.glob(_UNFINISHED)}
+        if names - {_LOCK}:
+            raise InputError(f"{directory}: holds {min(names)} and no study; give an empty or a new folder.")
+        return Store(directory, study, device)
     store = read_store(directory)
     now, before = msgspec.to_builtins(study), msgspec.to_builtins(store.study)
     changed = [f"`{key}` was {_short(before[key])}, now {_short(now[key])}" for key in now if now[key] != before[key]]
     if changed:
         raise InputError(f"{directory}: holds another study: {'; '.join(changed)}; give another folder.")
     return store
-
-
-def _check_folder(directory: Path) -> None:
-    if not directory.exists():
-        return
-    if not directory.is_dir():
-        raise InputError(f"{directory}: is a file; give a folder for the study.")
-    names = {path.name for path in directory.iterdir()} - {path.name for path in directory.glob(_UNFINISHED)}
-    if _SPECIFICATION not in names and names - {_LOCK}:
-        raise InputError(f"{directory}: holds {min(names)} and no study; give an empty or a new folder.")
 
 
 def _short(value: Any) -> str:
