@@ -18,6 +18,8 @@ from .results import Constant, ParameterEstimate, RigidBody, finite_or_none
 UNIT = "kg m^2"
 # The place of the alpha that is torque over this moment of inertia.
 INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
+# The scale of an accelerometer is known to 1 %, and so is what forward flight adds to the lift of rotors.
+_SCALE = 0.01
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
 _UNKNOWN = 1e3
 
@@ -100,6 +102,10 @@ def vehicle_constants(fit: Fit) -> RigidBody:
     unknown = np.where(known, 0.0, (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(unknown)
     scaled = any(model.parameters[i].scales_torque for i in free)
+    if scaled:
+        # What no likelihood sees makes all moments of inertia wrong by one factor.
+        shared = _SCALE * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
+        covariance += shared[:, None] * shared
     constants, thrust = {}, "mass" if scaled else "thrust_coefficient"
     notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and drag are right"}
     for name, row in INVERSE.items():

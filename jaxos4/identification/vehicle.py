@@ -33,7 +33,7 @@ _FIRST_SIGMA = 0.5
 # A flight has so many segments, which are filtered in parallel, and whose disagreement shows errors of the model; more
 # if there are several times so many recordings; fewer if they would be shorter than the last number [s].
 _SEGMENTS, _FEW_RECORDINGS, _SHORTEST_SEGMENT = 16, 4, 1.25
-# The cost has kinks where a delay passes a sample. Slopes jump closer to the minimum than this [standard deviations].
+# The cost has kinks where a delay passes a sample. Closer to the minimum than this, slopes jump [standard deviations].
 _KINKS = 0.05
 # The thrust carries the weight but for the velocity that a stretch gains [m/s], and for this share of the weight.
 _GAINED, _CARRIED = 1.0, 0.003
@@ -170,13 +170,17 @@ def _innovations(
 
 
 def _balance(prepared: Prepared, airframe: Airframe, capacity: int) -> Balance | None:
-    """The balance of weight, if the tilt is known: over each stretch the vehicle gains a velocity of about 1 m/s."""
+    """The balance of weight, if the tilt is known: over each stretch the vehicle gains a velocity of about 1 m/s.
+
+    Drag carries a part of the weight of a vehicle that leans into its airspeed.
+    """
     if prepared.upright is None:
         return None
     samples, gravity = prepared.upright.size, float(airframe.gravity)
     gained = _GAINED * np.sqrt(len(prepared.recordings)) / (samples * float(prepared.fitted.dt))
     weight = np.pad(prepared.upright / samples, (0, capacity - samples))
-    return Balance(weight, gravity, np.hypot(gained, _CARRIED * gravity))
+    drag_lift = prepared.drag_lift if np.isfinite(prepared.drag_lift) else 0.0
+    return Balance(weight, gravity - drag_lift, np.hypot(gained, _CARRIED * gravity))
 
 
 def _held_out(

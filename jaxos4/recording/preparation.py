@@ -50,6 +50,7 @@ class Prepared(NamedTuple):
     - `length`: of a window, in samples.
     - `available`: what every recording offers to the terms of a model, see `Term.needs`.
     - `upright`: the cosine of the tilt at each sample. `None`: unknown.
+    - `drag_lift`: the mean of `Motion.drag_lift` [m/s^2]. NaN: not measured.
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
     - `doubts`: cause and remedy of each doubt about the logs.
@@ -62,6 +63,7 @@ class Prepared(NamedTuple):
     length: int
     available: frozenset[str]
     upright: Float[np.ndarray, " samples"] | None
+    drag_lift: float
     seconds: tuple[float, float]
     notes: tuple[str, ...]
     doubts: tuple[tuple[str, str], ...]
@@ -213,6 +215,7 @@ def sampled(
         length,
         _available_inputs(whole, pieces, airframe, motions if moved else []),
         np.concatenate([motion.up[:, 2] for motion in motions]) if moved else None,
+        _mean([motion.drag_lift for motion in motions]) if moved else math.nan,
         seconds,
         usable.notes,
         usable.doubts,
@@ -235,6 +238,12 @@ def _available_inputs(
         VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
+
+
+def _mean(series: Sequence[np.ndarray]) -> float:
+    """The mean of what was measured; NaN if nothing was."""
+    values = np.concatenate(series)
+    return float(np.nanmean(values)) if np.isfinite(values).any() else math.nan
 
 
 def _seconds(recording: Recording) -> float:

@@ -49,7 +49,7 @@ class Balance(NamedTuple):
     """The balance of thrust and weight: over a flight the thrust carries the weight.
 
     - `weight`: of the specific force along z at each sample: the cosine of the tilt over the number of samples.
-    - `gravity`, `sigma`: the weighted sum, and its standard deviation [m/s^2].
+    - `gravity`, `sigma`: the weighted sum, without what drag carries of the weight, and its standard deviation [m/s^2].
     """
 
     weight: Float[Numeric, " samples"]
