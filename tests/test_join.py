@@ -1,17 +1,22 @@
 """Stretches joined into one flight of windows, and rows averaged onto a coarser grid."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import standard_flight
 from hypothesis import given, settings, strategies as st
 
 import jaxos4
+from jaxos4.errors import InputError
 from jaxos4.flight import Stretches, fill_gaps
 from jaxos4.logs.sampling import average
 from jaxos4.recording import Recording
 from jaxos4.recording.pieces import averaged, cut
+from jaxos4.recording.reading import as_recording
 from jaxos4.recording.usable import Stretch
 from jaxos4.shooting.padding import padded
 
@@ -182,3 +187,16 @@ def test_gaps_are_filled_from_their_own_stretch():
     found = fill_gaps(values, Stretches.of(number))[:, 0]
     np.testing.assert_array_equal(found, [1, 1, 1, 2, 0, 0, 5, 5, 5, 5])
     np.testing.assert_array_equal(fill_gaps(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])
+
+
+def test_impossible_values_of_a_flight_are_missing():
+    """A single glitch is no reason to lose a flight; many are one to refuse it."""
+    flight = standard_flight()
+    glitches = dataclasses.replace(flight, states=flight.states.at[7, 1].set(1e9).at[30, 7].set(-1e6))
+    found = as_recording(glitches)
+    assert np.argwhere(np.isnan(found.states)).tolist() == [[7, 1], [30, 7]]
+    (note,) = found.notes
+    assert note.startswith("impossible values count as not measured, in vx: 1 (first 1e+09 m/s at 0.07 s), p: 1 (first")
+    assert as_recording(flight).notes == ()
+    with pytest.raises(InputError, match=r"flight: field p: at 0 s is 1e\+06 rad/s, beyond 60 rad/s"):
+        as_recording(dataclasses.replace(flight, states=flight.states.at[:20, 7].set(1e6)))

@@ -66,8 +66,7 @@ def recording_of(
     dt = _check_time(table)
     table = _check_units(table.without_impossible())
     if table.impossible:
-        what = [f"{table.names.get(n, n)}: {k} (first {first})" for n, (k, first) in table.impossible.items()]
-        found.append(f"impossible values count as not measured, in {', '.join(what)}")
+        found.append(table.impossible_note)
     omega = _rotor_speeds(table, airframe, full_scale, found)
     if airframe is not None:
         thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient

@@ -145,6 +145,12 @@ class Table(NamedTuple):
         """Whether all these columns are there."""
         return self.columns.keys() >= set(names)
 
+    @property
+    def impossible_note(self) -> str:
+        """The values that `without_impossible` took out, in words."""
+        what = [f"{self.names.get(name, name)}: {k} (first {first})" for name, (k, first) in self.impossible.items()]
+        return f"impossible values count as not measured, in {', '.join(what)}"
+
     def without_impossible(self, limits: Mapping[str, Limit] = LIMITS) -> "Table":
         """The table without the values outside of `limits`: they count as not measured.
 

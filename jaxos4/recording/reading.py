@@ -3,8 +3,10 @@
 import os
 from collections.abc import Sequence
 
-from ..flight import Flight
-from ..logs import FORMATS, Recording as Recording, log_format, read_recording as read_recording
+import numpy as np
+
+from ..flight import CHANNEL_NAMES, Flight
+from ..logs import FORMATS, Recording as Recording, Table, log_format, read_recording as read_recording
 
 
 def vehicle_evidence(recording: Recording) -> str:
@@ -31,5 +33,17 @@ def as_recordings(
 
 
 def as_recording(flight: Flight | Recording, name: str = "flight") -> Recording:
-    """A flight as a recording of this name. A recording stays as it is."""
-    return flight if isinstance(flight, Recording) else Recording.of(flight, name)
+    """A flight as a recording of this name, without impossible values. A recording stays as it is.
+
+    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible.
+    """
+    if isinstance(flight, Recording):
+        return flight
+    found = Recording.of(flight, name)
+    columns = {"t": found.time, **dict(zip(CHANNEL_NAMES, found.channels.T, strict=True))}
+    table = Table(name, columns, first_row=None).without_impossible()
+    if not table.impossible:
+        return found
+    states, force = np.split(np.stack([table.columns[each] for each in CHANNEL_NAMES], axis=1), [12], axis=1)
+    specific = None if found.specific_force is None else force
+    return found._replace(states=states, specific_force=specific, notes=(table.impossible_note,))
