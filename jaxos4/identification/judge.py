@@ -244,13 +244,15 @@ def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
         )
 
 
-def _negative_drag(fit: Fit) -> Iterator[Doubt]:
-    """A vertical drag that came out negative, and is held at 0."""
-    if "z_drag" in fit.held and fit.held["z_drag"].value == 0:
-        yield _implausible(
-            "z_drag came out negative: no inflow makes thrust grow with the velocity along z",
-            "check the z axes of the log and `mass`, and fly climbs and descents",
-        )
+def _held_at_zero(fit: Fit) -> Iterator[Doubt]:
+    """Parameters that came out negative and are held at 0, if their term doubts such a flight."""
+    for parameter in fit.problem.model.parameters:
+        held = fit.held.get(parameter.name)
+        if held is None or held.value != 0 or not parameter.nonnegative or parameter.contradiction is None:
+            continue
+        verdict = parameter.contradiction(-np.inf, 0.0)
+        if verdict is not None:
+            yield _implausible(f"{parameter.name} {verdict[0]}", verdict[1])
 
 
 def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:
@@ -339,7 +341,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     doubts = (
         *(_implausible(cause, remedy) for cause, remedy in case.doubts),
         *(_implausible(why, f"fly more {axis}, or in calmer air") for axis, why in weak.items()),
-        *_negative_drag(fit),
+        *_held_at_zero(fit),
         *doubts_of(fit.problem.model, trusted, body.constants, skill, still, case.log_step),
     )
     step = float(fit.problem.flight.dt)

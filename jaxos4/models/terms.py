@@ -159,6 +159,8 @@ _GAINS = (
 )
 _BENT = f"is outside of 0 (linear) to {_STEEPEST:g}: the thrust of no propeller grows so with its speed"
 _CLIMB = "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`"
+_GROWS = "is negative: no inflow makes thrust grow with the velocity along z"
+_CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, and fly climbs and descents"))
 _OFF = f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so that the thrust is not the weight"
 _LEVEL = _limits((-2 * _BIAS, 2 * _BIAS, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
 
@@ -320,7 +322,7 @@ TERMS: dict[str, Term] = {
     "inflow": Term(
         "thrust falls with the velocity along z, which changes the inflow of the rotors: z_drag [1/s]",
         # g over twice the induced velocity, which is 4 to 10 m/s in hover.
-        (TermParameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True),),
+        (TermParameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
         needs=frozenset({AXIAL_VELOCITY, VERTICAL_FORCE}),
         by_default=lambda available: True,
         specific_force=_add_inflow,
