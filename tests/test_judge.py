@@ -3,17 +3,28 @@
 from pathlib import Path
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import chdtri
 
 import jaxos4
 from jaxos4.airframe import OS4
+from jaxos4.identification.answers import overwhelmed
+from jaxos4.identification.fit import Fit
 from jaxos4.identification.jackknife import disagreement, parts_of
-from jaxos4.identification.judge import doubts_of, overwhelmed, vibration
-from jaxos4.identification.results import Constant, Disturbance, ParameterEstimate, PredictionSkill, RateSkill
+from jaxos4.identification.judge import doubts_of, vibration
+from jaxos4.identification.results import (
+    Constant,
+    Disturbance,
+    HeldParameter,
+    ParameterEstimate,
+    PredictionSkill,
+    RateSkill,
+)
 from jaxos4.models.os4 import CorrectedOS4
 from jaxos4.recording import read_recording
+from jaxos4.results import RESULTS
 
 AIRFRAME = Path(__file__).parents[1] / "experiments" / "real_flight" / "crazyflie.toml"
 VEHICLE = jaxos4.FlightModel(
@@ -70,7 +81,10 @@ def test_nothing_speaks_against_a_good_estimate():
         ({"alpha7": (-3.0, 0.1)}, ("alpha7", "contradict")),
         ({"rotor_lag": (-0.02, 0.003)}, ("rotor_lag = -0.02 s is negative", "omega1..4")),
         ({"rotor_delay": (-0.06, 0.003)}, ("rotor_delay", "60 ms late", "time stamps")),
-        ({"thrust_curve": (1.5, 0.03)}, ("thrust_curve = 1.5 is outside of 0 (linear) to 1.2", "climbs")),
+        (
+            {"thrust_curve": (1.5, 0.03)},
+            ("thrust_curve = 1.5 is not between 0 (thrust linear", "climbs"),
+        ),
         ({"az_bias": (1.2, 0.02)}, ("az_bias = 1.2 m/s^2", "levelled accelerometer", "mass")),
         ({"thrust_gain": (0.02, 0.01)}, ("accelerometer", "does not follow")),
         ({"thrust_gain": (-1.0, 0.05)}, ("z axis points down",)),
@@ -148,18 +162,22 @@ def test_the_cause_comes_before_the_missing_skill():
 def test_a_disturbance_larger_than_the_control_is_named():
     omega = np.asarray(OS4.hover_speed) + np.random.default_rng(0).normal(0, 1.0, (1000, 4))
     torque = (omega[:-1] ** 2 @ np.asarray(OS4.mixer)[:3].T).std(axis=0)
-    found = {
-        name: parameter(1.0 / inertia, 0.1)
-        for name, inertia in zip(("alpha3", "alpha6", "alpha8"), OS4.inertia.tolist(), strict=True)
-    }
     sizes = torque / np.asarray(OS4.inertia) * np.array([0.9, 1.1, 0.9])
     gusts = {
         rate: Disturbance(size, "rad/s^2", 0.1, 0.01, 0.0) for rate, size in zip("pqr", sizes.tolist(), strict=True)
     }
-    weak = overwhelmed(omega, OS4, gusts, found)
+    model = jaxos4.CorrectedOS4(OS4)
+    flight = jaxos4.Flight(0.01 * np.arange(1000), omega, np.full((1000, 12), np.nan))
+    problem = jaxos4.ShootingProblem(model, flight, sigma=np.ones(12))
+    estimate = jaxos4.Estimate(
+        model.alpha, jnp.eye(8), jnp.zeros(3), *map(jnp.asarray, (0.0, 1, 1)), RESULTS.successful
+    )
+    fit = Fit(problem, estimate, np.ones(8), 1, disturbances=gusts)
+    weak = overwhelmed(fit)
     assert list(weak) == ["pitch"]
     assert "about pitch, the disturbance" in weak["pitch"]
-    assert not overwhelmed(omega, OS4, gusts, {})
+    held = {"alpha6": HeldParameter(0.0, "1", "")}
+    assert not overwhelmed(fit._replace(held=held))
 
 
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.

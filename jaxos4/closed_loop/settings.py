@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 from .._custom_types import Scalar, as_float
 from ..airframe import Airframe
 from ..models.rotors import Motor
+from ..models.terms import STEEPEST, has_full_scale
 from ..noise import FORCE_SIGMA
 
 PerAxis = Float[Array, "3"]
@@ -117,14 +118,14 @@ class ClosedLoop(eqx.Module):
 
     A setting "for each axis" is one number for all axes, or three for roll, pitch and yaw.
 
-    The vehicle. Its equations are those of `FlightModel` with the terms offset, damping, reaction, lag and delay, and
+    The vehicle. Its equations are those of `FlightModel` with the terms offset, damping, reaction, motor and delay, and
     what `air` adds:
 
     - `airframe`: the true constants. Rotor speeds lie between 0 and its `max_rotor_speed`. Its `rotor_inertia` makes
       the gyroscopic torque and the yaw moment of rotors that accelerate.
     - `rotor_lag`, `rotor_delay`: lag and delay of the rotors behind their commands [s], not only whole samples.
-    - `thrust_curve`, `motor_braking`: 1 for rotors that follow as first-order systems, else see `jaxos4.models.rotors`.
-      Both need `max_rotor_speed`.
+    - `thrust_curve`, `motor_braking`: see `jaxos4.models.rotors`. With 1 and 1, rotors are first-order systems. Other
+      values need `max_rotor_speed`.
     - `offset`: a constant torque over the inertia, for each axis [rad/s^2].
     - `damping`: a moment against the body rate, for each axis [1/s].
     - `sag`: the share of their thrust and drag that the rotors lose during the flight, linearly in time.
@@ -157,8 +158,8 @@ class ClosedLoop(eqx.Module):
     airframe: Airframe
     rotor_lag: Scalar = eqx.field(converter=setting("rotor_lag"), default=0.05)
     rotor_delay: Scalar = eqx.field(converter=setting("rotor_delay"), default=0.01)
-    thrust_curve: Scalar = eqx.field(converter=setting("thrust_curve"), default=1.0)
-    motor_braking: Scalar = eqx.field(converter=setting("motor_braking"), default=1.0)
+    thrust_curve: Scalar = eqx.field(converter=setting("thrust_curve", high=STEEPEST), default=1.0)
+    motor_braking: Scalar = eqx.field(converter=setting("motor_braking", high=1.0), default=1.0)
     offset: PerAxis = eqx.field(converter=setting("offset", _BODY, low=-np.inf), default=0.0)
     damping: PerAxis = eqx.field(converter=setting("damping", _BODY, low=-np.inf), default=0.0)
     sag: Scalar = eqx.field(converter=setting("sag", high=1.0), default=0.0)
@@ -184,6 +185,9 @@ class ClosedLoop(eqx.Module):
             raise ValueError(f"`logged` must be one of {', '.join(LOGGED)}, got {self.logged!r}.")
         if self.log_every < 1:
             raise ValueError(f"`log_every` must be at least 1, got {self.log_every}.")
+        loaded = [x for x in (self.thrust_curve, self.motor_braking) if not isinstance(x, Tracer) and float(x) != 1]
+        if loaded and not has_full_scale(self.airframe):
+            raise ValueError("`airframe.max_rotor_speed` must be known for `thrust_curve` and `motor_braking`: set it.")
 
     @property
     def motor(self) -> Motor:

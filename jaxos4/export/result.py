@@ -28,7 +28,7 @@ _NOT_EXPORTED = {
     ("roll_velocity", "pitch_velocity"): "no simulator has a moment proportional to the body velocity",
     ("roll_flapping", "pitch_flapping"): "no simulator has a moment proportional to the lateral specific force",
     ("voltage_exponent", "battery_fade"): "no simulator has the battery's voltage",
-    ("motor_braking",): "no simulator has motors that brake less than they drive",
+    ("motor_braking",): "is not carried: exported motors brake as they drive",
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
     ("alpha1", "alpha4", "alpha7"): "replaced by the values that follow from Ix, Iy, Iz",
 }
@@ -216,6 +216,9 @@ def _vehicle_parts(file: _File, covariance: np.ndarray) -> _Parts:
     """The parameters of a `FlightModel`."""
     rows, notes = file.parameters, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
+    for moment, name in INERTIAS.items():
+        if file.constants and moment not in file.constants:
+            found.pop(name, None)  # the estimate says that this one is not to be trusted
     if "rotor_reaction" in found and not found["rotor_reaction"][0] > _SIGNIFICANT * found["rotor_reaction"][1]:
         del found["rotor_reaction"]
         notes.append("rotor_reaction: below noise; the inertia of the rotors is the airframe's")

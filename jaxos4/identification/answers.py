@@ -18,7 +18,8 @@ from .results import Constant, ParameterEstimate, RigidBody, finite_or_none
 UNIT = "kg m^2"
 # The place of the alpha that is torque over this moment of inertia.
 INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
-# The scale of an accelerometer is known to 1 %, and so is what forward flight adds to the lift of rotors.
+AXES = {"p": "roll", "q": "pitch", "r": "yaw"}
+# The scale of an accelerometer, with what forward flight adds to the lift of rotors, is known to 1 %.
 _SCALE = 0.01
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
 _UNKNOWN = 1e3
@@ -70,6 +71,22 @@ def _note(fit: Fit, i: int, half_width: float) -> str:
     if seed is not None and not np.asarray(seed.lower)[i] <= value <= np.asarray(seed.upper)[i]:
         notes.append("outside the network's interval")
     return "; ".join(notes)
+
+
+def overwhelmed(fit: Fit) -> dict[str, str]:
+    """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words."""
+    omega, mixer = np.asarray(fit.problem.flight.omega, dtype=float), np.asarray(fit.problem.model.airframe.mixer)
+    torques, names = (omega[:-1] ** 2 @ mixer[:3].T).std(axis=0), fit.problem.model.parameter_names
+    alpha, weak = np.abs(np.asarray(fit.estimate.parameters)), {}
+    strengths = {rate: row.strength for rate, row in fit.disturbances.items()}
+    for (rate, axis), place, torque in zip(AXES.items(), INVERSE.values(), torques, strict=True):
+        control = alpha[place] * torque if names[place] not in fit.held else np.inf
+        if strengths.get(rate, 0.0) > control:
+            weak[axis] = (
+                f"about {axis}, the disturbance ({strengths[rate]:.2g} rad/s^2) is larger than what the rotors do "
+                f"({control:.2g} rad/s^2)"
+            )
+    return weak
 
 
 def rigid_body(case: Case, fit: Fit) -> RigidBody:

@@ -31,7 +31,7 @@ _PASSES = 3
 # A parameter that must not be negative, and is so by this many standard deviations, is held at 0.
 _NEGATIVE = 2.0
 _PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
-_NEGATIVE_NOTE = "came out negative, which is impossible in air"
+_NEGATIVE_NOTE = "came out negative, which is impossible"
 Progress = Callable[[str], None]
 
 
@@ -44,7 +44,8 @@ class Fit(NamedTuple):
     - `rollouts`: of all searches together.
     - `diagnostics`: of the residuals; `evaluation`: the flight simulated at the estimate. `None` without an answer, and
       for innovations.
-    - `held`: parameters of a vehicle that are not estimated.
+    - `held`: parameters of a vehicle that are not estimated. `negative`: value and standard deviation of those that are
+      held at 0 because they came out negative.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `disturbances`: by channel. `noise`: the same as logarithms. Only for innovations.
     """
@@ -56,6 +57,7 @@ class Fit(NamedTuple):
     diagnostics: Diagnostics | None = None
     evaluation: Evaluation | None = None
     held: dict[str, HeldParameter] = {}
+    negative: dict[str, tuple[float, float]] = {}
     widened: dict[str, float] = {}
     disturbances: dict[str, Disturbance] = {}
     noise: LogNoise | None = None
@@ -146,6 +148,7 @@ def fit_innovations(
     rollouts, std = int(found.rollouts), _std(found)
     values, nonnegative = np.asarray(found.parameters), [each.nonnegative for each in problem.model.parameters]
     at_zero = nonnegative & (values[: own.count] < -_NEGATIVE * std[: own.count])
+    negative = {names[i]: (float(values[i]), float(std[i])) for i in np.flatnonzero(at_zero)}
     if at_zero.any() and has_answer(found):
         progress("fitting again without what came out negative")
         zero = {name: np.zeros(()) for name, negative in zip(names, at_zero, strict=True) if negative}
@@ -172,6 +175,7 @@ def fit_innovations(
         bound=std,
         rollouts=rollouts,
         held=held,
+        negative=negative,
         widened={names[i]: float(factor[i]) for i in range(own.count) if factor[i] > 1 and names[i] not in held},
         disturbances=_disturbances(problem, found, noise),
         noise=noise,

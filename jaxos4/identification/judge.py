@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from .._custom_types import as_float
@@ -13,7 +14,7 @@ from ..analysis.prediction import Predictions
 from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
-from .answers import INVERSE, parameter_table, rigid_body
+from .answers import AXES, overwhelmed, parameter_table, rigid_body
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
@@ -42,7 +43,6 @@ _VIBRATION, _LONGEST_SAMPLE = 0.4, 0.008
 _HORIZON = 0.25  # [s]
 # Value and standard deviation of each parameter that has an estimate.
 Found = dict[str, tuple[float, float]]
-_PLACES = {"p": "roll", "q": "pitch", "r": "yaw"}
 _OF_YAW = ("alpha7", "alpha8")
 _LONGEST_DELAY = 0.04  # [s], of rotors; more is an error of clocks
 
@@ -135,7 +135,7 @@ def vibration(disturbances: dict[str, Disturbance], sample_time: float) -> Itera
         2 * sample_time <= _LONGEST_SAMPLE
     )
     for name, row in disturbances.items():
-        if name in _PLACES and abs(row.correlation) > _VIBRATION:
+        if name in AXES and abs(row.correlation) > _VIBRATION:
             yield _implausible(
                 f"the noise of {name} is not white (innovations correlate by {row.correlation:.2g}): the gyro vibrates",
                 f"{longer}damp the vibration, or log faster",
@@ -205,35 +205,13 @@ def _contradictions(found: Found, stds: dict[str, float], airframe: Airframe) ->
         )
 
 
-def overwhelmed(
-    omega: np.ndarray,
-    airframe: Airframe,
-    disturbances: dict[str, Disturbance],
-    parameters: dict[str, ParameterEstimate],
-) -> dict[str, str]:
-    """The axes on which disturbances are larger than the torque of the rotors, each with the figures in words.
-
-    `omega`: speeds of the rotors, shape (samples, 4) [rad/s].
-    """
-    torques = (omega[:-1].astype(float) ** 2 @ np.asarray(airframe.mixer, dtype=float)[:3].T).std(axis=0)
-    found, weak = _found(parameters), {}
-    for (rate, axis), row, torque in zip(_PLACES.items(), INVERSE.values(), torques, strict=True):
-        value, _ = found.get(f"alpha{row + 1}", (np.inf, 0.0))
-        if rate in disturbances and disturbances[rate].strength > abs(value) * torque:
-            weak[axis] = (
-                f"about {axis}, the disturbance ({disturbances[rate].strength:.2g} rad/s^2) is larger than what the "
-                f"rotors do ({abs(value) * torque:.2g} rad/s^2)"
-            )
-    return weak
-
-
 def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
     """A lag or delay of the rotors that the log is too slow to show. `log_step`: its longest sample [s]."""
     lag, error = found.get("rotor_lag", (np.inf, 0.0))
     if -_SURE * error <= lag < log_step - _SURE * error:
         yield _implausible(
             f"rotor_lag = {lag:.2g} s is shorter than a sample of the log, {log_step:.2g} s",
-            "log faster, or leave out the term `lag`",
+            "log faster, or leave out the term `motor` or `lag`",
         )
     delay, error = found.get("rotor_delay", (0.0, 0.0))
     if abs(delay) - _SURE * error > _LONGEST_DELAY:
@@ -245,20 +223,17 @@ def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
 
 
 def _held_at_zero(fit: Fit) -> Iterator[Doubt]:
-    """Parameters that came out negative and are held at 0, if their term doubts such a flight."""
+    """Parameters that are held at 0, although their values contradict physics beyond chance."""
     for parameter in fit.problem.model.parameters:
-        held = fit.held.get(parameter.name)
-        if held is None or held.value != 0 or not parameter.nonnegative or parameter.contradiction is None:
-            continue
-        verdict = parameter.contradiction(-np.inf, 0.0)
-        if verdict is not None:
-            yield _implausible(f"{parameter.name} {verdict[0]}", verdict[1])
+        value, std = fit.negative.get(parameter.name, (0.0, 0.0))
+        if value < 0 and parameter.contradiction and (verdict := parameter.contradiction(value, _SURE * std)):
+            yield _implausible(f"{parameter.name} = {value:.2g} {verdict[0]}", verdict[1])
 
 
 def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:
     """The axes about which the held-out part hardly turns."""
     still = []
-    for (rate, axis), measured in zip(_PLACES.items(), np.moveaxis(predicted.measured, 2, 0), strict=True):
+    for (rate, axis), measured in zip(AXES.items(), np.moveaxis(predicted.measured, 2, 0), strict=True):
         noise = fit.disturbances[rate].sensor if rate in fit.disturbances else 0.0
         seen = measured[np.isfinite(measured)]
         if seen.size and seen.std() < max(WEAK, OVER_NOISE * noise):
@@ -269,7 +244,7 @@ def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:
 def _skill(skill: PredictionSkill | None, still: Sequence[str]) -> Iterator[Doubt]:
     if skill is None:
         return
-    if len(still) == len(_PLACES):
+    if len(still) == len(AXES):
         yield Doubt(
             "no_skill",
             "the held-out part hardly turns, so that no prediction checks the fit",
@@ -277,11 +252,11 @@ def _skill(skill: PredictionSkill | None, still: Sequence[str]) -> Iterator[Doub
         )
         return
     place = int(np.argmin(np.abs(np.array(skill.horizons) - _HORIZON)))
-    values = {rate: getattr(skill, rate).skill[place] for rate in _PLACES}
-    poor = [rate for rate, value in values.items() if value is not None and value <= 0 and _PLACES[rate] not in still]
+    values = {rate: getattr(skill, rate).skill[place] for rate in AXES}
+    poor = [rate for rate, value in values.items() if value is not None and value <= 0 and AXES[rate] not in still]
     if poor:
         named = ", ".join(f"{rate} {values[rate]:.2g}" for rate in poor)
-        axes = " and ".join(_PLACES[rate] for rate in poor)
+        axes = " and ".join(AXES[rate] for rate in poor)
         yield Doubt(
             "no_skill",
             f"the fit predicts {axes} {_HORIZON:g} s ahead no better than constant rates (skill {named})",
@@ -326,17 +301,22 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     if held_out is not None:
         progress("predicting what was not fitted")
         predicted, skill = predict_held_out(fit, held_out)
-    omega, airframe = np.asarray(fit.problem.flight.omega), fit.problem.model.airframe
+    airframe = fit.problem.model.airframe
     still = () if predicted is None else _still_axes(fit, predicted)
     notes = [
         f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`"
-    ] * (0 < len(still) < len(_PLACES))
-    weak, trusted = overwhelmed(omega, airframe, fit.disturbances, table), table
+    ] * (0 < len(still) < len(AXES))
+    weak, trusted = overwhelmed(fit), table
     if yaw := weak.pop("yaw", None):
         # Vehicles hardly yaw. The other axes do not need it.
         body = RigidBody({name: row for name, row in body.constants.items() if name != "Iz"})
         trusted = {name: row for name, row in table.items() if name not in _OF_YAW}
-        still = tuple({*still, "yaw"})
+        table |= {
+            name: msgspec.structs.replace(table[name], note="not identified: the disturbance is larger")
+            for name in _OF_YAW
+            if name in table
+        }
+        still = (*still, *({"yaw"} - {*still}))
         notes.append(f"Iz is not identified: {yaw}; fly more yaw, or in calmer air")
     doubts = (
         *(_implausible(cause, remedy) for cause, remedy in case.doubts),

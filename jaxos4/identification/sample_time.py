@@ -16,7 +16,7 @@ from ..airframe import Airframe
 from ..estimate import REACH
 from ..flight import Flight
 from ..shooting import InnovationsProblem
-from .answers import vehicle_constants
+from .answers import overwhelmed, vehicle_constants
 from .fit import Fit, fit_innovations
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
@@ -90,6 +90,8 @@ def moved(answer: SampleTime, other: SampleTime) -> list[str]:
 
 def _answer(case: Case, fit: Fit) -> SampleTime:
     constants = vehicle_constants(fit).constants if fit.answered else {}
+    if fit.answered and "yaw" in overwhelmed(fit):
+        constants = {name: row for name, row in constants.items() if name != "Iz"}
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in _RATES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
     flight = case.shooting.flight

@@ -30,9 +30,10 @@ from .settings import VehicleSettings
 
 # The scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
 _FIRST_SIGMA = 0.5
-# A flight has so many segments, which are filtered in parallel, and whose disagreement shows errors of the model; more
-# if there are several times so many recordings; fewer if they would be shorter than the last number [s].
-_SEGMENTS, _FEW_RECORDINGS, _SHORTEST_SEGMENT = 16, 4, 1.25
+# Segments of a flight. They are filtered in parallel, and their disagreement shows errors of the model.
+_SEGMENTS = 16
+_FEW_RECORDINGS = 4  # from twice this number of recordings on, there are more segments
+_SHORTEST_SEGMENT = 1.25  # no segment is shorter than this [s]
 # The cost has kinks where a delay passes a sample. Closer to the minimum than this, slopes jump [standard deviations].
 _KINKS = 0.05
 # The thrust carries the weight but for the velocity that a stretch gains [m/s], and for this share of the weight.
@@ -252,4 +253,6 @@ def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tu
         if missing:
             what = " and ".join(sorted(missing))
             raise InputError(f"`terms`: {term} needs {what}, which these logs did not measure; leave it out.")
+    if {"motor", "lag"} <= set(terms):
+        raise InputError("`terms`: motor includes the lag of the rotors; leave out lag.")
     return tuple(term for term in TERMS if term in terms)

@@ -22,8 +22,8 @@ _LEAST = 1e-6
 class Grid(NamedTuple):
     """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that.
 
-    `elapsed`: since the recording began [s]. `voltage`: the battery's, divided by the voltage to which the airframe's
-    rotor speeds belong. `length`: see `Inputs`.
+    `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by the voltage
+    to which the airframe's rotor speeds belong. `length`: see `Inputs`.
     """
 
     dt: Scalar
@@ -47,7 +47,9 @@ class Grid(NamedTuple):
         zeros = jnp.zeros(samples, dtype=int)
         stretches = inputs.stretches or (zeros, zeros, zeros + samples - 1)
         recording = zeros if recordings is None else jnp.asarray(recordings)[stretches[0]]
-        elapsed = inputs.dt * (jnp.arange(samples) - jnp.searchsorted(recording, recording))
+        row = jnp.arange(samples)
+        begins = jnp.full(max(recordings or (0,)) + 1, samples).at[recording].min(row)
+        elapsed = inputs.dt * (row - begins[recording])
         return cls(inputs.dt, *stretches, elapsed, voltage, inputs.length)
 
 
@@ -139,7 +141,7 @@ class Motor(NamedTuple):
     def settled(self, command: Speed) -> Speed:
         """The speed [rad/s] that a command keeps."""
         root = jnp.sqrt(jnp.maximum(self.curve**2 + 4 * (1 - self.curve) * command / self.full, _LEAST))
-        return 2 * command / (self.curve + root)
+        return 2 * command / jnp.maximum(self.curve + root, _LEAST)
 
     def step(self, omega: Speed, command: Speed, dt: Scalar) -> Speed:
         """The speed after a time `dt` [s], by exponential Euler steps.

@@ -36,8 +36,9 @@ _EARLY = 0.002
 # A thrust gain beyond this factor, or its reciprocal, is no error of a scale or of a propeller's table. An
 # accelerometer that follows less than the second number does not measure the thrust.
 _FAR_GAIN, _DEAD = 2.0, 0.2
-# A thrust curve beyond this is no propeller's. No levelled accelerometer has twice this bias [m/s^2].
-_STEEPEST, _BIAS = 1.2, 0.3
+STEEPEST = 1.2
+"""A thrust curve beyond this is no propeller's."""
+_BIAS = 0.3  # no levelled accelerometer has twice this bias [m/s^2]
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 # The yaw torque of the rotors as a share of their roll torque.
 _YAW = 0.2
@@ -157,7 +158,7 @@ _GAINS = (
     (-_INF, _FAR_GAIN, "(the accelerometer shows more thrust than the airframe has)", _SCALES),
     (1 / _FAR_GAIN, _INF, "(the accelerometer shows less thrust than the airframe has)", _SCALES),
 )
-_BENT = f"is outside of 0 (linear) to {_STEEPEST:g}: the thrust of no propeller grows so with its speed"
+_BENT = f"is not between 0 (thrust linear in the command) and {STEEPEST:g}: no motor with a propeller is like this"
 _CLIMB = "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`"
 _GROWS = "is negative: no inflow makes thrust grow with the velocity along z"
 _CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, and fly climbs and descents"))
@@ -275,17 +276,17 @@ TERMS: dict[str, Term] = {
         (
             _LAG,
             TermParameter(
-                "thrust_curve", "1", 0.25, center=0.85, contradiction=_limits((0.0, _STEEPEST, _BENT, _CLIMB))
+                "thrust_curve", "1", 0.25, center=0.85, contradiction=_limits((0.0, STEEPEST, _BENT, _CLIMB))
             ),
-            TermParameter("motor_braking", "1", 0.5, center=0.5, nonnegative=True),
+            TermParameter("motor_braking", "1", 0.6, center=0.5, nonnegative=True),
         ),
-        # A measured specific force tells the propellers' load from their thrust.
+        # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),
         by_default=lambda available: True,
         speed=_drive,
     ),
     "lag": Term(
-        "rotors follow their commands as first-order systems: rotor_lag [s], where no load is known",
+        "rotors follow their commands as first-order systems: rotor_lag [s]; if no load can be found",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
         speed=lambda speeds, values, grid, airframe: driven(speeds.begin, Motor(values["rotor_lag"]), grid),

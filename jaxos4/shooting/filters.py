@@ -35,7 +35,7 @@ LAGS = 8
 """The largest lag at which innovations are compared, in samples."""
 
 BLOCK = 32
-"""So many rows are filtered, and then their likelihood is summed."""
+"""The number of rows that are filtered before their likelihood is summed."""
 
 # The number of body rates, which come first among the channels.
 _RATES = 3

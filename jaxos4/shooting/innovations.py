@@ -71,8 +71,8 @@ class InnovationsProblem(AbstractProblem):
       sigma do not matter.
     - `segment`: about how many samples are filtered in a row; segments are filtered in parallel. A short segment loses
       information if the disturbance is weak, because its filter begins without memory.
-    - `segments`: how many segments there are, instead. Padded flights (`ShootingProblem.length`) with equal numbers of
-      segments and equal room share a program, whatever their lengths.
+    - `segments`: the number of segments; replaces `segment`. Padded flights (`ShootingProblem.length`) with equal
+      numbers of segments and equal room share a program, whatever their lengths.
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
@@ -97,6 +97,10 @@ class InnovationsProblem(AbstractProblem):
         start: Float[ArrayLike, " unknowns"] | None = None,
         balance: Balance | None = None,
     ):
+        number = 1 if segments is None else segments
+        for name, value, least in (("segment", segment, 1), ("segments", number, 1), ("settling", settling, 0)):
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
         self.balance = None if balance is None else jax.tree.map(as_float, balance)
         self.problem, self.segment, self.settling = problem.restrict("rates"), segment, settling
         self.segments = segments

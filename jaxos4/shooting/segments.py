@@ -29,7 +29,7 @@ class Segments(NamedTuple):
 
     - `place`: the samples of each segment, in a multiple of `BLOCK` rows.
     - `owned`: whether a sample belongs to a segment. Each belongs to one; in other segments it settles the filter.
-    - `rows`: of the segments; what follows is padding.
+    - `rows`: the number of rows that are used; the others are padding.
     """
 
     place: Int[Numeric, "segments time"]
@@ -61,7 +61,7 @@ def observe_in_segments(problem: ShootingProblem, segments: Segments, settling: 
     they count: a simulation begins at rest.
     """
     flight, index, samples = problem.flight, jnp.asarray(segments.place), problem.flight.time.shape[0]
-    exists, place = (index < samples).T, jnp.minimum(index, samples - 1)
+    exists, place = ((index >= 0) & (index < samples)).T, jnp.minimum(index, samples - 1)
     measured = problem.measured()
     restart, settled = _restarts(jnp.isnan(measured[:, :3]).all(axis=1), flight, settling)
 
