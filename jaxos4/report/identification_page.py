@@ -3,10 +3,11 @@
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +18,7 @@ from ..analysis.frequency_response import AxisResponse, FrequencyResponse
 from ..analysis.prediction import Predictions
 from ..identification.results import Identification, SampleTime
 from ..results import NINETY_FIVE
-from .html import drawings, render
+from .html import inline, render
 from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg, ticks_at
 from .text import MISSING, plain
 
@@ -39,33 +40,30 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
     check_writable(path)
     look = styles([found.estimator])[found.estimator]
-    predictions, responses, sample_times = (), (), ()
+    predicted, sample_time = found.predictions, found.provenance.sample_time
+    horizons = () if predicted is None else predicted.horizons
+    rates: dict[str, Figure] = {}
     with drawing():
-        if (predicted := found.predictions) is not None:
-            labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
-            rates = (predicted_rates(predicted, found.provenance.sample_time, at, look) for at in range(len(labels)))
-            files = dict(zip(labels, map(svg, rates), strict=True))
-            chosen = list(files).index(labels[int(np.argmin(np.abs(predicted.horizons - _SHOWN)))])
-            description = "Measured and predicted body rates p, q, r"
-            predictions = drawings(files, chosen, stem="predictions", description=description)
-        if found.response is not None:
-            files = {"": svg(frequency_responses(found.response, look))}
-            description = "Frequency response of roll, pitch and yaw"
-            responses = drawings(files, 0, stem="response", description=description)
-        if found.sample_times:
-            files = {"": svg(inertias_by_sample_time(found.sample_times, found.provenance.sample_time, look))}
-            description = "Moments of inertia against the sample time"
-            sample_times = drawings(files, 0, stem="sample_times", description=description)
+        if predicted is not None:
+            rates = {
+                f"{h:.3g} s ahead": predicted_rates(predicted, sample_time, i, look) for i, h in enumerate(horizons)
+            }
+        responses = {"": frequency_responses(found.response, look)} if found.response else {}
+        inertias = {"": inertias_by_sample_time(found.sample_times, sample_time, look)} if found.sample_times else {}
+        drawings = {
+            "predictions": _inlined("predictions", "Measured and predicted body rates p, q, r", rates),
+            "responses": _inlined("response", "Frequency response of roll, pitch and yaw", responses),
+            "sample_times": _inlined("sample_times", "Moments of inertia against the sample time", inertias),
+        }
     text = render(
         "identification.html.j2",
         filters={"number": _number, "interval": _interval, "share": _share, "plain": plain},
         title=title,
         found=found,
         ninety_five=NINETY_FIVE,
-        predictions=predictions,
+        **drawings,
+        chosen=int(np.argmin(np.abs(np.array(horizons) - _SHOWN))) if rates else 0,
         band=f"{100 * BAND:g}",
-        responses=responses,
-        sample_times=sample_times,
         command=found.provenance.command or "",
         notes=[*found.provenance.notes, *([found.motor_clock] if found.motor_clock else [])],
         provenance=[
@@ -76,6 +74,15 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     )
     with write_atomically(path) as beside:
         beside.write_text(text, encoding="utf-8")
+
+
+def _inlined(stem: str, description: str, figures: Mapping[str, Figure]) -> dict[str, Markup]:
+    """Figures by label, among which the reader of the page chooses, as elements of the page."""
+    said = {label: f"{description}, {label}" if label else description for label in figures}
+    return {
+        label: inline(svg(figure), stem=f"{stem}-{i}", description=said[label])
+        for i, (label, figure) in enumerate(figures.items())
+    }
 
 
 def _number(value: float | None, digits: int = _DIGITS) -> str:

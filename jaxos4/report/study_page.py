@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import xarray as xr
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from .._files import check_writable, write_atomically
 from . import study_figures, study_tables
-from .html import Drawing, drawings, render
-from .study_data import Scenario, names, nearest_scale, scale_labels, scenarios
+from .html import inline, render
+from .study_data import Scenario, names, scenarios
 from .style import drawing, pdf, styles, svg
 
 MOST_DRAWN = 12
@@ -35,25 +36,16 @@ SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
 EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "trajectories": study_figures.trajectories,
     "deviations": partial(study_figures.trajectories, minus_truth=True),
-    "path": study_figures.path,
     "search": study_figures.search,
     "training": study_figures.training,
 }
-# These figures show one noise scale: in the files, the scale nearest 1; on the page, the scale that the reader chooses.
-_ONE_SCALE = ("distribution",)
 
 
 class Drawn(NamedTuple):
-    """A figure of a study.
-
-    - `stem`: the name of its files, without the suffix.
-    - `files`: the bytes of its files, by suffix.
-    - `choices`: the SVG figures among which the reader of the page chooses, by label. The file is one of them.
-    """
+    """A figure of a study: the name of its files without the suffix, and their bytes by suffix."""
 
     stem: str
     files: dict[str, bytes]
-    choices: dict[str, bytes]
 
 
 def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
@@ -93,16 +85,9 @@ def draw(
     made = {}
     for name, draw_figure in figures.items():
         with drawing():
-            figure = draw_figure(data)
-            if figure is None:
-                continue
-            files, choices = {"svg": svg(figure)} | ({"pdf": pdf(figure)} if with_pdf else {}), {}
-            for place, label in enumerate(scale_labels(data)) if name in _ONE_SCALE else ():
-                if place == nearest_scale(data):
-                    choices[label] = files["svg"]
-                elif draw_figure(data.isel(scale=[place]), figure) is not None:
-                    choices[label] = svg(figure)
-        made[name] = Drawn(f"{name}{suffix}", files, choices or {"": files["svg"]})
+            if (figure := draw_figure(data)) is not None:
+                files = {"svg": svg(figure)} | ({"pdf": pdf(figure)} if with_pdf else {})
+                made[name] = Drawn(f"{name}{suffix}", files)
     return made
 
 
@@ -112,13 +97,12 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
     estimators = names(dataset, "estimator")
     missing, cells = study_tables.cells_not_run(dataset)
 
-    def inline(drawn: Drawn, description: str) -> tuple[Drawing, ...]:
-        chosen = list(drawn.choices.values()).index(drawn.files["svg"])
-        return drawings(drawn.choices, chosen, stem=drawn.stem, description=description, estimators=estimators)
+    def inlined(drawn: Drawn, description: str) -> Markup:
+        return inline(drawn.files["svg"], stem=f"{drawn.stem}-0", description=description, estimators=estimators)
 
     return render(
         "study.html.j2",
-        filters={"inline": inline},
+        filters={"inline": inlined},
         title=attributes.get("title", "") or "A study",
         command=attributes.get("command", ""),
         specification=attributes.get("specification", ""),

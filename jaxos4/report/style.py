@@ -59,7 +59,6 @@ _LEGEND_WIDTH = 1.4  # the width of one entry [inch]
 _INKED = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color", "xtick.color", "ytick.color")
 _RC: dict[Any, Any] = {
     **dict.fromkeys(_INKED, INK),
-    **dict.fromkeys((f"axes3d.{axis}axis.panecolor" for axis in "xyz"), "none"),
     **dict.fromkeys(("axes.labelsize", "font.size", "legend.fontsize"), 8.5),
     **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), 8),
     "axes.grid": True,
