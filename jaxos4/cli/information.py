@@ -25,9 +25,6 @@ _CHANNELS = (
     (("ax", "ay", "az"), "m/s^2"),
     (("rotor1", "rotor2", "rotor3", "rotor4"), "rad/s"),
 )
-# Parameters with less than this share of the largest one are not shown in a direction.
-_SMALL = 0.1
-_MOST_HALF_WIDTHS = 1e3
 
 
 def inspect(
@@ -186,22 +183,11 @@ def _print_information(console: "Console", found: "FlightInformation") -> None:
         limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
         rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit))
     numbers = ("bound", "others known", "of bracket", "noise limit")
-    Listing(("parameter", "unit", *numbers), rows, numbers).print_on(console)
+    notes = [row.note for row in found.parameters.values()]
+    Listing(("parameter", "unit", *numbers), rows, numbers, notes).print_on(console)
     console.print(
         "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
         "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
         "identifiable; noise limit: the largest noise, in multiples of the noise that was found, at which the "
         "airframe's value can be distinguished from 0."
-    )
-    for name, row in found.parameters.items():
-        if row.note:
-            console.print(f"{name}: {row.note}")
-    if found.eigenvalues is None or found.directions is None:
-        return
-    ordered = sorted(zip(found.parameters, found.directions[0], strict=True), key=lambda item: -abs(item[1]))
-    parts = " ".join(f"{part:+.2f} {name}" for name, part in ordered if abs(part) > _SMALL * abs(ordered[0][1]))
-    spread = max(found.eigenvalues[0], 1e-300) ** -0.5
-    size = f"{spread:.2g}" if spread < _MOST_HALF_WIDTHS else f"over {_MOST_HALF_WIDTHS:g}"
-    console.print(
-        f"weakest direction, in half-widths of the bracket: {parts}, known to {size} (1: no better than the bracket)."
     )
