@@ -88,17 +88,11 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
     assert all(p.read_bytes().startswith(b"%PDF") for p in report if p.suffix == ".pdf")
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     xr.testing.assert_equal(read_results(tmp_path), study)
-    (tmp_path / "figures").mkdir()
-    for name in ("error-7.svg", "error-7.pdf", "notes.svg"):
-        (tmp_path / "figures" / name).write_text("of before")
     code, out, err = run("report", str(tmp_path))
     assert (code, err) == (0, "")
     assert "10 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
-    # A figure of an older report goes, what is not ours stays.
-    left = {path.name for path in (tmp_path / "figures").iterdir()} - {path.name for path in report}
-    assert left == {"notes.svg"}
 
 
 def test_every_number_in_the_tables(study, page):

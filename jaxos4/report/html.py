@@ -24,7 +24,7 @@ def render(template: str, *, filters: Mapping[str, Any], **values: Any) -> str:
     return environment.get_template(template).render(**values)
 
 
-def inline(svg: bytes, *, stem: str, description: str, estimators: Sequence[str] = ()) -> Markup:
+def inline(svg: bytes, stem: str, description: str, *, estimators: Sequence[str] = ()) -> Markup:
     """The element `<svg>` for a page, from an SVG file.
 
     **Arguments:**

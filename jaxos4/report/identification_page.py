@@ -3,11 +3,10 @@
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -40,49 +39,34 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
     check_writable(path)
     look = styles([found.estimator])[found.estimator]
-    predicted, sample_time = found.predictions, found.provenance.sample_time
-    horizons = () if predicted is None else predicted.horizons
-    rates: dict[str, Figure] = {}
+    predicted, used = found.predictions, found.provenance
+    rates, response, inertias, chosen = {}, {}, {}, 0
     with drawing():
         if predicted is not None:
-            rates = {
-                f"{h:.3g} s ahead": predicted_rates(predicted, sample_time, i, look) for i, h in enumerate(horizons)
-            }
-        responses = {"": frequency_responses(found.response, look)} if found.response else {}
-        inertias = {"": inertias_by_sample_time(found.sample_times, sample_time, look)} if found.sample_times else {}
-        drawings = {
-            "predictions": _inlined("predictions", "Measured and predicted body rates p, q, r", rates),
-            "responses": _inlined("response", "Frequency response of roll, pitch and yaw", responses),
-            "sample_times": _inlined("sample_times", "Moments of inertia against the sample time", inertias),
-        }
+            chosen = int(np.argmin(np.abs(predicted.horizons - _SHOWN)))
+            for i, horizon in enumerate(predicted.horizons):
+                rates[f"{horizon:.3g} s ahead"] = svg(predicted_rates(predicted, used.sample_time, i, look))
+        if found.response is not None:
+            response[""] = svg(frequency_responses(found.response, look))
+        if found.sample_times:
+            inertias[""] = svg(inertias_by_sample_time(found.sample_times, used.sample_time, look))
     text = render(
         "identification.html.j2",
-        filters={"number": _number, "interval": _interval, "share": _share, "plain": plain},
+        filters={"number": _number, "interval": _interval, "share": _share, "plain": plain, "inline": inline},
         title=title,
         found=found,
         ninety_five=NINETY_FIVE,
-        **drawings,
-        chosen=int(np.argmin(np.abs(np.array(horizons) - _SHOWN))) if rates else 0,
+        predictions=rates,
+        chosen=chosen,
         band=f"{100 * BAND:g}",
-        command=found.provenance.command or "",
-        notes=[*found.provenance.notes, *([found.motor_clock] if found.motor_clock else [])],
-        provenance=[
-            (name.replace("_", " "), _text(x))
-            for name, x in found.provenance.to_dict().items()
-            if name not in _ELSEWHERE
-        ],
+        responses=response,
+        sample_times=inertias,
+        command=used.command or "",
+        notes=[*used.notes, *filter(None, [found.motor_clock])],
+        provenance=[(name.replace("_", " "), _text(x)) for name, x in used.to_dict().items() if name not in _ELSEWHERE],
     )
     with write_atomically(path) as beside:
         beside.write_text(text, encoding="utf-8")
-
-
-def _inlined(stem: str, description: str, figures: Mapping[str, Figure]) -> dict[str, Markup]:
-    """Figures by label, among which the reader of the page chooses, as elements of the page."""
-    said = {label: f"{description}, {label}" if label else description for label in figures}
-    return {
-        label: inline(svg(figure), stem=f"{stem}-{i}", description=said[label])
-        for i, (label, figure) in enumerate(figures.items())
-    }
 
 
 def _number(value: float | None, digits: int = _DIGITS) -> str:

@@ -1,13 +1,11 @@
 """The report of a study: its figures with their captions, and one HTML page that needs no other file."""
 
-import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import xarray as xr
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from .._files import check_writable, write_atomically
@@ -51,7 +49,7 @@ class Drawn(NamedTuple):
 def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
     """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; returns their paths, the page first.
 
-    All figures are drawn before the first file is written. Figures that only an older report has are removed.
+    All figures are drawn before the first file is written.
 
     **Arguments:** `with_pdf`: if false, figures are SVG only, which takes half the time.
     """
@@ -63,19 +61,14 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
         suffix = f"-{scenario.number}" if len(every) > 1 else ""
         sections.append((scenario, draw(shown, scenario.data, suffix=suffix, with_pdf=with_pdf)))
     example = draw(EXAMPLE_FIGURES, dataset, with_pdf=with_pdf)
-    page = _page(dataset, sections, example).encode()
-    folder.mkdir(exist_ok=True)
-    files: dict[Path, bytes] = {}
+    files = {target: _page(dataset, sections, example).encode()}
     for drawn in [drawn for figures in (*(of for _, of in sections), example) for drawn in figures.values()]:
         files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in drawn.files.items()}
-    for path, content in (*files.items(), (target, page)):
+    folder.mkdir(exist_ok=True)
+    for path, content in reversed(files.items()):  # the page last
         with write_atomically(path) as beside:
             beside.write_bytes(content)
-    ours = "|".join(SCENARIO_FIGURES | EXAMPLE_FIGURES)
-    for path in folder.iterdir():
-        if path not in files and re.fullmatch(rf"({ours})(-\d+)?\.(svg|pdf)", path.name):
-            path.unlink()
-    return [target, *files]
+    return list(files)
 
 
 def draw(
@@ -97,12 +90,9 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
     estimators = names(dataset, "estimator")
     missing, cells = study_tables.cells_not_run(dataset)
 
-    def inlined(drawn: Drawn, description: str) -> Markup:
-        return inline(drawn.files["svg"], stem=f"{drawn.stem}-0", description=description, estimators=estimators)
-
     return render(
         "study.html.j2",
-        filters={"inline": inlined},
+        filters={"inline": partial(inline, estimators=estimators)},
         title=attributes.get("title", "") or "A study",
         command=attributes.get("command", ""),
         specification=attributes.get("specification", ""),
