@@ -17,14 +17,8 @@ if TYPE_CHECKING:
 
 # If a log has more parts, only the longest are printed.
 _MOST_PARTS = 14
-_CHANNELS = (
-    (("p", "q", "r"), "rad/s"),
-    (("phi", "theta", "psi"), "rad"),
-    (("x", "y", "z"), "m"),
-    (("vx", "vy", "vz"), "m/s"),
-    (("ax", "ay", "az"), "m/s^2"),
-    (("rotor1", "rotor2", "rotor3", "rotor4"), "rad/s"),
-)
+_UNITS = {"p q r": "rad/s", "phi theta psi": "rad", "x y z": "m", "vx vy vz": "m/s", "ax ay az": "m/s^2"}
+_UNITS |= {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 
 
 def inspect(
@@ -90,8 +84,8 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
     )
     for finding in found.findings:
         console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
-    for names, unit in _CHANNELS:
-        measured = {name: found.measured[name] for name in names if name in found.measured}
+    for names, unit in _UNITS.items():
+        measured = {name: found.measured[name] for name in names.split() if name in found.measured}
         if not measured:
             continue
         largest = max(abs(end) for channel in measured.values() for end in (channel.least, channel.most))

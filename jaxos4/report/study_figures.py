@@ -110,39 +110,6 @@ def _against_noise(
     return figure
 
 
-def frontier(data: xr.Dataset) -> Figure | None:
-    """The noise scale below which each parameter can be distinguished from 0, and the scales of the study."""
-    limits = metrics.frontier(data)
-    if not (limits > 0).any():
-        return None
-    parameters = names(data, "parameter")
-    figure, (panel,) = grid(1, columns=1, width=7.0, height=0.5 * len(parameters) + 0.6)
-    scales = data["scale"].values[data["scale"].values > 0]
-    seen = bounds(data)
-    least = min(float(limits.where(limits > 0).min()), float(scales.min()))
-    for scale in scales:
-        panel.axvline(scale, color=FAINT, linewidth=0.8, linestyle="dashed", zorder=0)
-    for row, (channels, estimator) in enumerate(seen.items()):
-        x = limits.isel(estimator=estimator).values
-        y = (np.arange(len(parameters)) + 0.36 * (row - (len(seen) - 1) / 2))[x > 0]
-        x, label = x[x > 0], f"bound of channels: {channels}"
-        panel.plot(x, y, "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=label)
-        for a, b in zip(x, y, strict=True):
-            panel.annotate(plain(a, 2), (a, b), (6, 0), textcoords="offset points", va="center", fontsize=7)
-    for y in np.flatnonzero((limits == 0).any("estimator").values):
-        panel.text(least, float(y), "the truth is 0: no noise is small enough", va="center", fontsize=7.5)
-    panel.set_xscale("log")
-    log_axis(panel, "x")
-    low, high = panel.get_xlim()
-    panel.set_xlim(low, high * (high / low) ** 0.06)
-    panel.set_yticks(range(len(parameters)), parameters)
-    panel.set_ylim(len(parameters) - 0.5, -0.5)
-    panel.set_xlabel("noise scale below which |truth| exceeds 1.96 bounds (dashed: the scales of this study)")
-    if len(seen) > 1:
-        figure.legend(loc="outside lower center", ncols=len(seen))
-    return figure
-
-
 def distribution(data: xr.Dataset) -> Figure | None:
     """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1."""
     every = metrics.normalised_error(data.isel(scale=nearest_scale(data)))

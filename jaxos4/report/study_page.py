@@ -29,7 +29,6 @@ SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "distribution": study_figures.distribution,
     "rollouts": study_figures.rollouts,
     "coverage": study_figures.coverage,
-    "frontier": study_figures.frontier,
 }
 EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "trajectories": study_figures.trajectories,

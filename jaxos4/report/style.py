@@ -153,12 +153,7 @@ def ticks_at(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
 
 
 def legend(
-    figure: Figure,
-    estimators: Sequence[str],
-    *,
-    bounds: Sequence[str] = (),
-    lines: bool = True,
-    markers: bool = True,
+    figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] = (), lines: bool = True, markers: bool = True
 ) -> None:
     """Adds a legend below the figure: an entry for each bound and each estimator, with lines, markers or both.
 
