@@ -46,11 +46,12 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
-    asked = options.of_kind(closed_loop, locals())
+    given = dict(locals())
+    asked = options.of_kind(closed_loop, given)
     check_outputs(airframe, references, speeds, out=out)
-    file, other = (references, "dt") if closed_loop else (speeds, "excitation")
-    for name, value in {"duration": duration, other: dt if closed_loop else excitation}.items():
-        if file is not None and value is not None:
+    file, names = (references, ("duration", "dt")) if closed_loop else (speeds, ("duration", "excitation"))
+    for name in names:
+        if file is not None and given[name] is not None:
             raise InputError(f"--{name}: {file} has its own; leave it out.")
     if asked["dt"] > 0 and asked["duration"] / asked["dt"] > MOST_SAMPLES:
         many = f"more than {MOST_SAMPLES} samples of {asked['dt']:g} s; ask for fewer."

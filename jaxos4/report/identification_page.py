@@ -167,15 +167,14 @@ def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: 
     own = next((each.constants for each in answers if math.isclose(each.sample_time, chosen)), {})
     figure, panels = grid(3, columns=3, width=9.0, height=2.4)
     ticks = [1e3 * each.sample_time for each in answers]
-    shown: list[Artist] = []
+    shown: list[Any] = []
     for panel, name in zip(panels, ("Ix", "Iy", "Iz"), strict=True):
         rows = [(1e3 * each.sample_time, each.constants[name]) for each in answers if name in each.constants]
         scale = own[name].estimate if name in own else math.nan
         times = [time for time, _ in rows]
         values, errors = ([getattr(row, field) / scale for _, row in rows] for field in ("estimate", "std"))
         errors = [NINETY_FIVE * error for error in errors]
-        (line,) = panel.plot(times, values, color=look.color, marker="o", markersize=4)
-        panel.errorbar(times, values, yerr=errors, color=look.color, fmt="none", capsize=3)
+        line = panel.errorbar(times, values, yerr=errors, color=look.color, marker="o", markersize=4, capsize=3)
         mark = panel.axvline(1e3 * chosen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
         level = panel.axhline(1.0, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[2])
         shown = [line, mark, level]
