@@ -12,8 +12,7 @@ from ._output import check_outputs, option_names, stages, write_json, write_text
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ..identification import FlightInformation
-    from ..recording.inspection import IdentifiableParameters, Inspection
+    from ..recording.inspection import Inspection
 
 # If a log has more parts, only the longest are printed.
 _MOST_PARTS = 14
@@ -62,8 +61,14 @@ def inspect(
         write_text(draft.text, airframe_out)
     _print_contents(console, found, log_format(log).label)
     _print_parts(console, found)
-    if found.identifiable is not None:
-        _print_identifiable(console, found.identifiable)
+    if (known := found.identifiable) is not None:
+        which = f"From the body rates between {known.begin:.2f} and {known.end:.2f} s, with the corrected model"
+        console.print(f"{which} (how well: see jaxos4 estimate):")
+        names = [name for name, row in known.parameters.items() if row.identifiable]
+        console.print(f"  identifiable: {', '.join(names) or 'nothing'}")
+        for name, row in known.parameters.items():
+            if row.note:
+                console.print(f"  {name}: {row.note}")
     elif found.findings:
         console.print("no parameter is identifiable, see the first lines.")
     elif vehicle is None:
@@ -114,18 +119,6 @@ def _print_parts(console: "Console", found: "Inspection") -> None:
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
 
 
-def _print_identifiable(console: "Console", found: "IdentifiableParameters") -> None:
-    console.print(
-        f"From the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model (how well: see "
-        "jaxos4 estimate):"
-    )
-    names = [name for name, row in found.parameters.items() if row.identifiable]
-    console.print(f"  identifiable: {', '.join(names) or 'nothing'}")
-    for name, row in found.parameters.items():
-        if row.note:
-            console.print(f"  {name}: {row.note}")
-
-
 def identifiability(
     flight: options.FlightFile,
     model: options.ModelOption = options.Model["published"],
@@ -145,6 +138,7 @@ def identifiability(
         from ..identification import assess
         from ..models import MODELS
         from ..recording import read_recording
+        from ..report.text import Listing
 
         progress("reading")
         subject = MODELS[model](load_airframe(airframe))
@@ -163,12 +157,6 @@ def identifiability(
     console = Console(highlight=False, markup=False)
     for note in recording.notes:
         console.print(f"note: {note}")
-    _print_information(console, found)
-
-
-def _print_information(console: "Console", found: "FlightInformation") -> None:
-    from ..report.text import Listing
-
     if not found.fitted:
         console.print("note: no fit; all numbers below hold at the bracket's centre")
     rows = []
