@@ -124,10 +124,12 @@ def test_identifiability_names_the_parameters_that_are_not_excited(run, tmp_path
     assert known["parameters"]["alpha3"]["note"] == ""
     assert known["parameters"]["alpha3"]["bound"] < known["parameters"]["alpha3"]["half_width"]
     assert len(known["directions"]) == len(known["eigenvalues"]) == 8
-    for name in ("alpha1", "alpha4", "alpha7"):  # a doublet moves one axis at a time: products of rates are 0
-        assert f"{name}: not identifiable: not excited" in out
-    assert "alpha2: below the noise floor: identifiable below" in out
-    assert "alpha3:" not in out
+    notes = {name: row["note"] for name, row in known["parameters"].items()}
+    rows = {line.split()[0]: line for line in out.splitlines() if line.startswith("alpha")}
+    # A doublet moves one axis at a time: products of rates are 0.
+    assert [name for name, row in rows.items() if "not identifiable" in row] == ["alpha1", "alpha4", "alpha7"]
+    assert notes["alpha2"].startswith("below the noise floor: identifiable below")
+    assert "below the noise" in rows["alpha2"]
 
 
 def test_a_flight_without_excitation_fails_with_a_message(run, tmp_path):

@@ -21,8 +21,8 @@ from jaxos4.report.style import drawing, grid, log_axis
 from jaxos4.report.text import percent, plain
 from jaxos4.study import metrics
 
-OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage", "frontier"}
-OF_EXAMPLE = {"trajectories", "deviations", "path", "search", "training"}
+OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage"}
+OF_EXAMPLE = {"trajectories", "deviations", "search", "training"}
 
 
 def few(study):
@@ -88,17 +88,11 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
     assert all(p.read_bytes().startswith(b"%PDF") for p in report if p.suffix == ".pdf")
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     xr.testing.assert_equal(read_results(tmp_path), study)
-    (tmp_path / "figures").mkdir()
-    for name in ("error-7.svg", "error-7.pdf", "notes.svg"):
-        (tmp_path / "figures" / name).write_text("of before")
     code, out, err = run("report", str(tmp_path))
     assert (code, err) == (0, "")
-    assert "11 figures" in out
+    assert "9 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
-    # A figure of an older report goes, what is not ours stays.
-    left = {path.name for path in (tmp_path / "figures").iterdir()} - {path.name for path in report}
-    assert left == {"notes.svg"}
 
 
 def test_every_number_in_the_tables(study, page):

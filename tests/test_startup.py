@@ -185,14 +185,6 @@ def test_a_cache_folder_that_cannot_be_used_is_no_error(tmp_path):
     assert (process.returncode, process.stderr) == (0, "")
 
 
-def test_a_full_disk_takes_no_programs(tmp_path, monkeypatch):
-    for name in ("HOME", "XDG_CACHE_HOME"):
-        monkeypatch.setenv(name, str(tmp_path))
-    assert _jax._usable_folder() is not None
-    monkeypatch.setattr(_jax.shutil, "disk_usage", lambda path: type("usage", (), {"free": 0})())
-    assert _jax._usable_folder() is None
-
-
 def test_the_cache_is_limited_and_keeps_what_was_used_last(tmp_path):
     for age, name in enumerate("abcd"):
         (tmp_path / name).write_bytes(b"0" * 10)

@@ -66,12 +66,9 @@ def main() -> None:
     except BrokenPipeError:  # the reader of our output has gone
         sys.stderr.close()
         raise SystemExit(1) from None
-    except (InputError, OSError) as error:
+    except (InputError, OSError, TrainingError) as error:
         typer.echo(f"jaxos4: {_one_line(error)}", err=True)
-        raise SystemExit(2) from None
-    except TrainingError as error:
-        typer.echo(f"jaxos4: {_one_line(error)}", err=True)
-        raise SystemExit(1) from None
+        raise SystemExit(1 if isinstance(error, TrainingError) else 2) from None
     except Exception as error:
         if not hasattr(error, "format_message"):  # what all errors of the parser have, in every version of typer
             raise

@@ -2,7 +2,6 @@
 
 import gc
 import os
-import shutil
 import tempfile
 import warnings
 from pathlib import Path
@@ -11,7 +10,6 @@ NO_CACHE = "JAXOS4_NO_CACHE"
 """The environment variable that switches off the cache of compiled programs."""
 
 _MOST_BYTES = 1 << 30
-_LEAST_FREE_BYTES = 200 << 20  # with less space on the disk, programs might be cut off while they are written
 _JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in less than this [s]
 
 
@@ -51,7 +49,7 @@ def _usable_folder() -> Path | None:
         with tempfile.TemporaryFile(dir=folder):
             pass
         _remove_oldest(folder, _MOST_BYTES)
-        return folder if shutil.disk_usage(folder).free > _LEAST_FREE_BYTES else None
+        return folder
     except OSError:
         return None
 

@@ -36,33 +36,31 @@ BracketOption = Annotated[Path | None, Option(help="TOML file: alpha1 = [lower, 
 ChannelsOption = Annotated[Channels | None, Option(help="Channels to fit. Default: all that were measured.")]
 InitialStateOption = Annotated[InitialState, Option(help="free: estimated too; known: equal to the first sample.")]
 WindowOption = Annotated[
-    float | None,
-    Option(metavar="SECONDS", help="Multiple shooting: windows of this length, each with its own initial state."),
+    float | None, Option(help="Multiple shooting: windows of this length [s], each with its own initial state.")
 ]
 OutOption = Annotated[Path | None, Option(help="JSON file to write.")]
 
 # The options that `simulate` and `design` share.
 OpenLoopModelOption = Annotated[Model | None, Option(help="Equations of motion. Default: published.")]
-DurationOption = Annotated[
-    float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.", metavar="SECONDS")
-]
-SampleTimeOption = Annotated[
-    float | None, Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.", metavar="SECONDS")
-]
+DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
+SampleTimeOption = Annotated[float | None, Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.")]
 GustOption = Annotated[
     float | None, Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5.")
 ]
-LagOption = Annotated[
-    float | None, Option(help="With --closed-loop: lag of the rotors. Default: 0.05.", metavar="SECONDS")
-]
-DelayOption = Annotated[
-    float | None, Option(help="With --closed-loop: delay of the commands. Default: 0.01.", metavar="SECONDS")
-]
+LagOption = Annotated[float | None, Option(help="With --closed-loop: lag of the rotors [s]. Default: 0.05.")]
+DelayOption = Annotated[float | None, Option(help="With --closed-loop: delay of the commands [s]. Default: 0.01.")]
 SensorsOption = Annotated[
     Sensors | None,
     Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
 ]
-_MOST = {"gust": 1e6, "lag": 1.0, "delay": 1.0}
+
+# The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
+_OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "model": Model["published"], "slew": None, "speeds": None}
+_OPEN |= {"excitation": Excitation["multisine"], "method": Method["euler"], "noise": 0.0}
+_OPEN |= {"channels": Channels["all"], "initial_state": InitialState["free"]}
+_CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
+_CLOSED |= {"sensors": None, "references": None}
+_MOST = {"gust": 1e6, "lag": 1.0, "delay": 1.0, "noise": 1e6}
 
 
 def check_seed(seed: int) -> None:
@@ -86,35 +84,33 @@ def read_bracket(path: Path | None) -> dict[str, Any] | None:
     return None if path is None else read_toml(path)
 
 
-def flight_times(closed_loop: bool, duration: float | None, dt: float | None) -> tuple[float, float]:
-    """Duration and sample time [s], by default those of the kind of flight."""
-    usual = (20.0, 0.004) if closed_loop else (5.0, 0.01)
-    return usual[0] if duration is None else duration, usual[1] if dt is None else dt
+def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a command, with the defaults of its kind of flight.
 
-
-def check_kind(closed_loop: bool, *, open_only: Mapping[str, Any], closed_only: Mapping[str, Any]) -> None:
-    """Refuses options of the other kind of flight, and settings of the closed loop that are out of range."""
-    for name, value in (open_only if closed_loop else closed_only).items():
-        if value is not None:
+    Refuses options of the other kind, and settings that are out of range.
+    """
+    own, others = (_CLOSED, _OPEN) if closed_loop else (_OPEN, _CLOSED)
+    for name, value in given(**asked).items():
+        if name in others and name not in own:
             how = "without --closed-loop; leave it out" if closed_loop else "with --closed-loop; add that"
-            raise InputError(f"--{name}: is for flights {how}.")
-    for name, most in _MOST.items():
-        value = closed_only[name]
-        if value is not None and not 0 <= value <= most:
-            raise InputError(f"--{name}: must lie in 0 to {most:g}, got {value}.")
+            raise InputError(f"--{name.replace('_', '-')}: is for flights {how}.")
+        if name in _MOST and not 0 <= value <= _MOST[name]:
+            raise InputError(f"--{name}: must lie in 0 to {_MOST[name]:g}, got {value}.")
+    check_seed(asked["seed"])
+    return dict(asked) | {name: default for name, default in own.items() if asked.get(name) is None}
 
 
-def make_loop(
-    airframe: str, gust: float | None, lag: float | None, delay: float | None, sensors: Sensors | None
-) -> "ClosedLoop":
+def make_loop(asked: Mapping[str, Any]) -> "ClosedLoop":
     """The vehicle in closed loop with these options."""
     from ..airframe import load_airframe
     from ..closed_loop import ClosedLoop
     from ..models.terms import has_full_scale
 
-    vehicle = load_airframe(airframe)
-    scaled = has_full_scale(vehicle)
-    if sensors == "commands" and not scaled:
-        raise InputError(f"--sensors commands: {airframe} has no max_rotor_speed [rad/s]; set it, or log speeds.")
-    logged, gust = chosen(sensors) or ("commands" if scaled else "speeds"), 5.0 if gust is None else gust
-    return ClosedLoop(vehicle, logged=logged, gust=gust, **given(rotor_lag=lag, rotor_delay=delay))
+    vehicle = load_airframe(asked["airframe"])
+    logged, scaled = chosen(asked["sensors"]), has_full_scale(vehicle)
+    if logged == "commands" and not scaled:
+        raise InputError(
+            f"--sensors commands: {asked['airframe']} has no max_rotor_speed [rad/s]; set it, or log speeds."
+        )
+    settings = given(rotor_lag=asked["lag"], rotor_delay=asked["delay"])
+    return ClosedLoop(vehicle, logged=logged or ("commands" if scaled else "speeds"), gust=asked["gust"], **settings)

@@ -87,13 +87,6 @@ def write_text(text: str, out: Path) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def check_new_folder(folder: Path) -> None:
-    """Refuses a folder that exists, or that cannot be made."""
-    if folder.exists():
-        raise InputError(f"{folder}: exists; remove it, or give the output another name.")
-    check_writable(folder)
-
-
 def write_folder(texts: dict[str, str], folder: Path) -> None:
     """Writes text files, by name, into a new folder. It appears when all files are in it."""
     beside = folder.with_name(f".{folder.name[:40]}.{secrets.token_hex(4)}.part")

@@ -13,7 +13,10 @@ from . import _options as options
 from ._output import check_outputs, in_options, option_names, stages, write_json
 
 if TYPE_CHECKING:
+    from ..airframe import Airframe
     from ..identification import Identification
+    from ..models.abstract import AbstractModel
+    from ..recording import Recording
 
 _OS4, _PUBLISHED = "os4", "published"
 
@@ -25,7 +28,7 @@ def estimate(
     ] = None,
     model: Annotated[
         options.VehicleModel | None,
-        Option(help="The equations: as printed, corrected, or those of a real vehicle. Default: by the log."),
+        Option(help="Equations: as published, corrected, or of a real vehicle. Default: by the log."),
     ] = None,
     airframe: Annotated[
         str | None, Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
@@ -37,55 +40,34 @@ def estimate(
     network: Annotated[
         Path | None, Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
     ] = None,
-    validate: Annotated[
-        Path | None, Option(metavar="OTHER.csv", help="Another flight: not fitted, but predicted.")
-    ] = None,
+    validate: Annotated[Path | None, Option(help="Another flight: not fitted, but predicted.")] = None,
     terms: Annotated[str | None, Option(help="Real vehicle: offset,damping,...; default: what the logs allow.")] = None,
-    begin: Annotated[
-        float | None, Option("--from", metavar="SECONDS", help="Real vehicle: use the logs from this time on.")
-    ] = None,
-    end: Annotated[
-        float | None, Option("--to", metavar="SECONDS", help="Real vehicle: use the logs up to this time.")
-    ] = None,
-    sample_time: Annotated[
-        float | None, Option(metavar="SECONDS", help="Real vehicle: the sample time to average to.")
-    ] = None,
-    holdout: Annotated[
-        float | None, Option(metavar="SHARE", help="Real vehicle: the share to predict; default: 0.25.")
-    ] = None,
-    report: Annotated[Path | None, Option(metavar="FILE.html", help="Real vehicle: an HTML report to write.")] = None,
+    begin: Annotated[float | None, Option("--from", help="Real vehicle: use the logs from this time on [s].")] = None,
+    end: Annotated[float | None, Option("--to", help="Real vehicle: use the logs up to this time [s].")] = None,
+    sample_time: Annotated[float | None, Option(help="Real vehicle: the sample time to average to [s].")] = None,
+    holdout: Annotated[float | None, Option(help="Real vehicle: the share to predict; default: 0.25.")] = None,
+    report: Annotated[Path | None, Option(help="Real vehicle: an HTML report to write.")] = None,
     out: options.OutOption = None,
 ) -> None:
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
     check_outputs(*flights, airframe, bracket, network, validate, out=out, report=report)
-    if report is not None and model not in (None, "flight"):
-        raise InputError(f"--report: is for --model flight, not {model}; leave it out.")
     listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
     asked = {"channels": options.chosen(channels), "initial_state": initial_state.value, "window": window}
     asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
     with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
-        from ..airframe import load_airframe
+        from ..airframe import Airframe, load_airframe
         from ..identification import identify, settings_for
-        from ..models import MODELS
-        from ..recording import read_recording, vehicle_evidence
+        from ..recording import read_recording
 
         progress("reading")
         vehicle = load_airframe(airframe or _OS4)
         # Without an airframe, commands are read only to find out that one is needed.
         full_scale = 1.0 if airframe is None and model in (None, "flight") else None
         recordings = [read_recording(path, vehicle, full_scale=full_scale) for path in flights]
-        # The first log that is evidently of a real vehicle, and why.
-        shown = (f"{each.name} {why}" for each in recordings if (why := vehicle_evidence(each)))
-        evidence = next(shown, "") if model is None else ""
-        is_vehicle = model == "flight" or bool(evidence)
-        if is_vehicle and airframe is None:
-            why = evidence or "--model flight"
-            begin_one = f"`jaxos4 inspect {shlex.quote(str(flights[0]))} --airframe-out mine.toml` begins one"
-            raise InputError(f"{why}: a real vehicle needs --airframe; {begin_one}.")
-        if report is not None and not is_vehicle:
-            raise InputError(f"--report: is for real vehicles, and {flights[0]} has no sign of one; leave it out.")
-        other = None if validate is None else read_recording(validate, vehicle)
-        subject = vehicle if is_vehicle else MODELS[model or _PUBLISHED](vehicle)
+        subject, evidence = _subject(recordings, model, vehicle, given=airframe is not None)
+        if report is not None and not isinstance(subject, Airframe):
+            sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
+            raise InputError(f"--report: is for real vehicles, {sign}; leave it out.")
         found = identify(
             recordings,
             subject,
@@ -93,12 +75,32 @@ def estimate(
             estimator=options.chosen(estimator),
             bracket=options.read_bracket(bracket),
             network=network,
-            validate=other,
+            validate=None if validate is None else read_recording(validate, vehicle),
             progress=progress,
         )
     notes = [f"{evidence}: taken as a real vehicle's (--model flight)"] if evidence else []
     title = ", ".join(path.name for path in flights)
     _publish(_with_command(found, airframe or _OS4, notes), out, report, title=title)
+
+
+def _subject(
+    recordings: "list[Recording]", model: options.VehicleModel | None, vehicle: "Airframe", *, given: bool
+) -> "tuple[Airframe | AbstractModel, str]":
+    """The airframe of a real vehicle, or a model of an OS4; and why a log is evidently of a real vehicle, if one is.
+
+    `given`: whether the user gave the airframe.
+    """
+    from ..models import MODELS
+    from ..recording import vehicle_evidence
+
+    shown = (f"{each.name} {why}" for each in recordings if (why := vehicle_evidence(each)))
+    evidence = next(shown, "") if model is None else ""
+    if model != "flight" and not evidence:
+        return MODELS[model or _PUBLISHED](vehicle), ""
+    if not given:
+        begin_one = f"`jaxos4 inspect {shlex.quote(recordings[0].name)} --airframe-out mine.toml` begins one"
+        raise InputError(f"{evidence or '--model flight'}: a real vehicle needs --airframe; {begin_one}.")
+    return vehicle, evidence
 
 
 def _with_command(found: "Identification", airframe: str, notes: list[str]) -> "Identification":

@@ -6,9 +6,10 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from .._files import check_writable
 from ..errors import InputError
 from . import _options as options
-from ._output import check_new_folder, check_outputs, option_names, stages, write_folder, write_text
+from ._output import check_outputs, option_names, stages, write_folder, write_text
 
 MOST_SAMPLES = 100_000
 
@@ -27,12 +28,12 @@ def export(
         raise InputError(f"--samples: must be at most {MOST_SAMPLES}, got {samples}.")
     if samples and out is None:
         raise InputError("--samples: are written into a folder beside --out; give that too.")
-    folder = None
-    if out is not None:
-        check_outputs(result, out=out)
-        if samples:
-            folder = out.with_name(f"{out.stem}-samples")
-            check_new_folder(folder)
+    check_outputs(result, out=out)
+    folder = out.with_name(f"{out.stem}-samples") if samples and out is not None else None
+    if folder is not None:
+        if folder.exists():
+            raise InputError(f"{folder}: exists; remove it, or give the output another name.")
+        check_writable(folder)
     with stages("loading the library") as progress, option_names():
         from ..export import TARGETS, export_vehicle, read_result
 

@@ -12,22 +12,12 @@ from ._output import check_outputs, option_names, stages, write_json, write_text
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ..identification import FlightInformation
-    from ..recording.inspection import IdentifiableParameters, Inspection
+    from ..recording.inspection import Inspection
 
 # If a log has more parts, only the longest are printed.
 _MOST_PARTS = 14
-_CHANNELS = (
-    (("p", "q", "r"), "rad/s"),
-    (("phi", "theta", "psi"), "rad"),
-    (("x", "y", "z"), "m"),
-    (("vx", "vy", "vz"), "m/s"),
-    (("ax", "ay", "az"), "m/s^2"),
-    (("rotor1", "rotor2", "rotor3", "rotor4"), "rad/s"),
-)
-# Parameters with less than this share of the largest one are not shown in a direction.
-_SMALL = 0.1
-_MOST_HALF_WIDTHS = 1e3
+_UNITS = {"p q r": "rad/s", "phi theta psi": "rad", "x y z": "m", "vx vy vz": "m/s", "ax ay az": "m/s^2"}
+_UNITS |= {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 
 
 def inspect(
@@ -71,8 +61,14 @@ def inspect(
         write_text(draft.text, airframe_out)
     _print_contents(console, found, log_format(log).label)
     _print_parts(console, found)
-    if found.identifiable is not None:
-        _print_identifiable(console, found.identifiable)
+    if (known := found.identifiable) is not None:
+        which = f"From the body rates between {known.begin:.2f} and {known.end:.2f} s, with the corrected model"
+        console.print(f"{which} (how well: see jaxos4 estimate):")
+        names = [name for name, row in known.parameters.items() if row.identifiable]
+        console.print(f"  identifiable: {', '.join(names) or 'nothing'}")
+        for name, row in known.parameters.items():
+            if row.note:
+                console.print(f"  {name}: {row.note}")
     elif found.findings:
         console.print("no parameter is identifiable, see the first lines.")
     elif vehicle is None:
@@ -93,8 +89,8 @@ def _print_contents(console: "Console", found: "Inspection", label: str) -> None
     )
     for finding in found.findings:
         console.print(f"cannot identify a vehicle: {finding}.", soft_wrap=True)
-    for names, unit in _CHANNELS:
-        measured = {name: found.measured[name] for name in names if name in found.measured}
+    for names, unit in _UNITS.items():
+        measured = {name: found.measured[name] for name in names.split() if name in found.measured}
         if not measured:
             continue
         largest = max(abs(end) for channel in measured.values() for end in (channel.least, channel.most))
@@ -123,18 +119,6 @@ def _print_parts(console: "Console", found: "Inspection") -> None:
     console.print("roll, pitch, yaw: the excitation, and the standard deviation of the body rate [rad/s].")
 
 
-def _print_identifiable(console: "Console", found: "IdentifiableParameters") -> None:
-    console.print(
-        f"From the body rates between {found.begin:.2f} and {found.end:.2f} s, with the corrected model (how well: see "
-        "jaxos4 estimate):"
-    )
-    names = [name for name, row in found.parameters.items() if row.identifiable]
-    console.print(f"  identifiable: {', '.join(names) or 'nothing'}")
-    for name, row in found.parameters.items():
-        if row.note:
-            console.print(f"  {name}: {row.note}")
-
-
 def identifiability(
     flight: options.FlightFile,
     model: options.ModelOption = options.Model["published"],
@@ -154,6 +138,7 @@ def identifiability(
         from ..identification import assess
         from ..models import MODELS
         from ..recording import read_recording
+        from ..report.text import Listing
 
         progress("reading")
         subject = MODELS[model](load_airframe(airframe))
@@ -172,12 +157,6 @@ def identifiability(
     console = Console(highlight=False, markup=False)
     for note in recording.notes:
         console.print(f"note: {note}")
-    _print_information(console, found)
-
-
-def _print_information(console: "Console", found: "FlightInformation") -> None:
-    from ..report.text import Listing
-
     if not found.fitted:
         console.print("note: no fit; all numbers below hold at the bracket's centre")
     rows = []
@@ -186,22 +165,11 @@ def _print_information(console: "Console", found: "FlightInformation") -> None:
         limit = f"{row.noise_limit:.2g} x" if bound <= row.half_width and row.noise_limit else "-"
         rows.append((name, row.unit, f"{bound:.2g}", f"{alone:.2g}", f"{bound / row.half_width:.2g}", limit))
     numbers = ("bound", "others known", "of bracket", "noise limit")
-    Listing(("parameter", "unit", *numbers), rows, numbers).print_on(console)
+    notes = [row.note for row in found.parameters.values()]
+    Listing(("parameter", "unit", *numbers), rows, numbers, notes).print_on(console)
     console.print(
         "bound: the smallest possible standard deviation at the noise that was found; others known: the same if all "
         "other parameters were known; of bracket: bound / half-width of the bracket, above 1 the parameter is not "
         "identifiable; noise limit: the largest noise, in multiples of the noise that was found, at which the "
         "airframe's value can be distinguished from 0."
-    )
-    for name, row in found.parameters.items():
-        if row.note:
-            console.print(f"{name}: {row.note}")
-    if found.eigenvalues is None or found.directions is None:
-        return
-    ordered = sorted(zip(found.parameters, found.directions[0], strict=True), key=lambda item: -abs(item[1]))
-    parts = " ".join(f"{part:+.2f} {name}" for name, part in ordered if abs(part) > _SMALL * abs(ordered[0][1]))
-    spread = max(found.eigenvalues[0], 1e-300) ** -0.5
-    size = f"{spread:.2g}" if spread < _MOST_HALF_WIDTHS else f"over {_MOST_HALF_WIDTHS:g}"
-    console.print(
-        f"weakest direction, in half-widths of the bracket: {parts}, known to {size} (1: no better than the bracket)."
     )

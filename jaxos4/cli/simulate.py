@@ -1,7 +1,7 @@
 """`jaxos4 simulate`: a simulated flight as CSV."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Option
@@ -11,7 +11,6 @@ from . import _options as options
 from ._output import check_outputs, stages
 
 if TYPE_CHECKING:
-    from ..airframe import Airframe
     from ..flight import Flight
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
@@ -47,85 +46,64 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
+    given = dict(locals())
+    asked = options.of_kind(closed_loop, given)
     check_outputs(airframe, references, speeds, out=out)
-    options.check_kind(
-        closed_loop,
-        open_only={"model": model, "excitation": excitation, "speeds": speeds, "method": method, "noise": noise},
-        closed_only={"gust": gust, "lag": lag, "delay": delay, "sensors": sensors, "references": references},
-    )
-    _check_not_given(references, duration=duration, dt=dt)
-    _check_not_given(speeds, duration=duration, excitation=excitation)
-    duration, dt = options.flight_times(closed_loop, duration, dt)
-    noise = 0.0 if noise is None else noise
-    if not 0 <= noise <= 1e6:
-        raise InputError(f"--noise: must lie in 0 to 1e+06, got {noise}.")
-    options.check_seed(seed)
-    if dt > 0 and duration / dt > MOST_SAMPLES:
-        raise InputError(f"--duration {duration:g}: more than {MOST_SAMPLES} samples of {dt:g} s; ask for fewer.")
+    file, names = (references, ("duration", "dt")) if closed_loop else (speeds, ("duration", "excitation"))
+    for name in names:
+        if file is not None and given[name] is not None:
+            raise InputError(f"--{name}: {file} has its own; leave it out.")
+    if asked["dt"] > 0 and asked["duration"] / asked["dt"] > MOST_SAMPLES:
+        many = f"more than {MOST_SAMPLES} samples of {asked['dt']:g} s; ask for fewer."
+        raise InputError(f"--duration {asked['duration']:g}: {many}")
     with stages("loading the library") as progress:
         from ..airframe import load_airframe
         from ..logs import write_flight
         from ..results import RESULTS, result_names
 
         progress("compiling and simulating")
-        vehicle = load_airframe(airframe)
-        if closed_loop:
-            try:
-                from ..closed_loop import fly_standard
-                from ..design import read_references
-
-                loop = options.make_loop(airframe, gust, lag, delay, sensors)
-                flown, dt = (None, dt) if references is None else read_references(references)
-                flight = fly_standard(loop, references=flown, duration=duration, dt=dt, seed=seed)
-            except ValueError as error:
-                raise InputError(f"--closed-loop: {error}") from None
-            how = f"closed loop, {loop.logged}, gusts of {5.0 if gust is None else gust:g} rad/s^2"
-        else:
-            model, method = model or options.Model["published"], method or options.Method["euler"]
-            flight = _open_loop(vehicle, model, excitation, method, duration, dt, speeds)
-            how = f"{model.value} model, {method.value}, noise {noise:g}"
+        flight, how = (_closed_loop if closed_loop else _open_loop)(asked)
         if flight.result != RESULTS.successful:
             typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
             raise typer.Exit(1)
-        if not closed_loop:
-            from ..noise import SENSOR_SIGMA, WhiteNoise, measure
-
-            flight = measure(flight, WhiteNoise(noise * SENSOR_SIGMA), seed=seed)
         progress("writing")
-        write_flight(flight, out, vehicle)
-    typer.echo(f"{out}: {flight.time.shape[0]} samples of {dt:g} s, {how}")
+        write_flight(flight, out, load_airframe(airframe))
+    typer.echo(f"{out}: {flight.time.shape[0]} samples of {how}")
 
 
-def _check_not_given(file: Path | None, **given: object) -> None:
-    """Refuses options if the file has their values."""
-    for name, value in given.items():
-        if file is not None and value is not None:
-            raise InputError(f"--{name}: {file} has its own; leave it out.")
+def _closed_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
+    """A flight of a real vehicle, and how it was made."""
+    from ..closed_loop import fly_standard
+    from ..design import read_references
+
+    loop, references, dt = options.make_loop(asked), None, asked["dt"]
+    try:
+        if asked["references"] is not None:
+            references, dt = read_references(asked["references"])
+        flight = fly_standard(loop, references=references, duration=asked["duration"], dt=dt, seed=asked["seed"])
+    except ValueError as error:
+        raise InputError(f"--closed-loop: {error}") from None
+    return flight, f"{dt:g} s, closed loop, {loop.logged}, gusts of {asked['gust']:g} rad/s^2"
 
 
-def _open_loop(
-    airframe: "Airframe",
-    model: options.Model,
-    excitation: options.Excitation | None,
-    method: options.Method,
-    duration: float,
-    dt: float,
-    speeds: Path | None,
-) -> "Flight":
-    """A flight with the rotor speeds of an excitation, or of a file, without noise."""
+def _open_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
+    """A flight with the rotor speeds of an excitation, or of a file, and how it was made."""
     from .._custom_types import as_float
+    from ..airframe import load_airframe
+    from ..design import read_input
     from ..excitation import EXCITATIONS
     from ..models import MODELS
+    from ..noise import SENSOR_SIGMA, WhiteNoise, measure
     from ..simulation import simulate as fly
 
-    vehicle, shape = MODELS[model](airframe), excitation or options.Excitation["multisine"]
+    model, shape, dt = MODELS[asked["model"]](load_airframe(asked["airframe"])), asked["excitation"], asked["dt"]
     try:
-        if speeds is None:
-            omega = EXCITATIONS[shape](airframe, duration=duration, dt=dt)
+        if asked["speeds"] is None:
+            omega = EXCITATIONS[shape](model.airframe, duration=asked["duration"], dt=dt)
         else:
-            from ..design import read_input
-
-            omega = as_float(read_input(speeds, dt))
-        return fly(vehicle, vehicle.alpha, omega, dt=dt, method=method.value)
+            omega = as_float(read_input(asked["speeds"], dt))
+        flight = fly(model, model.alpha, omega, dt=dt, method=asked["method"].value)
     except ValueError as error:
-        raise InputError(str(error) if speeds is not None else f"--excitation {shape.value}: {error}") from None
+        raise InputError(f"{'' if asked['speeds'] else f'--excitation {shape}: '}{error}") from None
+    flight = measure(flight, WhiteNoise(asked["noise"] * SENSOR_SIGMA), seed=asked["seed"])
+    return flight, f"{dt:g} s, {asked['model']} model, {asked['method']}, noise {asked['noise']:g}"

@@ -48,19 +48,14 @@ def study(
 
 
 def _print_plan(wanted: "Study", out: Path) -> None:
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
+    from ..report.text import Listing
     from ..study import device_name, plan
 
-    rows = plan(wanted, out)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("estimator", "cells", "flights", "programs", "networks", "time [min]"):
-        table.add_column(heading, justify="left" if heading == "estimator" else "right")
-    for *counts, seconds in rows:
-        table.add_row(*map(str, counts), "-" if seconds is None else f"{seconds / 60:.1f}")
-    Console(highlight=False).print(table, markup=False)
+    rows, numbers = plan(wanted, out), ("cells", "flights", "programs", "networks", "time [min]")
+    cells = [(*map(str, counts), "-" if seconds is None else f"{seconds / 60:.1f}") for *counts, seconds in rows]
+    Listing(("estimator", *numbers), cells, numbers).print_on(Console(highlight=False))
     cells, flights = sum(row.cells for row in rows), sum(row.flights for row in rows)
     typer.echo(
         f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}. The time "

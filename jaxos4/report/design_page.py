@@ -42,11 +42,10 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
     unexcited, targets, compared, _ = _WORDS[task.kind]
     every = {"designed": found.designed, **found.standard}
     for i, (name, unit) in enumerate(zip(task.names, task.units, strict=True)):
-        in_percent = _in_percent(found) and i < task.scale.size
-        factor = 100 / task.scale[i] if in_percent else 1.0
+        in_percent = task.kind == "references" and i < task.scale.size
+        unit, factor = ("%", 100 / task.scale[i]) if in_percent else (unit, 1.0)
         bounds = [one.bounds[i] for one in every.values()]
-        cells = [plain(factor * bound, 2) if bound < task.unexcited[i] else "-" for bound in bounds]
-        rows.append((name, "%" if in_percent else unit, *cells))
+        rows.append((name, unit, *(plain(factor * x, 2) if x < task.unexcited[i] else "-" for x in bounds)))
     Listing(("parameter", "unit", *every), rows, right=tuple(every)).print_on(console)
     console.print(f"the smallest possible standard deviation; -: {unexcited}.")
     gains = "; ".join(_gain(found, name) for name in found.standard)
@@ -54,11 +53,6 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
     uses = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.designed.uses.items())
     console.print(f"largest share of each limit, of {task.vehicles} vehicles from the bracket: {uses}.")
     console.print(_lengths(found, accuracy))
-
-
-def _in_percent(found: Design) -> bool:
-    """Whether bounds of the targets are shown in percent of their scale."""
-    return found.task.kind == "references"
 
 
 def _gain(found: Design, name: str) -> str:
@@ -74,20 +68,14 @@ def _lengths(found: Design, accuracy: float) -> str:
     task, designed = found.task, found.designed
     times = designed.shortest(accuracy * task.scale)
     longest = float(np.max(times))
-    if _in_percent(found):
-        names = task.names[: times.size]
-        after = ", ".join(f"{name} after {seconds:.3g} s" for name, seconds in zip(names, times, strict=True))
-        return (
-            f"known to {100 * accuracy:g} %: {after}. So fly at least {longest:.3g} s; the references repeat every "
-            f"{designed.period:.3g} s."
-        )
-    goal = f"every parameter known to {100 * accuracy:g} % of its bracket's half-width"
-    if longest <= designed.duration:
-        return f"{goal}: the first {longest:.2f} s are enough."
-    repeats = longest / designed.duration
-    return (
-        f"{goal}: fly it {math.ceil(repeats)} times." if repeats < _LONGEST_REPEATED else f"{goal}: not by this input."
-    )
+    if task.kind == "references":
+        after = ", ".join(f"{name} after {x:.3g} s" for name, x in zip(task.names, times, strict=False))
+        so = f"So fly at least {longest:.3g} s; the references repeat every {designed.period:.3g} s."
+        return f"known to {100 * accuracy:g} %: {after}. {so}"
+    repeats, how = longest / designed.duration, "not by this input"
+    if repeats < _LONGEST_REPEATED:
+        how = f"the first {longest:.2f} s are enough" if repeats <= 1 else f"fly it {math.ceil(repeats)} times"
+    return f"every parameter known to {100 * accuracy:g} % of its bracket's half-width: {how}."
 
 
 def write_design(found: Design, accuracy: float, out: Path) -> None:
@@ -97,7 +85,7 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
     """
     from .style import INK, drawing, grid, label_edges, log_axis, styles, svg  # a second that the table does not need
 
-    task, designed, in_percent = found.task, found.designed, _in_percent(found)
+    task, designed, in_percent = found.task, found.designed, found.task.kind == "references"
     every, targets = {"designed": designed, **found.standard}, task.scale.size
     with drawing():
         figure, panels = grid(_COLUMNS + targets, columns=_COLUMNS, height=1.9)

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 from markupsafe import Markup, escape
@@ -12,14 +12,6 @@ from .style import FAINT, GRID, INK, PAPER
 # CSS pixels in a point, and how much a drawing may grow to reach the width of the page's text.
 _PIXELS, _GROWTH = 4 / 3, 4 / 3
 _THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)", PAPER: "none"}
-
-
-class Drawing(NamedTuple):
-    """One choice of a figure on a page: its label, the element `<svg>`, and whether the page shows it first."""
-
-    label: str
-    svg: Markup
-    chosen: bool
 
 
 def render(template: str, *, filters: Mapping[str, Any], **values: Any) -> str:
@@ -32,26 +24,15 @@ def render(template: str, *, filters: Mapping[str, Any], **values: Any) -> str:
     return environment.get_template(template).render(**values)
 
 
-def drawings(
-    choices: Mapping[str, bytes], chosen: int, *, stem: str, description: str, estimators: Sequence[str] = ()
-) -> tuple[Drawing, ...]:
-    """Drawings from SVG files by label. The page shows one of them at a time.
+def inline(svg: bytes, stem: str, description: str, *, estimators: Sequence[str] = ()) -> Markup:
+    """The element `<svg>` for a page, from an SVG file.
 
     **Arguments:**
 
-    - `chosen`: the index of the drawing that the page shows first.
-    - `stem`: the ids in the elements begin with this text.
+    - `stem`: the ids in the element begin with this text.
     - `description`: what a screen reader says.
     - `estimators`: their names, for tooltips.
     """
-    made = []
-    for i, (label, file) in enumerate(choices.items()):
-        element = _inline(file, f"{stem}-{i}", escape(f"{description}, {label}" if label else description), estimators)
-        made.append(Drawing(label, Markup(element), i == chosen))  # noqa: S704  # text in our SVG is outlines
-    return tuple(made)
-
-
-def _inline(svg: bytes, stem: str, description: str, estimators: Sequence[str]) -> str:
     text = svg.decode()
     text = text[text.index("<svg") :]
     text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -74,4 +55,5 @@ def _inline(svg: bytes, stem: str, description: str, estimators: Sequence[str]) 
     pixels = _PIXELS * float(width[1]) if width else 0.0
     head = re.sub(r' (width|height)="[^"]*"', "", head)
     style = f"min-width: {0.8 * pixels:.0f}px; max-width: {_GROWTH * pixels:.0f}px"
-    return f'{head} role="img" aria-label="{description}" style="{style}">{rest}'
+    text = f'{head} role="img" aria-label="{escape(description)}" style="{style}">{rest}'
+    return Markup(text)  # noqa: S704  # text in our SVG is outlines

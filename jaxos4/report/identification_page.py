@@ -17,7 +17,7 @@ from ..analysis.frequency_response import AxisResponse, FrequencyResponse
 from ..analysis.prediction import Predictions
 from ..identification.results import Identification, SampleTime
 from ..results import NINETY_FIVE
-from .html import drawings, render
+from .html import inline, render
 from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg, ticks_at
 from .text import MISSING, plain
 
@@ -39,40 +39,31 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
     check_writable(path)
     look = styles([found.estimator])[found.estimator]
-    predictions, responses, sample_times = (), (), ()
+    predicted, used = found.predictions, found.provenance
+    rates, response, inertias, chosen = {}, {}, {}, 0
     with drawing():
-        if (predicted := found.predictions) is not None:
-            labels = [f"{horizon:.3g} s ahead" for horizon in predicted.horizons]
-            rates = (predicted_rates(predicted, found.provenance.sample_time, at, look) for at in range(len(labels)))
-            files = dict(zip(labels, map(svg, rates), strict=True))
-            chosen = list(files).index(labels[int(np.argmin(np.abs(predicted.horizons - _SHOWN)))])
-            description = "Measured and predicted body rates p, q, r"
-            predictions = drawings(files, chosen, stem="predictions", description=description)
+        if predicted is not None:
+            chosen = int(np.argmin(np.abs(predicted.horizons - _SHOWN)))
+            for i, horizon in enumerate(predicted.horizons):
+                rates[f"{horizon:.3g} s ahead"] = svg(predicted_rates(predicted, used.sample_time, i, look))
         if found.response is not None:
-            files = {"": svg(frequency_responses(found.response, look))}
-            description = "Frequency response of roll, pitch and yaw"
-            responses = drawings(files, 0, stem="response", description=description)
+            response[""] = svg(frequency_responses(found.response, look))
         if found.sample_times:
-            files = {"": svg(inertias_by_sample_time(found.sample_times, found.provenance.sample_time, look))}
-            description = "Moments of inertia against the sample time"
-            sample_times = drawings(files, 0, stem="sample_times", description=description)
+            inertias[""] = svg(inertias_by_sample_time(found.sample_times, used.sample_time, look))
     text = render(
         "identification.html.j2",
-        filters={"number": _number, "interval": _interval, "share": _share, "plain": plain},
+        filters={"number": _number, "interval": _interval, "share": _share, "plain": plain, "inline": inline},
         title=title,
         found=found,
         ninety_five=NINETY_FIVE,
-        predictions=predictions,
+        predictions=rates,
+        chosen=chosen,
         band=f"{100 * BAND:g}",
-        responses=responses,
-        sample_times=sample_times,
-        command=found.provenance.command or "",
-        notes=[*found.provenance.notes, *([found.motor_clock] if found.motor_clock else [])],
-        provenance=[
-            (name.replace("_", " "), _text(x))
-            for name, x in found.provenance.to_dict().items()
-            if name not in _ELSEWHERE
-        ],
+        responses=response,
+        sample_times=inertias,
+        command=used.command or "",
+        notes=[*used.notes, *filter(None, [found.motor_clock])],
+        provenance=[(name.replace("_", " "), _text(x)) for name, x in used.to_dict().items() if name not in _ELSEWHERE],
     )
     with write_atomically(path) as beside:
         beside.write_text(text, encoding="utf-8")
@@ -176,15 +167,14 @@ def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: 
     own = next((each.constants for each in answers if math.isclose(each.sample_time, chosen)), {})
     figure, panels = grid(3, columns=3, width=9.0, height=2.4)
     ticks = [1e3 * each.sample_time for each in answers]
-    shown: list[Artist] = []
+    shown: list[Any] = []
     for panel, name in zip(panels, ("Ix", "Iy", "Iz"), strict=True):
         rows = [(1e3 * each.sample_time, each.constants[name]) for each in answers if name in each.constants]
         scale = own[name].estimate if name in own else math.nan
         times = [time for time, _ in rows]
         values, errors = ([getattr(row, field) / scale for _, row in rows] for field in ("estimate", "std"))
         errors = [NINETY_FIVE * error for error in errors]
-        (line,) = panel.plot(times, values, color=look.color, marker="o", markersize=4)
-        panel.errorbar(times, values, yerr=errors, color=look.color, fmt="none", capsize=3)
+        line = panel.errorbar(times, values, yerr=errors, color=look.color, marker="o", markersize=4, capsize=3)
         mark = panel.axvline(1e3 * chosen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
         level = panel.axhline(1.0, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[2])
         shown = [line, mark, level]

@@ -18,19 +18,8 @@ Section = Iterator[str | Listing]
 
 def print_identification(console: Console, found: Identification) -> None:
     """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; or why there is no answer."""
-    sections = (
-        _notes,
-        _parameters,
-        _held,
-        _fit,
-        _inertias,
-        _sample_times,
-        _validation,
-        _disturbances,
-        _skill,
-        _summary,
-    )
-    for section in sections if found.has_answer else (_notes, _failure):
+    every = (_notes, _parameters, _held, _fit, _inertias, _sample_times, _validation, _disturbances, _skill, _summary)
+    for section in every if found.has_answer else (_notes, _failure):
         for part in section(found):
             if isinstance(part, Listing):
                 part.print_on(console)

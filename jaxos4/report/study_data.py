@@ -11,21 +11,8 @@ import xarray as xr
 from ..errors import InputError
 from ..study import RESULTS_FILE, metrics
 
-_FLIGHT = (*metrics.SCENARIO, "flight")
-_DIMENSIONS = (*_FLIGHT, "parameter")
-_VARIABLES = {
-    "truth": tuple(name for name in _DIMENSIONS if name != "estimator"),
-    "center": ("model", "airframe", "width", "parameter"),
-    "estimate": _DIMENSIONS,
-    "half_width": (*_DIMENSIONS, "level"),
-    "bound": _DIMENSIONS,
-    "result": _FLIGHT,
-    "rollouts": _FLIGHT,
-    "hit": _FLIGHT,
-    "seen": ("channels", "estimator"),
-    "unit": ("parameter",),
-}
-_TEXT = ("result", "seen", "unit")
+_DIMENSIONS = {*metrics.SCENARIO, "flight", "parameter", "level"}
+_VARIABLES = {"truth", "center", "estimate", "half_width", "bound", "result", "rollouts", "hit", "seen", "unit"}
 _PHRASES = {
     "model": "{} model",
     "airframe": "airframe {}",
@@ -54,29 +41,9 @@ def read_results(directory: Path) -> xr.Dataset:
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         what = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
-    if missing := _missing(dataset):
-        raise InputError(f"{path}: not the results of a study: {missing}; give a folder that `jaxos4 study` wrote.")
+    if missing := ", ".join(sorted(_VARIABLES - dataset.variables.keys() | _DIMENSIONS - set(dataset.dims))):
+        raise InputError(f"{path}: not the results of a study: no {missing}; give a folder that `jaxos4 study` wrote.")
     return dataset
-
-
-def _missing(dataset: xr.Dataset) -> str:
-    """The reason why a Dataset is not the results of a study. Empty if it is."""
-    for name, dimensions in _VARIABLES.items():
-        if name not in dataset.variables:
-            return f"no variable `{name}`"
-        if set(dataset[name].dims) != set(dimensions):
-            return f"`{name}` is not along {', '.join(dimensions)}"
-    for name in (*_DIMENSIONS, "level"):
-        if dataset.sizes[name] == 0:
-            return f"nothing along `{name}`"
-        if name not in dataset.coords:
-            return f"no coordinate `{name}`"
-    for name in (*(name for name in _VARIABLES if name not in _TEXT), "scale", "level"):
-        if dataset[name].dtype.kind not in "fiu":
-            return f"`{name}` does not hold numbers"
-    if not {"flag_values", "flag_meanings"} <= dataset["result"].attrs.keys():
-        return "`result` does not say what its codes mean"
-    return ""
 
 
 class Scenario(NamedTuple):

@@ -3,12 +3,11 @@
 Each function returns `None` if its data are absent.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
@@ -43,25 +42,23 @@ _NO_ROLLOUTS = 0.5
 def errors(data: xr.Dataset) -> Figure | None:
     """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
     data = positive_scales(data)
-    found, best = metrics.estimator_error(data), metrics.bound_error(data)
-    if not data.sizes["scale"] or not found["absolute"].notnull().any():
+    found, best, seen = metrics.estimator_error(data), metrics.bound_error(data), bounds(data)
+    units = [error_unit(data, place) for place in range(data.sizes["parameter"])]
+    values = [found[kind].isel(parameter=place) for place, (kind, _, _) in enumerate(units)]
+    figure, x = _against_noise(data, values, "RMS error", bounds=list(seen)), data["scale"].values
+    if figure is None:
         return None
-    figure, axes = grid(data.sizes["parameter"], columns=_COLUMNS, height=2.2)
-    x = data["scale"].values
-    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
-        kind, unit, why = error_unit(data, place)
-        for dash, estimator in zip(BOUND_DASHES, bounds(data).values(), strict=False):
+    for place, (panel, (kind, unit, why)) in enumerate(zip(figure.axes, units, strict=True)):
+        for dash, estimator in zip(BOUND_DASHES, seen.values(), strict=False):
             y = best[kind].isel(parameter=place, estimator=estimator).values
-            panel.plot(x, y, color=INK, linestyle=dash, linewidth=1.1, marker="_" if len(x) == 1 else None)
-        _draw_estimators(panel, data, found[kind].isel(parameter=place))
+            marker = "_" if len(x) == 1 else None
+            panel.plot(x, y, color=INK, linestyle=dash, linewidth=1.1, marker=marker, zorder=1.9)
         log_axis(panel, "y")
-        panel.set_title(f"{name} [{unit}]")
+        panel.set_title(f"{names(data, 'parameter')[place]} [{unit}]")
         if why:
             low, high = panel.get_ylim()
             panel.set_ylim(low, high * (high / low) ** 0.22)
             panel.text(0.03, 0.98, f"absolute: {why}", transform=panel.transAxes, va="top", fontsize=7)
-    label_edges(axes, _COLUMNS, x="noise scale", y="RMS error")
-    legend(figure, names(data, "estimator"), bounds=list(bounds(data)))
     return figure
 
 
@@ -69,75 +66,62 @@ def efficiency(data: xr.Dataset) -> Figure | None:
     """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
     data = positive_scales(data)
     found = metrics.efficiency(data)
-    if not data.sizes["scale"] or not found["efficiency"].notnull().any():
+    values = [found["efficiency"].isel(parameter=place) for place in range(data.sizes["parameter"])]
+    figure = _against_noise(data, values, "RMSE / bound", interval=found)
+    if figure is None:
         return None
-    figure, axes = grid(data.sizes["parameter"], columns=_COLUMNS, height=2.2)
-    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
-        panel.axhline(1, color=INK, linewidth=1.1)
-        one = found.isel(parameter=place)
-        _draw_estimators(panel, data, one["efficiency"], interval=one)
-        panel.set_yscale("log")
-        panel.set_title(name)
-    label_edges(axes, _COLUMNS, x="noise scale", y="RMSE / bound")
-    lows, highs = zip(*(panel.get_ylim() for panel in axes), strict=True)
-    for panel in axes:
+    for panel in figure.axes:
+        panel.axhline(1, color=INK, linewidth=1.1, zorder=1.9)
+    lows, highs = zip(*(panel.get_ylim() for panel in figure.axes), strict=True)
+    for panel in figure.axes:
         panel.set_ylim(min(lows), max(highs))
         log_axis(panel, "y")
-    legend(figure, names(data, "estimator"))
     return figure
 
 
-def frontier(data: xr.Dataset) -> Figure | None:
-    """The noise scale below which each parameter can be distinguished from 0, and the scales of the study."""
-    limits = metrics.frontier(data)
-    if not (limits > 0).any():
+def _against_noise(
+    data: xr.Dataset,
+    values: list[xr.DataArray],
+    label: str,
+    *,
+    interval: xr.Dataset | None = None,
+    bounds: Sequence[str] = (),
+) -> Figure | None:
+    """A panel for each parameter: its `values` for each estimator against the noise scale, with intervals if any."""
+    if not any(one.notnull().any() for one in values):
         return None
-    parameters = names(data, "parameter")
-    figure, (panel,) = grid(1, columns=1, width=7.0, height=0.5 * len(parameters) + 0.6)
-    scales = data["scale"].values[data["scale"].values > 0]
-    seen = bounds(data)
-    least = min(float(limits.where(limits > 0).min()), float(scales.min()))
-    for scale in scales:
-        panel.axvline(scale, color=FAINT, linewidth=0.8, linestyle="dashed", zorder=0)
-    for row, (channels, estimator) in enumerate(seen.items()):
-        x = limits.isel(estimator=estimator).values
-        y = (np.arange(len(parameters)) + 0.36 * (row - (len(seen) - 1) / 2))[x > 0]
-        x, label = x[x > 0], f"bound of channels: {channels}"
-        panel.plot(x, y, "oDs"[row % 3], color=INK, fillstyle="none" if row else "full", label=label)
-        for a, b in zip(x, y, strict=True):
-            panel.annotate(plain(a, 2), (a, b), (6, 0), textcoords="offset points", va="center", fontsize=7)
-    for y in np.flatnonzero((limits == 0).any("estimator").values):
-        panel.text(least, float(y), "the truth is 0: no noise is small enough", va="center", fontsize=7.5)
-    panel.set_xscale("log")
-    log_axis(panel, "x")
-    low, high = panel.get_xlim()
-    panel.set_xlim(low, high * (high / low) ** 0.06)
-    panel.set_yticks(range(len(parameters)), parameters)
-    panel.set_ylim(len(parameters) - 0.5, -0.5)
-    panel.set_xlabel("noise scale below which |truth| exceeds 1.96 bounds (dashed: the scales of this study)")
-    if len(seen) > 1:
-        figure.legend(loc="outside lower center", ncols=len(seen))
+    figure, axes = grid(len(values), columns=_COLUMNS, height=2.2)
+    scales = data["scale"].values
+    for parameter, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
+        for place, look in _looks(data):
+            x = scales if interval is None else dodged(scales, place, data.sizes["estimator"])
+            panel.plot(x, values[parameter].isel(estimator=place).values, gid=estimator_gid(place), **look.line)
+            if interval is not None:
+                one = interval.isel(parameter=parameter, estimator=place)
+                ends = one["low"].values, one["high"].values
+                panel.vlines(x, *ends, color=look.color, linewidth=1.0, gid=estimator_gid(place))
+        if not np.isfinite(values[parameter].values).any():
+            panel.text(0.5, 0.5, "no estimates", transform=panel.transAxes, ha="center")
+        scale_axis(panel, scales)
+        panel.set_yscale("log")
+        panel.set_title(name)
+    label_edges(axes, _COLUMNS, x="noise scale", y=label)
+    legend(figure, names(data, "estimator"), bounds=bounds)
     return figure
 
 
-def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None:
-    """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1.
-
-    `drawn`: this figure of another scale, whose boxes are replaced. It keeps its layout, which takes half of the time.
-    """
+def distribution(data: xr.Dataset) -> Figure | None:
+    """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1."""
     every = metrics.normalised_error(data.isel(scale=nearest_scale(data)))
     some = every.notnull().any("flight")
     if not some.any():
         return None
     found = every.where(some, 0.0).quantile(list(_QUANTILES), dim="flight").where(some)
     estimators = names(data, "estimator")
-    if drawn is None:
-        drawn, _ = grid(data.sizes["parameter"], columns=_COLUMNS, height=0.28 * len(estimators) + 0.75)
+    figure, axes = grid(data.sizes["parameter"], columns=_COLUMNS, height=0.28 * len(estimators) + 0.75)
     # Wide enough for the boxes, but limited in case one estimator is very bad.
     reach = float(np.clip(1.08 * np.nanmax(np.abs(found.values), initial=0.0), 3.0, 12.0))
-    for place, (panel, name) in enumerate(zip(drawn.axes, names(data, "parameter"), strict=True)):
-        for old in (*panel.lines, *panel.texts):
-            old.remove()
+    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
         for x in (-NINETY_FIVE, NINETY_FIVE):
             panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
         panel.axvline(0, color=INK, linewidth=0.8)
@@ -156,8 +140,8 @@ def distribution(data: xr.Dataset, drawn: Figure | None = None) -> Figure | None
         panel.set_ylim(len(estimators) - 0.4, -0.6)
         panel.set_yticks(range(len(estimators)), estimators if place % _COLUMNS == 0 else [])
         panel.grid(axis="y", visible=False)
-    label_edges(drawn.axes, _COLUMNS, x="error / bound")
-    return drawn
+    label_edges(axes, _COLUMNS, x="error / bound")
+    return figure
 
 
 def coverage(data: xr.Dataset) -> Figure | None:
@@ -233,20 +217,6 @@ def _looks(data: xr.Dataset) -> Iterator[tuple[int, Style]]:
     return enumerate(styles(names(data, "estimator")).values())
 
 
-def _draw_estimators(panel: Axes, data: xr.Dataset, values: xr.DataArray, interval: xr.Dataset | None = None) -> None:
-    """A line of each estimator against the noise scale, with its intervals if there are any."""
-    for place, look in _looks(data):
-        x, y = data["scale"].values, values.isel(estimator=place).values
-        x = x if interval is None else dodged(x, place, data.sizes["estimator"])
-        panel.plot(x, y, gid=estimator_gid(place), **look.line)
-        if interval is not None:
-            low, high = (interval[end].isel(estimator=place).values for end in ("low", "high"))
-            panel.vlines(x, low, high, color=look.color, linewidth=1.0, gid=estimator_gid(place))
-    if not np.isfinite(values.values).any():
-        panel.text(0.5, 0.5, "no estimates", transform=panel.transAxes, ha="center")
-    scale_axis(panel, data["scale"].values)
-
-
 def search(data: xr.Dataset) -> Figure | None:
     """Half-widths and centres of the brackets of IBSS after each sweep, in units of the first half-widths."""
     if "search_half_width" not in data:
@@ -296,26 +266,6 @@ def trajectories(data: xr.Dataset, *, minus_truth: bool = False) -> Figure | Non
                 panel.plot(one["time"], y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=gid)
         panel.set_title(f"{one['state'].item()} [{one['state_unit'].item()}]")
     label_edges(axes, 3, x="time [s]")
-    legend(figure, names(data, "estimator"), markers=False)
-    return figure
-
-
-def path(data: xr.Dataset) -> Figure | None:
-    """The example flight in space."""
-    if "example_true" not in data:
-        return None
-    data = data.isel(state=[names(data, "state").index(axis) for axis in "xyz"])
-    if not np.isfinite(data["example_true"].values).any():
-        return None
-    figure = Figure(figsize=(6.5, 5.0), layout="constrained")
-    panel = figure.add_subplot(projection="3d")
-    panel.plot(*data["example_measured"].values.T, ".", color=FAINT, markersize=1.5, label="measured")
-    panel.plot(*data["example_true"].values.T, color=INK, linewidth=1.2)
-    for row, look in _looks(data):
-        line = data["example_simulated"].isel(estimator=row).values
-        if np.isfinite(line).any():
-            panel.plot(*line.T, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(row))
-    panel.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"})
     legend(figure, names(data, "estimator"), markers=False)
     return figure
 

@@ -1,6 +1,5 @@
 """The report of a study: its figures with their captions, and one HTML page that needs no other file."""
 
-import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -11,8 +10,8 @@ from matplotlib.figure import Figure
 
 from .._files import check_writable, write_atomically
 from . import study_figures, study_tables
-from .html import Drawing, drawings, render
-from .study_data import Scenario, names, nearest_scale, scale_labels, scenarios
+from .html import inline, render
+from .study_data import Scenario, names, scenarios
 from .style import drawing, pdf, styles, svg
 
 MOST_DRAWN = 12
@@ -30,36 +29,26 @@ SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "distribution": study_figures.distribution,
     "rollouts": study_figures.rollouts,
     "coverage": study_figures.coverage,
-    "frontier": study_figures.frontier,
 }
 EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "trajectories": study_figures.trajectories,
     "deviations": partial(study_figures.trajectories, minus_truth=True),
-    "path": study_figures.path,
     "search": study_figures.search,
     "training": study_figures.training,
 }
-# These figures show one noise scale: in the files, the scale nearest 1; on the page, the scale that the reader chooses.
-_ONE_SCALE = ("distribution",)
 
 
 class Drawn(NamedTuple):
-    """A figure of a study.
-
-    - `stem`: the name of its files, without the suffix.
-    - `files`: the bytes of its files, by suffix.
-    - `choices`: the SVG figures among which the reader of the page chooses, by label. The file is one of them.
-    """
+    """A figure of a study: the name of its files without the suffix, and their bytes by suffix."""
 
     stem: str
     files: dict[str, bytes]
-    choices: dict[str, bytes]
 
 
 def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
     """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; returns their paths, the page first.
 
-    All figures are drawn before the first file is written. Figures that only an older report has are removed.
+    All figures are drawn before the first file is written.
 
     **Arguments:** `with_pdf`: if false, figures are SVG only, which takes half the time.
     """
@@ -71,19 +60,14 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
         suffix = f"-{scenario.number}" if len(every) > 1 else ""
         sections.append((scenario, draw(shown, scenario.data, suffix=suffix, with_pdf=with_pdf)))
     example = draw(EXAMPLE_FIGURES, dataset, with_pdf=with_pdf)
-    page = _page(dataset, sections, example).encode()
-    folder.mkdir(exist_ok=True)
-    files: dict[Path, bytes] = {}
+    files = {target: _page(dataset, sections, example).encode()}
     for drawn in [drawn for figures in (*(of for _, of in sections), example) for drawn in figures.values()]:
         files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in drawn.files.items()}
-    for path, content in (*files.items(), (target, page)):
+    folder.mkdir(exist_ok=True)
+    for path, content in reversed(files.items()):  # the page last
         with write_atomically(path) as beside:
             beside.write_bytes(content)
-    ours = "|".join(SCENARIO_FIGURES | EXAMPLE_FIGURES)
-    for path in folder.iterdir():
-        if path not in files and re.fullmatch(rf"({ours})(-\d+)?\.(svg|pdf)", path.name):
-            path.unlink()
-    return [target, *files]
+    return list(files)
 
 
 def draw(
@@ -93,16 +77,9 @@ def draw(
     made = {}
     for name, draw_figure in figures.items():
         with drawing():
-            figure = draw_figure(data)
-            if figure is None:
-                continue
-            files, choices = {"svg": svg(figure)} | ({"pdf": pdf(figure)} if with_pdf else {}), {}
-            for place, label in enumerate(scale_labels(data)) if name in _ONE_SCALE else ():
-                if place == nearest_scale(data):
-                    choices[label] = files["svg"]
-                elif draw_figure(data.isel(scale=[place]), figure) is not None:
-                    choices[label] = svg(figure)
-        made[name] = Drawn(f"{name}{suffix}", files, choices or {"": files["svg"]})
+            if (figure := draw_figure(data)) is not None:
+                files = {"svg": svg(figure)} | ({"pdf": pdf(figure)} if with_pdf else {})
+                made[name] = Drawn(f"{name}{suffix}", files)
     return made
 
 
@@ -112,13 +89,9 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
     estimators = names(dataset, "estimator")
     missing, cells = study_tables.cells_not_run(dataset)
 
-    def inline(drawn: Drawn, description: str) -> tuple[Drawing, ...]:
-        chosen = list(drawn.choices.values()).index(drawn.files["svg"])
-        return drawings(drawn.choices, chosen, stem=drawn.stem, description=description, estimators=estimators)
-
     return render(
         "study.html.j2",
-        filters={"inline": inline},
+        filters={"inline": partial(inline, estimators=estimators)},
         title=attributes.get("title", "") or "A study",
         command=attributes.get("command", ""),
         specification=attributes.get("specification", ""),

@@ -53,14 +53,12 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
     def table(found: xr.Dataset, measure: str, text: Callable[[float], str], headings: list[str]) -> Table:
         return _by_estimator(data, headings, lambda at: _with_intervals(found.isel(at), measure, text))
 
-    parameters = names(data, "parameter")
+    parameters, levels = names(data, "parameter"), [f"{100 * x:g} %" for x in data["level"].values]
     return {
         "error": error_table(data),
         "efficiency": table(metrics.efficiency(data), "efficiency", plain, parameters),
         "coverage": table(metrics.coverage(data).sel(level=shown_level(data)), "coverage", percent, parameters),
-        "levels": table(
-            metrics.mean_coverage(data), "coverage", percent, [f"{100 * x:g} %" for x in data["level"].values]
-        ),
+        "levels": table(metrics.mean_coverage(data), "coverage", percent, levels),
         "results": _result_table(data),
     }
 

@@ -59,7 +59,6 @@ _LEGEND_WIDTH = 1.4  # the width of one entry [inch]
 _INKED = ("axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "text.color", "xtick.color", "ytick.color")
 _RC: dict[Any, Any] = {
     **dict.fromkeys(_INKED, INK),
-    **dict.fromkeys((f"axes3d.{axis}axis.panecolor" for axis in "xyz"), "none"),
     **dict.fromkeys(("axes.labelsize", "font.size", "legend.fontsize"), 8.5),
     **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), 8),
     "axes.grid": True,
@@ -154,12 +153,7 @@ def ticks_at(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
 
 
 def legend(
-    figure: Figure,
-    estimators: Sequence[str],
-    *,
-    bounds: Sequence[str] = (),
-    lines: bool = True,
-    markers: bool = True,
+    figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] = (), lines: bool = True, markers: bool = True
 ) -> None:
     """Adds a legend below the figure: an entry for each bound and each estimator, with lines, markers or both.
 
