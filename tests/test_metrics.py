@@ -95,14 +95,6 @@ def test_accuracy_is_against_the_least_bound(study):
         same(accuracy.isel(at), math.exp(sum(math.log(r) for r in ratios) / 8) if converged else math.nan)
 
 
-def test_the_frontier_is_the_scale_at_which_the_truth_is_the_noise_floor():
-    study = synthetic_study(flights=3, spoiled=False, example=False)
-    frontier = metrics.frontier(study).squeeze().sel(estimator="ibss")
-    truth = abs(study["truth"].isel(scale=0, flight=0).squeeze().values)
-    assert np.allclose(frontier, truth / (1.959964 * BOUND["all"]))
-    assert float(frontier.sel(parameter="alpha7")) == 0  # its truth is 0
-
-
 @pytest.mark.parametrize("spread", [1.0, 1.5])
 def test_efficiency_of_errors_of_a_known_size(spread):
     study = synthetic_study(flights=2000, scales=(1.0,), estimators=("ibss",), spoiled=False, example=False)
@@ -147,7 +139,6 @@ def test_metrics_of_a_study_without_results_are_nan_without_a_warning():
     assert metrics.center_error(study)["absolute"].isnull().all()
     assert metrics.mean_rollouts(study).isnull().all()
     assert metrics.accuracy(study).isnull().all()
-    assert metrics.frontier(study).isnull().all()
     assert int(metrics.result_counts(study).sel(code="not_run").sum()) == 4 * 15
 
 
@@ -155,4 +146,3 @@ def test_without_noise_there_is_no_efficiency():
     study = synthetic_study(flights=4, scales=(0.0, 1.0), spoiled=False, example=False)
     assert metrics.efficiency(study)["efficiency"].isel(scale=0).isnull().all()
     assert metrics.estimator_error(study)["percent"].sel(parameter="alpha2").isel(scale=0).notnull().all()
-    assert metrics.frontier(study).notnull().all()

@@ -129,15 +129,6 @@ def accuracy(dataset: xr.Dataset) -> xr.DataArray:
     return xr.apply_ufunc(np.exp, logarithm.mean("parameter", skipna=False))
 
 
-def frontier(dataset: xr.Dataset) -> xr.DataArray:
-    """The noise scale below which a parameter can be distinguished from 0: |truth| is `NINETY_FIVE` bounds there.
-
-    The bound is proportional to the scale, so that every flight gives this scale; the result is the median. 0: never.
-    """
-    bound = dataset["bound"].where(dataset["bound"] > 0)
-    return (dataset["scale"] * abs(dataset["truth"]) / (NINETY_FIVE * bound)).median(("scale", "flight"))
-
-
 def _one_of(dataset: xr.Dataset, names: tuple[str, ...]) -> xr.DataArray:
     known = codes(dataset)
     return dataset["result"].isin([known[name] for name in names if name in known])
