@@ -19,7 +19,8 @@ import jaxos4
 from jaxos4.estimators import FilterError
 from jaxos4.models.state import CASCADE_ORDER
 from jaxos4.shooting import InnovationsProblem, pad_flight
-from jaxos4.shooting.filters import BLOCK, LogNoise, Observed, gains_of
+from jaxos4.shooting.filters import BLOCK
+from jaxos4.shooting.gains import LogNoise, Observed, gains_of
 from jaxos4.shooting.innovations import SETTLING
 from jaxos4.shooting.segments import Segments
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import xarray as xr
-from synthetic_study import BOUND, LEVELS, RESULTS, SCENARIO, synthetic_study
+from synthetic_study import LEVELS, RESULTS, SCENARIO, synthetic_study
 
 from jaxos4.study import metrics
 

@@ -11,6 +11,7 @@ from helpers import CRAZYFLIE
 from lanes import names
 
 import jaxos4
+from jaxos4.identification import vehicle
 from jaxos4.identification.fit import fit_innovations
 from jaxos4.shooting import InnovationsProblem
 
@@ -144,6 +145,23 @@ def test_the_hybrid_finds_it_too():
     found, newton = hybrid(problem), jaxos4.FilterError()(problem)
     assert names(found) == "successful"
     assert (np.abs(found.parameters - newton.parameters) / newton.std)[: unknowns.count].max() < 0.05
+
+
+def test_an_identification_may_use_a_network(monkeypatch):
+    """The network sees the flight as it was trained for it, without padding."""
+
+    def trained(problem, name, *, seed):
+        bracket = jaxos4.Bracket.around(problem.unknowns.center, 0.3 * problem.unknowns.half_width)
+        settings = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
+        return settings.fit(problem, bracket, key=jax.random.key(seed))
+
+    monkeypatch.setattr(vehicle, "vehicle_network_for", trained)
+    flight, airframe = (lane(part, 0) for part in flown())
+    shorter = jax.tree.map(lambda leaf: leaf[:1001] if leaf.ndim else leaf, flight)
+    settings = jaxos4.VehicleSettings(terms=("offset", "lag"), sample_time=0.016, holdout=0.0)
+    found = jaxos4.identify(shorter, airframe, settings=settings, estimator="hybrid")
+    assert found.estimate.seed is not None
+    assert not any("no network" in note for note in found.provenance.notes or ())
 
 
 # The fit of an identification.

@@ -13,7 +13,7 @@ from .._xla import quick_jit
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
-from ..shooting.filters import LogNoise, Observed, gains_of, transition
+from ..shooting.gains import LogNoise, Observed, gains_of, transition
 from .frequency_response import modelled_acceleration
 
 HORIZONS = (0.1, 0.25, 0.5)

@@ -22,7 +22,7 @@ from ..models.state import Attitude
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, default_terms, has_full_scale
 from ..models.vehicle import FlightModel
 from ..shooting import InnovationsProblem, ShootingProblem
-from ..shooting.filters import LogNoise
+from ..shooting.gains import LogNoise
 from ..shooting.innovations import NOISE_PRECISION, joined
 from .envelope import ANGLES, POSITION, VELOCITY, Envelope, hover_squares
 from .rotor_speeds import drawn

@@ -20,7 +20,7 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
 from ..results import RESULTS
 from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
-from ..shooting.filters import LogNoise
+from ..shooting.gains import LogNoise
 from .jackknife import disagreement, parts_of
 from .noise_levels import diagnose, evaluate_estimate, refine
 from .prepare import Case

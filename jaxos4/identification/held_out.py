@@ -14,7 +14,7 @@ from ..analysis.prediction import Predictions, Skill, disturbances, predictions,
 from ..estimate import fit_start
 from ..estimators import EquationError
 from ..shooting import ShootingProblem, padded
-from ..shooting.filters import LogNoise
+from ..shooting.gains import LogNoise
 from .fit import Fit
 from .noise_levels import channel_fits, diagnose
 from .prepare import HeldOut

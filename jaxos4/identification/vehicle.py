@@ -127,7 +127,15 @@ def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int,
         note = f"no network for these flights ({error}); IBSS searched the whole bracket"
         provenance = msgspec.structs.replace(case.provenance, notes=[*case.provenance.notes, note])
         return case._replace(estimator=_coarser(IBSS()), provenance=provenance)
-    return case._replace(estimator=_coarser(make_estimator(estimator, trained)))
+    return case._replace(problem=_unpadded(case), estimator=_coarser(make_estimator(estimator, trained)))
+
+
+def _unpadded(case: Case) -> InnovationsProblem:
+    """The likelihood without padding: a network answers flights of the length that it was trained for."""
+    problem, samples = case.innovations, case.shooting.flight.time.shape[0]
+    balance = problem.balance
+    balance = None if balance is None else balance._replace(weight=balance.weight[:samples])
+    return dataclasses.replace(problem, problem=case.shooting, balance=balance)
 
 
 def _coarser(method: AbstractEstimator) -> AbstractEstimator:

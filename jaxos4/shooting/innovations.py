@@ -26,7 +26,8 @@ from ..models.abstract import AbstractModel
 from ..models.state import CHANNELS, Forcing
 from ..models.vehicle import FlightModel
 from .abstract import AbstractProblem, Stages, WindowUnknowns
-from .filters import Innovations, LogNoise, Observed, innovate
+from .filters import Innovations, innovate
+from .gains import LogNoise, Observed, first_noise
 from .problem import ShootingProblem
 from .rows import Rows, windowed
 from .scans import Curvature, Parts, Shot
@@ -147,7 +148,7 @@ class InnovationsProblem(AbstractProblem):
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The parameters, then the logarithms of the noise, with their brackets from differences of measurements."""
         own, dt = self.problem.unknowns, self.flight.dt
-        first = jnp.stack(_first_noise(self.problem.measured(), dt), axis=1)
+        first = jnp.stack(first_noise(self.problem.measured(), dt, _TIMES[0]), axis=1)
         lowest, highest = first - np.log(_NOISE_REACH), first + np.log(_NOISE_REACH)
         is_rate = np.arange(first.shape[0]) < CHANNELS["rates"]
         shortest = jnp.where(is_rate, jnp.log(_SHORTEST * dt), np.log(_FORCE_SHORTEST))
@@ -337,23 +338,3 @@ def joined(
         whole = whole.at[own, :count].set(information[i, count:, :count])
         whole = whole.at[own, own].set(information[i, count:, count:])
     return total, whole
-
-
-def _first_noise(measured: Float[Array, "samples channels"], dt: Scalar) -> LogNoise:
-    """The center of the noise's bracket, from differences of the measurements."""
-    is_rate = np.arange(measured.shape[1]) < CHANNELS["rates"]
-
-    def power(values: Float[Array, "rows channels"]) -> Float[Array, " channels"]:
-        known = ~jnp.isnan(values)
-        return jnp.where(known, jnp.square(values), 0.0).sum(axis=0) / jnp.maximum(known.sum(axis=0), 1)
-
-    def logarithm(values: Float[Array, " channels"]) -> Float[Array, " channels"]:
-        return jnp.log(jnp.where((values > 0) & jnp.isfinite(values), values, 1.0))
-
-    # White noise has second differences of 6 times its variance.
-    sensor = jnp.sqrt(power(jnp.diff(measured, n=2, axis=0)) / 6)
-    change = jnp.sqrt(power(jnp.diff(measured, axis=0))) / dt / 2
-    mean = jnp.nansum(measured, axis=0) / jnp.maximum((~jnp.isnan(measured)).sum(axis=0), 1)
-    spread = jnp.sqrt(power(measured - mean)) / 2
-    strength = jnp.where(is_rate, change, spread)
-    return LogNoise(logarithm(strength), jnp.full(strength.shape, np.log(_TIMES[0])), logarithm(sensor))

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Int
 from .._custom_types import Count, Numeric
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, CHANNELS
-from .filters import BLOCK, Observed
+from .filters import BLOCK
+from .gains import Observed
 from .problem import ShootingProblem
 
 # A gap of this length ends what a filter knows [s].

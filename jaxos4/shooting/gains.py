@@ -1,0 +1,197 @@
+"""The gains of the Kalman filters of filter error, which do not depend on the parameters of the model.
+
+A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a
+force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
+The filter of a body rate knows the rate and its disturbance; that of a specific force knows its disturbance. Channels
+share no covariance.
+
+Arrays have the axes (time, channels, segments). A segment is one part of the flight.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._custom_types import Numeric, Scalar
+
+Channels = Float[Array, "channels segments"]
+Series = Float[Array, "time channels segments"]
+
+RATES = 3
+"""The number of body rates, which come first among the channels."""
+# Standard deviation of the rates before the first measurement of a segment [rad/s]: as good as unknown.
+_UNKNOWN_RATE = 1e3
+# The sample time over the time constant below which a Taylor series is more exact.
+_SHORT = 0.03
+
+
+class LogNoise(NamedTuple):
+    """The logarithms of each channel's noise levels. Logarithms may have any sign.
+
+    - `strength`: standard deviation of the disturbance, [rad/s^2] for rates and [m/s^2] for specific force.
+    - `time_constant`: of the disturbance [s].
+    - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
+    """
+
+    strength: Float[Numeric, " channels"]
+    time_constant: Float[Numeric, " channels"]
+    sensor: Float[Numeric, " channels"]
+
+
+class Observed(NamedTuple):
+    """What was measured, in segments.
+
+    - `measured`: body rates, then specific force. NaN: not measured.
+    - `restart`: whether a segment forgets what it knew before this sample.
+    - `counts`: whether the innovations at a sample count.
+    - `known`: the rates at the first sample. `None`: unknown.
+    """
+
+    measured: Series
+    restart: Bool[Array, "time segments"]
+    counts: Bool[Array, "time segments"]
+    known: Float[Array, "3 segments"] | None = None
+
+
+class Gains(NamedTuple):
+    """What a unit of innovation adds to rate and disturbance, and the variance of the innovation."""
+
+    rate: Series
+    disturbance: Series
+    variance: Series
+
+
+class Covariance(NamedTuple):
+    """Of the rate, of rate and disturbance, and of the disturbance."""
+
+    rate: Channels
+    cross: Channels
+    disturbance: Channels
+
+
+class _Step(NamedTuple):
+    """The disturbance over one sample, of each channel.
+
+    - `kept`: the share of it that remains. `reach`: what a unit of it adds to the rate.
+    - `added`: the covariance that its noise adds.
+    - `variance`: of the disturbance. `sensor`: of the sensor's noise.
+    """
+
+    kept: Channels
+    reach: Channels
+    added: Covariance
+    variance: Channels
+    sensor: Channels
+
+
+def transition(time_constant: Float[Array, "*channels"], dt: Scalar) -> tuple[Array, Array]:
+    """The share of a disturbance that remains after one sample, and what a unit of it adds to the rate [s]."""
+    share = dt / time_constant
+    return jnp.exp(-share), -time_constant * jnp.expm1(-share)
+
+
+def _is_rate(channels: int) -> Bool[np.ndarray, "channels 1"]:
+    """Which channels are body rates; the others are specific force."""
+    return np.arange(channels)[:, None] < RATES
+
+
+def _step_of(noise: LogNoise, dt: Scalar) -> _Step:
+    """Exact for an Ornstein-Uhlenbeck process."""
+    strength, time_constant, sensor = (leaf[:, None] for leaf in noise)
+    variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
+    share, (kept, reach) = dt / tau, transition(tau, dt)
+    lost, lost_twice = -jnp.expm1(-share), -jnp.expm1(-2 * share)
+    is_rate = _is_rate(strength.shape[0])
+    # For long time constants a difference of nearly equal numbers, and so its Taylor series.
+    series = share**3 / 3 * (1 - share * (3 / 4 - share * (7 / 20 - share * (1 / 8 - share * (31 / 840)))))
+    spread = jnp.where(share < _SHORT, series, share - 2 * lost + lost_twice / 2)
+    rate = jnp.where(is_rate, 2 * variance * tau**2 * spread, 0.0)
+    cross = jnp.where(is_rate, variance * tau * lost**2, 0.0)
+    reach = jnp.where(is_rate, reach, 0.0)
+    return _Step(kept, reach, Covariance(rate, cross, variance * lost_twice), variance, jnp.exp(2 * sensor))
+
+
+def _restart(p: Covariance, restart: Bool[Array, " segments"], step: _Step) -> Covariance:
+    is_rate = _is_rate(p.rate.shape[0])
+    return Covariance(
+        jnp.where(restart, jnp.where(is_rate, _UNKNOWN_RATE**2, 0.0), p.rate),
+        jnp.where(restart, 0.0, p.cross),
+        jnp.where(restart, step.variance, p.disturbance),
+    )
+
+
+def _measure(p: Covariance, is_measured: Bool[Array, "channels segments"], step: _Step) -> tuple[Covariance, "Gains"]:
+    """The covariance after a measurement, and the gains that belong to it."""
+    is_rate = _is_rate(p.rate.shape[0])
+    variance = jnp.where(is_rate, p.rate, p.disturbance) + step.sensor
+    weight = jnp.where(is_measured, 1 / variance, 0.0)
+    # The share that remains, without a difference of large numbers.
+    kept = jnp.where(is_measured, step.sensor / variance, 1.0)
+    disturbance = jnp.where(is_rate, p.cross, p.disturbance) * weight
+    after = Covariance(
+        p.rate * jnp.where(is_rate, kept, 1.0),
+        p.cross * kept,
+        jnp.where(is_rate, p.disturbance - p.cross * disturbance, p.disturbance * kept),
+    )
+    return after, Gains(p.rate * weight, disturbance, jnp.where(is_measured, variance, 1.0))
+
+
+def _predict(p: Covariance, step: _Step) -> Covariance:
+    """The covariance one sample later."""
+    reach, kept, added = step.reach, step.kept, step.added
+    return Covariance(
+        p.rate + 2 * reach * p.cross + reach**2 * p.disturbance + added.rate,
+        kept * (p.cross + reach * p.disturbance) + added.cross,
+        kept**2 * p.disturbance + added.disturbance,
+    )
+
+
+def gains_of(observed: Observed, noise: LogNoise, dt: Scalar) -> Gains:
+    """The gains of the filters of all channels."""
+    return gains_after(first_covariance(observed, noise, dt), noise, observed, dt)[1]
+
+
+def first_covariance(observed: Observed, noise: LogNoise, dt: Scalar) -> Covariance:
+    """The covariance before the first measurement of a segment."""
+    zero = jnp.zeros(observed.measured.shape[1:], dtype=float)
+    return Covariance(zero, zero, zero + _step_of(noise, dt).variance)
+
+
+def gains_after(p: Covariance, noise: LogNoise, observed: Observed, dt: Scalar) -> tuple[Covariance, Gains]:
+    """The gains of some rows, and the covariance after them, from that before them."""
+    step = _step_of(noise, dt)
+
+    def body(p: Covariance, row):
+        is_measured, restart = row
+        p, gain = _measure(_restart(p, restart, step), is_measured, step)
+        return _predict(p, step), gain
+
+    return jax.lax.scan(body, p, (~jnp.isnan(observed.measured), observed.restart))
+
+
+def basis(noise: LogNoise) -> LogNoise:
+    """The three directions of `noise`: in each, the same logarithm of all channels changes."""
+    return LogNoise(*np.eye(3)[:, :, None] * np.ones(noise.strength.shape[0]))
+
+
+def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_constant: float) -> LogNoise:
+    """Rough noise levels from differences of the measurements. `time_constant`: of all disturbances [s]."""
+    is_rate = np.arange(measured.shape[1]) < RATES
+
+    def power(values: Float[Array, "rows channels"]) -> Float[Array, " channels"]:
+        known = ~jnp.isnan(values)
+        return jnp.where(known, jnp.square(values), 0.0).sum(axis=0) / jnp.maximum(known.sum(axis=0), 1)
+
+    def logarithm(values: Float[Array, " channels"]) -> Float[Array, " channels"]:
+        return jnp.log(jnp.where((values > 0) & jnp.isfinite(values), values, 1.0))
+
+    # White noise has second differences of 6 times its variance.
+    sensor = jnp.sqrt(power(jnp.diff(measured, n=2, axis=0)) / 6)
+    change = jnp.sqrt(power(jnp.diff(measured, axis=0))) / dt / 2
+    mean = jnp.nansum(measured, axis=0) / jnp.maximum((~jnp.isnan(measured)).sum(axis=0), 1)
+    spread = jnp.sqrt(power(measured - mean)) / 2
+    strength = jnp.where(is_rate, change, spread)
+    return LogNoise(logarithm(strength), jnp.full(strength.shape, np.log(time_constant)), logarithm(sensor))
