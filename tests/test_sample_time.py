@@ -1,13 +1,18 @@
 """The rule that chooses the sample time of a vehicle, and what the fits at several sample times share."""
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE, compiled_programs
 
 import jaxos4
-from jaxos4.identification.results import Constant, SampleTime
-from jaxos4.identification.sample_time import moved, noise_of_speeds, shortest
+from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.results import Constant, HeldParameter, SampleTime
+from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, noise_of_speeds, shortest
+from jaxos4.identification.vehicle import prepare_vehicle
+from jaxos4.recording.reading import as_recordings
 
 
 def table(*rows):
@@ -76,3 +81,25 @@ def test_four_sample_times_need_one_program():
     np.testing.assert_allclose([each.sample_time for each in found.sample_times], [0.004, 0.008, 0.016, 0.032])
     searches = [name for name in programs if name is not None and "call" in name.lower()]
     assert len(searches) == 1, programs
+
+
+def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
+    """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
+    keys = jax.random.split(jax.random.key(1))
+    references = jaxos4.random_references(duration=8.0, dt=0.008, key=keys[0])
+    flight = jaxos4.fly_closed_loop(jaxos4.ClosedLoop(CRAZYFLIE, gust=2.0), references, dt=0.008, key=keys[1])
+    settings = jaxos4.VehicleSettings(terms=("offset", "lag", "delay", "accelerometer"), sample_time=0.008, holdout=0.0)
+    (case,) = prepare_vehicle(
+        as_recordings(flight), CRAZYFLIE, settings, estimator=None, bracket=None, network=None, validate=None
+    )
+    _, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
+    assert set(answer.constants) == {"Ix", "Iy", "Iz"}
+    place = fit.problem.model.parameter_names.index("thrust_gain")
+    unknown = np.asarray(fit.estimate.covariance).copy()
+    unknown[place, place] = 0.45**2
+    held = {"thrust_gain": HeldParameter(float(fit.estimate.parameters[place]), "1", "not identifiable")}
+    weak = fit._replace(estimate=eqx.tree_at(lambda e: e.covariance, fit.estimate, jnp.asarray(unknown)), held=held)
+    for name, row in vehicle_constants(weak).constants.items():
+        assert row.estimate == pytest.approx(vehicle_constants(fit).constants[name].estimate)
+        assert row.std > 0.4 * row.estimate
+    assert not answer_of(case, weak).constants

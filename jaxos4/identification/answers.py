@@ -110,20 +110,20 @@ def vehicle_constants(fit: Fit) -> RigidBody:
     model, free, values = fit.problem.model, fit.free, np.asarray(fit.estimate.parameters)
     known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), fit.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
-    for gain in [i for i in free if model.parameters[i].scales_torque]:
-        # Torques exceed those of the airframe by this factor.
+    gains = [i for i, parameter in enumerate(model.parameters) if parameter.scales_torque]
+    for gain in gains:
+        # Torques exceed those of the airframe by this factor, also if it is hardly known.
         for row in INVERSE.values():
             alpha[row] /= values[gain]
             slopes[row, row], slopes[row, gain] = 1 / values[gain], -alpha[row] / values[gain]
     slopes[~known] = 0.0
     unknown = np.where(known, 0.0, (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(unknown)
-    scaled = any(model.parameters[i].scales_torque for i in free)
-    if scaled:
+    if gains:
         # What no likelihood sees makes all moments of inertia wrong by one factor.
         shared = _SCALE * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
         covariance += shared[:, None] * shared
-    constants, thrust = {}, "mass" if scaled else "thrust_coefficient"
+    constants, thrust = {}, "mass" if gains else "thrust_coefficient"
     notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and drag are right"}
     for name, row in INVERSE.items():
         if known[row] and alpha[row] > 0:

@@ -43,7 +43,7 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
         if fits and fits[0].answered and _is_inside(problem, found := np.asarray(fits[0].estimate.parameters)):
             problem = problem.starting_from(found)
         fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
-    answers = tuple(_answer(case, fit) for case, fit in zip(cases, fits, strict=True))
+    answers = tuple(answer_of(case, fit) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
 
@@ -88,9 +88,12 @@ def moved(answer: SampleTime, other: SampleTime) -> list[str]:
     return [name for name in both if differs(answer.constants[name], other.constants[name])]
 
 
-def _answer(case: Case, fit: Fit) -> SampleTime:
-    constants = vehicle_constants(fit).constants if fit.answered else {}
-    if fit.answered and "yaw" in overwhelmed(fit):
+def answer_of(case: Case, fit: Fit) -> SampleTime:
+    """The answer of one sample time. Without a thrust there is no scale of torques, and so no answer."""
+    scales = [each.name for each in fit.problem.model.parameters if each.scales_torque]
+    answered = fit.answered and not any(name in fit.held for name in scales)
+    constants = vehicle_constants(fit).constants if answered else {}
+    if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in _RATES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
