@@ -118,11 +118,10 @@ class RecursiveLeastSquares(AbstractEstimator):
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model that is not linear
-        in those that are not held, or a flight that is cut into windows.
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model with parameters of
+        the rotors or the sensors, or a flight that is cut into windows.
         """
         check_recursive(problem)
-        check_linear(problem)
         return _in_blocks(self._identify, problem.within(bracket))
 
     def _identify(self, problem: ShootingProblem) -> Estimate:

@@ -16,7 +16,7 @@ from ..airframe import Airframe
 from ..estimate import REACH
 from ..flight import Flight
 from ..shooting import InnovationsProblem
-from .answers import overwhelmed, vehicle_constants
+from .answers import AXES, overwhelmed, vehicle_constants
 from .fit import Fit, fit_innovations
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
@@ -26,7 +26,6 @@ from .results import Constant, SampleTime
 WHITE, AGREE, _DISCRETE = 0.3, 2.0, 0.03
 # Noise may be this share of the changes of the rotors' torque from sample to sample. More makes inertias too large.
 NOISY = 0.1
-_RATES = ("p", "q", "r")
 # The share of the way to its limit at which an unknown counts as being there.
 _NEAR = 0.95
 
@@ -95,7 +94,7 @@ def answer_of(case: Case, fit: Fit) -> SampleTime:
     constants = vehicle_constants(fit).constants if answered else {}
     if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
-    correlations = [row.correlation for name, row in fit.disturbances.items() if name in _RATES] if fit.answered else []
+    correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
     flight = case.shooting.flight
     return SampleTime(float(flight.dt), constants, largest, noise_of_speeds(flight, fit.problem.model.airframe))

@@ -144,8 +144,8 @@ def innovate(
       a program.
     """
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
-    unknowns, first = count + 3, first_covariance(observed, noise, dt)
-    push = jax.linearize(lambda noise: first_covariance(observed, noise, dt), noise)[1]
+    unknowns = count + 3
+    first, push = jax.linearize(lambda noise: first_covariance(observed, noise, dt), noise)
     start = _start(observed, jnp.zeros((channels, segments), dtype=float))
     zero = jnp.zeros(segments, dtype=float)
     known = _Known(Rates(*start[:RATES]), (zero,) * channels)

@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Numeric, Scalar
+from ..models.state import CHANNELS
 
 Channels = Float[Array, "channels segments"]
 Series = Float[Array, "time channels segments"]
 
-RATES = 3
+RATES = CHANNELS["rates"]
 """The number of body rates, which come first among the channels."""
 # Standard deviation of the rates before the first measurement of a segment [rad/s]: as good as unknown.
 _UNKNOWN_RATE = 1e3
