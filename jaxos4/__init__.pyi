@@ -12,6 +12,7 @@ from . import (
     excitation as excitation,
     export as export,
     flight as flight,
+    forecast as forecast,
     identification as identification,
     linalg as linalg,
     logs as logs,
@@ -88,6 +89,7 @@ from .estimators import (
 )
 from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
 from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight
+from .forecast import FlightPrediction as FlightPrediction, predict as predict
 from .identification import (
     FlightInformation as FlightInformation,
     FlightSettings as FlightSettings,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Parameters, Scalar, as_float
 from .._xla import quick_jit
-from ..flight import Flight
+from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
 from ..shooting.gains import LogNoise, Observed, gains_of, transition
@@ -25,14 +25,16 @@ _PARTS = 10
 
 
 class Disturbances(NamedTuple):
-    """Angular accelerations that act on the body rates besides the model.
+    """What acts on each channel besides the model. The channels are the body rates, then specific forces.
 
-    - `value`: at each sample, from the measurements until then [rad/s^2].
+    - `value`: at each sample, from the measurements until then [rad/s^2; m/s^2].
     - `time_constant`: with which they fade [s].
+    - `rates`: the body rates that the measurements until then imply [rad/s]. `None`: not computed.
     """
 
-    value: Float[np.ndarray, "samples 3"]
-    time_constant: Float[np.ndarray, "3"]
+    value: Float[np.ndarray, "samples channels"]
+    time_constant: Float[np.ndarray, " channels"]
+    rates: Float[np.ndarray, "samples 3"] | None = None
 
 
 class Predictions(NamedTuple):
@@ -165,40 +167,60 @@ def skill(predicted: Predictions) -> Skill:
         return Skill(rmse, persistence, 1 - total[0] / total[1], spread, errors.shape[0])
 
 
-def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Disturbances:
-    """The disturbance of each body rate by Kalman filters, for the noise that `FilterError` found.
+def disturbances(
+    problem: ShootingProblem, parameters: Parameters, noise: LogNoise, *, forces: bool = False
+) -> Disturbances:
+    """The disturbance of each channel by Kalman filters, for the noise that `FilterError` found.
 
-    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r.
+    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r; the others are the
+    specific forces along `model.force_axes`, which `forces` includes.
     """
-    rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
-    modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
-    own = LogNoise(*(as_float(np.asarray(leaf)[:3]) for leaf in noise))
+    flight, channels = problem.flight, len(noise.strength) if forces else len(RATES)
+    rates, stretch = np.asarray(flight.states)[:, RATES], flight.stretch
+    measured, modelled = rates, np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
+    if channels > len(RATES):
+        known = np.where(np.isnan(rates).any(axis=1, keepdims=True), 0.0, rates)
+        expected = np.stack(_observed(problem, parameters, as_float(known))[len(RATES) :], axis=1)
+        force = flight.recorded[:, [len(STATE_NAMES) + axis for axis in problem.model.force_axes]]
+        measured = np.concatenate([rates, force - expected], axis=1)
+        modelled = np.pad(modelled, ((0, 0), (0, force.shape[1])))
+    own = LogNoise(*(as_float(np.asarray(leaf)[:channels]) for leaf in noise))
     begins = np.diff(np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch), prepend=-1) != 0
-    value = _filtered(own, as_float(rates), as_float(modelled), jnp.asarray(begins), problem.flight.dt)
-    return Disturbances(np.asarray(value), np.exp(np.asarray(own.time_constant)))
+    rate, value = _filtered(own, as_float(measured), as_float(modelled), jnp.asarray(begins), flight.dt)
+    time_constant = np.exp(np.asarray(own.time_constant))
+    return Disturbances(np.asarray(value), time_constant, np.asarray(rate)[:, : len(RATES)])
+
+
+@quick_jit
+def _observed(
+    problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
+) -> tuple[Float[Array, " samples"], ...]:
+    """The outputs of the model's sensors at these body rates: rates, then specific forces."""
+    return problem.model.observe(unstack(rates.T), problem.forcing(parameters), tuple(parameters))
 
 
 @quick_jit
 def _filtered(
     noise: LogNoise,
-    rates: Float[Array, "samples 3"],
-    modelled: Float[Array, "samples 3"],
+    measured: Float[Array, "samples channels"],
+    modelled: Float[Array, "samples channels"],
     begins: Bool[Array, " samples"],
     dt: Scalar,
-) -> Float[Array, "samples 3"]:
-    measured = ~jnp.isnan(rates)
-    observed = Observed(rates[:, :, None], begins[:, None], begins[:, None])
+) -> tuple[Float[Array, "samples channels"], Float[Array, "samples channels"]]:
+    """Rates and disturbances. A specific force is measured less its model, and has no rate."""
+    is_known, is_rate = ~jnp.isnan(measured), np.arange(measured.shape[1]) < len(RATES)
+    observed = Observed(measured[:, :, None], begins[:, None], begins[:, None])
     gains = gains_of(observed, noise, dt)
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
+    reach = jnp.where(is_rate, reach, 0.0)
 
-    def step(known: tuple[Array, Array], row) -> tuple[tuple[Array, Array], Array]:
-        (rate, disturbance), (y, measured, added, begins, by_rate, by_disturbance) = known, row
+    def step(known: tuple[Array, Array], row) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        (rate, disturbance), (y, is_known, added, begins, by_rate, by_disturbance) = known, row
         rate, disturbance = (jnp.where(begins, 0.0, x) for x in (rate, disturbance))
-        error = jnp.where(measured, y - rate, 0.0)
-        disturbance = disturbance + by_disturbance * error
-        moved = rate + by_rate * error + added * dt + reach * disturbance
-        return (moved, kept * disturbance), disturbance
+        error = jnp.where(is_known, y - jnp.where(is_rate, rate, disturbance), 0.0)
+        rate, disturbance = rate + by_rate * error, disturbance + by_disturbance * error
+        return (rate + added * dt + reach * disturbance, kept * disturbance), (rate, disturbance)
 
-    zero = jnp.zeros(3, dtype=float)
-    rows = rates, measured, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]
+    zero = jnp.zeros(measured.shape[1], dtype=float)
+    rows = measured, is_known, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]
     return jax.lax.scan(step, (zero, zero), rows)[1]

@@ -17,7 +17,7 @@ from ..models.abstract import PARAMETER_NAMES
 from ..results import NAMES, meaning
 from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
 
-_VEHICLE = "flight"
+VEHICLE = "flight"
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
 # differs from 1 by as many.
 _SIGNIFICANT = 3.0
@@ -54,8 +54,24 @@ class _Doubt(msgspec.Struct):
     remedy: str
 
 
-class _File(msgspec.Struct):
-    """The parts of a result file that an export needs."""
+class Disturbance(msgspec.Struct, frozen=True):
+    """See `jaxos4.identification.results.Disturbance`."""
+
+    strength: float
+    time_constant: float
+    sensor: float
+
+
+class Provenance(msgspec.Struct, frozen=True):
+    """See `jaxos4.identification.results.Provenance`."""
+
+    terms: list[str] = []
+    sample_time: float | None = None
+    battery_voltage: float | None = None
+
+
+class ResultFile(msgspec.Struct):
+    """The parts of a result that an export or a prediction needs."""
 
     estimator: str
     model: str
@@ -66,6 +82,13 @@ class _File(msgspec.Struct):
     covariance: list[list[float]] | None
     held: dict[str, _Held] = {}
     doubts: list[_Doubt] = []
+    disturbances: dict[str, Disturbance] = {}
+    provenance: Provenance = Provenance()
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the estimate cannot be trusted, and what to do; one line each."""
+        return tuple(f"not to be trusted because {doubt.cause}; {doubt.remedy}" for doubt in self.doubts)
 
 
 class Identified(NamedTuple):
@@ -135,8 +158,17 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.
     """
+    file = read_file(path)
     try:
-        return _identified(Path(path).name, msgspec.json.decode(Path(path).read_bytes(), type=_File))
+        return _identified(Path(path).name, file)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def read_file(path: str | os.PathLike[str]) -> ResultFile:
+    """The parts of a result file. Raises `InputError` if it is no result or has no estimate, as `read_result` does."""
+    try:
+        return checked(msgspec.json.decode(Path(path).read_bytes(), type=ResultFile))
     except msgspec.MsgspecError as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(
@@ -146,8 +178,9 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
         raise InputError(f"{path}: {error}") from None
 
 
-def _identified(name: str, file: _File) -> Identified:
-    for key, value, known in (("result", file.result, NAMES), ("model", file.model, (*MODELS, _VEHICLE))):
+def checked(file: ResultFile) -> ResultFile:
+    """The result. Raises `InputError` if it has no estimate, or is not of this version."""
+    for key, value, known in (("result", file.result, NAMES), ("model", file.model, (*MODELS, VEHICLE))):
         if value not in known:
             raise InputError(f"`{key}` {value[:40]}: must be one of {', '.join(known)}; run `jaxos4 estimate` again.")
     if not file.covariance or file.airframe is None:
@@ -156,8 +189,12 @@ def _identified(name: str, file: _File) -> Identified:
     shape = [len(row) for row in file.covariance] == count * [count]
     if not shape or any(row[i] < 0 for i, row in enumerate(file.covariance)):
         raise InputError(f"`covariance`: is not one of {count} parameters; run `jaxos4 estimate` again.")
-    airframe, covariance = airframe_from_table(file.airframe), np.array(file.covariance)
-    if file.model == _VEHICLE:
+    return file
+
+
+def _identified(name: str, file: ResultFile) -> Identified:
+    airframe, covariance = airframe_from_table(file.airframe or {}), np.array(file.covariance)
+    if file.model == VEHICLE:
         values, drawn, covariance, notes = _vehicle_parts(file, covariance)
     else:
         values, drawn, covariance, notes = _flight_parts(file, airframe, covariance)
@@ -173,7 +210,7 @@ def _identified(name: str, file: _File) -> Identified:
         values=_clipped(values),
         drawn=tuple(drawn[place] for place in kept),
         covariance=covariance[np.ix_(kept, kept)],
-        doubts=tuple(f"not to be trusted because {doubt.cause}; {doubt.remedy}" for doubt in file.doubts),
+        doubts=file.reasons,
         notes=tuple(notes),
     )
     if found.vehicle.impossible:
@@ -191,7 +228,7 @@ def _clipped(values: dict[str, float]) -> dict[str, float]:
 _Parts = tuple[dict[str, float], tuple[str, ...], np.ndarray, list[str]]
 
 
-def _flight_parts(file: _File, airframe: Airframe, covariance: np.ndarray) -> _Parts:
+def _flight_parts(file: ResultFile, airframe: Airframe, covariance: np.ndarray) -> _Parts:
     """Ix, Iy, Iz and J_R: the rigid body that explains the alphas of a flight best."""
     names = ("Ix", "Iy", "Iz", "J_R")
     if not file.constants.keys() >= set(names) or tuple(file.parameters) != PARAMETER_NAMES:
@@ -212,7 +249,7 @@ def _flight_parts(file: _File, airframe: Airframe, covariance: np.ndarray) -> _P
     return values, names[:known], spread[:known, :known], notes
 
 
-def _vehicle_parts(file: _File, covariance: np.ndarray) -> _Parts:
+def _vehicle_parts(file: ResultFile, covariance: np.ndarray) -> _Parts:
     """The parameters of a `FlightModel`."""
     rows, notes = file.parameters, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}

@@ -47,6 +47,7 @@ class Prepared(NamedTuple):
     - `fitted`: one flight of all stretches; measurements that are held out are missing.
     - `tested`: the same samples with only the held-out measurements; `None`: nothing is held out.
     - `recordings`: for each stretch, the number of its recording, from 0.
+    - `time`: of each sample in its log [s].
     - `length`: of a window, in samples.
     - `available`: what every recording offers to the terms of a model, see `Term.needs`.
     - `upright`: the cosine of the tilt at each sample. `None`: unknown.
@@ -60,6 +61,7 @@ class Prepared(NamedTuple):
     fitted: Flight
     tested: Flight | None
     recordings: tuple[int, ...]
+    time: Float[np.ndarray, " samples"]
     length: int
     available: frozenset[str]
     upright: Float[np.ndarray, " samples"] | None
@@ -205,13 +207,14 @@ def sampled(
     moved = len(motions) == len(pieces)
     if moved:
         pieces = [piece._replace(body_velocity=motion.velocity) for piece, motion in zip(pieces, motions, strict=True)]
-    whole = joined(pieces)
+    whole, whole_time = joined(pieces), np.concatenate([piece.time for piece in pieces])
     fitted, tested = hold_out(whole, length, holdout)
     seconds = _seconds(fitted), 0.0 if tested is None else _seconds(tested)
     return Prepared(
         fitted.flight,
         None if tested is None else tested.flight,
         numbers,
+        whole_time,
         length,
         _available_inputs(whole, pieces, airframe, motions if moved else []),
         np.concatenate([motion.up[:, 2] for motion in motions]) if moved else None,

@@ -1,0 +1,143 @@
+"""What a flight measured, with the attitude as a quaternion; and the simple predictions for comparison."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..flight import STATE_NAMES, Flight
+from .motion import inverse, product, turned
+
+# Median of |x| over the standard deviation of a Gaussian x, and the root sum of squares of a fourth difference.
+_MEDIAN, _FOURTH = 0.6745, np.sqrt(70.0)
+
+
+class Measured(NamedTuple):
+    """What a flight measured. NaN: not measured.
+
+    - `states`: see `jaxos4.forecast.motion.PARTS`.
+    - `omega`: rotor speeds or commands [rad/s]. `stretch`: the number of each sample's stretch. `dt`: sample time [s].
+    - `noise`: standard deviation of the white noise of position, velocity, attitude and rates.
+    """
+
+    states: Float[np.ndarray, "samples 13"]
+    omega: Float[np.ndarray, "samples 4"]
+    stretch: Int[np.ndarray, " samples"]
+    dt: float
+    noise: Float[np.ndarray, "12"]
+
+    @classmethod
+    def of(cls, flight: Flight) -> "Measured":
+        """The measurements of a flight."""
+        recorded = np.asarray(flight.states)
+        position, velocity, angles, rates = (
+            recorded[:, [STATE_NAMES.index(name) for name in names.split()]]
+            for names in ("x y z", "vx vy vz", "phi theta psi", "p q r")
+        )
+        half = np.stack([np.cos(angles / 2), np.sin(angles / 2)])
+        zero = np.zeros(len(angles))
+        roll, pitch, yaw = ((half[0, :, i], *np.insert([zero, zero], i, half[1, :, i], axis=0)) for i in range(3))
+        attitude = np.stack(product(yaw, product(pitch, roll)), axis=1)
+        stretch = np.zeros(len(angles), int) if flight.stretch is None else np.asarray(flight.stretch)
+        noise = np.concatenate([_white_noise(each) for each in (position, velocity, angles, rates)])
+        states = np.concatenate([position, velocity, attitude, rates], axis=1)
+        return cls(states, np.asarray(flight.omega), stretch, float(flight.dt), noise)
+
+    @property
+    def first_half(self) -> "Measured":
+        """The first half of the samples."""
+        half = slice(len(self.stretch) // 2)
+        return self._replace(states=self.states[half], omega=self.omega[half], stretch=self.stretch[half])
+
+
+def _white_noise(values: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, " columns"]:
+    """The standard deviation of white noise on slow columns, from their fourth differences; 0 if nothing is measured.
+
+    Their median: jumps between stretches, and of angles by a turn, do not count.
+    """
+    differences = np.abs(np.diff(values, n=4, axis=0))
+    known = np.isfinite(differences).sum(axis=0) > 0
+    differences = np.where(known, differences, 0.0)
+    return np.nanmedian(differences, axis=0) / (_MEDIAN * _FOURTH) if len(differences) else np.zeros(values.shape[1])
+
+
+def constant_rates(
+    begin: Float[np.ndarray, "starts 13"], steps: int, dt: float
+) -> Float[np.ndarray, "starts steps 13"]:
+    """The states if velocity and body rates stay as they were measured."""
+    return _moved(begin, np.repeat(begin[:, None, 10:], steps, 1), np.repeat(begin[:, None, 3:6], steps, 1), dt)
+
+
+class Regression(NamedTuple):
+    """A linear model: the change of rates, and the specific force, from rates, velocity and squared rotor speeds.
+
+    - `weights`: least squares, of the features in the rows. `scale`: of the features.
+    - `gravity`: [m/s^2].
+    - `moves`: whether velocity was measured; if not, it stays constant.
+    """
+
+    weights: Float[np.ndarray, "features 6"]
+    scale: Float[np.ndarray, " features"]
+    gravity: float
+    moves: bool
+
+    @classmethod
+    def of(cls, flight: Measured, gravity: float) -> "Regression | None":
+        """The regression of a flight; `None` if it measured too little."""
+        now, after = flight.states[:-1], flight.states[1:]
+        same = np.diff(flight.stretch) == 0
+        moves = bool(np.isfinite(flight.states[:, 3:10]).all(axis=1).any())
+        force = turned(inverse(now[:, 6:10].T), tuple(((after - now)[:, 3:6] / flight.dt + [0.0, 0.0, gravity]).T))
+        targets = np.concatenate([(after - now)[:, 10:] / flight.dt, np.stack(force, axis=1)], axis=1)
+        features = _features(now, flight.omega[:-1], moves)
+        targets = targets if moves else targets[:, :3]
+        usable = same & np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
+        if usable.sum() <= features.shape[1]:
+            return None
+        scale = np.maximum(np.abs(features[usable]).max(axis=0), 1e-12)
+        weights = np.linalg.lstsq(features[usable] / scale, targets[usable])[0]
+        return cls(weights, scale, gravity, moves)
+
+    def __call__(
+        self, begin: Float[np.ndarray, "starts 13"], omega: Float[np.ndarray, "starts steps 4"], dt: float
+    ) -> Float[np.ndarray, "starts steps 13"]:
+        """The states one step after another."""
+        rates, velocities, now = [], [], begin
+        for speeds in np.moveaxis(omega, 1, 0):
+            found = (_features(now, speeds, self.moves) / self.scale) @ self.weights
+            rate, velocity = np.clip(now[:, 10:] + dt * found[:, :3], -1e3, 1e3), now[:, 3:6]
+            if self.moves:
+                push = np.stack(turned(now[:, 6:10].T, tuple(found[:, 3:].T)), axis=1)
+                velocity = velocity + dt * (push - [0.0, 0.0, self.gravity])
+            following = _moved(now, rate[:, None], velocity[:, None], dt)[:, 0]
+            rates.append(rate), velocities.append(velocity)
+            now = following
+        return _moved(begin, np.stack(rates, axis=1), np.stack(velocities, axis=1), dt)
+
+
+def _features(states: np.ndarray, omega: np.ndarray, moves: bool) -> np.ndarray:
+    rates, one = states[:, 10:], np.ones((len(states), 1))
+    velocity = [np.stack(turned(inverse(states[:, 6:10].T), tuple(states[:, 3:6].T)), axis=1)] if moves else []
+    return np.concatenate([one, rates, *velocity, omega**2], axis=1)
+
+
+def _moved(
+    begin: Float[np.ndarray, "starts 13"],
+    rates: Float[np.ndarray, "starts steps 3"],
+    velocity: Float[np.ndarray, "starts steps 3"],
+    dt: float,
+) -> Float[np.ndarray, "starts steps 13"]:
+    """The states with these rates and velocities, which change linearly over a step."""
+
+    def means(first: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        whole = np.concatenate([first[:, None], rest], axis=1)
+        return (whole[:, 1:] + whole[:, :-1]) / 2
+
+    position = begin[:, None, :3] + dt * np.cumsum(means(begin[:, 3:6], velocity), axis=1)
+    turns, attitude, attitudes = dt * means(begin[:, 10:], rates), tuple(begin[:, 6:10].T), []
+    for turn in np.moveaxis(turns, 1, 0):
+        angle = np.linalg.norm(turn, axis=1)
+        axis = turn * (np.sinc(angle / (2 * np.pi)) / 2)[:, None]
+        attitude = product(attitude, (np.cos(angle / 2), *axis.T))
+        attitudes.append(np.stack(attitude, axis=1))
+    return np.concatenate([position, velocity, np.stack(attitudes, axis=1), rates], axis=2)

@@ -1,0 +1,209 @@
+"""`jaxos4.predict`: the whole flight, open loop, from many starts."""
+
+import dataclasses
+import math
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from .._custom_types import as_float
+from ..analysis.prediction import disturbances
+from ..errors import InputError
+from ..flight import Flight
+from ..identification import Identification
+from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
+from ..recording import preparation
+from ..recording.preparation import SAMPLE_TIME, Prepared
+from ..recording.reading import Recording, as_recording
+from ..shooting import ShootingProblem, padded
+from ..shooting.gains import Covariance, LogNoise
+from .measured import Measured, Regression, constant_rates
+from .motion import CHUNK, PARTS, Known, Lanes, fly_chunk, forcing_of, settled, turned
+from .prediction import FlightPrediction
+from .vehicle import Vehicle, vehicle_of
+
+# Futures of each start for the band, and half the width of a 95 % interval in their standard deviations (Student).
+_DRAWS, _NINETY_FIVE = 64, 1.9977
+# What a log cannot replace by a prediction.
+_INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
+
+
+def predict(
+    found: Identification | str | os.PathLike[str],
+    flight: Flight | Recording,
+    *,
+    horizon: float = 0.5,
+    sample_time: float | None = None,
+    spacing: float = 0.05,
+    seed: int = 0,
+) -> FlightPrediction:
+    """Predict position, velocity, attitude and body rates from many starts of a flight, with its rotor speeds.
+
+        prediction = jaxos4.predict("found.json", jaxos4.read_flight("flight.csv", airframe))
+        prediction.quality["attitude"].error       # by horizon [rad]
+
+    A prediction begins with the measured position, velocity and attitude, and with the rates and disturbances that
+    Kalman filters know from the measurements until then. After that it knows rotor speeds or commands, and the
+    battery's voltage if the model needs it, and nothing else that was measured.
+
+    The 95 % band holds what will be measured. It comes from 64 futures: parameters drawn from their covariance, errors
+    of the start, and disturbances drawn as the fit found them. The noise of the sensors is added.
+
+    **Arguments:**
+
+    - `found`: the identification of a vehicle, or the file that `jaxos4 estimate --out` wrote.
+    - `flight`: has body rates and attitude at least. Without a velocity, predictions begin with that of dead reckoning
+      along the body's z axis, or at rest; what was not measured is not compared.
+    - `horizon`: how far ahead [s].
+    - `sample_time`: the log is averaged to it [s]. Default: that of the fit.
+    - `spacing`: the time between two starts [s]; 0: at each sample.
+    - `seed`: of the draws.
+
+    The regression for comparison is fitted to the flight of `found`, or to the first half of `flight` if `found` is a
+    file.
+
+    **Raises:** `InputError`, one line, for a result without a vehicle, a flight that cannot be predicted, or unusable
+    arguments; `OSError` if `found` cannot be read.
+    """
+    for name, value, least in (("horizon", horizon, "positive"), ("spacing", spacing, "at least 0")):
+        if not math.isfinite(value) or value < 0 or (value == 0 and name == "horizon"):
+            raise InputError(f"`{name}`: must be a number of seconds, {least}, got {value:g}.")
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
+    vehicle, recording = vehicle_of(found), as_recording(flight)
+    prepared = _prepare(vehicle, recording, sample_time)
+    measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
+    dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
+    columns = np.isfinite(measured.states).any(axis=0)
+    missing = tuple(part for part in ("position", "velocity") if not columns[PARTS[part]].all())
+    start = _starts(measured, recording.name, steps, max(round(spacing / dt), 1), missing)
+    # White noise of longer samples is smaller.
+    noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
+    known = _known(problem, vehicle, measured, noise, start, missing)
+    states, spread = _fly(problem, vehicle, known, noise, measured, steps, seed)
+    ahead = start[:, None] + np.arange(1, steps + 1)
+    begin = np.asarray(known.state)
+    trained = Measured.of(found.problem.flight) if isinstance(found, Identification) else measured.first_half
+    regression = Regression.of(trained, float(vehicle.model.airframe.gravity))
+    sensors = np.append(measured.noise[:9], np.exp(noise.sensor[:3]))
+    return FlightPrediction(
+        found=vehicle.name,
+        flight=recording.name,
+        time=prepared.time[start],
+        horizons=dt * np.arange(1, steps + 1),
+        begin=begin,
+        predicted=states[:, 0],
+        unaware=states[:, 1],
+        half_width=_NINETY_FIVE * np.sqrt(spread**2 + sensors**2),
+        measured=measured.states[ahead],
+        constant=constant_rates(begin, steps, dt),
+        regression=None if regression is None else regression(begin, measured.omega[ahead - 1], dt),
+        missing=missing,
+        seed=seed,
+        notes=(*vehicle.notes, *prepared.notes),
+    )
+
+
+def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) -> Prepared:
+    """The usable parts of a log with the sample time of the fit, or that of the log if it is longer."""
+    name, airframe = recording.name, vehicle.model.airframe
+    if np.isnan(recording.states[:, [6, 8, 10]]).all(axis=0).any():
+        raise InputError(f"{name}: a prediction begins with the attitude; log phi, theta and psi.")
+    usable = preparation.usable_parts(
+        [recording], airframe, begin=None, end=None, sample_time=sample_time, holdout=0.0, predicted=True
+    )
+    step = max(vehicle.sample_time, SAMPLE_TIME, usable.slowest) if sample_time is None else sample_time
+    prepared = preparation.sampled(usable, airframe, sample_time=step, holdout=0.0)
+    for term in vehicle.model.terms:
+        if lacking := (TERMS[term].needs & _INPUTS) - prepared.available:
+            raise InputError(f"{name}: has no {' and '.join(sorted(lacking))}, which the term {term} needs; log it.")
+    return prepared
+
+
+def _problem(vehicle: Vehicle, prepared: Prepared) -> ShootingProblem:
+    """The flight, with what the model's forcing needs."""
+    flight, recordings = prepared.fitted, (0,) * len(prepared.recordings)
+    if flight.body_velocity is None:
+        flight = dataclasses.replace(flight, body_velocity=np.zeros((flight.time.size, 3)))
+    if flight.specific_force is None:
+        flight = dataclasses.replace(flight, specific_force=np.full((flight.time.size, 3), np.nan))
+    model = dataclasses.replace(vehicle.model, recordings=recordings)
+    return ShootingProblem(model, flight, sigma=np.ones(12), channels="rates", method="rk4")
+
+
+def _starts(
+    measured: Measured, name: str, steps: int, every: int, missing: tuple[str, ...]
+) -> Int[np.ndarray, " starts"]:
+    """The samples at which the state is measured, and that have so many samples after them."""
+    start = np.arange(0, len(measured.stretch) - steps, every)
+    start = start[measured.stretch[start] == measured.stretch[start + steps]]
+    if not start.size:
+        longest = (np.bincount(measured.stretch).max() - 1) * measured.dt
+        raise InputError(f"{name}: no part is longer than `horizon`; give at most {longest:.3g}.")
+    needed = np.concatenate([places for part, places in PARTS.items() if part not in missing])
+    start = start[np.isfinite(measured.states[start][:, needed]).all(axis=1)]
+    if not start.size:
+        raise InputError(f"{name}: rates and attitude are nowhere measured together; log both at one rate.")
+    return start
+
+
+def _known(
+    problem: ShootingProblem,
+    vehicle: Vehicle,
+    measured: Measured,
+    noise: LogNoise,
+    start: Int[np.ndarray, " starts"],
+    missing: tuple[str, ...],
+) -> Known:
+    """What is known at the starts, in NumPy. A position that was not measured is 0."""
+    filtered = disturbances(problem, as_float(vehicle.parameters), noise, forces=True)
+    state, flight = measured.states[start], problem.flight
+    if "velocity" in missing:
+        axial = np.asarray(flight.body_velocity)[start, 2]
+        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, (0 * axial, 0 * axial, axial)), 1)
+    if "position" in missing:
+        state[:, PARTS["position"]] = 0.0
+    lateral = np.nan_to_num(np.asarray(flight.specific_force)[start, :2])
+    return Known(start, state, np.asarray(filtered.rates)[start], filtered.value[start], lateral)
+
+
+def _fly(
+    problem: ShootingProblem,
+    vehicle: Vehicle,
+    known: Known,
+    noise: LogNoise,
+    measured: Measured,
+    steps: int,
+    seed: int,
+) -> tuple[Float[np.ndarray, "starts 2 steps 13"], Float[np.ndarray, "starts steps 12"]]:
+    """The states with and without the filters' knowledge, and the spread of the futures about the former."""
+    generator, channels = np.random.default_rng(seed), noise.strength.size
+    after, added = jax.tree.map(np.asarray, settled(LogNoise(*map(as_float, noise)), problem.flight.dt))
+    sure = np.stack([vehicle.parameters] * 2)
+    parameters = as_float(np.concatenate([sure, vehicle.draw(_DRAWS, generator)]))
+    begin = generator.standard_normal((_DRAWS, 12)) * np.nan_to_num(measured.noise)
+    first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
+    begin[:, 9:] = first[:, :3, 0]
+    gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
+    surely = (np.concatenate([np.zeros((2, *x.shape[1:])), x]) for x in (begin, first[..., 1], gusts))
+    filtered = np.arange(len(parameters)) != 1
+    lanes = Lanes(parameters, forcing_of(problem, parameters), jnp.asarray(filtered), *map(as_float, surely))
+    starts, found = len(known.first), []
+    model = vehicle.model
+    for chunk in range(0, starts, CHUNK):
+        rows = np.minimum(np.arange(chunk, chunk + CHUNK), starts - 1)
+        some = jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), known)  # noqa: B023
+        found.append(fly_chunk(model, lanes, some, LogNoise(*map(as_float, noise)), problem.flight.dt))
+    states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[:starts] for i in range(2))
+    return states, spread
+
+
+def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:
+    """Rates and disturbances with this covariance, from independent numbers of variance 1."""
+    rate = np.sqrt(np.maximum(covariance.rate, 0.0))
+    slope = np.divide(covariance.cross, rate, out=np.zeros_like(rate), where=rate > 0)
+    own = np.sqrt(np.maximum(covariance.disturbance - slope**2, 0.0))
+    return np.stack([rate * normal[..., 0], slope * normal[..., 0] + own * normal[..., 1]], axis=-1)

@@ -1,0 +1,197 @@
+"""A prediction of a flight: states, band, errors beside those of simple predictions, tables and files."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from .._files import write_atomically
+from .._version import __version__
+from ..errors import InputError
+from .motion import PARTS, departures
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+QUANTITIES: dict[str, tuple[str, list[int]]] = {
+    "position": ("m", [0, 1, 2]),
+    "velocity": ("m/s", [3, 4, 5]),
+    "attitude": ("rad", [6, 7, 8]),
+    "rates": ("rad/s", [9, 10, 11]),
+    "p": ("rad/s", [9]),
+    "q": ("rad/s", [10]),
+    "r": ("rad/s", [11]),
+}
+"""What is compared: the unit, and the components of an error."""
+
+_AXES = {"attitude": ("component", ["w", "x", "y", "z"]), "rates": ("rate", ["p", "q", "r"])}
+_SUFFIXES = (".nc", ".csv")
+
+
+class Quality(NamedTuple):
+    """The mean absolute error of one quantity by horizon, in its unit, over all starts.
+
+    The error of a start is the length of the vector of the error, and of the attitude the geodesic angle. NaN: nothing
+    was measured.
+
+    - `error`: of the prediction. `unaware`: of the prediction that knows no disturbance at the start.
+    - `constant`: if velocity and body rates stay constant. `regression`: of the regression; NaN if there is none.
+    - `coverage`: the share of measured components inside the 95 % band.
+    """
+
+    error: Float[np.ndarray, " horizons"]
+    unaware: Float[np.ndarray, " horizons"]
+    constant: Float[np.ndarray, " horizons"]
+    regression: Float[np.ndarray, " horizons"]
+    coverage: Float[np.ndarray, " horizons"]
+
+    @property
+    def sums(self) -> dict[str, float]:
+        """The sum of each error over all horizons."""
+        return {name: float(getattr(self, name).sum()) for name in self._fields[:-1]}
+
+
+class FlightPrediction(NamedTuple):
+    """Predictions of a flight from many starts, open loop, with the recorded rotor speeds. Made by `jaxos4.predict`.
+
+    States are arrays of 13: position [m] and velocity [m/s] in the earth frame, the attitude as the quaternion w, x, y,
+    z from body to earth, body rates [rad/s]. NaN: not measured.
+
+    - `found`, `flight`: names of the result and of the flight.
+    - `time`: of each start in the log [s]. `horizons`: time from the start to the prediction [s].
+    - `begin`: the state at the start.
+    - `predicted`: with the disturbance at the start that the filters know. `unaware`: without.
+    - `half_width`: of the 95 % band of what is measured: position, velocity, attitude as a small rotation about the
+      body's axes [rad], rates.
+    - `measured`: the states at each horizon.
+    - `constant`, `regression`: the states by simple predictions. `None`: the flight says too little for a regression.
+    - `missing`: the quantities that were not measured, and are not compared.
+    - `seed`: of the draws for the band. `notes`: about the result and the data.
+    """
+
+    found: str
+    flight: str
+    time: Float[np.ndarray, " starts"]
+    horizons: Float[np.ndarray, " horizons"]
+    begin: Float[np.ndarray, "starts 13"]
+    predicted: Float[np.ndarray, "starts horizons 13"]
+    unaware: Float[np.ndarray, "starts horizons 13"]
+    half_width: Float[np.ndarray, "starts horizons 12"]
+    measured: Float[np.ndarray, "starts horizons 13"]
+    constant: Float[np.ndarray, "starts horizons 13"]
+    regression: Float[np.ndarray, "starts horizons 13"] | None
+    missing: tuple[str, ...]
+    seed: int
+    notes: tuple[str, ...]
+
+    @property
+    def quality(self) -> dict[str, Quality]:
+        """The errors of each measured quantity."""
+        every = (self.predicted, self.unaware, self.constant, self.regression)
+        off = [None if states is None else departures(states, self.measured) for states in every]
+        return {name: self._quality(name, off) for name in QUANTITIES if name not in self.missing}
+
+    def _quality(self, name: str, off: list[np.ndarray | None]) -> Quality:
+        columns = QUANTITIES[name][1]
+
+        def mean(departed: np.ndarray | None) -> np.ndarray:
+            if departed is None:
+                return np.full(self.horizons.size, np.nan)
+            length = np.linalg.norm(departed[..., columns], axis=-1)
+            return _mean(2 * np.arcsin(np.minimum(length / 2, 1.0)) if name == "attitude" else length)
+
+        inside = np.abs(off[0])[..., columns] <= self.half_width[..., columns]
+        inside = np.where(np.isfinite(off[0][..., columns]), inside, np.nan)
+        return Quality(*(mean(departed) for departed in off), _mean(inside).mean(axis=-1))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Dictionaries, lists, numbers and strings: what `jaxos4 predict --json` writes."""
+        quantities = {
+            name: {"unit": QUANTITIES[name][0]}
+            | {field: [_finite(x) for x in values] for field, values in quality._asdict().items()}
+            | {"sum": {field: _finite(x) for field, x in quality.sums.items()}}
+            for name, quality in self.quality.items()
+        }
+        return {
+            "found": self.found,
+            "flight": self.flight,
+            "starts": self.time.size,
+            "horizons": self.horizons.tolist(),
+            "quantities": quantities,
+            "missing": list(self.missing),
+            "notes": list(self.notes),
+            "seed": self.seed,
+            "version": __version__,
+        }
+
+    def to_dataset(self) -> "xr.Dataset":
+        """The predictions as an xarray Dataset. A quantity that was not measured is left out."""
+        import xarray as xr
+
+        variables, both = {}, ("start", "horizon")
+        for name, places in PARTS.items():
+            if name in self.missing:
+                continue
+            unit, errors = QUANTITIES[name]
+            axis, labels = _AXES.get(name, ("axis", ["x", "y", "z"]))
+            rows = {"": self.predicted, "_unaware": self.unaware, "_measured": self.measured}
+            for suffix, states in rows.items():
+                unit_of = "1" if name == "attitude" else unit
+                variables[name + suffix] = ((*both, axis), states[..., places], {"units": unit_of})
+            across = axis if name != "attitude" else "axis"
+            variables[f"{name}_half_width"] = ((*both, across), self.half_width[..., errors], {"units": unit})
+            variables |= {axis: (axis, labels)}
+        coordinates = {"start": ("start", self.time, {"units": "s"}), "axis": ["x", "y", "z"]}
+        coordinates |= {"horizon": ("horizon", self.horizons, {"units": "s"})}
+        about = {"found": self.found, "flight": self.flight, "seed": self.seed, "version": __version__}
+        return xr.Dataset(variables, coords=coordinates, attrs=about | {"notes": "\n".join(self.notes)})
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write netCDF (`.nc`) or CSV (`.csv`), one row for each start and horizon; completely or not at all.
+
+        **Raises:** `InputError` for another suffix; `OSError` if the file cannot be written.
+        """
+        check_suffix(path)
+        if Path(path).suffix == ".nc":
+            data = self.to_dataset().to_netcdf(engine="h5netcdf")  # in memory: HDF5 can crash on a full disk
+            with write_atomically(path) as beside:
+                beside.write_bytes(data)
+            return
+        names, columns = zip(*self._columns(), strict=True)
+        with write_atomically(path) as beside, beside.open("w", encoding="utf-8") as file:
+            file.write(",".join(names) + "\n")
+            for row in np.stack(columns, axis=1).tolist():
+                file.write(",".join("" if x != x else f"{x:.9g}" for x in row) + "\n")
+
+    def _columns(self) -> Iterator[tuple[str, np.ndarray]]:
+        """The columns of the CSV."""
+        shape = self.predicted.shape[:2]
+        yield "t", np.broadcast_to(self.time[:, None], shape).ravel()
+        yield "horizon", np.broadcast_to(self.horizons, shape).ravel()
+        names = "x y z vx vy vz qw qx qy qz p q r".split()
+        kept = [i for name, places in PARTS.items() if name not in self.missing for i in places]
+        for suffix, states in (("", self.predicted), ("_measured", self.measured)):
+            yield from ((names[i] + suffix, states[..., i].ravel()) for i in kept)
+        names = "x y z vx vy vz turn_x turn_y turn_z p q r".split()
+        kept = [i for name in PARTS if name not in self.missing for i in QUANTITIES[name][1]]
+        yield from ((f"{names[i]}_half_width", self.half_width[..., i].ravel()) for i in kept)
+
+
+def check_suffix(path: str | os.PathLike[str]) -> None:
+    """Refuse a file of an unknown format."""
+    if Path(path).suffix not in _SUFFIXES:
+        raise InputError(f"{path}: predictions are written as netCDF or CSV; give a name that ends with .nc or .csv.")
+
+
+def _finite(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None
+
+
+def _mean(values: Float[np.ndarray, "starts *rest"]) -> Float[np.ndarray, "*rest"]:
+    """The mean over the starts of what was measured; NaN if nothing was."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    return np.where(count > 0, np.where(known, values, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)

@@ -1,0 +1,110 @@
+"""The vehicle of a result: its model, its parameters with their covariance, and the noise that the fit found."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+
+from ..airframe import airframe_from_table
+from ..errors import InputError
+from ..export.result import VEHICLE, ResultFile, checked, read_file
+from ..flight import FORCE_NAMES
+from ..identification import Identification
+from ..models.vehicle import FlightModel
+from ..results import meaning
+from ..shooting.gains import LogNoise
+
+_LEAST = 1e-9  # of a noise level, whose logarithm must be finite
+
+
+class Vehicle(NamedTuple):
+    """What predicts.
+
+    - `name`: of the result's file; `estimator` and model if there is none.
+    - `model`: of one recording.
+    - `parameters`, `covariance`: of the model. The mean of the recordings, if each had its own value.
+    - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
+    - `sample_time`: of the fit [s].
+    - `notes`: why the estimate cannot be trusted; one line each.
+    """
+
+    name: str
+    model: FlightModel
+    parameters: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+    noise: LogNoise
+    sample_time: float
+    notes: tuple[str, ...]
+
+    def draw(self, count: int, generator: np.random.Generator) -> Float[np.ndarray, "count parameters"]:
+        """Parameters drawn from the estimate's uncertainty."""
+        std = np.sqrt(np.diagonal(self.covariance))
+        scale = np.where(std > 0, std, 1.0)
+        spread, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        root = scale[:, None] * axes * np.sqrt(np.maximum(spread, 0.0))
+        return self.parameters + generator.standard_normal((count, std.size)) @ root.T
+
+
+def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
+    """The vehicle of an identification, or of the file that `jaxos4 estimate --out` wrote.
+
+    **Raises:** `InputError`, one line, if the result has no vehicle or no estimate; `OSError` if it cannot be read.
+    """
+    if not isinstance(found, Identification):
+        file = read_file(found)
+        try:
+            return _vehicle(file, Path(found).name)
+        except InputError as error:
+            raise InputError(f"{found}: {error}") from None
+    return _vehicle(checked(msgspec.convert(found.to_dict(), ResultFile)), f"{found.estimator}, {found.model} model")
+
+
+def _vehicle(file: ResultFile, name: str) -> Vehicle:
+    used = file.provenance
+    if file.model != VEHICLE:
+        raise InputError(f"holds no vehicle, but a {file.model} OS4; use a result of `jaxos4 estimate --model flight`.")
+    if not file.disturbances or used.sample_time is None:
+        raise InputError("does not say its disturbances and its sample time; run `jaxos4 estimate` again.")
+    airframe = airframe_from_table(file.airframe or {})
+    try:
+        model = FlightModel(airframe, terms=tuple(used.terms), battery_voltage=used.battery_voltage)
+    except ValueError as error:
+        raise InputError(f"its terms fit no vehicle ({error}); run `jaxos4 estimate` again.") from None
+    known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
+    known |= {row: each.value for row, each in file.held.items()}
+    center = dict(zip(model.parameter_names, np.asarray(model.alpha).tolist(), strict=True))
+    rows, covariance = list(file.parameters), np.array(file.covariance)
+    # Each parameter is the mean of its rows: one, or one for each recording.
+    shares = np.zeros((len(center), len(rows)))
+    values = []
+    for place, each in enumerate(center):
+        own = [row for row in known if row == each or row.rpartition("_")[::2] == (each, row.rpartition("_")[2])]
+        own = [row for row in own if row == each or row.rpartition("_")[2].isdigit()]
+        values.append(float(np.mean([known[row] for row in own])) if own else center[each])
+        for row in own:
+            if row in file.parameters:
+                shares[place, rows.index(row)] = 1 / len(own)
+    untrusted = () if file.result == "successful" else (f"{file.result}: {meaning(file.result)}",)
+    return Vehicle(
+        name,
+        model,
+        np.array(values),
+        shares @ covariance @ shares.T,
+        _noise(file, model.force_axes),
+        used.sample_time,
+        (*untrusted, *file.reasons),
+    )
+
+
+def _noise(file: ResultFile, force_axes: Sequence[int]) -> LogNoise:
+    channels = (*"pqr", *(FORCE_NAMES[axis] for axis in force_axes))
+    try:
+        levels = [file.disturbances[channel] for channel in channels]
+    except KeyError as error:
+        raise InputError(f"does not say the disturbance of {error.args[0]}; run `jaxos4 estimate` again.") from None
+    table = np.array([(each.strength, each.time_constant, each.sensor) for each in levels])
+    return LogNoise(*np.log(np.maximum(table, _LEAST)).T)
