@@ -168,17 +168,22 @@ def skill(predicted: Predictions) -> Skill:
 
 
 def disturbances(
-    problem: ShootingProblem, parameters: Parameters, noise: LogNoise, *, forces: bool = False
+    problem: ShootingProblem,
+    parameters: Parameters,
+    noise: LogNoise,
+    *,
+    offset: Float[np.ndarray, "samples 3"] | None = None,
 ) -> Disturbances:
     """The disturbance of each channel by Kalman filters, for the noise that `FilterError` found.
 
-    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r; the others are the
-    specific forces along `model.force_axes`, which `forces` includes.
+    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r. `offset`: what to
+    add to the model [rad/s^2]; with it, the specific forces along `model.force_axes` are channels too.
     """
-    flight, channels = problem.flight, len(noise.strength) if forces else len(RATES)
+    flight, channels = problem.flight, len(RATES) if offset is None else len(noise.strength)
     rates, stretch = np.asarray(flight.states)[:, RATES], flight.stretch
     measured, modelled = rates, np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
-    if channels > len(RATES):
+    if offset is not None:
+        modelled = modelled + offset
         known = np.where(np.isnan(rates).any(axis=1, keepdims=True), 0.0, rates)
         expected = np.stack(_observed(problem, parameters, as_float(known))[len(RATES) :], axis=1)
         force = flight.recorded[:, [len(STATE_NAMES) + axis for axis in problem.model.force_axes]]

@@ -1,16 +1,15 @@
 """The free motion of a vehicle from many starts: attitude as a quaternion, so that no attitude is singular."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Scalar
+from .._custom_types import Numeric, Scalar
 from .._xla import quick_jit
-from ..models.state import Forcing, Rates, Samples, State, Vector
+from ..models.state import CASCADE_ORDER, Forcing, Rates, Samples, State, Vector
 from ..models.vehicle import FlightModel
 from ..shooting import FASTEST, ShootingProblem
 from ..shooting.gains import Covariance, LogNoise, Observed, first_covariance, gains_after, transition
@@ -20,7 +19,7 @@ Quaternion = tuple[Samples, Samples, Samples, Samples]
 PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10], "rates": np.r_[10:13]}
 """The places of the parts of a state in an array of 13. The attitude is the quaternion w, x, y, z, body to earth."""
 
-CHUNK = 64
+CHUNK = 32
 """The number of starts that fly in one call of a program."""
 
 # Rows after which the covariance of a filter no longer changes.
@@ -42,31 +41,37 @@ class Known(NamedTuple):
     - `first`: the sample.
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: by the filters [rad/s], [rad/s^2; m/s^2].
+    - `unsure`: the standard deviation of the offsets of p', q', r' [rad/s^2].
     - `lateral`: the measured specific force along x and y [m/s^2], which lasts, for the terms that need it.
     """
 
-    first: Int[Array, "*starts"]
-    state: Float[Array, "*starts 13"]
-    rates: Float[Array, "*starts 3"]
-    disturbance: Float[Array, "*starts channels"]
-    lateral: Float[Array, "*starts 2"]
+    first: Int[Numeric, "*starts"]
+    state: Float[Numeric, "*starts 13"]
+    rates: Float[Numeric, "*starts 3"]
+    disturbance: Float[Numeric, "*starts channels"]
+    unsure: Float[Numeric, "*starts 3"]
+    lateral: Float[Numeric, "*starts 2"]
 
 
 class Lanes(NamedTuple):
     """Several futures of each start.
 
     - `parameters`: of the model. `forcing`: of these parameters, one row for each sample.
+    - `offset`: of p', q', r' in this recording besides the parameters, from the past of each sample [rad/s^2].
     - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
     - `begin`: errors of the state at the start; of the attitude as a small rotation [rad].
     - `pushed`: errors of the disturbances at the start.
+    - `off`: errors of the offsets, and what they make of the disturbances at the start, in standard deviations.
     - `gusts`: what rate and disturbance of each channel gain in each step besides the model.
     """
 
     parameters: Float[Array, "lanes parameters"]
     forcing: Forcing
+    offset: Float[Array, "lanes samples 3"]
     filtered: Bool[Array, " lanes"]
     begin: Float[Array, "lanes 12"]
     pushed: Float[Array, "lanes channels"]
+    off: Float[Array, "lanes 2 3"]
     gusts: Float[Array, "lanes steps channels 2"]
 
 
@@ -96,12 +101,12 @@ class _Free(NamedTuple):
 
 def product(a, b) -> Quaternion:
     """The quaternion of the rotation `b`, and then `a`. NumPy and JAX."""
-    (w, x, y, z), (k, l, m, n) = a, b
+    (w, x, y, z), (k, j, m, n) = a, b
     return (
-        w * k - x * l - y * m - z * n,
-        w * l + x * k + y * n - z * m,
-        w * m - x * n + y * k + z * l,
-        w * n + x * m - y * l + z * k,
+        w * k - x * j - y * m - z * n,
+        w * j + x * k + y * n - z * m,
+        w * m - x * n + y * k + z * j,
+        w * n + x * m - y * j + z * k,
     )
 
 
@@ -113,7 +118,13 @@ def inverse(a) -> Quaternion:
 
 def turned(a, vector) -> Vector:
     """A vector turned by a quaternion: from the body's axes to the earth's, if that is the attitude."""
-    return product(product(a, (0.0 * vector[0], *vector)), inverse(a))[1:]
+    (w, *axis), b = a, cross(a[1:], vector)
+    return tuple(v + 2 * (w * x + y) for v, x, y in zip(vector, b, cross(axis, b), strict=True))
+
+
+def cross(a, b) -> Vector:
+    """The cross product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def deviation(a, b) -> Vector:
@@ -132,20 +143,22 @@ def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Sca
     scalars, lateral, axes = tuple(lane.parameters), tuple(start.lateral), model.force_axes
     p, v, q, w = (start.state[places] for places in PARTS.values())
     # A gyro bias is part of the measurement, not of the state.
-    still = _row(lane.forcing, start.first)._replace(velocity=(0.0, 0.0, 0.0), lateral=lateral)
+    steps = lane.gusts.shape[0]
+    rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start.first, steps), lane.forcing)
+    still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0), lateral=lateral)
     biased = jnp.stack(model.observe(State(Rates(*w)), still, scalars)[:3])
     w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin[9:]
+    error, absorbed = start.unsure * lane.off
+    offset = lane.offset[start.first] + error
     tilt = (jnp.ones(()), *(lane.begin[6:9] / 2))
-    begin = Motion(
-        tuple(p + lane.begin[:3]), tuple(v + lane.begin[3:6]), _unit(product(tuple(q), tilt)), Rates(*w)
-    )
+    begin = Motion(tuple(p + lane.begin[:3]), tuple(v + lane.begin[3:6]), _unit(product(tuple(q), tilt)), Rates(*w))
 
     def step(carry: tuple[Motion, Array, Array], row) -> tuple[tuple[Motion, Array, Array], Array]:
-        (motion, disturbance, sound), (i, gust) = carry, row
-        forcing = _row(lane.forcing, start.first + i)._replace(lateral=lateral)
-        turning = (reach * disturbance + gust[:, 0])[:3] / dt
+        (motion, disturbance, sound), (forcing, gust) = carry, row
+        turning = offset + (reach * disturbance + gust[:, 0])[:3] / dt
         pushing = jnp.zeros(3).at[np.asarray(axes, dtype=int)].set(disturbance[3:])
-        moved = rk4_step(_Free(model), motion, _Acting(forcing, tuple(turning), tuple(pushing)), scalars, dt)
+        acting = _Acting(forcing._replace(lateral=lateral), tuple(turning), tuple(pushing))
+        moved = rk4_step(_Free(model), motion, acting, scalars, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
         values = jnp.stack(jax.tree.leaves(moved))
         sound = sound & jnp.isfinite(values).all() & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
@@ -153,12 +166,8 @@ def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Sca
         return (motion, kept * disturbance + gust[:, 1], sound), jnp.stack(jax.tree.leaves(motion))
 
     pushed = jnp.where(lane.filtered, start.disturbance, 0.0) + lane.pushed
-    steps = lane.gusts.shape[0]
-    return jax.lax.scan(step, (begin, pushed, jnp.array(True)), (jnp.arange(steps), lane.gusts))[1]
-
-
-def _row(forcing: Forcing, row: Int[Array, ""]) -> Forcing:
-    return jax.tree.map(lambda leaf: leaf[row], forcing)
+    pushed = pushed.at[:3].add(absorbed)
+    return jax.lax.scan(step, (begin, pushed, jnp.array(True)), (rows, lane.gusts))[1]
 
 
 def _unit(a: Quaternion) -> Quaternion:
@@ -166,14 +175,17 @@ def _unit(a: Quaternion) -> Quaternion:
     return tuple(x / length for x in a)
 
 
-def departures(states: Float[Array, "*batch 13"], others: Float[Array, "*batch 13"]) -> Float[Array, "*batch 12"]:
-    """How far other states are off: position, velocity, attitude by `deviation`, rates. NumPy and JAX."""
+def departures(states: Any, others: Any) -> Any:
+    """How far other states are off: position, velocity, attitude by `deviation`, rates. NumPy and JAX.
+
+    From (..., 13) to (..., 12).
+    """
     difference, xp = others - states, np if isinstance(states, np.ndarray) else jnp
     turn = deviation(xp.moveaxis(states[..., 6:10], -1, 0), xp.moveaxis(others[..., 6:10], -1, 0))
     return xp.concatenate([difference[..., :6], xp.stack(turn, axis=-1), difference[..., 10:]], axis=-1)
 
 
-@eqx.filter_jit
+@quick_jit
 def fly_chunk(
     model: FlightModel, lanes: Lanes, starts: Known, noise: LogNoise, dt: Scalar
 ) -> tuple[Float[Array, "starts 2 steps 13"], Float[Array, "starts steps 12"]]:
@@ -188,15 +200,48 @@ def fly_chunk(
 
 
 @quick_jit
-def forcing_of(problem: ShootingProblem, parameters: Float[Array, "lanes parameters"]) -> Forcing:
-    """The forcing of a flight for each row of parameters. Velocity and lateral force are those of the prediction."""
-    forcing = jax.vmap(problem.forcing)(parameters)
-    return forcing._replace(velocity=None, lateral=None, recording=())
+def forcing_and_offsets(
+    problem: ShootingProblem,
+    parameters: Float[Array, "lanes parameters"],
+    weight: Float[Array, "samples 3"],
+    kept: Scalar,
+) -> tuple[Forcing, Float[Array, "lanes samples 3"]]:
+    """The forcing and the offsets of p', q', r' for each row of parameters.
+
+    An offset is a weighted sum of what the measured accelerations before a sample exceed the model's by: each sample
+    earlier has less weight by the factor `kept`, and `weight` multiplies the sum. Velocity and lateral force are left
+    out of the forcing: they will be those of the prediction.
+    """
+    model, flight = problem.model, problem.flight
+    rates = flight.states[:, CASCADE_ORDER[:3]]
+    change, middle = jnp.diff(rates, axis=0) / flight.dt, (rates[1:] + rates[:-1]) / 2
+    within = ~jnp.isnan(change)
+    if flight.stretch is not None:
+        within &= (jnp.diff(flight.stretch) == 0)[:, None]
+
+    def of_lane(values: Array) -> tuple[Forcing, Array]:
+        forcing = problem.forcing(values)
+        rows = jax.tree.map(lambda leaf: leaf[:-1], forcing)
+        added = model.angular_acceleration(Rates(*jnp.where(within, middle, 0.0).T), rows, tuple(values))
+        residual = jnp.where(within, change - jnp.stack(added, axis=1), 0.0)
+
+        def gather(total: Array, row: Array) -> tuple[Array, Array]:
+            return kept * total + row, kept * total + row
+
+        past = jax.lax.scan(gather, jnp.zeros(3), residual)[1]
+        offset = weight * jnp.concatenate([jnp.zeros((1, 3)), past])
+        return forcing._replace(velocity=None, lateral=None, recording=()), offset
+
+    return jax.vmap(of_lane)(parameters)
 
 
 @quick_jit
-def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance]:
-    """The covariance of rate and disturbance after a measurement, and what a step adds to it, of each channel."""
+def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[Array, " channels"]]:
+    """Of each channel's filter, when its gains no longer change.
+
+    **Returns:** the covariance of rate and disturbance after a measurement; what a step adds to it; and the share of a
+    constant acceleration that the disturbance absorbs.
+    """
     channels = noise.strength.shape[0]
 
     def rows(value: float, count: int) -> Observed:
@@ -209,5 +254,7 @@ def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance]:
     of_rate = p.disturbance - p.cross * disturbance
     is_rate = jnp.arange(channels)[:, None] < len(Rates._fields)
     after = Covariance(p.rate * rate, p.cross * rate, jnp.where(is_rate, of_rate, p.disturbance * (1 - disturbance)))
-    none = jax.tree.map(jnp.zeros_like, p)
-    return jax.tree.map(lambda x: x[:, 0], (after, gains_after(none, noise, unknown, dt)[0]))
+    added = gains_after(jax.tree.map(jnp.zeros_like, p), noise, unknown, dt)[0]
+    lost = 1 - transition(jnp.exp(noise.time_constant), dt)[0][:, None]
+    absorbed = disturbance * dt / (disturbance * dt + lost * gains.rate[-1])
+    return jax.tree.map(lambda x: x[:, 0], (after, added, absorbed))

@@ -21,12 +21,14 @@ from ..recording.reading import Recording, as_recording
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .measured import Measured, Regression, constant_rates
-from .motion import CHUNK, PARTS, Known, Lanes, fly_chunk, forcing_of, settled, turned
+from .motion import CHUNK, PARTS, Known, Lanes, fly_chunk, forcing_and_offsets, settled, turned
 from .prediction import FlightPrediction
 from .vehicle import Vehicle, vehicle_of
 
 # Futures of each start for the band, and half the width of a 95 % interval in their standard deviations (Student).
 _DRAWS, _NINETY_FIVE = 64, 1.9977
+# A recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
+_MEMORY = 5.0
 # What a log cannot replace by a prediction.
 _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
@@ -37,7 +39,7 @@ def predict(
     *,
     horizon: float = 0.5,
     sample_time: float | None = None,
-    spacing: float = 0.05,
+    spacing: float = 0.1,
     seed: int = 0,
 ) -> FlightPrediction:
     """Predict position, velocity, attitude and body rates from many starts of a flight, with its rotor speeds.
@@ -82,10 +84,8 @@ def predict(
     start = _starts(measured, recording.name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
-    known = _known(problem, vehicle, measured, noise, start, missing)
-    states, spread = _fly(problem, vehicle, known, noise, measured, steps, seed)
+    begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed)
     ahead = start[:, None] + np.arange(1, steps + 1)
-    begin = np.asarray(known.state)
     trained = Measured.of(found.problem.flight) if isinstance(found, Identification) else measured.first_half
     regression = Regression.of(trained, float(vehicle.model.airframe.gravity))
     sensors = np.append(measured.noise[:9], np.exp(noise.sensor[:3]))
@@ -150,55 +150,94 @@ def _starts(
     return start
 
 
-def _known(
-    problem: ShootingProblem,
-    vehicle: Vehicle,
-    measured: Measured,
-    noise: LogNoise,
-    start: Int[np.ndarray, " starts"],
-    missing: tuple[str, ...],
-) -> Known:
-    """What is known at the starts, in NumPy. A position that was not measured is 0."""
-    filtered = disturbances(problem, as_float(vehicle.parameters), noise, forces=True)
-    state, flight = measured.states[start], problem.flight
-    if "velocity" in missing:
-        axial = np.asarray(flight.body_velocity)[start, 2]
-        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, (0 * axial, 0 * axial, axial)), 1)
-    if "position" in missing:
-        state[:, PARTS["position"]] = 0.0
-    lateral = np.nan_to_num(np.asarray(flight.specific_force)[start, :2])
-    return Known(start, state, np.asarray(filtered.rates)[start], filtered.value[start], lateral)
+def _offsets(
+    vehicle: Vehicle, measured: Measured, noise: LogNoise
+) -> tuple[float, Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
+    """How the offsets of p', q', r' follow from the past of a recording.
+
+    Each recording has its own offset. The mean of the residuals before a sample, of which it forgets the oldest, is
+    drawn to that of the fit as far as the bracket says that offsets do not differ.
+
+    **Returns:** the share of a residual's weight that remains one sample later, what multiplies the sum of the weighted
+    residuals, and the standard deviation of the offsets.
+    """
+    dt, rates = measured.dt, measured.states[:, PARTS["rates"]]
+    kept, names = math.exp(-dt / _MEMORY), vehicle.model.parameter_names
+    places = [names.index(f"{axis}_offset") if f"{axis}_offset" in names else -1 for axis in ("roll", "pitch", "yaw")]
+    prior = np.where(np.array(places) < 0, 0.0, np.asarray(vehicle.model.half_width)[places]) ** 2
+    within = np.isfinite(np.diff(rates, axis=0)) & (np.diff(measured.stretch) == 0)[:, None]
+    total, squares, sums = np.zeros(3), np.zeros(3), [np.zeros((2, 3))]
+    for known in within:
+        total, squares = kept * total + known, kept**2 * squares + known
+        sums.append(np.stack([total, squares]))
+    total, squares = np.moveaxis(np.array(sums), 1, 0)
+    strength, time_constant, sensor = (np.exp(leaf[:3]) for leaf in noise)
+    count = np.maximum(total, 1.0)
+    seconds = dt * count**2 / np.maximum(squares, 1.0)  # a uniform mean over this time is as exact
+    variance = strength**2 * np.minimum(1.0, 2 * time_constant / seconds) + 2 * (sensor / (dt * count)) ** 2
+    share = prior / (prior + variance)
+    return kept, share / count, np.sqrt(np.where(total > 0, share * variance, prior))
 
 
 def _fly(
     problem: ShootingProblem,
     vehicle: Vehicle,
-    known: Known,
-    noise: LogNoise,
     measured: Measured,
+    start: Int[np.ndarray, " starts"],
+    missing: tuple[str, ...],
+    noise: LogNoise,
     steps: int,
     seed: int,
-) -> tuple[Float[np.ndarray, "starts 2 steps 13"], Float[np.ndarray, "starts steps 12"]]:
-    """The states with and without the filters' knowledge, and the spread of the futures about the former."""
-    generator, channels = np.random.default_rng(seed), noise.strength.size
-    after, added = jax.tree.map(np.asarray, settled(LogNoise(*map(as_float, noise)), problem.flight.dt))
-    sure = np.stack([vehicle.parameters] * 2)
-    parameters = as_float(np.concatenate([sure, vehicle.draw(_DRAWS, generator)]))
+) -> tuple[
+    Float[np.ndarray, "starts 13"], Float[np.ndarray, "starts 2 steps 13"], Float[np.ndarray, "starts steps 12"]
+]:
+    """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures."""
+    generator, channels, own = np.random.default_rng(seed), noise.strength.size, LogNoise(*map(as_float, noise))
+    parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(_DRAWS, generator)]))
+    kept, weight, unsure = _offsets(vehicle, measured, noise)
+    padding = ((0, problem.flight.time.size - len(weight)), (0, 0))
+    forcing, offset = forcing_and_offsets(problem, parameters, as_float(np.pad(weight, padding)), as_float(kept))
+    known = _known(problem, vehicle, measured, noise, np.asarray(offset[0]), missing)._replace(unsure=unsure)
+
+    after, added, absorbed = jax.tree.map(np.asarray, settled(own, problem.flight.dt))
     begin = generator.standard_normal((_DRAWS, 12)) * np.nan_to_num(measured.noise)
     first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
     begin[:, 9:] = first[:, :3, 0]
     gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
-    surely = (np.concatenate([np.zeros((2, *x.shape[1:])), x]) for x in (begin, first[..., 1], gusts))
-    filtered = np.arange(len(parameters)) != 1
-    lanes = Lanes(parameters, forcing_of(problem, parameters), jnp.asarray(filtered), *map(as_float, surely))
-    starts, found = len(known.first), []
-    model = vehicle.model
-    for chunk in range(0, starts, CHUNK):
-        rows = np.minimum(np.arange(chunk, chunk + CHUNK), starts - 1)
-        some = jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), known)  # noqa: B023
-        found.append(fly_chunk(model, lanes, some, LogNoise(*map(as_float, noise)), problem.flight.dt))
-    states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[:starts] for i in range(2))
-    return states, spread
+    off = generator.standard_normal((_DRAWS, 3))
+    drawn = begin, first[..., 1], np.stack([off, -absorbed[:3] * off], axis=1), gusts
+    surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
+    lanes = Lanes(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
+
+    found = []
+    for chunk in range(0, start.size, CHUNK):
+        rows = start[np.minimum(np.arange(chunk, chunk + CHUNK), start.size - 1)]
+        some = Known(*(jnp.asarray(leaf[rows]) for leaf in known))
+        found.append(fly_chunk(vehicle.model, lanes, some, own, problem.flight.dt))
+    states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[: start.size] for i in range(2))
+    return known.state[start], states, spread
+
+
+def _known(
+    problem: ShootingProblem,
+    vehicle: Vehicle,
+    measured: Measured,
+    noise: LogNoise,
+    offset: Float[np.ndarray, "padded 3"],
+    missing: tuple[str, ...],
+) -> Known:
+    """What is known at each sample, in NumPy; `unsure` is missing. A position that was not measured is 0."""
+    samples = slice(len(measured.stretch))
+    filtered = disturbances(problem, as_float(vehicle.parameters), noise, offset=offset)
+    state, flight = measured.states.copy(), problem.flight
+    if "velocity" in missing:
+        axial = np.asarray(flight.body_velocity)[samples, 2]
+        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, (0 * axial, 0 * axial, axial)), 1)
+    if "position" in missing:
+        state[:, PARTS["position"]] = 0.0
+    lateral = np.nan_to_num(np.asarray(flight.specific_force)[samples, :2])
+    rates, value = np.asarray(filtered.rates)[samples], filtered.value[samples]
+    return Known(np.arange(len(state)), state, rates, value, np.zeros((len(state), 3)), lateral)
 
 
 def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:

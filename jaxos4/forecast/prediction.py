@@ -131,7 +131,10 @@ class FlightPrediction(NamedTuple):
         """The predictions as an xarray Dataset. A quantity that was not measured is left out."""
         import xarray as xr
 
+        coordinates: dict[str, Any]
         variables, both = {}, ("start", "horizon")
+        coordinates = {"start": ("start", self.time, {"units": "s"}), "axis": ["x", "y", "z"]}
+        coordinates |= {"horizon": ("horizon", self.horizons, {"units": "s"})}
         for name, places in PARTS.items():
             if name in self.missing:
                 continue
@@ -143,9 +146,7 @@ class FlightPrediction(NamedTuple):
                 variables[name + suffix] = ((*both, axis), states[..., places], {"units": unit_of})
             across = axis if name != "attitude" else "axis"
             variables[f"{name}_half_width"] = ((*both, across), self.half_width[..., errors], {"units": unit})
-            variables |= {axis: (axis, labels)}
-        coordinates = {"start": ("start", self.time, {"units": "s"}), "axis": ["x", "y", "z"]}
-        coordinates |= {"horizon": ("horizon", self.horizons, {"units": "s"})}
+            coordinates[axis] = labels
         about = {"found": self.found, "flight": self.flight, "seed": self.seed, "version": __version__}
         return xr.Dataset(variables, coords=coordinates, attrs=about | {"notes": "\n".join(self.notes)})
 
