@@ -14,6 +14,7 @@ from .design import design
 from .estimate import estimate
 from .export import export
 from .information import identifiability, inspect
+from .predict import predict
 from .simulate import simulate
 from .studies import compare, report, study
 from .train import train
@@ -34,7 +35,7 @@ def _prepared(command: Callable[..., None]) -> Callable[..., None]:
 
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
-for command in (simulate, design, estimate, export, train, inspect, identifiability, compare, study, report):
+for command in (simulate, design, estimate, predict, export, train, inspect, identifiability, compare, study, report):
     app.command()(_prepared(command))
 
 

@@ -22,8 +22,8 @@ _PHRASES = {
     "`end`": "--to",
 }
 _OPTIONS = (
-    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|gust|holdout|initial_state|"
-    "network|rate|sample_time|samples|seed|slew|slowest|terms|validate|velocity|window"
+    "angle|bandwidth|bracket|channels|criterion|distance|dt|duration|estimator|fastest|gust|holdout|horizon|initial_state|"
+    "network|rate|sample_time|samples|seed|slew|slowest|spacing|terms|validate|velocity|window"
 )
 
 

@@ -34,7 +34,7 @@ _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
 
 def predict(
-    found: Identification | str | os.PathLike[str],
+    found: Identification | Vehicle | str | os.PathLike[str],
     flight: Flight | Recording,
     *,
     horizon: float = 0.5,
@@ -56,7 +56,8 @@ def predict(
 
     **Arguments:**
 
-    - `found`: the identification of a vehicle, or the file that `jaxos4 estimate --out` wrote.
+    - `found`: the identification of a vehicle, or the file that `jaxos4 estimate --out` wrote, or what
+      `jaxos4.forecast.vehicle_of` makes of one of these.
     - `flight`: has body rates and attitude at least. Without a velocity, predictions begin with that of dead reckoning
       along the body's z axis, or at rest; what was not measured is not compared.
     - `horizon`: how far ahead [s].
@@ -64,8 +65,7 @@ def predict(
     - `spacing`: the time between two starts [s]; 0: at each sample.
     - `seed`: of the draws.
 
-    The regression for comparison is fitted to the flight of `found`, or to the first half of `flight` if `found` is a
-    file.
+    The regression for comparison is fitted to the flight of an identification, or else to the first half of `flight`.
 
     **Raises:** `InputError`, one line, for a result without a vehicle, a flight that cannot be predicted, or unusable
     arguments; `OSError` if `found` cannot be read.
@@ -75,7 +75,7 @@ def predict(
             raise InputError(f"`{name}`: must be a number of seconds, {least}, got {value:g}.")
     if not isinstance(seed, int) or seed < 0:
         raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
-    vehicle, recording = vehicle_of(found), as_recording(flight)
+    vehicle, recording = found if isinstance(found, Vehicle) else vehicle_of(found), as_recording(flight)
     prepared = _prepare(vehicle, recording, sample_time)
     measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)

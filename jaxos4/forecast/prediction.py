@@ -28,7 +28,6 @@ QUANTITIES: dict[str, tuple[str, list[int]]] = {
 """What is compared: the unit, and the components of an error."""
 
 _AXES = {"attitude": ("component", ["w", "x", "y", "z"]), "rates": ("rate", ["p", "q", "r"])}
-_SUFFIXES = (".nc", ".csv")
 
 
 class Quality(NamedTuple):
@@ -155,9 +154,11 @@ class FlightPrediction(NamedTuple):
 
         **Raises:** `InputError` for another suffix; `OSError` if the file cannot be written.
         """
-        check_suffix(path)
+        check_suffix(path, ".nc", ".csv")
         if Path(path).suffix == ".nc":
-            data = self.to_dataset().to_netcdf(engine="h5netcdf")  # in memory: HDF5 can crash on a full disk
+            dataset = self.to_dataset()
+            packed = dict.fromkeys(dataset.data_vars, {"zlib": True, "complevel": 1})
+            data = dataset.to_netcdf(engine="h5netcdf", encoding=packed)  # in memory: HDF5 can crash on a full disk
             with write_atomically(path) as beside:
                 beside.write_bytes(data)
             return
@@ -181,10 +182,10 @@ class FlightPrediction(NamedTuple):
         yield from ((f"{names[i]}_half_width", self.half_width[..., i].ravel()) for i in kept)
 
 
-def check_suffix(path: str | os.PathLike[str]) -> None:
-    """Refuse a file of an unknown format."""
-    if Path(path).suffix not in _SUFFIXES:
-        raise InputError(f"{path}: predictions are written as netCDF or CSV; give a name that ends with .nc or .csv.")
+def check_suffix(path: str | os.PathLike[str], *suffixes: str) -> None:
+    """Refuse a file whose name does not end with one of the suffixes."""
+    if Path(path).suffix not in suffixes:
+        raise InputError(f"{path}: the name says the format; give one that ends with {' or '.join(suffixes)}.")
 
 
 def _finite(x: float) -> float | None:
