@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..flight import STATE_NAMES, Flight
-from .motion import inverse, product, turned
+from .motion import PARTS, inverse, product, turned
 
 # Median of |x| over the standard deviation of a Gaussian x, and the root sum of squares of a fourth difference.
 _MEDIAN, _FOURTH = 0.6745, np.sqrt(70.0)
@@ -42,6 +42,10 @@ class Measured(NamedTuple):
         noise = np.concatenate([_white_noise(each) for each in (position, velocity, angles, rates)])
         states = np.concatenate([position, velocity, attitude, rates], axis=1)
         return cls(states, np.asarray(flight.omega), stretch, float(flight.dt), noise)
+
+    def has(self, part: str) -> bool:
+        """Whether all components of a part of the state were measured at some time."""
+        return bool(np.isfinite(self.states[:, PARTS[part]]).any(axis=0).all())
 
     @property
     def first_half(self) -> "Measured":
@@ -109,9 +113,9 @@ class Regression(NamedTuple):
             if self.moves:
                 push = np.stack(turned(now[:, 6:10].T, tuple(found[:, 3:].T)), axis=1)
                 velocity = velocity + dt * (push - [0.0, 0.0, self.gravity])
-            following = _moved(now, rate[:, None], velocity[:, None], dt)[:, 0]
-            rates.append(rate), velocities.append(velocity)
-            now = following
+            now = _moved(now, rate[:, None], velocity[:, None], dt)[:, 0]
+            rates.append(rate)
+            velocities.append(velocity)
         return _moved(begin, np.stack(rates, axis=1), np.stack(velocities, axis=1), dt)
 
 

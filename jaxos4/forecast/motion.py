@@ -90,13 +90,17 @@ class _Free(NamedTuple):
 
     def cascade(self, state: Motion, forcing: _Acting, parameters) -> Motion:
         """The time derivative of the motion."""
-        acting = forcing.forcing._replace(velocity=turned(inverse(state.attitude), state.velocity))
-        turning = self.model.angular_acceleration(state.rates, acting, parameters)
-        force = self.model.specific_force(acting.thrust, acting, parameters)
-        x, y, z = turned(state.attitude, _sum(force, forcing.pushing))
-        spin = product(state.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in state.rates)))
-        moving = (x, y, z - self.model.airframe.gravity)
-        return Motion(state.velocity, moving, spin, Rates(*_sum(turning, forcing.turning)))
+        return _derivative(self.model, state, forcing, parameters)
+
+
+@jax.jit  # traced once for the four stages of a step
+def _derivative(model: FlightModel, state: Motion, acting: _Acting, parameters) -> Motion:
+    forcing = acting.forcing._replace(velocity=turned(inverse(state.attitude), state.velocity))
+    turning = model.angular_acceleration(state.rates, forcing, parameters)
+    force = model.specific_force(forcing.thrust, forcing, parameters)
+    x, y, z = turned(state.attitude, _sum(force, acting.pushing))
+    spin = product(state.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in state.rates)))
+    return Motion(state.velocity, (x, y, z - model.airframe.gravity), spin, Rates(*_sum(turning, acting.turning)))
 
 
 def product(a, b) -> Quaternion:
@@ -118,8 +122,10 @@ def inverse(a) -> Quaternion:
 
 def turned(a, vector) -> Vector:
     """A vector turned by a quaternion: from the body's axes to the earth's, if that is the attitude."""
-    (w, *axis), b = a, cross(a[1:], vector)
-    return tuple(v + 2 * (w * x + y) for v, x, y in zip(vector, b, cross(axis, b), strict=True))
+    w, *axis = a
+    b = cross(axis, vector)
+    x, y, z = (v + 2 * (w * c + d) for v, c, d in zip(vector, b, cross(axis, b), strict=True))
+    return x, y, z
 
 
 def cross(a, b) -> Vector:
@@ -130,11 +136,12 @@ def cross(a, b) -> Vector:
 def deviation(a, b) -> Vector:
     """Twice the vector part of the rotation from attitude `a` to `b`, in the axes of `a`: [rad] if it is small."""
     w, *vector = product(inverse(a), b)
-    return tuple(2 * x * (1 - 2 * (w < 0)) for x in vector)
+    x, y, z = (2 * x * (1 - 2 * (w < 0)) for x in vector)
+    return x, y, z
 
 
 def _sum(a: Vector, b: Vector) -> Vector:
-    return tuple(x + y for x, y in zip(a, b, strict=True))
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Scalar) -> Float[Array, "steps 13"]:
@@ -171,8 +178,9 @@ def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Sca
 
 
 def _unit(a: Quaternion) -> Quaternion:
-    length = jnp.sqrt(sum(x * x for x in a))
-    return tuple(x / length for x in a)
+    w, x, y, z = a
+    share = 1 / jnp.sqrt(w * w + x * x + y * y + z * z)
+    return share * w, share * x, share * y, share * z
 
 
 def departures(states: Any, others: Any) -> Any:

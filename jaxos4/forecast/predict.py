@@ -79,8 +79,7 @@ def predict(
     prepared = _prepare(vehicle, recording, sample_time)
     measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
     dt, steps = measured.dt, max(round(horizon / measured.dt), 1)
-    columns = np.isfinite(measured.states).any(axis=0)
-    missing = tuple(part for part in ("position", "velocity") if not columns[PARTS[part]].all())
+    missing = tuple(part for part in ("position", "velocity") if not measured.has(part))
     start = _starts(measured, recording.name, steps, max(round(spacing / dt), 1), missing)
     # White noise of longer samples is smaller.
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
@@ -215,7 +214,7 @@ def _fly(
         some = Known(*(jnp.asarray(leaf[rows]) for leaf in known))
         found.append(fly_chunk(vehicle.model, lanes, some, own, problem.flight.dt))
     states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[: start.size] for i in range(2))
-    return known.state[start], states, spread
+    return np.asarray(known.state)[start], states, spread
 
 
 def _known(

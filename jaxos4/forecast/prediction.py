@@ -90,21 +90,18 @@ class FlightPrediction(NamedTuple):
     def quality(self) -> dict[str, Quality]:
         """The errors of each measured quantity."""
         every = (self.predicted, self.unaware, self.constant, self.regression)
-        off = [None if states is None else departures(states, self.measured) for states in every]
-        return {name: self._quality(name, off) for name in QUANTITIES if name not in self.missing}
+        off = [departures(np.full_like(self.measured, np.nan) if x is None else x, self.measured) for x in every]
+        inside = np.where(np.isfinite(off[0]), np.abs(off[0]) <= self.half_width, np.nan)
 
-    def _quality(self, name: str, off: list[np.ndarray | None]) -> Quality:
-        columns = QUANTITIES[name][1]
-
-        def mean(departed: np.ndarray | None) -> np.ndarray:
-            if departed is None:
-                return np.full(self.horizons.size, np.nan)
-            length = np.linalg.norm(departed[..., columns], axis=-1)
+        def mean(departed: np.ndarray, name: str) -> np.ndarray:
+            length = np.linalg.norm(departed[..., QUANTITIES[name][1]], axis=-1)
             return _mean(2 * np.arcsin(np.minimum(length / 2, 1.0)) if name == "attitude" else length)
 
-        inside = np.abs(off[0])[..., columns] <= self.half_width[..., columns]
-        inside = np.where(np.isfinite(off[0][..., columns]), inside, np.nan)
-        return Quality(*(mean(departed) for departed in off), _mean(inside).mean(axis=-1))
+        return {
+            name: Quality(*(mean(x, name) for x in off), coverage=_mean(inside)[..., columns].mean(axis=-1))
+            for name, (_, columns) in QUANTITIES.items()
+            if name not in self.missing
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings: what `jaxos4 predict --json` writes."""

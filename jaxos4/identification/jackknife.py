@@ -9,7 +9,6 @@ Reference: Efron and Tibshirani 1993, An Introduction to the Bootstrap, ch. 11.
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.special import chdtri
 
 # The most parts, and the fewest that can show a disagreement.
 _MOST, _FEWEST = 20, 4
@@ -41,6 +40,8 @@ def disagreement(
     - `prior`: the information of the prior.
     - `part`: the number of the part of each lane.
     """
+    from scipy.special import chdtri  # slow to import
+
     numbers = np.unique(part)
     whole = information.sum(axis=0) + prior
     scale = np.sqrt(np.diagonal(whole))

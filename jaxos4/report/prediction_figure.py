@@ -1,0 +1,71 @@
+"""The prediction of a flight as a figure: `jaxos4 predict --figure`."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from .._files import write_atomically
+from ..forecast import FlightPrediction
+from .style import BOUND_DASHES, INK, drawing, grid, pdf, style, svg
+
+# The figure shows at most this much time [s], with as many predictions as fit into it without overlap.
+_SHOWN = 10.0
+
+
+def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction) -> None:
+    """Writes the figure as SVG or PDF, by the suffix. Raises `OSError` if it cannot be written."""
+    with drawing():
+        drawn = (pdf if Path(path).suffix == ".pdf" else svg)(prediction_figure(found))
+    with write_atomically(path) as beside:
+        beside.write_bytes(drawn)
+
+
+def prediction_figure(found: FlightPrediction) -> Figure:
+    """Measured lines, and predictions with their band from starts that are one horizon apart; 10 s at most."""
+    columns = [(f"{axis} [m/s]", 3 + i) for i, axis in enumerate(("vx", "vy", "vz"))] * (
+        "velocity" not in found.missing
+    )
+    columns += [("roll [rad]", 6), ("pitch [rad]", 7), ("yaw [rad]", 8)]
+    columns += [(f"{axis} [rad/s]", 9 + i) for i, axis in enumerate("pqr")]
+    if "velocity" not in found.missing:
+        columns += [(f"{axis} [m/s]", 3 + i) for i, axis in enumerate(("vx", "vy", "vz"))]
+    figure, panels = grid(len(columns), columns=3, width=11.0, height=1.9)
+    look, shown, times = style(0), [], found.time.tolist()
+    for start, time in enumerate(times):
+        is_free = not shown or time >= times[shown[-1]] + found.horizons[-1]
+        if is_free and time + found.horizons[-1] <= times[0] + max(_SHOWN, 2 * found.horizons[-1]):
+            shown.append(start)
+    # Lines break between predictions.
+    x = np.pad(found.time[shown, None] + found.horizons, ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+    measured, predicted = (_angles(states[shown]) for states in (found.measured, found.predicted))
+    # The same turn of an angle.
+    predicted[..., 6:9] -= 2 * np.pi * np.nan_to_num(np.round((predicted - measured)[..., 6:9] / (2 * np.pi)))
+    handles = []
+    for panel, (title, column) in zip(panels, columns, strict=True):
+        y, half, seen = (
+            np.pad(values[..., column], ((0, 0), (0, 1)), constant_values=np.nan).ravel()
+            for values in (predicted, found.half_width[shown], measured)
+        )
+        band = panel.fill_between(x, y - half, y + half, color=look.color, alpha=0.22, linewidth=0)
+        (line,) = panel.plot(x, y, color=look.color)
+        (dots,) = panel.plot(x, seen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
+        handles = [dots, line, band]
+        panel.set_title(title)
+        panel.margins(x=0.01)
+    for panel in panels[-3:]:
+        panel.set_xlabel("time [s]")
+    labels = ("measured", f"predicted up to {found.horizons[-1]:.3g} s ahead", "95 % band")
+    figure.legend(handles, labels, loc="outside lower left", ncols=3)
+    return figure
+
+
+def _angles(states: np.ndarray) -> np.ndarray:
+    """The states with roll, pitch and yaw [rad] in the place of the quaternion."""
+    w, x, y, z = np.moveaxis(states[..., 6:10], -1, 0)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    angles = np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=-2)
+    return np.concatenate([states[..., :6], angles, states[..., 10:]], axis=-1)
