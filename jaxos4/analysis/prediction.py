@@ -201,7 +201,9 @@ def _observed(
     problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
 ) -> tuple[Float[Array, " samples"], ...]:
     """The outputs of the model's sensors at these body rates: rates, then specific forces."""
-    return problem.model.observe(unstack(rates.T), problem.forcing(parameters), tuple(parameters))
+    scalars = tuple(parameters)
+    observe = jax.vmap(lambda rates, row: problem.model.observe(unstack(rates), row, scalars))
+    return observe(rates, problem.forcing(parameters))
 
 
 @quick_jit

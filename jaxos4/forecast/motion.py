@@ -9,13 +9,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric, Scalar
 from .._xla import quick_jit
-from ..models.state import CASCADE_ORDER, Forcing, Rates, Samples, State, Vector
+from ..models.state import CASCADE_ORDER, Forcing, Rates, State
 from ..models.vehicle import FlightModel
 from ..shooting import FASTEST, ShootingProblem
 from ..shooting.gains import Covariance, LogNoise, Observed, first_covariance, gains_after, transition
 from ..simulation import rk4_step
 
-Quaternion = tuple[Samples, Samples, Samples, Samples]
+_Samples = Float[Numeric, "*samples"]
+Vector = tuple[_Samples, _Samples, _Samples]
+Quaternion = tuple[_Samples, _Samples, _Samples, _Samples]
 PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10], "rates": np.r_[10:13]}
 """The places of the parts of a state in an array of 13. The attitude is the quaternion w, x, y, z, body to earth."""
 

@@ -161,9 +161,7 @@ def _offsets(
     residuals, and the standard deviation of the offsets.
     """
     dt, rates = measured.dt, measured.states[:, PARTS["rates"]]
-    kept, names = math.exp(-dt / _MEMORY), vehicle.model.parameter_names
-    places = [names.index(f"{axis}_offset") if f"{axis}_offset" in names else -1 for axis in ("roll", "pitch", "yaw")]
-    prior = np.where(np.array(places) < 0, 0.0, np.asarray(vehicle.model.half_width)[places]) ** 2
+    kept, prior = math.exp(-dt / _MEMORY), vehicle.offset**2
     within = np.isfinite(np.diff(rates, axis=0)) & (np.diff(measured.stretch) == 0)[:, None]
     total, squares, sums = np.zeros(3), np.zeros(3), [np.zeros((2, 3))]
     for known in within:
@@ -196,7 +194,7 @@ def _fly(
     kept, weight, unsure = _offsets(vehicle, measured, noise)
     padding = ((0, problem.flight.time.size - len(weight)), (0, 0))
     forcing, offset = forcing_and_offsets(problem, parameters, as_float(np.pad(weight, padding)), as_float(kept))
-    known = _known(problem, vehicle, measured, noise, np.asarray(offset[0]), missing)._replace(unsure=unsure)
+    known = _known(problem, vehicle, measured, noise, np.asarray(offset)[0], missing)._replace(unsure=unsure)
 
     after, added, absorbed = jax.tree.map(np.asarray, settled(own, problem.flight.dt))
     begin = generator.standard_normal((_DRAWS, 12)) * np.nan_to_num(measured.noise)

@@ -1,6 +1,7 @@
 """The vehicle of a result: its model, its parameters with their covariance, and the noise that the fit found."""
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +10,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from .._custom_types import Parameters
+from .._xla import quick_jit
 from ..airframe import airframe_from_table
 from ..errors import InputError
 from ..export.result import VEHICLE, ResultFile, checked, read_file
@@ -27,6 +30,8 @@ class Vehicle(NamedTuple):
     - `name`: of the result's file; `estimator` and model if there is none.
     - `model`: of one recording.
     - `parameters`, `covariance`: of the model. The mean of the recordings, if each had its own value.
+    - `offset`: how far an offset of p', q', r' may be from the parameter in another recording, as a standard deviation
+      [rad/s^2]; 0 if the model has none.
     - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
     - `sample_time`: of the fit [s].
     - `notes`: why the estimate cannot be trusted; one line each.
@@ -36,6 +41,7 @@ class Vehicle(NamedTuple):
     model: FlightModel
     parameters: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
+    offset: Float[np.ndarray, "3"]
     noise: LogNoise
     sample_time: float
     notes: tuple[str, ...]
@@ -72,32 +78,38 @@ def _vehicle(file: ResultFile, name: str) -> Vehicle:
     airframe = airframe_from_table(file.airframe or {})
     try:
         model = FlightModel(airframe, terms=tuple(used.terms), battery_voltage=used.battery_voltage)
-    except ValueError as error:
-        raise InputError(f"its terms fit no vehicle ({error}); run `jaxos4 estimate` again.") from None
+    except ValueError:
+        raise InputError(
+            f"a vehicle cannot have its terms, {', '.join(used.terms)}; run `jaxos4 estimate` again."
+        ) from None
     known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
     known |= {row: each.value for row, each in file.held.items()}
-    center = dict(zip(model.parameter_names, np.asarray(model.alpha).tolist(), strict=True))
+    alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))
+    center, width = (dict(zip(model.parameter_names, each, strict=True)) for each in (alpha, half_width))
     rows, covariance = list(file.parameters), np.array(file.covariance)
     # Each parameter is the mean of its rows: one, or one for each recording.
-    shares = np.zeros((len(center), len(rows)))
-    values = []
+    shares, values = np.zeros((len(center), len(rows))), []
     for place, each in enumerate(center):
-        own = [row for row in known if row == each or row.rpartition("_")[::2] == (each, row.rpartition("_")[2])]
-        own = [row for row in own if row == each or row.rpartition("_")[2].isdigit()]
-        values.append(float(np.mean([known[row] for row in own])) if own else center[each])
-        for row in own:
-            if row in file.parameters:
-                shares[place, rows.index(row)] = 1 / len(own)
+        own = [row for row in known if re.fullmatch(rf"{each}(_\d+)?", row)]
+        values.append(np.mean([known[row] for row in own]) if own else center[each])
+        shares[place, [rows.index(row) for row in own if row in file.parameters]] = 1 / max(len(own), 1)
     untrusted = () if file.result == "successful" else (f"{file.result}: {meaning(file.result)}",)
     return Vehicle(
         name,
         model,
         np.array(values),
         shares @ covariance @ shares.T,
+        np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
         _noise(file, model.force_axes),
         used.sample_time,
         (*untrusted, *file.reasons),
     )
+
+
+@quick_jit
+def _bracket(model: FlightModel) -> tuple[Parameters, Parameters]:
+    """The centre and the half-width of the default bracket."""
+    return model.alpha, model.half_width
 
 
 def _noise(file: ResultFile, force_axes: Sequence[int]) -> LogNoise:

@@ -24,10 +24,7 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
 
 def prediction_figure(found: FlightPrediction) -> Figure:
     """Measured lines, and predictions with their band from starts that are one horizon apart; 10 s at most."""
-    columns = [(f"{axis} [m/s]", 3 + i) for i, axis in enumerate(("vx", "vy", "vz"))] * (
-        "velocity" not in found.missing
-    )
-    columns += [("roll [rad]", 6), ("pitch [rad]", 7), ("yaw [rad]", 8)]
+    columns = [("roll [rad]", 6), ("pitch [rad]", 7), ("yaw [rad]", 8)]
     columns += [(f"{axis} [rad/s]", 9 + i) for i, axis in enumerate("pqr")]
     if "velocity" not in found.missing:
         columns += [(f"{axis} [m/s]", 3 + i) for i, axis in enumerate(("vx", "vy", "vz"))]
@@ -54,6 +51,10 @@ def prediction_figure(found: FlightPrediction) -> Figure:
         handles = [dots, line, band]
         panel.set_title(title)
         panel.margins(x=0.01)
+        # The band of the first predictions is wide, because their offsets are unknown.
+        lines = np.concatenate([y, seen])
+        low, high = np.nanmin(lines), np.nanmax(lines)
+        panel.set_ylim(low - 0.4 * (high - low) - 1e-3, high + 0.4 * (high - low) + 1e-3)
     for panel in panels[-3:]:
         panel.set_xlabel("time [s]")
     labels = ("measured", f"predicted up to {found.horizons[-1]:.3g} s ahead", "95 % band")
