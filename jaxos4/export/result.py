@@ -1,7 +1,9 @@
 """Result files of `jaxos4 estimate`, and vehicles drawn from the uncertainty of a result."""
 
+import contextlib
 import itertools
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -158,17 +160,25 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.
     """
-    file = read_file(path)
-    try:
-        return _identified(Path(path).name, file)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    with _named(path):
+        return _identified(Path(path).name, _decoded(path))
 
 
 def read_file(path: str | os.PathLike[str]) -> ResultFile:
     """The parts of a result file. Raises `InputError` if it is no result or has no estimate, as `read_result` does."""
+    with _named(path):
+        return _decoded(path)
+
+
+def _decoded(path: str | os.PathLike[str]) -> ResultFile:
+    return checked(msgspec.json.decode(Path(path).read_bytes(), type=ResultFile))
+
+
+@contextlib.contextmanager
+def _named(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Raises an error of the result again, with the name of its file."""
     try:
-        return checked(msgspec.json.decode(Path(path).read_bytes(), type=ResultFile))
+        yield
     except msgspec.MsgspecError as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(

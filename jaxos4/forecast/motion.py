@@ -142,7 +142,7 @@ def deviation(a, b) -> Vector:
     return x, y, z
 
 
-def _sum(a: Vector, b: Vector) -> Vector:
+def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
