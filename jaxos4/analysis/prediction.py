@@ -173,11 +173,13 @@ def disturbances(
     noise: LogNoise,
     *,
     offset: Float[np.ndarray, "samples 3"] | None = None,
+    memory: float = np.inf,
 ) -> Disturbances:
     """The disturbance of each channel by Kalman filters, for the noise that `FilterError` found.
 
     The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r. `offset`: what to
-    add to the model [rad/s^2]; with it, the specific forces along `model.force_axes` are channels too.
+    add to the model [rad/s^2]; with it, the specific forces along `model.force_axes` are channels too, each without its
+    mean over the last `memory` [s], which an accelerometer's bias may be.
     """
     flight, channels = problem.flight, len(RATES) if offset is None else len(noise.strength)
     rates, stretch = np.asarray(flight.states)[:, RATES], flight.stretch
@@ -186,14 +188,34 @@ def disturbances(
         modelled = modelled + offset
         known = np.where(np.isnan(rates).any(axis=1, keepdims=True), 0.0, rates)
         expected = np.stack(_observed(problem, parameters, as_float(known))[len(RATES) :], axis=1)
-        force = flight.recorded[:, [len(STATE_NAMES) + axis for axis in problem.model.force_axes]]
-        measured = np.concatenate([rates, force - expected], axis=1)
+        axes = np.asarray(problem.model.force_axes, dtype=int)
+        force = flight.recorded[:, len(STATE_NAMES) + axes] - expected
+        force -= past_means(force, float(np.exp(-float(flight.dt) / memory)))[0]
+        measured = np.concatenate([rates, force], axis=1)
         modelled = np.pad(modelled, ((0, 0), (0, force.shape[1])))
     own = LogNoise(*(as_float(np.asarray(leaf)[:channels]) for leaf in noise))
     begins = np.diff(np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch), prepend=-1) != 0
     rate, value = _filtered(own, as_float(measured), as_float(modelled), jnp.asarray(begins), flight.dt)
     time_constant = np.exp(np.asarray(own.time_constant))
     return Disturbances(np.asarray(value), time_constant, np.asarray(rate)[:, : len(RATES)])
+
+
+def past_means(
+    values: Float[np.ndarray, "samples columns"], kept: float
+) -> tuple[Float[np.ndarray, "samples columns"], ...]:
+    """The mean of what was measured before each sample; 0 if nothing was. NaN: not measured.
+
+    **Arguments:** `kept`: the share of a value's weight that remains one sample later.
+
+    **Returns:** the means, the sums of the weights, and those of the squared weights.
+    """
+    known, sums = np.isfinite(values), []
+    total = weight = square = np.zeros(values.shape[1])
+    for value, is_known in zip(np.where(known, values, 0.0), known, strict=True):
+        sums.append((total, weight, square))
+        total, weight, square = kept * total + value, kept * weight + is_known, kept**2 * square + is_known
+    total, weight, square = np.moveaxis(np.array(sums), 1, 0)
+    return total / np.maximum(weight, 1.0), weight, square
 
 
 @quick_jit

@@ -43,6 +43,13 @@ class Measured(NamedTuple):
         states = np.concatenate([position, velocity, attitude, rates], axis=1)
         return cls(states, np.asarray(flight.omega), stretch, float(flight.dt), noise)
 
+    def accelerations(self, gravity: float) -> Float[np.ndarray, "samples 6"]:
+        """From each sample to the next: p', q', r' [rad/s^2], and the specific force that velocity implies [m/s^2]."""
+        change = np.diff(self.states, axis=0) / self.dt
+        change[np.diff(self.stretch) != 0] = np.nan
+        force = turned(inverse(self.states[:-1, 6:10].T), tuple((change[:, 3:6] + [0.0, 0.0, gravity]).T))
+        return np.pad(np.hstack([change[:, 10:], np.stack(force, 1)]), ((0, 1), (0, 0)), constant_values=np.nan)
+
     def has(self, part: str) -> bool:
         """Whether all components of a part of the state were measured at some time."""
         return bool(np.isfinite(self.states[:, PARTS[part]]).any(axis=0).all())
@@ -88,14 +95,10 @@ class Regression(NamedTuple):
     @classmethod
     def of(cls, flight: Measured, gravity: float) -> "Regression | None":
         """The regression of a flight; `None` if it measured too little."""
-        now, after = flight.states[:-1], flight.states[1:]
-        same = np.diff(flight.stretch) == 0
-        moves = bool(np.isfinite(flight.states[:, 3:10]).all(axis=1).any())
-        force = turned(inverse(now[:, 6:10].T), tuple(((after - now)[:, 3:6] / flight.dt + [0.0, 0.0, gravity]).T))
-        targets = np.concatenate([(after - now)[:, 10:] / flight.dt, np.stack(force, axis=1)], axis=1)
-        features = _features(now, flight.omega[:-1], moves)
+        moves = flight.has("velocity")
+        features, targets = _features(flight.states, flight.omega, moves), flight.accelerations(gravity)
         targets = targets if moves else targets[:, :3]
-        usable = same & np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
+        usable = np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
         if usable.sum() <= features.shape[1]:
             return None
         scale = np.maximum(np.abs(features[usable]).max(axis=0), 1e-12)

@@ -9,9 +9,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric, Scalar
 from .._xla import quick_jit
+from ..flight import Flight
 from ..models.state import CASCADE_ORDER, Forcing, Rates, State
 from ..models.vehicle import FlightModel
-from ..shooting import FASTEST, ShootingProblem
+from ..shooting import FASTEST
 from ..shooting.gains import Covariance, LogNoise, Observed, first_covariance, gains_after, transition
 from ..simulation import rk4_step
 
@@ -43,7 +44,7 @@ class Known(NamedTuple):
     - `first`: the sample.
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: by the filters [rad/s], [rad/s^2; m/s^2].
-    - `unsure`: the standard deviation of the offsets of p', q', r' [rad/s^2].
+    - `unsure`: the standard deviation of the offsets.
     - `lateral`: the measured specific force along x and y [m/s^2], which lasts, for the terms that need it.
     """
 
@@ -51,7 +52,7 @@ class Known(NamedTuple):
     state: Float[Numeric, "*starts 13"]
     rates: Float[Numeric, "*starts 3"]
     disturbance: Float[Numeric, "*starts channels"]
-    unsure: Float[Numeric, "*starts 3"]
+    unsure: Float[Numeric, "*starts 6"]
     lateral: Float[Numeric, "*starts 2"]
 
 
@@ -59,7 +60,8 @@ class Lanes(NamedTuple):
     """Several futures of each start.
 
     - `parameters`: of the model. `forcing`: of these parameters, one row for each sample.
-    - `offset`: of p', q', r' in this recording besides the parameters, from the past of each sample [rad/s^2].
+    - `offset`: what p', q', r' [rad/s^2] and the specific force [m/s^2] have in this recording besides the model, from
+      the past of each sample.
     - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
     - `begin`: errors of the state at the start; of the attitude as a small rotation [rad].
     - `pushed`: errors of the disturbances at the start.
@@ -69,11 +71,11 @@ class Lanes(NamedTuple):
 
     parameters: Float[Array, "lanes parameters"]
     forcing: Forcing
-    offset: Float[Array, "lanes samples 3"]
+    offset: Float[Array, "lanes samples 6"]
     filtered: Bool[Array, " lanes"]
     begin: Float[Array, "lanes 12"]
     pushed: Float[Array, "lanes channels"]
-    off: Float[Array, "lanes 2 3"]
+    off: Float[Array, "lanes 2 6"]
     gusts: Float[Array, "lanes steps channels 2"]
 
 
@@ -164,8 +166,8 @@ def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Sca
 
     def step(carry: tuple[Motion, Array, Array], row) -> tuple[tuple[Motion, Array, Array], Array]:
         (motion, disturbance, sound), (forcing, gust) = carry, row
-        turning = offset + (reach * disturbance + gust[:, 0])[:3] / dt
-        pushing = jnp.zeros(3).at[np.asarray(axes, dtype=int)].set(disturbance[3:])
+        turning = offset[:3] + (reach * disturbance + gust[:, 0])[:3] / dt
+        pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(disturbance[3:])
         acting = _Acting(forcing._replace(lateral=lateral), tuple(turning), tuple(pushing))
         moved = rk4_step(_Free(model), motion, acting, scalars, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
@@ -175,7 +177,7 @@ def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Sca
         return (motion, kept * disturbance + gust[:, 1], sound), jnp.stack(jax.tree.leaves(motion))
 
     pushed = jnp.where(lane.filtered, start.disturbance, 0.0) + lane.pushed
-    pushed = pushed.at[:3].add(absorbed)
+    pushed = pushed.at[:3].add(absorbed[:3])
     return jax.lax.scan(step, (begin, pushed, jnp.array(True)), (rows, lane.gusts))[1]
 
 
@@ -211,36 +213,33 @@ def fly_chunk(
 
 @quick_jit
 def forcing_and_offsets(
-    problem: ShootingProblem,
+    model: FlightModel,
+    flight: Flight,
     parameters: Float[Array, "lanes parameters"],
-    weight: Float[Array, "samples 3"],
+    measured: Float[Array, "samples 6"],
+    weight: Float[Array, "samples 6"],
     kept: Scalar,
-) -> tuple[Forcing, Float[Array, "lanes samples 3"]]:
-    """The forcing and the offsets of p', q', r' for each row of parameters.
+) -> tuple[Forcing, Float[Array, "lanes samples 6"]]:
+    """The forcing and the offsets of `Lanes` for each row of parameters.
 
-    An offset is a weighted sum of what the measured accelerations before a sample exceed the model's by: each sample
+    An offset is a weighted sum of what the `measured` accelerations before a sample exceed the model's by: each sample
     earlier has less weight by the factor `kept`, and `weight` multiplies the sum. Velocity and lateral force are left
     out of the forcing: they will be those of the prediction.
     """
-    model, flight = problem.model, problem.flight
-    rates = flight.states[:, CASCADE_ORDER[:3]]
-    change, middle = jnp.diff(rates, axis=0) / flight.dt, (rates[1:] + rates[:-1]) / 2
-    within = ~jnp.isnan(change)
-    if flight.stretch is not None:
-        within &= (jnp.diff(flight.stretch) == 0)[:, None]
+    rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs
+    middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
 
     def of_lane(values: Array) -> tuple[Forcing, Array]:
-        forcing = problem.forcing(values)
-        rows = jax.tree.map(lambda leaf: leaf[:-1], forcing)
-        added = model.angular_acceleration(Rates(*jnp.where(within, middle, 0.0).T), rows, tuple(values))
-        residual = jnp.where(within, change - jnp.stack(added, axis=1), 0.0)
+        forcing, scalars = model.forcing(inputs, values), tuple(values)
+        turning = model.angular_acceleration(Rates(*middle.T), forcing, scalars)
+        pushing = model.specific_force(forcing.thrust, forcing, scalars)
+        residual = measured - jnp.stack([*turning, *pushing], axis=1)
 
         def gather(total: Array, row: Array) -> tuple[Array, Array]:
-            return kept * total + row, kept * total + row
+            return kept * total + row, total
 
-        past = jax.lax.scan(gather, jnp.zeros(3), residual)[1]
-        offset = weight * jnp.concatenate([jnp.zeros((1, 3)), past])
-        return forcing._replace(velocity=None, lateral=None, recording=()), offset
+        past = jax.lax.scan(gather, jnp.zeros(6), jnp.where(jnp.isnan(residual), 0.0, residual))[1]
+        return forcing._replace(velocity=None, lateral=None, recording=()), weight * past
 
     return jax.vmap(of_lane)(parameters)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import as_float
-from ..analysis.prediction import disturbances
+from ..analysis.prediction import disturbances, past_means
 from ..errors import InputError
 from ..flight import Flight
 from ..identification import Identification
@@ -29,6 +29,9 @@ from .vehicle import Vehicle, vehicle_of
 _DRAWS, _NINETY_FIVE = 64, 1.9977
 # A recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
 _MEMORY = 5.0
+# The standard deviation of an offset of the specific force, and of the force that a model lacks [m/s^2]; and the
+# correlation time of the latter [s].
+_PUSH = 1.0, 0.25
 # What a log cannot replace by a prediction.
 _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
@@ -150,25 +153,23 @@ def _starts(
 
 
 def _offsets(
-    vehicle: Vehicle, measured: Measured, noise: LogNoise
-) -> tuple[float, Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
-    """How the offsets of p', q', r' follow from the past of a recording.
+    vehicle: Vehicle, measured: Measured, accelerations: Float[np.ndarray, "samples 6"], noise: LogNoise
+) -> tuple[float, Float[np.ndarray, "samples 6"], Float[np.ndarray, "samples 6"]]:
+    """How the offsets of p', q', r' and of the specific force follow from the past of a recording.
 
-    Each recording has its own offset. The mean of the residuals before a sample, of which it forgets the oldest, is
-    drawn to that of the fit as far as the bracket says that offsets do not differ.
+    Each recording has its own. The mean of the residuals before a sample, of which it forgets the oldest, is drawn to 0
+    as far as offsets are known not to differ. If no velocity is measured, the specific force has no offset.
 
     **Returns:** the share of a residual's weight that remains one sample later, what multiplies the sum of the weighted
     residuals, and the standard deviation of the offsets.
     """
-    dt, rates = measured.dt, measured.states[:, PARTS["rates"]]
-    kept, prior = math.exp(-dt / _MEMORY), vehicle.offset**2
-    within = np.isfinite(np.diff(rates, axis=0)) & (np.diff(measured.stretch) == 0)[:, None]
-    total, squares, sums = np.zeros(3), np.zeros(3), [np.zeros((2, 3))]
-    for known in within:
-        total, squares = kept * total + known, kept**2 * squares + known
-        sums.append(np.stack([total, squares]))
-    total, squares = np.moveaxis(np.array(sums), 1, 0)
-    strength, time_constant, sensor = (np.exp(leaf[:3]) for leaf in noise)
+    dt, kept = measured.dt, math.exp(-measured.dt / _MEMORY)
+    _, total, squares = past_means(accelerations, kept)
+    strength, time_constant = np.full(6, _PUSH[0]), np.full(6, _PUSH[1])
+    channels = [0, 1, 2, *(3 + axis for axis in vehicle.model.force_axes)]
+    strength[channels], time_constant[channels] = np.exp(noise.strength), np.exp(noise.time_constant)
+    sensor = np.append(np.exp(noise.sensor[:3]), measured.noise[3:6])
+    prior = np.append(vehicle.offset, [_PUSH[0] * measured.has("velocity")] * 3) ** 2
     count = np.maximum(total, 1.0)
     seconds = dt * count**2 / np.maximum(squares, 1.0)  # a uniform mean over this time is as exact
     variance = strength**2 * np.minimum(1.0, 2 * time_constant / seconds) + 2 * (sensor / (dt * count)) ** 2
@@ -191,9 +192,12 @@ def _fly(
     """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures."""
     generator, channels, own = np.random.default_rng(seed), noise.strength.size, LogNoise(*map(as_float, noise))
     parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(_DRAWS, generator)]))
-    kept, weight, unsure = _offsets(vehicle, measured, noise)
+    accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
+    kept, weight, unsure = _offsets(vehicle, measured, accelerations, noise)
     padding = ((0, problem.flight.time.size - len(weight)), (0, 0))
-    forcing, offset = forcing_and_offsets(problem, parameters, as_float(np.pad(weight, padding)), as_float(kept))
+    above, weight = (as_float(np.pad(each, padding)) for each in (accelerations, weight))
+    model = dataclasses.replace(vehicle.model, recordings=(0,) * (int(measured.stretch.max()) + 1))
+    forcing, offset = forcing_and_offsets(model, problem.flight, parameters, above, weight, as_float(kept))
     known = _known(problem, vehicle, measured, noise, np.asarray(offset)[0], missing)._replace(unsure=unsure)
 
     after, added, absorbed = jax.tree.map(np.asarray, settled(own, problem.flight.dt))
@@ -201,8 +205,8 @@ def _fly(
     first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
     begin[:, 9:] = first[:, :3, 0]
     gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
-    off = generator.standard_normal((_DRAWS, 3))
-    drawn = begin, first[..., 1], np.stack([off, -absorbed[:3] * off], axis=1), gusts
+    off = generator.standard_normal((_DRAWS, 6))
+    drawn = begin, first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
     surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
     lanes = Lanes(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
@@ -220,12 +224,12 @@ def _known(
     vehicle: Vehicle,
     measured: Measured,
     noise: LogNoise,
-    offset: Float[np.ndarray, "padded 3"],
+    offset: Float[np.ndarray, "padded 6"],
     missing: tuple[str, ...],
 ) -> Known:
     """What is known at each sample, in NumPy; `unsure` is missing. A position that was not measured is 0."""
     samples = slice(len(measured.stretch))
-    filtered = disturbances(problem, as_float(vehicle.parameters), noise, offset=offset)
+    filtered = disturbances(problem, as_float(vehicle.parameters), noise, offset=offset[:, :3], memory=_MEMORY)
     state, flight = measured.states.copy(), problem.flight
     if "velocity" in missing:
         axial = np.asarray(flight.body_velocity)[samples, 2]
@@ -234,7 +238,7 @@ def _known(
         state[:, PARTS["position"]] = 0.0
     lateral = np.nan_to_num(np.asarray(flight.specific_force)[samples, :2])
     rates, value = np.asarray(filtered.rates)[samples], filtered.value[samples]
-    return Known(np.arange(len(state)), state, rates, value, np.zeros((len(state), 3)), lateral)
+    return Known(np.arange(len(state)), state, rates, value, np.zeros((len(state), 6)), lateral)
 
 
 def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:
