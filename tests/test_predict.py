@@ -256,6 +256,15 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     np.testing.assert_allclose(table["p_half_width"], dataset.rates_half_width.values[..., 0].ravel(), rtol=1e-8)
 
 
+def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_path, write):
+    write(result(result="no_skill", doubts=[{"cause": "yaw is not predicted", "remedy": "fly more yaw"}]))
+    jaxos4.write_flight(flown(2), tmp_path / "log.csv", CRAZYFLIE)
+    code, out, err = run("predict", "found.json", "log.csv")
+    assert code == 1
+    assert "note: not to be trusted because yaw is not predicted; fly more yaw" in out
+    assert err.startswith("jaxos4: no_skill: ")
+
+
 @pytest.mark.parametrize(
     ("content", "options", "fragments"),
     [

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
+import typer
 from typer import Argument, Option
 
 from . import _options as options
@@ -50,8 +51,12 @@ def predict(
     from rich.console import Console
 
     from ..report import print_prediction
+    from ..results import meaning
 
     console = Console()
     print_prediction(console, found._replace(notes=tuple(in_options(note) for note in found.notes)))
     for path in filter(None, (out, json, figure)):
         console.print(f"written: {path}", markup=False, highlight=False)
+    if vehicle.result != "successful":
+        typer.echo(f"jaxos4: {vehicle.result}: {meaning(vehicle.result)}", err=True)
+        raise typer.Exit(1)

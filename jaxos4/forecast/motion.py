@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Numeric, Scalar
+from .._custom_types import Count, Numeric, Scalar
 from .._xla import quick_jit
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER, Forcing, Rates, State
@@ -215,6 +215,7 @@ def fly_chunk(
 def forcing_and_offsets(
     model: FlightModel,
     flight: Flight,
+    length: Count,
     parameters: Float[Array, "lanes parameters"],
     measured: Float[Array, "samples 6"],
     weight: Float[Array, "samples 6"],
@@ -224,9 +225,9 @@ def forcing_and_offsets(
 
     An offset is a weighted sum of what the `measured` accelerations before a sample exceed the model's by: each sample
     earlier has less weight by the factor `kept`, and `weight` multiplies the sum. Velocity and lateral force are left
-    out of the forcing: they will be those of the prediction.
+    out of the forcing: they will be those of the prediction. `length`: the samples of the flight that are no padding.
     """
-    rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs
+    rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
 
     def of_lane(values: Array) -> tuple[Forcing, Array]:

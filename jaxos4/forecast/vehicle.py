@@ -18,7 +18,6 @@ from ..export.result import VEHICLE, ResultFile, checked, read_file
 from ..flight import FORCE_NAMES
 from ..identification import Identification
 from ..models.vehicle import FlightModel
-from ..results import meaning
 from ..shooting.gains import LogNoise
 
 _LEAST = 1e-9  # of a noise level, whose logarithm must be finite
@@ -34,6 +33,7 @@ class Vehicle(NamedTuple):
       [rad/s^2]; 0 if the model has none.
     - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
     - `sample_time`: of the fit [s].
+    - `result`: the name of the result code.
     - `notes`: why the estimate cannot be trusted; one line each.
     """
 
@@ -44,6 +44,7 @@ class Vehicle(NamedTuple):
     offset: Float[np.ndarray, "3"]
     noise: LogNoise
     sample_time: float
+    result: str
     notes: tuple[str, ...]
 
     def draw(self, count: int, generator: np.random.Generator) -> Float[np.ndarray, "count parameters"]:
@@ -93,7 +94,6 @@ def _vehicle(file: ResultFile, name: str) -> Vehicle:
         own = [row for row in known if re.fullmatch(rf"{each}(_\d+)?", row)]
         values.append(np.mean([known[row] for row in own]) if own else center[each])
         shares[place, [rows.index(row) for row in own if row in file.parameters]] = 1 / max(len(own), 1)
-    untrusted = () if file.result == "successful" else (f"{file.result}: {meaning(file.result)}",)
     return Vehicle(
         name,
         model,
@@ -102,7 +102,8 @@ def _vehicle(file: ResultFile, name: str) -> Vehicle:
         np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
         _noise(file, model.force_axes),
         used.sample_time,
-        (*untrusted, *file.reasons),
+        file.result,
+        file.reasons,
     )
 
 
