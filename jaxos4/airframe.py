@@ -3,6 +3,7 @@
 import math
 from dataclasses import fields
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -110,7 +111,10 @@ def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tup
 
 
 def load_airframe(source: str | PathLike[str]) -> Airframe:
-    """Load an airframe by the name of a preset (`os4`, `os4-simulator`, `voos`) or from a TOML file.
+    """Load an airframe by the name of a preset, or from a TOML file.
+
+    Presets: `os4`, `os4-simulator`, `voos`, and vehicles to start from: `crazyflie`, `crazyflie-brushless`, `x500`.
+    Their files (`jaxos4/airframes`) say where each number is from.
 
     The keys of the file, in SI units: `mass`, `inertia = [Ix, Iy, Iz]`, `thrust_coefficient`, `drag_coefficient`,
     `rotor_inertia`; either `arm` (plus layout) or `rotor_positions = [[x1, y1], ...]`; optionally `rotor_spins`,
@@ -125,10 +129,11 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
     """
     if source in PRESETS:
         return PRESETS[str(source)]
+    files = {path.stem: path for path in sorted(Path(__file__).with_name("airframes").glob("*.toml"))}
     try:
-        table = read_toml(source)
+        table = read_toml(files.get(str(source), source))
     except FileNotFoundError:
-        presets = ", ".join(PRESETS)
+        presets = ", ".join((*PRESETS, *files))
         raise InputError(f"{source}: neither a file nor a preset; give a TOML file or one of {presets}.") from None
     try:
         return airframe_from_table(table)

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxos4
 from jaxos4.airframe import (
     ALTERNATING_SPINS,
     OS4,
@@ -184,8 +186,17 @@ def test_unusable_toml_is_refused_in_one_line(tmp_path, key, text):
     assert "\n" not in message
 
 
+@pytest.mark.parametrize("name", ["crazyflie", "crazyflie-brushless", "x500"])
+def test_a_vehicle_to_start_from_can_hover_and_names_its_sources(name):
+    airframe = load_airframe(name)
+    assert 0.3 < airframe.hover_speed / airframe.max_rotor_speed < 0.85
+    assert np.linalg.matrix_rank(np.asarray(airframe.mixer)) == 4
+    text = (Path(jaxos4.__file__).parent / "airframes" / f"{name}.toml").read_text(encoding="utf-8")
+    assert all("#" in line or '"guess"' in line for line in text.splitlines())
+
+
 def test_neither_file_nor_preset(tmp_path):
-    with pytest.raises(InputError, match="os4-simulator") as caught:
+    with pytest.raises(InputError, match="os4-simulator, voos, crazyflie") as caught:
         load_airframe(tmp_path / "none.toml")
     assert "none.toml" in str(caught.value)
 

@@ -31,7 +31,8 @@ def estimate(
         Option(help="Equations: as published, corrected, or of a real vehicle. Default: by the log."),
     ] = None,
     airframe: Annotated[
-        str | None, Option(help="os4, os4-simulator, voos, or a TOML file. Default: os4; a vehicle needs one.")
+        str | None,
+        Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Default: os4; a vehicle needs one."),
     ] = None,
     bracket: options.BracketOption = None,
     channels: options.ChannelsOption = None,

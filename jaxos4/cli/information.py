@@ -23,7 +23,8 @@ _UNITS |= {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 def inspect(
     log: Annotated[Path, Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox or Crazyflie.")],
     airframe: Annotated[
-        str | None, Option(help="os4, os4-simulator, voos, or a TOML file. Needed for torques and parameters.")
+        str | None,
+        Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Needed for torques and parameters."),
     ] = None,
     airframe_out: Annotated[
         Path | None,
