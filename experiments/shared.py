@@ -1,5 +1,6 @@
 """Functions that the experiments share: batched identification, tables, Datasets and figure files."""
 
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -26,6 +27,17 @@ from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_data
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""
+
+
+def flight_files(folder: Path | None, names: Iterable[str]) -> list[Path]:
+    """The files of recorded flights in a folder, by default `$JAXOS4_FLIGHTS`. Ends the script if one is missing."""
+    if folder is None and os.environ.get("JAXOS4_FLIGHTS"):
+        folder = Path(os.environ["JAXOS4_FLIGHTS"])
+    paths = [] if folder is None else [folder / name for name in names]
+    missing = next((path.name for path in paths if not path.is_file()), None)
+    if folder is None or missing is not None:
+        raise SystemExit(f"--flights: no {missing or 'flights'} in {folder}: give the folder of the flights.")
+    return paths
 
 
 def run_studies(studies: dict[str, Study], out: Path) -> None:

@@ -11,7 +11,6 @@ deviation; 99 % of such figures should be below 2.58.
 
 import itertools
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,7 +25,7 @@ from jaxos4.results import NINETY_FIVE
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from shared import table_of
+from shared import flight_files, table_of
 
 jax.config.update("jax_enable_x64", True)
 
@@ -95,12 +94,8 @@ def main(
     estimators: Annotated[list[str], typer.Option(help="Names of the estimators.")] = ("filter-error", "ibss"),
 ) -> None:
     """Identify each flight alone, and all together."""
-    folder = flights or (Path(os.environ["JAXOS4_FLIGHTS"]) if os.environ.get("JAXOS4_FLIGHTS") else None)
-    paths = {} if folder is None else {name: folder / f"arpl_crazyflie_{name}.csv" for name in names}
-    missing = next((path.name for path in paths.values() if not path.is_file()), None)
-    if folder is None or missing is not None:
-        raise SystemExit(f"--flights: no {missing or 'flights'} in {folder}: give the folder of the flights.")
-    recordings = {name: read_recording(path, AIRFRAME) for name, path in paths.items()}
+    paths = flight_files(flights, [f"arpl_crazyflie_{name}.csv" for name in names])
+    recordings = {name: read_recording(path, AIRFRAME) for name, path in zip(names, paths, strict=True)}
     groups = {name: [recording] for name, recording in recordings.items()}
     if len(groups) > 1:
         groups[TOGETHER] = list(recordings.values())
