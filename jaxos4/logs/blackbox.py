@@ -2,9 +2,9 @@
 
 | column | column of the log | unit in the log |
 | --- | --- | --- |
-| `t` | `time (us)`, `time (ms)`, `time (s)`, or Explorer's `time`; 0 at the first row | as named; Explorer: us |
-| `p, q, r` | `gyroUnfilt[0..2]`, or `gyroADC[0..2]` | deg/s, or as named: `(deg/s)`, `(rad/s)` |
-| `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g, or as named: `(g)`, `(m/s2)` |
+| `t` | `time (us)`, or Explorer's `time`; 0 at the first row | us |
+| `p, q, r` | `gyroUnfilt[0..2]`, or `gyroADC[0..2]` | deg/s |
+| `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g |
 | `omega1..4` | `eRPM[0..3]`, measured | 100 electrical revolutions a minute |
 | `command1..4` | `motor[0..3]`, if there is no `eRPM` | DShot 48..2047, or PWM 1000..2000 |
 | `voltage` | `vbatLatest` of Betaflight 4, INAV's `vbat` | 0.01 V |
@@ -17,9 +17,8 @@ estimators would attribute to the vehicle. Commands count as fractions of the ai
 
 **Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
 reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle`, `gyro_scale` and
-`blackbox_high_resolution` (rates are in tenths of a deg/s). For the CSV of `blackbox_decode` they are taken from the
-`.bbl` or `.BFL` file beside it (`LOG00001.02.csv`: second session of `LOG00001.BFL`). Without settings, the reader
-assumes 14 poles, deg/s, 1 g from the accelerometer's median, the protocol from the commands' range, and notes it.
+`blackbox_high_resolution` (rates are in tenths of a deg/s). The CSV of `blackbox_decode` has no settings. Then the
+reader assumes 14 poles, deg/s, 1 g from the accelerometer's median and the protocol from the range, and notes it.
 
 **Sessions.** A vehicle writes one session each time that it is armed. The sessions of a file follow each other in one
 flight, with an unmeasured second between them.
@@ -39,10 +38,8 @@ import contextlib
 import csv
 import itertools
 import math
-import os
 import re
 import struct
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -61,10 +58,8 @@ _BETWEEN = 1.0  # [s], put between sessions
 _DEGREE, _GRAVITY = math.pi / 180, 9.80665
 _POLES = 14
 _COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
-_TIMES = {"time (us)": 1e-6, "time (ms)": 1e-3, "time (s)": 1.0, "time": 1e-6}
+_TIMES = ("time (us)", "time")
 _RATES = ("gyroUnfilt", "gyroADC")
-_RATE_UNITS = {"": _DEGREE, " (deg/s)": _DEGREE, " (rad/s)": 1.0}
-_FORCE_UNITS = {"": math.nan, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
 _TENTH = _DEGREE / 10
 _INAV = {  # column: column of the log, unit in our frame
@@ -78,8 +73,7 @@ _DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _KNOWN = (
     *_TIMES,
-    *(f"{name}[{i}]{unit}" for name in _RATES for i in range(3) for unit in _RATE_UNITS),
-    *(f"accSmooth[{i}]{unit}" for i in range(3) for unit in _FORCE_UNITS),
+    *(f"{name}[{i}]" for name in (*_RATES, "accSmooth") for i in range(3)),
     *(name for name, _ in _INAV.values()),
     *_VOLTAGES,
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
@@ -110,14 +104,6 @@ class _Log(NamedTuple):
         self.names.update(names)
         self.columns.update((column, self.raw[name] * factor) for column, name in names.items())
 
-    def vector(self, fields: Iterable[str], units: Iterable[str]) -> tuple[str, str, list[str]] | None:
-        """The first field with three columns in one of the units, the unit, and the columns."""
-        for field, unit in itertools.product(fields, units):
-            names = [f"{field}[{i}]{unit}" for i in range(3)]
-            if self.raw.keys() >= set(names):
-                return field, unit, names
-        return None
-
     def setting(self, name: str, least: float, most: float) -> float | None:
         """A setting, or the last of several, if it is a number within these limits."""
         try:
@@ -134,7 +120,7 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
         refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
-    log.names["t"], log.columns["t"] = time, (raw[time] - np.nan_to_num(raw[time][0])) * _TIMES[time]
+    log.names["t"], log.columns["t"] = time, (raw[time] - np.nan_to_num(raw[time][0])) * 1e-6
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
@@ -157,15 +143,11 @@ BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
 
 
 def _csv(path: Path) -> _Log:
-    """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
+    """A CSV, with the settings above its header, if there are any."""
     settings, skip = _settings_above(path)
-    notes = []
-    if not settings:
-        settings, beside = _settings_beside(path)
-        notes += [f"settings are taken from {beside} beside it"] * bool(settings)
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    return _Log(path, skip + 1, settings, raw, {}, {}, notes)
+    return _Log(path, skip + 1, settings, raw, {}, {}, [])
 
 
 def _is_header(line: str) -> bool:
@@ -189,21 +171,6 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _settings_beside(path: Path) -> tuple[Settings, str]:
-    """The settings of the log that a CSV of `blackbox_decode` was made from, if it lies beside it, and its name."""
-    folder, name = os.path.split(os.fspath(path))
-    match = re.fullmatch(r"(.+?)(?:\.(\d{2}))?\.csv", name, re.IGNORECASE)
-    if match is None:
-        return {}, ""
-    for ending in ("bbl", "BBL", "bfl", "BFL", "txt", "TXT"):
-        beside = os.path.join(folder, f"{match[1]}.{ending}")
-        every = _sessions(beside) if os.path.isfile(beside) else []
-        number = int(match[2]) if match[2] else 1 if len(every) == 1 else 0
-        if 0 < number <= len(every):
-            return every[number - 1][0], os.path.basename(beside)
-    return {}, ""
-
-
 def _is_raw(path: Path) -> bool:
     """Whether a file is a blackbox log that was not decoded."""
     with opened(path, "rb") as file:
@@ -211,11 +178,11 @@ def _is_raw(path: Path) -> bool:
 
 
 def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
-    """The settings and the frames of the sessions of a file, in order; none if it is no blackbox log.
+    """The settings and the frames of the sessions of a file, in order.
 
     A header ends at the first line that does not begin with `H `, or is not text.
     """
-    content, found = read_bytes(path, _LARGEST) if _is_raw(path) else b"", []
+    content, found = read_bytes(path, _LARGEST), []
     places = [match.start() for match in re.finditer(_MAGIC, content)]
     for at, end in itertools.pairwise([*places, len(content)]):
         settings: Settings = {}
@@ -277,17 +244,13 @@ def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
 
 
 def _add_rates(log: _Log) -> None:
-    found = log.vector(_RATES, _RATE_UNITS)
-    if found is None:
+    field = next((name for name in _RATES if log.raw.keys() >= {f"{name}[{i}]" for i in range(3)}), None)
+    if field is None:
         refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
-    field, unit, names = found
-    factor = _RATE_UNITS[unit]
-    if unit == "":
-        factor *= _gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-        fine = "with blackbox_high_resolution its unit is 0.1 deg/s"
-        remedy = "give the .bbl or .BFL file, or keep it beside this one"
-        log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}; {remedy}"])
-    log.add(dict(zip("pqr", names, strict=True)), factor)
+    fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
+    log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}"])
+    unit = _gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
+    log.add({name: f"{field}[{i}]" for i, name in enumerate("pqr")}, _DEGREE * unit)
 
 
 def _gyro_unit(settings: Settings) -> float:
@@ -326,22 +289,18 @@ def _add_rotors(log: _Log) -> None:
 
 
 def _add_force(log: _Log) -> None:
-    found = log.vector(("accSmooth",), _FORCE_UNITS)
-    if found is None:
+    names = [f"accSmooth[{i}]" for i in range(3)]
+    if not log.raw.keys() >= set(names):
         return
-    _, unit, names = found
     if log.setting("acc_1G", 0, 0) is not None or not any(np.ptp(_finite(log.raw[name])) for name in names):
         log.notes.append("the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked")
         return
-    factor = _FORCE_UNITS[unit]
-    if unit == "":
-        one = log.setting("acc_1G", 1, 65535)
-        if one is None:
-            median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
-            one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
-            log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
-        factor = _GRAVITY / one
-    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), factor)
+    one = log.setting("acc_1G", 1, 65535)
+    if one is None:
+        median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
+        one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
+        log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
+    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), _GRAVITY / one)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
