@@ -28,17 +28,6 @@ _MOST_SEEKS = 1000  # pyulog seeks for each corrupt byte, and a few times in an 
 Fields = dict[str, np.ndarray]
 
 
-class Source(NamedTuple):
-    """Three fields of a topic that measure a vector along the body's axes, and how to calibrate them.
-
-    `calibration`: the beginning of the parameters' names, for the raw values of a sensor.
-    """
-
-    topic: str
-    fields: tuple[str, str, str]
-    calibration: str = ""
-
-
 class Topics(NamedTuple):
     """The decoded topics, each with its instances; the parameters; the log's names of our columns; the notes."""
 
@@ -74,44 +63,22 @@ class Topics(NamedTuple):
             values = np.column_stack([np.asarray(raw[name], dtype=float)[kept] for name in fields])
         return Series(stamp[kept] / 1e6, np.where(np.isfinite(values), values, np.nan))
 
-    def fastest(self, sources: Sequence[Source], columns: Sequence[str]) -> tuple[Series, str] | None:
-        """The source that was logged most often, in our frame, and its topic. Of equals, the first.
+    def fastest(self, sources: Mapping[str, str], columns: Sequence[str]) -> tuple[Series, str] | None:
+        """The vector that was logged most often, in our frame, and its topic. Of equals, the first.
 
-        Raw values of a sensor count only if they can be calibrated.
+        `sources`: by topic, the field with three numbers along the body's axes.
         """
-        best: tuple[float, Series, Source] | None = None
-        for source in sources:
-            for instance in range(len(self.topics.get(source.topic, []))):
-                series = self.series(source.topic, source.fields, instance)
-                if series is not None and source.calibration:
-                    series = self._calibrated(series, source, instance)
+        best, found = 0.0, None
+        for topic, field in sources.items():
+            fields = [f"{field}[{i}]" for i in range(3)]
+            for instance in range(len(self.topics.get(topic, []))):
+                series = self.series(topic, fields, instance)
                 if series is None or not np.isfinite(series.values).any():
                     continue
-                rate = logged_rate(series.t)
-                if best is None or rate > _FASTER * best[0]:
-                    best = rate, series, source
-        if best is None:
-            return None
-        _, series, source = best
-        self.names.update((c, f"{source.topic}.{f}") for c, f in zip(columns, source.fields, strict=True))
-        return Series(series.t, series.values * HALF_TURN), source.topic
-
-    def _calibrated(self, series: Series, source: Source, instance: int) -> Series | None:
-        """Raw values with the offset and scale of their sensor; None if the board is turned, or they are unknown.
-
-        Reference: `calibration::Gyroscope::Correct` and `calibration::Accelerometer::Correct` of PX4.
-        """
-        get, device = self.parameters.get, self.fields(source.topic, instance).get("device_id", np.empty(0))
-        if get("SENS_BOARD_ROT", 0.0) or any(get(f"SENS_BOARD_{axis}_OFF", 0.0) for axis in "XYZ"):
-            return None
-        for name in (f"{source.calibration}{number}_" for number in range(4)):
-            # A parameter is a signed number of 32 bits, the identity of a sensor an unsigned one.
-            known = device.size and int(get(f"{name}ID", 0.0)) % (1 << 32) == int(device[0]) != 0
-            if known and not get(f"{name}ROT", -1.0) > 0:
-                offset = np.array([get(f"{name}{axis}OFF", 0.0) for axis in "XYZ"])
-                scale = np.array([get(f"{name}{axis}SCALE", 1.0) for axis in "XYZ"])
-                return Series(series.t, (series.values - offset) * scale)
-        return None
+                if found is None or logged_rate(series.t) > _FASTER * best:
+                    best, found = logged_rate(series.t), (Series(series.t, series.values * HALF_TURN), topic)
+                    self.names.update((c, f"{topic}.{f}") for c, f in zip(columns, fields, strict=True))
+        return found
 
 
 def decoded(path: Path, topics: Sequence[str]) -> Topics:
