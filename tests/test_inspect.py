@@ -69,7 +69,7 @@ def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
 BAD = {
     "missing": (None, "there is no such file"),
     "empty": (b"", "is empty"),
-    "ulog": (LOGS["ULog"][:14], "ends within its header"),
+    "ulog": (LOGS["ULog"][:14], "Header too short"),
     "nothing flown": (crazyflie([("e", ["a.b(f)"], [0.0, 1.0], np.zeros((2, 1)))]), "no body rates"),
 }
 

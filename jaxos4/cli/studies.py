@@ -53,14 +53,11 @@ def _print_plan(wanted: "Study", out: Path) -> None:
     from ..report.text import Listing
     from ..study import device_name, plan
 
-    rows, numbers = plan(wanted, out), ("cells", "flights", "programs", "networks", "time [min]")
-    cells = [(*map(str, counts), "-" if seconds is None else f"{seconds / 60:.1f}") for *counts, seconds in rows]
-    Listing(("estimator", *numbers), cells, numbers).print_on(Console(highlight=False))
-    cells, flights = sum(row.cells for row in rows), sum(row.flights for row in rows)
-    typer.echo(
-        f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}. The time "
-        "is known for estimators with finished cells. It does not include the training of networks."
-    )
+    rows = plan(wanted, out)
+    table = [(estimator, *map(str, counts)) for estimator, counts in rows.items()]
+    Listing(("estimator", "cells", "flights"), table, ("cells", "flights")).print_on(Console(highlight=False))
+    cells, flights = (sum(column) for column in zip(*rows.values(), strict=True))
+    typer.echo(f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}.")
 
 
 def _connected(address: str):

@@ -14,7 +14,7 @@ from ..logs import log_format
 from ..models.os4 import CorrectedOS4
 from ..noise import SENSOR_SIGMA
 from ..shooting import ShootingProblem
-from .motion import RATE_COLUMNS, WEAK, excitation, motor_clock_note, opposite_axes, refused_note, yaw_doubt
+from .motion import RATE_COLUMNS, WEAK, excitation, opposite_axes, refused_note, yaw_doubt
 from .pieces import cut
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
@@ -114,7 +114,6 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     usable = [cut(recording, part) for part in found if not part.reason]
     opposite = {} if airframe is None else opposite_axes(usable, airframe)
     doubt = yaw_doubt(opposite)
-    clock = "" if airframe is None else motor_clock_note(usable, airframe)
     findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts), refused_note(opposite))))
     identifiable = None
     if longest is not None and not facts.too_slow and airframe is not None and rates_measured:
@@ -128,7 +127,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         measured=_measured(recording),
         findings=findings,
-        notes=(*recording.notes, *filter(None, ("; ".join(doubt or ()), clock))),
+        notes=(*recording.notes, *(["; ".join(doubt)] if doubt else [])),
         parts=parts,
         identifiable=identifiable,
     )

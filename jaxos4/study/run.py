@@ -12,7 +12,6 @@ import functools
 import io
 import itertools
 import os
-import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Container, Iterator
 from pathlib import Path
@@ -27,7 +26,7 @@ from ..networks import TrainedNetwork, encode_network, load_network
 from .cell import blank_problem, fleet_of, key_of, programs_of, run_cell
 from .dataset import assemble, save_dataset
 from .specification import Cell, Job, Study
-from .store import Store, check_store, open_store
+from .store import Store, check_store, open_store, write_file
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -52,20 +51,6 @@ class Step(NamedTuple):
     label: str
 
 
-class Plan(NamedTuple):
-    """The remaining work of an estimator: programs to be compiled, networks to be trained.
-
-    `seconds`: of the cells on this process's devices, from the mean time of this estimator's finished cells, or `None`.
-    """
-
-    estimator: str
-    cells: int
-    flights: int
-    programs: int
-    networks: int
-    seconds: float | None
-
-
 def use_all_cores() -> None:
     """Makes each core a device, or as many as `JAX_NUM_CPU_DEVICES` says. Call it before any computation."""
     if os.environ.get("JAX_NUM_CPU_DEVICES"):
@@ -80,24 +65,12 @@ def device_name() -> str:
     return f"{len(devices)} x {devices[0].device_kind}"
 
 
-def plan(study: Study, directory: Path) -> list[Plan]:
-    """A row for each estimator. Programs and networks count for the first that needs them. Raises as `open_store`."""
-    store, seconds, rows = check_store(directory, study), defaultdict(list), []
-    for entry in store.read_log():
-        if "cell" in entry:
-            seconds[study.cell(entry["cell"]).scenario.estimator].append(entry["seconds"])
-    remaining = [study.cell(index) for index in store.missing()]
-    trained = {job for job, number in study.jobs().items() if store.network_file(number).exists()}
-    compiled: set[tuple] = set()
-    for estimator in study.estimators:
-        cells, times = [cell for cell in remaining if cell.scenario.estimator == estimator], seconds[estimator]
-        flights = sum(min(study.batch, study.flights - cell.first) for cell in cells)
-        programs = {program for cell in cells for program in programs_of(study, cell.scenario)} - compiled
-        networks = {job for cell in cells if (job := study.job(cell.scenario))} - trained
-        compiled |= programs
-        trained |= networks
-        expected = sum(times) / len(times) * len(cells) / len(jax.local_devices()) if times else None
-        rows.append(Plan(estimator, len(cells), flights, len(programs), len(networks), expected))
+def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
+    """The numbers of cells and flights that remain, by estimator. Raises as `open_store`."""
+    rows = dict.fromkeys(study.estimators, (0, 0))
+    for cell in map(study.cell, check_store(directory, study).missing()):
+        cells, flights = rows[cell.scenario.estimator]
+        rows[cell.scenario.estimator] = cells + 1, flights + min(study.batch, study.flights - cell.first)
     return rows
 
 
@@ -148,7 +121,7 @@ def run_here(store: Store) -> Iterator[Step]:
                 if isinstance(task, Job):
                     networks[task] = future.result()
                 else:
-                    store.write_cell(task.number, *future.result())
+                    write_file(store.cell_file(task.number), future.result())
                     done += 1
     finally:
         # An interrupt does not wait for running tasks, which may last minutes; their results are lost.
@@ -176,13 +149,13 @@ def _give_memory_back() -> None:
 
 def _train(store: Store, job: Job, device: Any) -> bytes | str:
     """`train` on a device, or the file of an earlier run."""
-    begin, number = time.perf_counter(), store.study.jobs()[job]
+    number = store.study.jobs()[job]
     if store.read_network(number) is None:
         with jax.default_device(device):
             data = train(store.study, job)
         if isinstance(data, str):
             return data
-        store.write_network(number, data, seconds=round(time.perf_counter() - begin, 3))
+        write_file(store.network_file(number), data)
     return store.network_file(number).read_bytes()
 
 
@@ -201,9 +174,8 @@ def train(study: Study, job: Job) -> bytes | str:
         return str(error)
 
 
-def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> tuple[bytes, float]:
-    """The bytes of a cell's file, and the seconds of its computation. Equal results give equal bytes."""
-    begin = time.perf_counter()
+def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> bytes:
+    """The bytes of a cell's file. Equal results give equal bytes."""
     try:
         if isinstance(network, str):
             raise TrainingError(network)
@@ -216,7 +188,7 @@ def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> t
         results = {"failed": np.asarray(" ".join(str(error).split())[:500])}
     file = io.BytesIO()
     np.savez(file, **results)  # pyright: ignore[reportArgumentType]
-    return file.getvalue(), round(time.perf_counter() - begin, 3)
+    return file.getvalue()
 
 
 def label_of(study: Study, task: Job | Cell) -> str:
@@ -266,15 +238,15 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         future = next(finished)
         cell, job = running.pop(future)
         try:
-            data, seconds = future.result()
+            data = future.result()
             trained = None if job is None or store.network_file(numbers[job]).exists() else networks[job].result()
         except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
             what = " ".join(str(error).split())[:300] or type(error).__name__
             lost = f"cell {cell.number}: lost by the cluster ({what})"
             raise InputError(f"{lost}; run the study again to resume.") from None
         if job is not None and isinstance(trained, bytes):
-            store.write_network(numbers[job], trained)
-        store.write_cell(cell.number, data, seconds)
+            write_file(store.network_file(numbers[job]), trained)
+        write_file(store.cell_file(cell.number), data)
         done += 1
         yield Step(done, label_of(study, cell))
         submit()
