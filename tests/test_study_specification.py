@@ -41,7 +41,6 @@ WRONG_SPECIFICATIONS = [
     ("[network]\nsteps = 0", "network.steps"),
     ("[network]\nsteps = 100_000_000", "`network`: `steps`"),
     ("[network]\nheld_out = 10", "network.held_out"),
-    ('[network]\nfeatures = "raw"\napproximator = "cmac"', "`network`: `approximator`"),
     (MINE + "wheels = 4", "[airframe.mine]: `wheels` is not a known key"),
     (MINE.replace("mass = 0.6", "mass = -0.6"), "[airframe.mine]: `mass`"),
     (MINE + "max_rotor_speed = inf", "[airframe.mine]: not finite"),

@@ -74,7 +74,6 @@ CASES = {
 NETWORKS = {
     "score, mlp": {},
     "raw, mlp": {"features": "raw", "steps": 3000},
-    "score, cmac": {"approximator": "cmac", "learning_rate": 0.005, "steps": 10_000},
 }
 
 

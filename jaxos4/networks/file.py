@@ -25,7 +25,7 @@ from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_sca
 from .estimator import NetworkEstimator, TrainedNetwork
 from .features import Coordinates, Features
 
-_FORMAT = 3
+_FORMAT = 4
 _LARGEST = 2**30
 
 
@@ -133,7 +133,7 @@ def _blank(settings: NetworkEstimator, problem: ShootingProblem, checks: int) ->
     features = Features.blank(settings.features, problem, coordinates)
     key, unknowns = jax.random.key(0), coordinates.center
     linear_map = jnp.zeros((unknowns.size, features.size))
-    regressor = Regressor(linear_map, settings.approximator, width=settings.width, depth=settings.depth, key=key)
+    regressor = Regressor(linear_map, width=settings.width, depth=settings.depth, key=key)
     shapes = ((parameters,), (parameters, parameters), (len(LEVELS), parameters), (len(LEVELS),))
     errors = ErrorTable(scales, *(jnp.zeros((scales.size, *shape)) for shape in shapes))
     scaling = Scaling(linear_map[0], unknowns, unknowns, scales[0])

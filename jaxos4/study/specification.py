@@ -53,7 +53,6 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """
 
     features: Literal["score", "raw"] = "score"
-    approximator: Literal["mlp", "cmac"] = "mlp"
     steps: Count = NetworkEstimator.steps
     held_out: Annotated[int, msgspec.Meta(ge=1000)] = NetworkEstimator.held_out
     hybrid_channels: Literal["rates", "attitude", "all"] = "all"
@@ -61,8 +60,7 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def estimator(self, channels: str, noise: tuple[float, float]) -> NetworkEstimator:
         """The network to be trained. Raises `ValueError` as `NetworkEstimator` does."""
-        sizes = {"steps": self.steps, "held_out": self.held_out}
-        return NetworkEstimator(self.features, self.approximator, channels, noise, **sizes)
+        return NetworkEstimator(self.features, channels, noise, steps=self.steps, held_out=self.held_out)
 
 
 class Scenario(NamedTuple):
