@@ -188,7 +188,6 @@ BAD = {
     "fast rate": (edited(5, "p", "-61"), ["row 5, column p", "looks like deg/s", "57.3"]),
     "psi far": (edited(5, "psi", "2e4"), ["row 5, column psi", "looks like degrees"]),
     "psi wrapped at 180": (edited(5, "psi", "-359.8"), ["row 5, column psi", "looks like degrees"]),
-    "phi": (edited(5, "q", "7", HEADER).replace("q", "phi"), ["row 5, column phi", "looks like degrees"]),
     "theta": (edited(5, "q", "-1.6").replace("q", "theta"), ["row 5, column theta", "degrees", "pi/2"]),
     "position": (edited(5, "q", "1e7").replace("q", "x"), ["row 5, column x", "metres"]),
     "velocity": (edited(5, "q", "1001").replace("q", "vx"), ["row 5, column vx", "m/s"]),

@@ -79,14 +79,14 @@ def test_a_vehicle_that_does_not_turn_is_not_judged():
 def test_a_fit_is_refused_with_the_remedy():
     recording = flown(CRAZYFLIE, 0)
     # Opposite yaw is only doubted.
-    ((cause, remedy),) = prepare([recording], turned(CRAZYFLIE, "rotor_spins")).doubts
+    ((cause, remedy),) = prepare([recording], turned(CRAZYFLIE, "rotor_spins"))[0].doubts
     assert cause.startswith("a.bbl: yaw answers the rotors with the opposite sign (torque and angular acceleration ")
     assert "change all four signs" in remedy
     with pytest.raises(
         InputError, match=r"a.bbl: roll and pitch answer .* are in another order .* correct one of them"
     ):
         prepare([recording], turned(CRAZYFLIE, "rotor_positions"))
-    prepared = prepare([recording], CRAZYFLIE)
+    prepared, *_ = prepare([recording], CRAZYFLIE)
     assert (prepared.windows > 0, prepared.doubts) == (True, ())
 
 
@@ -134,8 +134,8 @@ def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():
     for error in (predicted, slower):
         assert "`begin`" not in str(error.value)
     partly = flight._replace(omega=flight.omega * (flight.time[:, None] > 2))
-    assert "(`begin` and `end` override)" in prepare([partly], CRAZYFLIE, **options).notes[-1]
-    assert "override" not in prepare([partly], CRAZYFLIE, **options, predicted=True).notes[-1]
+    assert "(`begin` and `end` override)" in prepare([partly], CRAZYFLIE, **options)[0].notes[-1]
+    assert "override" not in prepare([partly], CRAZYFLIE, **options, predicted=True)[0].notes[-1]
 
 
 @pytest.mark.parametrize("name", ["arpl_crazyflie_yaw_a.csv", "nanobench/B2_circle_fast_rep2.csv"])
@@ -143,7 +143,7 @@ def test_single_precision_rounds_the_cleaned_data_once(name, shared_flights):
     """Reading, cutting, averaging and joining compute in double precision; only the flight to fit is rounded."""
 
     def cleaned():
-        prepared = prepare([read_recording(shared_flights / name, CRAZYFLIE)], CRAZYFLIE, begin=1.0, end=6.0)
+        prepared, *_ = prepare([read_recording(shared_flights / name, CRAZYFLIE)], CRAZYFLIE, begin=1.0, end=6.0)
         return jax.tree.leaves((prepared.fitted, prepared.tested)), prepared.seconds
 
     double, seconds = cleaned()

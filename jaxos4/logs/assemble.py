@@ -1,10 +1,5 @@
-"""Columns of a log become a `Recording`: checks of time and units, rotor speeds from commands, a uniform grid.
+"""Columns of a log become a `Recording`: checks of time and units, rotor speeds from commands, a uniform grid."""
 
-A wrong unit can give numbers within `LIMITS`, so each angle is also compared with the integral of its rate, if both
-were measured.
-"""
-
-import math
 import os
 import re
 
@@ -13,13 +8,11 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
-from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, unwrap
+from .sampling import UNIFORM, grid_size, held_regularly, logged_rate, resample, unwrap
 from .table import (
     COMMAND_NAMES as COMMAND_NAMES,
     LIMITS,
     MAX_ROWS,
-    PITCH,
-    ROLL,
     SPEED_NAMES as SPEED_NAMES,
     Recording,
     Sampling,
@@ -40,12 +33,6 @@ _MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of g
 _STILL = 100  # samples of an accelerometer that never change: it is off
 _REPEATED = 0.9  # values that change at less than this share of the rate of their rows were repeated
 _SHORTEST_STEP, _LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
-_DEGREES = 180 / math.pi
-_ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
-_WINDOW = 0.2  # [s]: increments of an angle over this time are compared with the integral of its rate
-_FEWEST = 8  # windows that a comparison needs
-_SIMILARITY = 0.7  # smallest cosine between increments and integrals at which their ratio is used
-_SPREAD = 1.6  # a ratio within this factor of 57.3 counts as 57.3
 
 
 def recording_of(
@@ -64,7 +51,8 @@ def recording_of(
     rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
     facts = table.facts._replace(**{name: getattr(table.facts, name) or found for name, found in rarest.items()})
     dt = _check_time(table)
-    table = _check_units(table.without_impossible())
+    table = table.without_impossible()
+    _check_heading(table)
     if table.impossible:
         found.append(table.impossible_note)
     omega = _rotor_speeds(table, airframe, full_scale, found)
@@ -152,30 +140,13 @@ def _check_time(table: Table) -> float:
     return dt
 
 
-def _check_units(table: Table) -> Table:
-    """Refuse angles that contradict their rates or jump by 360. Returns the table without impossible angles.
-
-    Roll may pass 2 pi if its rate agrees: the vehicle made a flip.
-    """
-    columns, limits = table.columns, ROLL | PITCH
-    for name, rate in _ANGLES:
-        ratio = _scale_ratio(columns["t"], columns[name], columns[rate]) if table.holds(name, rate) else None
-        if ratio is None:
-            continue
-        if name == "phi" and 1 / 3 < ratio < 3:
-            limits = PITCH
-        for wrong, unit, off, what in (
-            (name, "degrees", ratio / _DEGREES, f"changes {ratio:.3g} times as fast as {rate}"),
-            (rate, "deg/s", ratio * _DEGREES, f"is {1 / ratio:.3g} times as fast as {name} changes"),
-        ):
-            if 1 / _SPREAD < off < _SPREAD:
-                table.refuse(f"{what}: {table.remedy or f'it looks like {unit}, divide by 57.3'}", column=wrong)
+def _check_heading(table: Table) -> None:
+    """Refuse a heading that jumps by 360."""
     if table.holds("psi"):
-        measured = np.flatnonzero(np.isfinite(columns["psi"]))
-        jumps = np.zeros(columns["psi"].size, dtype=bool)
-        jumps[measured[1:]] = np.abs(np.abs(np.diff(columns["psi"][measured])) - 360) < 20
+        psi = table.columns["psi"]
+        measured, jumps = np.flatnonzero(np.isfinite(psi)), np.zeros(psi.size, dtype=bool)
+        jumps[measured[1:]] = np.abs(np.abs(np.diff(psi[measured])) - 360) < 20
         _refuse_any(table, "psi", jumps, "jumps by about 360: it looks like degrees, divide by 57.3")
-    return table.without_impossible(limits)
 
 
 def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
@@ -183,35 +154,6 @@ def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
     if wrong.any():
         index = int(np.argmax(wrong))
         table.refuse(what.format(table.columns[name][index]), index=index, column=name)
-
-
-def _scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | None:
-    """How much faster an angle changes than its rate, or None if the flight does not show it.
-
-    Increments of the angle over 0.2 s are compared with the integral of the rate, so that noise averages out. In a
-    steep attitude the axes are coupled, and the increments no longer resemble the integral: the result is then None.
-    """
-    with_rate = np.isfinite(rate)
-    if np.count_nonzero(with_rate) < 2:
-        return None
-    rates = Series(t[with_rate], rate[with_rate, None])
-    with_angle = np.isfinite(angle) & (t >= rates.t[0]) & (t <= rates.t[-1])
-    instants, angle = t[with_angle], angle[with_angle]
-    knots = np.empty(0, dtype=int)
-    if instants.size > _FEWEST:
-        windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
-        knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
-        knots = knots[knots < instants.size]
-    if knots.size <= _FEWEST:
-        return None
-    steps = np.diff(angle)
-    turn = 360.0 if np.abs(steps).max() > 3 * math.pi else 2 * math.pi
-    increments = np.diff(np.concatenate([[0.0], np.cumsum(steps - turn * np.rint(steps / turn))])[knots])
-    expected = np.diff(integral(rates, instants[knots], linear=True)[:, 0])
-    sizes = float(np.linalg.norm(increments)), float(np.linalg.norm(expected))
-    if min(sizes) == 0 or increments @ expected < _SIMILARITY * sizes[0] * sizes[1]:
-        return None
-    return sizes[0] / sizes[1]
 
 
 def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | None, notes: list[str]) -> np.ndarray:
