@@ -29,7 +29,7 @@ from .specification import Cell, Job, Study
 from .store import Store, check_store, open_store, write_file
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client
 
 # The bytes of a network's file, or a message that says why there is none; `None` for an estimator without a network.
 Trained = bytes | str | None
@@ -38,8 +38,6 @@ Trained = bytes | str | None
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
 # A device joins the program of another device if at least this number of cells waits: it must compile the program too.
 _WORTH_COMPILING = 8
-# Cells that wait on a cluster for each of its threads: enough to keep it busy.
-_AHEAD = 3
 # How often a task that raises an unexpected exception is repeated. The cluster itself counts lost workers.
 _RETRIES = 2
 
@@ -67,7 +65,7 @@ def device_name() -> str:
 
 def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
     """The numbers of cells and flights that remain, by estimator. Raises as `open_store`."""
-    rows = dict.fromkeys(study.estimators, (0, 0))
+    rows: dict[str, tuple[int, int]] = dict.fromkeys(study.estimators, (0, 0))
     for cell in map(study.cell, check_store(directory, study).missing()):
         cells, flights = rows[cell.scenario.estimator]
         rows[cell.scenario.estimator] = cells + 1, flights + min(study.batch, study.flights - cell.first)
@@ -207,13 +205,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
     """
     from distributed import as_completed
 
-    study, waiting, numbers = store.study, deque(map(store.study.cell, store.missing())), store.study.jobs()
-    done = study.count - len(waiting)
-    networks: dict[Job | None, Any] = {None: None}
-    running: dict[Future, tuple[Cell, Job | None]] = {}
-    finished = as_completed(loop=client.loop, raise_errors=False)
-    threads: Any = client.nthreads
-    if waiting and not threads():
+    study, cells, numbers = store.study, [store.study.cell(index) for index in store.missing()], store.study.jobs()
+    if cells and not client.nthreads():
         raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
 
     def network_of(job: Job) -> Any:
@@ -222,20 +215,16 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         # Read here, and not on a worker, because it may be damaged. As a task: data of a lost worker are lost with it.
         return client.submit(bytes, store.network_file(numbers[job]).read_bytes(), pure=False)
 
-    def submit() -> None:
-        room = _AHEAD * max(sum(threads().values()), 1) - len(running)
-        for _ in range(min(room, len(waiting))):
-            cell = waiting.popleft()
-            job = study.job(cell.scenario)
-            if job is not None and job not in networks:
-                networks[job] = network_of(job)
-            future = client.submit(compute, study, cell, networks[job], retries=_RETRIES, pure=False)
-            running[future] = cell, job
-            finished.add(future)
-
-    submit()
-    while running:
-        future = next(finished)
+    jobs = [study.job(cell.scenario) for cell in cells]
+    networks: dict[Job | None, Any] = {job: network_of(job) for job in dict.fromkeys(jobs) if job is not None} | {
+        None: None
+    }
+    running = {
+        client.submit(compute, study, cell, networks[job], retries=_RETRIES, pure=False): (cell, job)
+        for cell, job in zip(cells, jobs, strict=True)
+    }
+    finished = as_completed(list(running), loop=client.loop, raise_errors=False)
+    for done, future in enumerate(finished, start=study.count - len(cells) + 1):
         cell, job = running.pop(future)
         try:
             data = future.result()
@@ -247,10 +236,7 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         if job is not None and isinstance(trained, bytes):
             write_file(store.network_file(numbers[job]), trained)
         write_file(store.cell_file(cell.number), data)
-        done += 1
         yield Step(done, label_of(study, cell))
-        submit()
-    yield Step(done, "")
 
 
 @functools.lru_cache(maxsize=8)
