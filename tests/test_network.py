@@ -120,7 +120,7 @@ def test_intervals_hold_whatever_the_networks_quality(changes):
 
 def test_the_same_key_gives_the_same_network_and_another_another():
     small = jaxos4.NetworkEstimator(**SHORT)
-    a, b, c = (small.fit(problem_of(), BRACKET, key=jax.random.key(k), progress=k == 1) for k in (0, 0, 1))
+    a, b, c = (small.fit(problem_of(), BRACKET, key=jax.random.key(k)) for k in (0, 0, 1))
     assert same(a, b)
     assert not same(a.regressor, c.regressor)
 

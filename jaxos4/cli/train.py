@@ -56,7 +56,7 @@ def train(
     for note in recording.notes:
         typer.echo(f"note: {note}")
     begin = time.perf_counter()
-    with option_names(bracket=bracket):
+    with stages("training the network"), option_names(bracket=bracket):
         network = train_network(
             recording,
             subject,

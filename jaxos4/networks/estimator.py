@@ -93,7 +93,7 @@ class NetworkEstimator(eqx.Module):
         if not (len(self.noise) == 2 and 0 < self.noise[0] <= self.noise[1] < np.inf):
             raise ValueError(f"`noise` must be (lowest, highest), positive and finite, got {self.noise}.")
 
-    def fit(self, problem: ShootingProblem, bracket: Bracket, *, key: Key, progress: bool = False) -> "TrainedNetwork":
+    def fit(self, problem: ShootingProblem, bracket: Bracket, *, key: Key) -> "TrainedNetwork":
         """Trains a network for the inputs, sampling, start and missing samples of a problem, and calibrates it.
 
         **Arguments:**
@@ -101,7 +101,6 @@ class NetworkEstimator(eqx.Module):
         - `problem`: its measured values are not used, except the first if the initial state is free.
         - `bracket`: parameters of the simulated flights are uniform in it.
         - `key`: the random key: the same key gives the same network.
-        - `progress`: whether to show a bar in the terminal.
 
         **Raises:** `ValueError` for a bracket without width or channels that the problem lacks; `TrainingError` if
         training diverges, or if the flights of the bracket diverge.
@@ -110,8 +109,7 @@ class NetworkEstimator(eqx.Module):
         scales = np.asarray(self.noise, float)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
         scaling, regressor = untrained(features, scales, key, {"width": self.width, "depth": self.depth})
-        pace: dict[str, Any] = {"batch": self.batch, "steps": self.steps, "patience": self.patience}
-        pace |= {"learning_rate": self.learning_rate, "progress": progress}
+        pace: dict[str, Any] = {name: getattr(self, name) for name in ("batch", "steps", "patience", "learning_rate")}
         regressor, history = train(regressor, scaling, features, scales, **pace, key=key)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
