@@ -149,7 +149,6 @@ WHOLE = {
     "Crazyflie, version 1": (crazyflie.one_event(crazyflie.T, version=1), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
     "Crazyflie": (crazyflie.one_event(crazyflie.T), STATE_NAMES, 3.0, 2e-3, 0.6 * RPM),
     "blackbox": (blackbox_csv(blackbox.recorded(blackbox.T)), blackbox.RATES, 0.0, 5e-3, 100 / 7 * RPM),
-    "INAV": (blackbox_csv(blackbox.recorded(blackbox.T) | blackbox.inav(blackbox.T)), STATE_NAMES, 0.0, 5e-3, 9.0),
 }
 
 
@@ -160,7 +159,7 @@ def test_a_flight_comes_back_in_our_frame_and_units(name, save):
     options = {"names": states, "start": start, "atol": atol}
     assert check(flight, **options) >= 0.95 * 3 / 0.02  # each sample of the slowest sensor is one sample
     assert flight.time[0] == 0
-    middle = np.asarray(flight.time)[:-1] + start + (0.0 if name in ("blackbox", "INAV") else float(flight.dt) / 2)
+    middle = np.asarray(flight.time)[:-1] + start + (0.0 if name == "blackbox" else float(flight.dt) / 2)
     np.testing.assert_allclose(flight.omega[:-1], speeds(middle), atol=of_speeds)
     assert any("is rotor 1" in note for note in notes) == (not name.startswith("Crazyflie"))
     for column in {STATE_NAMES.index(each) for each in ("q", "theta", "psi", "y", "vz") if each in states}:

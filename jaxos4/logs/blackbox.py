@@ -7,16 +7,13 @@
 | `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g |
 | `omega1..4` | `eRPM[0..3]`, measured | 100 electrical revolutions a minute |
 | `command1..4` | `motor[0..3]`, if there is no `eRPM` | DShot 48..2047, or PWM 1000..2000 |
-| `voltage` | `vbatLatest` of Betaflight 4, INAV's `vbat` | 0.01 V |
-| `phi, theta, psi` | INAV's `attitude[0..2]` | 0.1 deg |
-| `x, y, z` | INAV's `navPos[0..2]` | cm |
-| `vx, vy, vz` | INAV's `navVel[0..2]` | cm/s |
+| `voltage` | `vbatLatest` of Betaflight 4 | 0.01 V |
 
 The unfiltered gyro is preferred: the filters of the flight controller delay the rates by some milliseconds, which the
 estimators would attribute to the vehicle. Commands count as fractions of the airframe's `max_rotor_speed`.
 
 **Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
-reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle`, `gyro_scale` and
+reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle` and
 `blackbox_high_resolution` (rates are in tenths of a deg/s). The CSV of `blackbox_decode` has no settings. Then the
 reader assumes 14 poles, deg/s, 1 g from the accelerometer's median and the protocol from the range, and notes it.
 
@@ -25,8 +22,6 @@ flight, with an unmeasured second between them.
 
 **Frames.** Gyro and accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose
 down, yaw counter-clockwise seen from above. (The firmware's own telemetry has the opposite signs of pitch and yaw.)
-INAV's `attitude` is roll to the right, pitch nose down, and heading clockwise from north, so psi = -heading. INAV's
-`navPos` is north, east, up; ours is north, west, up.
 
 **Rotors.** They keep the log's numbers (Betaflight's quad X: 1 rear right, 2 front right, 3 rear left, 4 front left).
 The airframe's `rotor_positions` and `rotor_spins` must have the same order.
@@ -39,7 +34,6 @@ import csv
 import itertools
 import math
 import re
-import struct
 from typing import NamedTuple
 
 import numpy as np
@@ -61,25 +55,18 @@ _COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
 _TIMES = ("time (us)", "time")
 _RATES = ("gyroUnfilt", "gyroADC")
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
-_TENTH = _DEGREE / 10
-_INAV = {  # column: column of the log, unit in our frame
-    **{"phi": ("attitude[0]", _TENTH), "theta": ("attitude[1]", _TENTH), "psi": ("attitude[2]", -_TENTH)},
-    **{"x": ("navPos[0]", 0.01), "y": ("navPos[1]", -0.01), "z": ("navPos[2]", 0.01)},
-    **{"vx": ("navVel[0]", 0.01), "vy": ("navVel[1]", -0.01), "vz": ("navVel[2]", 0.01)},
-}
-_VOLTAGES = {"vbatLatest": r"Betaflight ([4-9]|\d{2,})\.", "vbat": "INAV"}  # the firmware whose unit is known
+_VOLTAGE, _KNOWN_UNIT = "vbatLatest", re.compile(r"Betaflight ([4-9]|\d{2,})\.")
 _EXPORT = "export it as CSV by Blackbox Explorer"
 _DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _KNOWN = (
     *_TIMES,
     *(f"{name}[{i}]" for name in (*_RATES, "accSmooth") for i in range(3)),
-    *(name for name, _ in _INAV.values()),
-    *_VOLTAGES,
+    _VOLTAGE,
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
 # A session is read with the longest one only if they agree in these settings.
-_USED = ("acc_1G", "gyro_scale", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
+_USED = ("acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
 
 Settings = dict[str, str]
 Columns = dict[str, np.ndarray]
@@ -124,12 +111,9 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
-    for column, (name, unit) in _INAV.items():
-        log.add({column: name} if name in raw else {}, unit)
-    for name, firmware in _VOLTAGES.items():
-        if name in raw and re.match(firmware, log.settings.get("Firmware revision", "")):
-            log.add({"voltage": name}, 1.0)
-            log.columns["voltage"] /= 100
+    if _VOLTAGE in raw and _KNOWN_UNIT.match(log.settings.get("Firmware revision", "")):
+        log.add({"voltage": _VOLTAGE}, 1.0)
+        log.columns["voltage"] /= 100
     log.notes.append(order_note(log.names.get("omega1", log.names.get("command1", ""))))
     return Table(path, log.columns, first_row=first_row, names=log.names, remedy=_REMEDY), tuple(log.notes)
 
@@ -249,17 +233,8 @@ def _add_rates(log: _Log) -> None:
         refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
     fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
     log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}"])
-    unit = _gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-    log.add({name: f"{field}[{i}]" for i, name in enumerate("pqr")}, _DEGREE * unit)
-
-
-def _gyro_unit(settings: Settings) -> float:
-    """The unit of the gyro [deg/s], by the setting `gyro_scale`, as `0x3f800000`; 1 if there is none."""
-    text = settings.get("gyro_scale", "")
-    if not re.fullmatch("0x[0-9a-fA-F]{1,8}", text):
-        return 1.0
-    (value,) = struct.unpack("<f", int(text, 16).to_bytes(4, "little"))
-    return value if 1e-3 <= value <= 1 else 1.0
+    unit = _DEGREE / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
+    log.add({name: f"{field}[{i}]" for i, name in enumerate("pqr")}, unit)
 
 
 def _add_rotors(log: _Log) -> None:
