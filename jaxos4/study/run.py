@@ -164,7 +164,7 @@ def train(study: Study, job: Job) -> bytes | str:
     """
     scales = [scale or 1.0 for scale in study.scales]
     try:
-        with jax.enable_x64(study.double):
+        with jax.enable_x64(True):
             fleet, key = fleet_of(study, job), key_of(study.network.seed, study.jobs()[job])
             settings = study.network.estimator(job.channels, (min(scales), max(scales)))
             return encode_network(settings.fit(blank_problem(study, fleet, 1.0, job.channels), fleet.bracket, key=key))
@@ -178,7 +178,7 @@ def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> b
         if isinstance(network, str):
             raise TrainingError(network)
         with jax.default_device(device):
-            results = run_cell(study, cell, None if network is None else _loaded(network, study.double))
+            results = run_cell(study, cell, None if network is None else _loaded(network))
     except FAILURES as error:
         if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
             remedy = "free some and run the study again, or start another study with a smaller `batch`"
@@ -240,8 +240,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
 
 
 @functools.lru_cache(maxsize=8)
-def _loaded(network: bytes, double: bool) -> TrainedNetwork:
-    with jax.enable_x64(double):
+def _loaded(network: bytes) -> TrainedNetwork:
+    with jax.enable_x64(True):
         return load_network(io.BytesIO(network))
 
 

@@ -67,7 +67,7 @@ class Store:
         if not path.exists():
             return None
         try:
-            with jax.enable_x64(self.study.double):
+            with jax.enable_x64(True):
                 return load_network(path)
         except InputError:
             raise InputError(f"{path}: not a whole network; delete it, and run the study again.") from None
