@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -36,20 +37,18 @@ _PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -
 Signs = tuple[float, ...]
 
 
-class Excitation(NamedTuple):
-    """How much a flight excites one axis.
+class Excitation(msgspec.Struct, frozen=True):
+    """How much a flight excites one axis. `None`: not known.
 
-    - `axis`: roll, pitch or yaw.
-    - `torque`: standard deviation of the rotors' torque [N m]; NaN without an airframe.
-    - `rate`: standard deviation of the body rate [rad/s]; NaN if neither it nor its angle was measured.
+    - `torque`: standard deviation of the rotors' torque [N m]; it needs an airframe.
+    - `rate`: standard deviation of the body rate [rad/s].
     - `noise`: standard deviation of the gyro's white noise [rad/s], see `gyro_noise`.
     - `verdict`: "good", "weak", "none" or "not measured".
     """
 
-    axis: str
-    torque: float
-    rate: float
-    noise: float
+    torque: float | None
+    rate: float | None
+    noise: float | None
     verdict: str
 
 
@@ -64,17 +63,29 @@ class RotorSigns(NamedTuple):
     spins: Signs | None
 
 
-def excitation(
-    flight: Flight | Recording, airframe: Airframe | None = None
-) -> tuple[Excitation, Excitation, Excitation]:
-    """The excitation of roll, pitch and yaw over the whole flight; the torque needs an airframe."""
-    recording = as_recording(flight)
+def excitation(flight: Flight | Recording, airframe: Airframe | None = None) -> dict[str, Excitation]:
+    """The excitation of roll, pitch and yaw over the whole flight. Without a rate, it is the slope of the angle."""
+    recording, found = as_recording(flight), {}
     torque = np.full(3, math.nan)
     if airframe is not None:
         mixer = np.asarray(airframe.mixer, dtype=float)[:3]
         torque = (recording.omega[:-1] ** 2 @ mixer.T).std(axis=0)
-    roll, pitch, yaw = (_excitation(recording, i, float(torque[i])) for i in range(3))
-    return roll, pitch, yaw
+    for i, axis in enumerate(AXES):
+        rate, angle = recording.states[:, RATE_COLUMNS[i]], recording.states[:, _ANGLE_COLUMNS[i]]
+        noise = gyro_noise(rate)
+        if np.count_nonzero(np.isfinite(rate)) < 3:
+            seen = np.isfinite(angle)
+            measured = np.count_nonzero(seen) > 2
+            rate = np.gradient(angle[seen], recording.time[seen]) if measured else np.full(1, math.nan)
+        size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
+        verdict = "good" if size >= _GOOD else "weak"
+        if math.isnan(size):
+            verdict = "not measured"
+        elif size < WEAK or size < OVER_NOISE * noise:
+            verdict = "none"
+        known = [x if math.isfinite(x) else None for x in (float(torque[i]), size, noise)]
+        found[axis] = Excitation(known[0], known[1], known[2], verdict)
+    return found
 
 
 def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
@@ -148,23 +159,6 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
     return RotorSigns(tuple(forward.tolist()), tuple(left.tolist()), spins)
 
 
-def _excitation(recording: Recording, i: int, torque: float) -> Excitation:
-    """The excitation of one axis. Without a measured rate, it is the slope of the angle."""
-    rate, angle = recording.states[:, RATE_COLUMNS[i]], recording.states[:, _ANGLE_COLUMNS[i]]
-    noise = gyro_noise(rate)
-    if np.count_nonzero(np.isfinite(rate)) < 3:
-        seen = np.isfinite(angle)
-        rate = np.gradient(angle[seen], recording.time[seen]) if np.count_nonzero(seen) > 2 else np.full(1, math.nan)
-    size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
-    if math.isnan(size):
-        verdict = "not measured"
-    elif size < WEAK or size < OVER_NOISE * noise:
-        verdict = "none"
-    else:
-        verdict = "good" if size >= _GOOD else "weak"
-    return Excitation(AXES[i], torque, size, noise, verdict)
-
-
 def _correlations(
     pieces: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"], between: tuple[float, float]
 ) -> Float[np.ndarray, "delays rows 3"]:
@@ -214,7 +208,7 @@ def _response(piece: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndar
     """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
     _, omega, rates = average(piece.time, piece.omega, piece.states[:, RATE_COLUMNS], step)
     acceleration = np.diff(rates, axis=0) / step
-    for i, axis in enumerate(excitation(piece)):
+    for i, axis in enumerate(excitation(piece).values()):
         if axis.verdict not in ("good", "weak"):
             acceleration[:, i] = np.nan
     return _between((omega**2 @ mixer.T)[:-1]), _between(acceleration)
