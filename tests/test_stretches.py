@@ -60,7 +60,6 @@ CASES = {
     "clipped below full speed": (changed(at(5, 5.4), omega=(2, 2300.0)), ["", "rotor 3 at full speed", ""]),
     "full speed for a moment": (changed(at(12, 12.05), omega=(2, 2500.0)), [""]),
     "constant rotors": (changed(slice(None), omega=(slice(None), HOVER)), [""]),
-    "clipped gyro": (changed(slice(1000, 1020), states=(R, -34.9)), ["", "the gyro is clipped", ""]),
     "fast gyro": (changed(slice(1000, 1020), states=(R, RAMP)), [""]),
     "a gap": (changed(slice(1000, 1100), states=(slice(None), np.nan)), ["", "nothing was measured", ""]),
     "a gap of a moment": (changed(slice(2000, 2004), states=(P, np.nan)), [""]),
