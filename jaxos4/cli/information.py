@@ -34,10 +34,9 @@ def inspect(
     """Show what a log contains, which parts of it can be used, and how much they excite each axis."""
     check_outputs(log, airframe, out=out, airframe_out=airframe_out)
     if airframe_out is not None and airframe_out.exists():
-        raise InputError(
-            f"{airframe_out}: exists, and may hold what you measured; give another name, and --airframe {airframe_out} "
-            "to keep its values."
-        )
+        raise InputError(f"{airframe_out}: exists, and may hold what you measured; give another name.")
+    if airframe is not None and airframe_out is not None:
+        raise InputError("--airframe-out: begins an airframe from the log alone; leave out --airframe.")
     with stages("loading the library") as progress:
         from rich.console import Console
 
@@ -51,7 +50,7 @@ def inspect(
         vehicle = None if airframe is None else load_airframe(airframe)
         recording = read_recording(log, vehicle, full_scale=1.0)
         found = inspect_log(recording, vehicle)
-        draft = None if airframe_out is None else airframe_draft(recording, airframe)
+        draft = None if airframe_out is None else airframe_draft(recording)
     console = Console(highlight=False, markup=False)
     if out is not None:
         write_json(found.to_dict(), out)
