@@ -135,13 +135,12 @@ def test_what_the_log_knows_of_a_quadrotor(save):
     found = read_recording(save(log(*topics, **quad)))
     np.testing.assert_allclose(found.facts.rotor_positions, [(x, -y) for x, y in places], rtol=1e-6)
     assert found.facts.rotor_spins == (1.0, 1.0, -1.0, -1.0)
-    assert found.facts.cells == 4
     np.testing.assert_allclose(found.voltage, 15.2, rtol=1e-6)
     assert "SDLOG_PROFILE to 147" in found.facts.faster
     generic = quad | {f"CA_ROTOR{i}_P{axis}": 1.0 for i in range(4) for axis in "XY"}
     assert read_recording(save(log(*topics, **generic))).facts.rotor_positions is None
     bare = read_recording(save(log(combined(grid(0.005)), ROTORS))).facts
-    assert (bare.rotor_positions, bare.rotor_spins, bare.cells, bare.landed) == (None, None, None, ())
+    assert (bare.rotor_positions, bare.rotor_spins, bare.landed) == (None, None, ())
 
 
 def test_the_land_detector_counts_as_the_ground(save, run, tmp_path):

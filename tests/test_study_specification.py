@@ -33,7 +33,6 @@ WRONG_SPECIFICATIONS = [
     ("scales = []", "`scales` is empty"),
     ("scales = [1, 1.0]", "`scales` names a value twice"),
     ("flights = 1_000_000_000", "cells"),
-    ("flights = 1_000_000_000\nbatch = 1_000_000", "estimates"),
     ('durations = [0.5]\nexcitations = ["chirp"]', "`excitations`: chirp of 0.5 s by os4: `duration`"),
     ("dt = 0.5", "`excitations`: multisine of 5 s by os4: `tones`"),
     ("[network]\nsteps = 0", "network.steps"),

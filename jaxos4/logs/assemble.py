@@ -1,7 +1,6 @@
 """Columns of a log become a `Recording`: checks of time and units, rotor speeds from commands, a uniform grid."""
 
 import os
-import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,12 +22,6 @@ from .table import (
 
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
 
-_OTHER_NAMES = {  # names that other loggers use, for the question "should 'time' be t?"
-    **dict.fromkeys(("time", "timestamp", "times"), "t"),
-    **{"roll": "phi", "pitch": "theta", "yaw": "psi"},
-    **{"gyrox": "p", "gyroy": "q", "gyroz": "r", "accx": "ax", "accy": "ay", "accz": "az"},
-    **dict.fromkeys(("vbat", "vbatt", "batteryvoltage"), "voltage"),
-}
 _MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
 _STILL = 100  # samples of an accelerometer that never change: it is off
 _REPEATED = 0.9  # values that change at less than this share of the rate of their rows were repeated
@@ -39,13 +32,13 @@ def recording_of(
     table: Table, notes: tuple[str, ...] = (), airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> Recording:
     """Make a recording from the columns of a log and the `notes` of its reader; see `read_log`."""
-    found = [*notes, *([_unknown_note(table.unknown)] if table.unknown else [])]
+    shown = ", ".join(map(quoted, table.unknown[:8])) + ", ..." * (len(table.unknown) > 8)
+    found = [*notes, *([f"unknown columns are ignored: {shown}"] if table.unknown else [])]
     table = table._replace(columns={n: column for n, column in table.columns.items() if not np.isnan(column).all()})
     if not table.holds("t"):
-        table.refuse(_missing("there is no time", ("t",), table) + "; each row needs its time [s]", column="t")
+        table.refuse("there is no time; each row needs its time [s]", column="t")
     if not any(map(table.holds, STATE_NAMES)):
-        what = _missing("no state was measured", STATE_NAMES, table)
-        table.refuse(f"{what}; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
+        table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
     # Cells that hold no value were not logged, also those of a rotor.
     motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
     rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
@@ -56,9 +49,6 @@ def recording_of(
     if table.impossible:
         found.append(table.impossible_note)
     omega = _rotor_speeds(table, airframe, full_scale, found)
-    if airframe is not None:
-        thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient
-        found += _thrust_note(float(thrust / (airframe.mass * airframe.gravity)))
     channels, voltage = _channels(table, found), _voltage(table)
     with_force = any(map(table.holds, FORCE_NAMES))
     commanded = motors is COMMAND_NAMES
@@ -82,23 +72,6 @@ def recording_of(
     states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
     about = {"commanded": commanded, "name": os.fspath(table.path), "notes": tuple(found), "facts": facts}
     return Recording(time, omega, states, force if with_force else None, voltage, **about)
-
-
-def _missing(what: str, wanted: tuple[str, ...], table: Table) -> str:
-    hints = [f"{quoted(name)} be {_meant(name)}" for name in table.unknown if _meant(name) in wanted]
-    return f"{what} (should {hints[0]}?)" if hints else what
-
-
-def _meant(name: str) -> str | None:
-    """The column that an unknown name may mean: in another case, with other separators, or as other loggers say."""
-    plain = re.sub(r"[\W_]", "", name).lower()
-    return _OTHER_NAMES.get(plain, plain if plain in COLUMN_NAMES else None)
-
-
-def _unknown_note(unknown: tuple[str, ...]) -> str:
-    shown = [quoted(name) + (f" (did you mean {_meant(name)}?)" if _meant(name) else "") for name in unknown[:8]]
-    more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
-    return f"unknown columns are ignored: {', '.join(shown)}{more}"
 
 
 def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
@@ -163,8 +136,8 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
     if len(names) < 4:
         wanted = COMMAND_NAMES if commands and not speeds else SPEED_NAMES
         lacking = next(name for name in wanted if name not in names)
-        what = _missing("is missing", wanted, table)
-        table.refuse(f"{what}; a flight needs omega1..4 [rad/s] or command1..4 [0..1], all four", column=lacking)
+        what = "is missing; a flight needs omega1..4 [rad/s] or command1..4 [0..1], all four"
+        table.refuse(what, column=lacking)
     if speeds and commands:
         notes.append(f"measured {speeds[0]}..{speeds[-1]} are used; {', '.join(commands)} are ignored")
     omega = np.column_stack([_held(table, name, notes) for name in names])
@@ -195,17 +168,6 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
     return column[last]
 
 
-def _thrust_note(ratio: float) -> list[str]:
-    """A note, if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
-    if 1 / 25 < ratio < 25:
-        return []
-    if ratio == 0:
-        return ["the rotors do not turn for at least half of the flight: keep only the part in the air"]
-    unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
-    advice = f"check the airframe, and whether rotor speeds are in {unit}"
-    return [f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight: {advice}"]
-
-
 def _channels(table: Table, notes: list[str]) -> np.ndarray:
     """States and specific force, shape (rows, 15), with unwrapped angles."""
     nothing = np.full(table.columns["t"].size, np.nan)
@@ -221,10 +183,6 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
     if len(measured) >= _STILL and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
         notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
         force[:] = np.nan
-    size = np.sqrt((force**2).sum(axis=1))
-    size = size[np.isfinite(size)]
-    if size.size and 0.5 < (median := np.median(size)) < 2:
-        notes.append(f"ax, ay, az have a median magnitude of {median:.2g} m/s^2: if they are in g, multiply by 9.80665")
     return channels
 
 

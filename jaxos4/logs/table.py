@@ -49,7 +49,6 @@ class LogFacts(NamedTuple):
     - `landed`: from when to when the vehicle itself says that it is on the ground [s], in the flight's time.
     - `rotor_positions`: x forward and y left of each rotor [m], in the order of the rotors in the flight.
     - `rotor_spins`: +1 for counter-clockwise seen from above, -1 for clockwise.
-    - `cells`: number of the battery's cells in series.
     """
 
     motors: Sampling | None = None
@@ -58,7 +57,6 @@ class LogFacts(NamedTuple):
     landed: tuple[tuple[float, float], ...] = ()
     rotor_positions: tuple[tuple[float, float], ...] | None = None
     rotor_spins: tuple[float, ...] | None = None
-    cells: int | None = None
 
     @property
     def too_slow(self) -> str:

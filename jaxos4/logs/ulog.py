@@ -156,14 +156,12 @@ def _position(log: Topics) -> Series | None:
 
 
 def _voltage(log: Topics) -> Series | None:
-    """The battery's voltage [V]."""
-    for name in ("voltage_v", "voltage_filtered_v"):
-        series = log.series("battery_status", (name,))
-        if series is not None:
-            log.names["voltage"] = f"battery_status.{name}"
-            possible = (series.values > 0) & (series.values < LIMITS["voltage"].largest)
-            return Series(series.t, np.where(possible, series.values, np.nan))
-    return None
+    series = log.series("battery_status", ("voltage_v",))
+    if series is None:
+        return None
+    log.names["voltage"] = "battery_status.voltage_v"
+    possible = (series.values > 0) & (series.values < LIMITS["voltage"].largest)
+    return Series(series.t, np.where(possible, series.values, np.nan))
 
 
 def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
@@ -175,7 +173,6 @@ def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
     # PX4's y points to the right. Generic airframes say 1 m, because only the directions of the rotors matter to PX4.
     placed = known and np.isfinite(positions).all() and not np.isin(np.abs(positions), (0.0, 1.0)).all()
     spun = known and all(moment != 0 and math.isfinite(moment) for moment in moments)
-    cells = (log.latest("battery_status", "cell_count"), get("BAT1_N_CELLS"), get("BAT_N_CELLS"))
     profile, high_rate = int(get("SDLOG_PROFILE", 1.0)), 16  # `add_high_rate_topics`
     faster = f"set SDLOG_PROFILE to {profile | high_rate} (which includes {high_rate}, 'high rate'), and fly again"
     if profile & high_rate:
@@ -185,7 +182,6 @@ def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
         landed=_landed(log, rows),
         rotor_positions=tuple((float(x), -float(y)) for x, y in positions) if placed else None,
         rotor_spins=tuple(math.copysign(1.0, moment) for moment in moments) if spun else None,
-        cells=next((int(each) for each in cells if each and each > 0), None),
     )
 
 

@@ -47,7 +47,7 @@ def airframe_draft(recording: Recording) -> AirframeDraft:
     parts = [cut(recording, part) for part in stretches(recording, landed=facts.landed) if not part.reason]
     signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
     spins = facts.rotor_spins or (None if signs is None else signs.spins)
-    _say(document, f"The airframe of {Path(recording.name).name}. SI units.", *_battery(recording))
+    _say(document, f"The airframe of {Path(recording.name).name}. SI units.")
     _head(document, "Weigh and measure: write the numbers, and remove the # in front.")
     _say(document, "mass =   # kg, with battery: all inertias are proportional to it")
     if facts.rotor_positions is None:
@@ -94,14 +94,6 @@ def _hover(parts: Sequence[Recording]) -> _Hover | None:
     share = float(np.median(vertical[np.isfinite(vertical)])) / _GRAVITY if np.isfinite(vertical).any() else np.nan
     felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
     return _Hover(float(np.sqrt(np.median(squares) / (share if felt else 1.0))), seconds, felt)
-
-
-def _battery(recording: Recording) -> list[str]:
-    """The cells and the voltage, if the log has them: the model takes the voltage from each log."""
-    cells, voltage = recording.facts.cells, recording.voltage
-    words = [] if cells is None else [f"{cells} cells"]
-    words += [] if voltage is None else [f"{float(np.median(voltage)):.3g} V (median)"]
-    return [f"Battery: {', '.join(words)}."] if words else []
 
 
 def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:

@@ -40,9 +40,8 @@ _CHOICES: dict[str, Collection[str]] = {
     "channels": CHANNELS,
     "estimators": ESTIMATORS,
 }
-# A larger study is a mistake in its specification: each cell is a file, and all estimates must fit in memory.
+# A larger study is a mistake in its specification: each cell is a file.
 _MOST_CELLS = 1_000_000
-_MOST_ESTIMATES = 100_000_000
 _MOST_SAMPLES = 1_000_000
 
 
@@ -173,9 +172,6 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise InputError(f"`durations`: {got} is not 2 to {_MOST_SAMPLES} samples; change one.")
         if self.count > _MOST_CELLS:
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
-        if (estimates := math.prod(self.shape) * self.flights) > _MOST_ESTIMATES:
-            most = f"more than {_MOST_ESTIMATES}"
-            raise InputError(f"{estimates} estimates, {most}; reduce `flights`, or shorten an axis.")
 
     def check_computable(self) -> None:
         """Raises `InputError` for an excitation that an airframe cannot fly, or a network that cannot be trained."""
