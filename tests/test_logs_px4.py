@@ -170,7 +170,7 @@ REAL = {
         "is_vtol: this is no quadrotor",
         "only a quadrotor can be identified",
     ),
-    "pyulog_sample_px4_events": ("at 10 Hz (actuator_motors)", "too little flight", "set SDLOG_PROFILE to 147"),
+    "pyulog_sample_px4_events": ("at 10 Hz (actuator_motors)", "cannot identify a vehicle", "set SDLOG_PROFILE to 147"),
     "pyulog_sample_appended_multiple": ("the vehicle never flew", "on the ground", "give the log of a flight"),
     "px4_ulog_rs_esc_status": ("at 9.6 Hz (actuator_outputs)", "UAVCAN 1..8191", "set SDLOG_PROFILE to 17"),
 }

@@ -84,10 +84,10 @@ def test_a_damaged_network_is_named(whole, client, tmp_path, run):
     whole_network, address = network.read_bytes(), client.scheduler.address
     network.write_bytes(whole_network[: len(whole_network) // 2])
     cell.unlink()
-    for options in ((), ("--executor", "dask", "--scheduler", address)):
+    for options in ((), ("--scheduler", address)):
         refused(run("study", "spec.toml", "--out", "out", *options), "0000.net", "delete it")
     network.unlink()
-    code, out, err = run("study", "spec.toml", "--out", "out", "--executor", "dask", "--scheduler", address)
+    code, out, err = run("study", "spec.toml", "--out", "out", "--scheduler", address)
     assert (code, err) == (0, "")
     assert "95 estimates" in out
     assert network.read_bytes() == whole_network
@@ -97,9 +97,7 @@ def test_a_damaged_network_is_named(whole, client, tmp_path, run):
 def test_a_cluster_that_is_not_there_or_without_workers_is_refused(run, tmp_path):
     specification(tmp_path, NETWORKED)
     study = ("study", "spec.toml", "--out", "out")
-    refused(run(*study, "--executor", "dask"), "--scheduler")
-    refused(run(*study, "--scheduler", "tcp://127.0.0.1:1"), "--executor dask")
-    refused(run(*study, "--executor", "dask", "--scheduler", "nonsense://x"), "--scheduler nonsense://x")
+    refused(run(*study, "--scheduler", "nonsense://x"), "--scheduler nonsense://x")
     assert not (tmp_path / "out").exists()
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
-        refused(run(*study, "--executor", "dask", "--scheduler", empty.scheduler_address), "no workers")
+        refused(run(*study, "--scheduler", empty.scheduler_address), "no workers")

@@ -8,7 +8,7 @@ import numpy as np
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES
 from ..logs import log_format
-from .motion import WEAK, Excitation, excitation, opposite_axes, refused_note, yaw_doubt
+from .motion import Excitation, excitation, opposite_axes, refused_note, yaw_doubt
 from .pieces import cut
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
@@ -77,7 +77,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     nothing = "" if usable else f"{nothing_usable(found)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(usable, airframe)
     doubt = yaw_doubt(opposite)
-    findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts), refused_note(opposite))))
+    findings = tuple(filter(None, (nothing, facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
         format=log_format(recording.name).name,
@@ -106,16 +106,3 @@ def _measured(recording: Recording) -> dict[str, Channel]:
             gaps = np.diff(np.concatenate([time[:1], time[at], time[-1:]]))
             channels[name] = Channel(rate, float(gaps.max()), float(values[at].min()), float(values[at].max()))
     return channels
-
-
-def _too_little(parts: list[Part]) -> str:
-    """A finding, if the vehicle hardly turns in its usable parts."""
-    usable = [part for part in parts if part.usable]
-    rates = [axis.rate for part in usable for axis in part.excitation.values() if axis.rate is not None]
-    if not rates or max(rates) >= WEAK:
-        return ""
-    seconds = sum(part.end - part.begin for part in usable)
-    return (
-        f"too little flight: in the {seconds:.1f} s that can be used, the vehicle turns with at most {max(rates):.2g} "
-        "rad/s (standard deviation); fly rolls, pitches and turns"
-    )
