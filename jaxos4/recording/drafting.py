@@ -1,12 +1,11 @@
 """An airframe's file with everything that a log knows of its vehicle, and with marks at what must be measured."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tomlkit
-from tomlkit import TOMLDocument
 
 from ..airframe import GUESS
 from .motion import RotorSigns, rotor_signs
@@ -43,41 +42,48 @@ def airframe_draft(recording: Recording) -> AirframeDraft:
 
     **Arguments:** `recording`: read without an airframe, and with `full_scale=1.0`.
     """
-    facts, document, missing = recording.facts, tomlkit.document(), ["mass"]
+    facts, lines, missing = recording.facts, [], ["mass"]
+
+    def say(*texts: str) -> None:
+        lines.extend(f"# {text}" for text in texts)
+
+    def add(key: str, value: Any, comment: str) -> None:
+        lines.append(f"{key} = {json.dumps(value)} # {comment}")
+
     parts = [cut(recording, part) for part in stretches(recording, landed=facts.landed) if not part.reason]
     signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
     spins = facts.rotor_spins or (None if signs is None else signs.spins)
-    _say(document, f"The airframe of {Path(recording.name).name}. SI units.")
-    _head(document, "Weigh and measure: write the numbers, and remove the # in front.")
-    _say(document, "mass =   # kg, with battery: all inertias are proportional to it")
+    say(f"The airframe of {Path(recording.name).name}. SI units.")
+    lines.extend(["", "# Weigh and measure: write the numbers, and remove the # in front."])
+    say("mass =   # kg, with battery: all inertias are proportional to it")
     if facts.rotor_positions is None:
         missing.append("rotor_positions")
-        _say(document, *_positions_to_measure(signs))
-    _head(document, "From the log.")
+        say(*_positions_to_measure(signs))
+    lines.extend(["", "# From the log."])
     if facts.rotor_positions is not None:
-        _add(document, "rotor_positions", _short(facts.rotor_positions), "m, x forward and y left: check")
-        _say(document, "(settings of the autopilot, which needs only their ratios; inertias need the true distances)")
+        add("rotor_positions", _short(facts.rotor_positions), "m, x forward and y left: check")
+        say("(settings of the autopilot, which needs only their ratios; inertias need the true distances)")
     if spins is None:
         missing.append("rotor_spins")
-        _add(document, "rotor_spins", [], "fill in, such as [1, -1, 1, -1]; 1: counter-clockwise seen from above")
+        add("rotor_spins", [], "fill in, such as [1, -1, 1, -1]; 1: counter-clockwise seen from above")
     else:
         how = "settings of the autopilot" if facts.rotor_spins else "as the vehicle yaws in this flight"
-        _add(document, "rotor_spins", [int(spin) for spin in spins], f"1: counter-clockwise seen from above; {how}")
+        add("rotor_spins", [int(spin) for spin in spins], f"1: counter-clockwise seen from above; {how}")
     full = FULL_SCALE if recording.commanded else 1.0
     if hover is None:
         missing.append("hover_speed")
-        _say(document, "hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
+        say("hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
     else:
-        _add(document, "hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
+        add("hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
         if not hover.felt:
-            _say(document, "Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
+            say("Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
     if recording.commanded:
-        _add(document, "max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
-    _head(document, "Guesses from mass and positions, where the search begins. Numbers are better.")
-    _add(document, "inertia", GUESS, "kg m^2, as [Ix, Iy, Iz]")
-    _add(document, "drag_coefficient", GUESS, "N m s^2/rad^2: Iz is proportional to it")
-    _add(document, "rotor_inertia", GUESS, "kg m^2, of a propeller with its motor's bell")
-    return AirframeDraft(tomlkit.dumps(document), tuple(missing))
+        add("max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
+    lines.extend(["", "# Guesses from mass and positions, where the search begins. Numbers are better."])
+    add("inertia", GUESS, "kg m^2, as [Ix, Iy, Iz]")
+    add("drag_coefficient", GUESS, "N m s^2/rad^2: Iz is proportional to it")
+    add("rotor_inertia", GUESS, "kg m^2, of a propeller with its motor's bell")
+    return AirframeDraft("\n".join(lines) + "\n", tuple(missing))
 
 
 def _hover(parts: Sequence[Recording]) -> _Hover | None:
@@ -120,17 +126,3 @@ def _short(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_short(each) for each in value]
     return float(f"{value:.4g}")
-
-
-def _head(document: TOMLDocument, text: str) -> None:
-    document.add(tomlkit.nl())
-    document.add(tomlkit.comment(text))
-
-
-def _say(document: TOMLDocument, *lines: str) -> None:
-    for line in lines:
-        document.add(tomlkit.comment(line))
-
-
-def _add(document: TOMLDocument, key: str, value: Any, comment: str) -> None:
-    document.add(key, tomlkit.item(value).comment(comment))
