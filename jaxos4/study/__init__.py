@@ -3,7 +3,6 @@
 from .cell import OUTCOMES as OUTCOMES
 from .dataset import assemble as assemble, provenance as provenance, save_dataset as save_dataset
 from .run import (
-    Plan as Plan,
     Step as Step,
     carry_out as carry_out,
     device_name as device_name,

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from .._xla import quick_jit
+from ..airframe import PRESETS
 from ..analysis.covariance import cramer_rao_bound
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
@@ -74,8 +75,8 @@ class Flights(NamedTuple):
 
 def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
     """Model, bracket and rotor speeds of a scenario or of a network's job."""
-    with jax.enable_x64(study.double):
-        model = MODELS[scenario.model](study.vehicle(scenario.airframe))
+    with jax.enable_x64(True):
+        model = MODELS[scenario.model](PRESETS[scenario.airframe])
         offset = study.truth == "airframe"
         bracket = _bracket(model, np.asarray(scenario.width), key_of(study.seed, 0), offset=offset)
         omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)
@@ -121,7 +122,7 @@ def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
     """Simulates the flights of a cell. Flights of one number have the same random numbers in all scenarios."""
     scenario, numbers = cell.scenario, cell.first + np.arange(study.batch)
     kinds = {"method": scenario.method, "kind": scenario.noise, "drawn": study.truth == "drawn"}
-    with jax.enable_x64(study.double):
+    with jax.enable_x64(True):
         return _fly(fleet, numbers, key_of(study.seed, 1), as_float(scenario.scale), **kinds)
 
 
@@ -160,7 +161,7 @@ def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "la
 
 def fly_again(study: Study, scenario: Scenario, results: dict[str, np.ndarray]) -> Float[np.ndarray, "samples 12"]:
     """A scenario's first flight as simulated with the estimate in the `results` of its cell; NaN without one."""
-    with jax.enable_x64(study.double):
+    with jax.enable_x64(True):
         fleet, start = fleet_of(study, scenario), np.zeros(12)
         parameters, known = results["estimate"][0], results["initial_state"][0]
         if not np.isfinite(parameters).all():
@@ -173,7 +174,7 @@ def fly_again(study: Study, scenario: Scenario, results: dict[str, np.ndarray]) 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
     """Identifies the flights of a cell on the default device; `network`: that of `Study.job`."""
     scenario = cell.scenario
-    with jax.enable_x64(study.double):
+    with jax.enable_x64(True):
         with one_core():
             fleet = fleet_of(study, scenario)
             flights = fly(study, fleet, cell)
