@@ -47,26 +47,36 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
     computes the whole batch at once. `function` may be a method; the arrays of its module are batched as arguments are.
     """
 
-    def call(function: Callable, *arguments: Any) -> Any:
+    arrays, settings = eqx.partition((function, *arguments), eqx.is_array)
+
+    @jax.jit  # traced once, although a batch calls it twice
+    def one(arrays: Any) -> Any:
+        function, *arguments = eqx.combine(arrays, settings)
         return function(*arguments)
 
-    def of_batch(lanes: int, many: Any, shared: Any) -> Any:
+    blocked = custom_vmap(one)
+
+    @blocked.def_vmap
+    def batch(lanes: int, is_batched: list, arrays: Any) -> tuple[Any, Any]:
+        many, shared = eqx.partition(arrays, is_batched[0])
         blocks = max(-(-lanes // _BLOCK), 1) if jax.default_backend() == "cpu" else 1
         size = -(-lanes // blocks)
 
         def block(many: Any) -> Any:
-            return jax.vmap(lambda one: call(*eqx.combine(one, shared)))(many)
+            return jax.vmap(lambda each: one(eqx.combine(each, shared)))(many)
 
         def cut(leaf: Array) -> Array:
             more = jnp.repeat(leaf[-1:], blocks * size - lanes, axis=0)
             return jnp.concatenate([leaf, more]).reshape(blocks, size, *leaf.shape[1:])
 
         if blocks == 1:
-            return block(many)
-        out = jax.lax.map(block, jax.tree.map(cut, many))
-        return jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
+            out = block(many)
+        else:
+            out = jax.lax.map(block, jax.tree.map(cut, many))
+            out = jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
+        return out, jax.tree.map(lambda _: True, out)
 
-    return with_batch(call, of_batch, function, *arguments)
+    return blocked(arrays)
 
 
 def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) -> Any:

@@ -7,7 +7,7 @@ Arrays have the axes (time, channels, segments). A segment is one part of the fl
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,10 @@ from .gains import (
     Observed,
     Series,
     basis,
+    Step,
     first_covariance,
-    gains_after,
-    transition,
+    next_gains,
+    step_of,
 )
 from .scans import FASTEST
 
@@ -74,17 +75,8 @@ class _Known(NamedTuple):
     disturbance: tuple[Segments, ...]
 
 
-class _Feedback(NamedTuple):
-    """What the noise changes in a filter: its gains, and the disturbance over one sample."""
-
-    rate: tuple[Segments, ...]
-    disturbance: tuple[Segments, ...]
-    reach: tuple[Scalar, ...]
-    kept: tuple[Scalar, ...]
-
-
 def _advance(
-    move: Move, observe: Observe, known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
+    move: Move, observe: Observe, known: _Known, forcing: Forcing, scalars: Scalars, feedback: "_Feedback", row: _Row
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """What is known one sample later, and the innovations of this sample."""
     y, restart = row
@@ -96,11 +88,20 @@ def _advance(
     disturbance = tuple(
         d + gain * e for d, gain, e in zip(known.disturbance, feedback.disturbance, errors, strict=True)
     )
-    rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors[:RATES], strict=True))
+    rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors[:RATES], strict=False))
     following = move(State(Rates(*rates)), forcing, scalars).rates
-    pushed = (x + a * d for x, a, d in zip(following, feedback.reach, disturbance[:RATES], strict=True))
+    pushed = (x + a * d for x, a, d in zip(following, feedback.reach, disturbance[:RATES], strict=False))
     faded = tuple(share * d for share, d in zip(feedback.kept, disturbance, strict=True))
     return _Known(Rates(*pushed), faded), errors
+
+
+class _Feedback(NamedTuple):
+    """What the noise changes in a filter: its gains, and the disturbance over one sample. Each is a channel's."""
+
+    rate: tuple[Segments, ...]
+    disturbance: tuple[Segments, ...]
+    reach: tuple[Segments, ...]
+    kept: tuple[Segments, ...]
 
 
 class _Carry(NamedTuple):
@@ -145,7 +146,9 @@ def innovate(
     """
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
     unknowns = count + 3
-    first, push = jax.linearize(lambda noise: first_covariance(observed, noise, dt), noise)
+    step, push = jax.linearize(lambda noise: step_of(noise, dt), noise)
+    steps = step, jax.vmap(push)(basis(noise))
+    covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
     start = _start(observed, jnp.zeros((channels, segments), dtype=float))
     zero = jnp.zeros(segments, dtype=float)
     known = _Known(Rates(*start[:RATES]), (zero,) * channels)
@@ -157,14 +160,13 @@ def innovate(
         products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
     )
     carry = _Carry(
-        (first, jax.vmap(push)(basis(noise))),
+        (covariance, jax.vmap(push)(steps[1])),
         (known, jax.tree.map(lambda leaf: jnp.zeros((unknowns, *leaf.shape), dtype=float), known)),
         jnp.zeros((LAGS, channels, segments), dtype=float),
         nothing,
     )
-    filtered = functools.partial(
-        _filter_rows, move, observe, parameters, noise, dt, np.asarray(forcing_parameters, int)
-    )
+    advance = functools.partial(_advance, move, observe)
+    filtered = functools.partial(_filter_rows, advance, parameters, steps, np.asarray(forcing_parameters, int))
     data = observed._replace(known=None), forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
@@ -175,44 +177,34 @@ def innovate(
 
 
 def _filter_rows(
-    move: Move,
-    observe: Observe,
+    advance: Callable[..., tuple[_Known, Scalars]],
     parameters: Parameters,
-    noise: LogNoise,
-    dt: Scalar,
+    steps: tuple[Step, Step],
     positions: np.ndarray,
     carry: _Carry,
     observed: Observed,
     forcing: Forcing,
     forcing_tangents: Forcing | None,
 ) -> _Carry:
-    """The filters after some more rows. Other arguments as of `innovate`."""
+    """The filters after some more rows. `steps`: the disturbance over a sample, with its derivatives in the noise."""
     count, segments = parameters.shape[0], observed.measured.shape[2]
-    scalars, units = tuple(parameters), tuple(np.eye(count + 3, count, dtype=parameters.dtype).T)
-    (at, gains), push = jax.linearize(lambda p, noise: gains_after(p, noise, observed, dt), carry.covariance[0], noise)
-    by_noise, gain_slopes = jax.vmap(push, out_axes=(0, 1))(carry.covariance[1], basis(noise))
-    covariance = at, by_noise
-    advance = functools.partial(_advance, *(jax.vmap(each, in_axes=(0, 0, None)) for each in (move, observe)))
-
-    def over_a_sample(noise: LogNoise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
-        kept, reach = transition(jnp.exp(noise.time_constant), dt)
-        return tuple(reach[:RATES]), tuple(kept)
-
-    (reach, kept), push = jax.linearize(over_a_sample, noise)
-    by_noise = jax.vmap(push)(basis(noise))
-    by_noise = jax.tree.map(lambda slope: jnp.concatenate([jnp.zeros(count), slope]), by_noise)
+    scalars, own = tuple(parameters), parameters.shape[1:]
+    units = tuple(np.eye(count + 3, count, dtype=parameters.dtype).T)
 
     def body(carry, row):
-        known, slopes, sound = carry
-        forcing, tangents, gain, gain_slope, row = row
+        (covariance, by_noise), (known, slopes), sound = carry
+        forcing, tangents, row = row
         for x in known.rates:
             sound = sound & ((jnp.abs(x) < FASTEST) | row[1])
-        feedback = _Feedback(tuple(gain.rate[:RATES]), tuple(gain.disturbance), reach, kept)
-        by_gain = (tuple(jnp.moveaxis(leaf, 0, 1)) for leaf in (gain_slope.rate[:, :RATES], gain_slope.disturbance))
-        nothing = jnp.zeros((count, segments), dtype=float)
-        by_gain = (tuple(jnp.concatenate([nothing, slope]) for slope in each) for each in by_gain)
-        direction = _Feedback(*by_gain, *by_noise)
-        at, directions = (known, scalars, feedback), (slopes, units, direction)
+        (covariance, gains), push = jax.linearize(lambda p, step: next_gains(p, step, *row), covariance, steps[0])
+        by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
+
+        def feedback(gains: Gains, step: Step) -> _Feedback:
+            return _Feedback(*map(tuple, (gains.rate, gains.disturbance, step.reach, step.kept)))
+
+        direction = jax.vmap(feedback)(gain_slopes, steps[1])
+        direction = jax.tree.map(lambda s: jnp.concatenate([jnp.zeros((count, *s.shape[1:])), s]), direction)
+        at, directions = (known, scalars, feedback(gains, steps[0])), (slopes, units, direction)
         if tangents is not None:
             wide = jax.tree.map(lambda t: jnp.zeros((count + 3, segments), dtype=float).at[positions].set(t), tangents)
             at, directions = (*at, forcing), (*directions, wide)
@@ -220,20 +212,25 @@ def _filter_rows(
         def step(known: _Known, scalars, feedback: _Feedback, forcing: Forcing = forcing):
             return advance(known, forcing, scalars, feedback, row)
 
-        (known, errors), push = jax.linearize(step, *at)
-        slopes, by_errors = jax.vmap(push)(*directions)
-        return (known, slopes, sound), (jnp.stack(errors), jnp.stack(by_errors))
+        def pushed(slopes: _Known, units: Scalars, *others: Any) -> tuple[_Known, Scalars]:
+            return push(slopes, tuple(jnp.broadcast_to(unit, own) for unit in units), *others)
 
-    rows = forcing, forcing_tangents, gains, gain_slopes, (observed.measured, observed.restart)
-    (known, known_slopes, sound), (errors, slopes) = jax.lax.scan(body, (*carry.known, carry.sums.sound), rows)
-    found, last = _likelihood(observed, gains, gain_slopes.variance, carry.last, sound, errors, slopes)
+        (known, errors), push = jax.linearize(step, *at)
+        slopes, by_errors = jax.vmap(pushed)(*directions)
+        found = jnp.stack(errors), jnp.stack(by_errors), gains.variance, gain_slopes.variance
+        return ((covariance, by_noise), (known, slopes), sound), found
+
+    rows = forcing, forcing_tangents, (observed.measured, observed.restart)
+    (covariance, known, sound), found = jax.lax.scan(body, (carry.covariance, carry.known, carry.sums.sound), rows)
+    errors, slopes, variance, variance_slopes = found
+    found, last = _likelihood(observed, variance, variance_slopes, carry.last, sound, errors, slopes)
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(sound=sound)
-    return _Carry(covariance, (known, known_slopes), last, sums)
+    return _Carry(covariance, known, last, sums)
 
 
 def _likelihood(
     observed: Observed,
-    gains: Gains,
+    variance: Series,
     variance_slopes: Float[Array, "time 3 channels segments"],
     last: Float[Array, "lags channels segments"],
     sound: Bool[Array, " segments"],
@@ -243,8 +240,8 @@ def _likelihood(
     """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations."""
     count = slopes.shape[2] - 3
     counts = ~jnp.isnan(observed.measured) & observed.counts[:, None]
-    weight = jnp.where(counts, 1 / gains.variance, 0.0)
-    logarithm = jnp.where(counts, jnp.log(gains.variance), 0.0)
+    weight = jnp.where(counts, 1 / variance, 0.0)
+    logarithm = jnp.where(counts, jnp.log(variance), 0.0)
     relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, 3, segments)
     gradient = jnp.einsum("tcul,tcl->cul", slopes, weight * errors)
     surprise = (weight > 0) * (1 - weight * errors**2) / 2
