@@ -46,7 +46,6 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
     A slow flight then holds up its block only. The last lane is repeated until all blocks are full. An accelerator
     computes the whole batch at once. `function` may be a method; the arrays of its module are batched as arguments are.
     """
-
     arrays, settings = eqx.partition((function, *arguments), eqx.is_array)
 
     @jax.jit  # traced once, although a batch calls it twice

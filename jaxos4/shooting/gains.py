@@ -156,9 +156,11 @@ def first_covariance(step: Step, segments: int) -> Covariance:
     return Covariance(zero, zero, zero + step.variance)
 
 
-def next_gains(p: Covariance, step: Step, measured: Channels, restart: Bool[Array, " segments"]):
+def next_gains(
+    p: Covariance, step: Step, is_measured: Bool[Array, "channels segments"], restart: Bool[Array, " segments"]
+) -> tuple[Covariance, Gains]:
     """The covariance one sample later, and the gains of this sample, from the covariance before it."""
-    p, gains = _measure(_restart(p, restart, step), ~jnp.isnan(measured), step)
+    p, gains = _measure(_restart(p, restart, step), is_measured, step)
     return _predict(p, step), gains
 
 
@@ -166,7 +168,9 @@ def gains_of(observed: Observed, noise: LogNoise, dt: Scalar) -> Gains:
     """The gains of the filters of all channels."""
     step = step_of(noise, dt)
     first = first_covariance(step, observed.measured.shape[-1])
-    return jax.lax.scan(lambda p, row: next_gains(p, step, *row), first, (observed.measured, observed.restart))[1]
+    return jax.lax.scan(
+        lambda p, row: next_gains(p, step, *row), first, (~jnp.isnan(observed.measured), observed.restart)
+    )[1]
 
 
 def basis(noise: LogNoise) -> LogNoise:

@@ -26,7 +26,6 @@ from ..models.abstract import AbstractModel
 from ..models.state import CHANNELS, Forcing
 from ..models.vehicle import FlightModel
 from .abstract import AbstractProblem, Stages, WindowUnknowns
-from .batching import with_batch
 from .filters import Innovations, innovate
 from .gains import LogNoise, Observed, first_noise
 from .problem import ShootingProblem
@@ -271,9 +270,17 @@ class InnovationsProblem(AbstractProblem):
         problem, model, dt, rows = self.problem, self.model, self.flight.dt, self.cut.rows
 
         def at(parameters: Parameters, noise: LogNoise, forcing: Forcing, tangents: Forcing | None) -> Innovations:
-            flight = observed, forcing, tangents
-            return with_batch(
-                _alone, _as_segments, (problem.step, model.observe), model.forcing_parameters, rows, dt, flight, parameters, noise
+            return innovate(
+                problem.step,
+                model.observe,
+                observed,
+                forcing,
+                parameters,
+                noise,
+                dt,
+                rows=rows,
+                forcing_tangents=tangents,
+                forcing_parameters=model.forcing_parameters,
             )
 
         return at
@@ -315,53 +322,6 @@ class InnovationsProblem(AbstractProblem):
             return value, slopes
 
         return lift
-
-
-def _alone(functions, forcing_parameters, rows, dt, flight, parameters, noise) -> Innovations:
-    move, observe = (jax.vmap(each, in_axes=(0, 0, None)) for each in functions)
-    return _innovate(move, observe, forcing_parameters, rows, dt, flight, parameters, noise)
-
-
-def _innovate(move, observe, forcing_parameters, rows, dt, flight, parameters, noise) -> Innovations:
-    observed, forcing, tangents = flight
-    return innovate(
-        move, observe, observed, forcing, parameters, noise, dt,
-        rows=rows, forcing_tangents=tangents, forcing_parameters=forcing_parameters,
-    )
-
-
-def _as_segments(lanes: int, many, shared) -> Innovations:
-    """The innovations of a batch: lanes are more segments."""
-    segments = eqx.combine(many[4], shared[4])[0].measured.shape[-1]
-
-    def lanes_last(leaf):
-        return jnp.moveaxis(leaf, 0, -1)
-
-    def repeated(leaf):
-        return jnp.tile(leaf, (*(1 for _ in leaf.shape[:-1]), segments))
-
-    def in_segments(leaf):
-        return leaf.reshape(*leaf.shape[:-2], segments * lanes)
-
-    def every(one, same):
-        return eqx.combine(
-            jax.tree.map(lambda leaf: lanes_last(leaf), one),
-            jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, lanes)), same),
-        )
-
-    flight = jax.tree.map(in_segments, every(many[4], shared[4]))
-    parameters, noise = jax.tree.map(repeated, every(many[5:], shared[5:]))
-    rows = shared[2] if many[2] is None else many[2].max()
-    dt = shared[3] if many[3] is None else repeated(many[3])
-    own = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * segments), many[0])
-
-    def each(which: int):
-        def function(*at):
-            return jax.vmap(lambda one, *at: eqx.combine(one, shared[0][which])(*at))(own[which], *at)
-        return function
-
-    out = _innovate(each(0), each(1), shared[1], rows, dt, flight, parameters, noise)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], segments, lanes), -1, 0), out)
 
 
 def joined(
