@@ -17,6 +17,7 @@ from small_study import AIRFRAME, COMMAND, environment, run_study, specification
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
+from jaxos4.shooting import cores
 from jaxos4.study import (
     OUTCOMES,
     Study,
@@ -70,7 +71,6 @@ def test_a_dry_run_writes_nothing_and_counts(tmp_path):
     text = "airframes = ['mine']\ntruth = 'drawn'\nflights = 1000\nbatch = 100\nestimators = ['ibss', 'kalman']\n"
     specification(tmp_path, text + AIRFRAME)
     command = [sys.executable, "-c", COMMAND, "study", "spec.toml", "--out", "out", "--dry-run"]
-    # In its own process: the devices must be chosen before the airframe's table is computed.
     env = {name: value for name, value in environment().items() if name != "JAX_NUM_CPU_DEVICES"} | {"COLUMNS": "100"}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")
@@ -91,7 +91,7 @@ def test_a_plan_counts_networks_once_and_takes_its_times_from_the_log(tmp_path):
     # One more network, for the attitude. Three programs: that network and two searches.
     assert hybrid == ("hybrid", 18, 1500, 3, 1, None)
     assert ibss[:5] == ("ibss", 12, 900, 0, 0)  # the same searches
-    assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / len(jax.local_devices()))
+    assert ibss.seconds == pytest.approx(12 * (2.0 + 11.1 / 3) / cores())
 
 
 # The grid.

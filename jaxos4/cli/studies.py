@@ -30,9 +30,8 @@ def study(
     if (executor is Executor["dask"]) != (scheduler is not None):
         raise InputError("--executor dask and --scheduler ADDRESS: give both, or neither.")
     with stages("loading the library"):
-        from ..study import load_study, run_on_cluster, use_all_cores
+        from ..study import load_study, run_on_cluster
 
-        use_all_cores()  # before anything is computed
         wanted = load_study(specification)
     if dry_run:
         _print_plan(wanted, out)
@@ -106,9 +105,7 @@ def compare(
         from ..report import error_table, write_report
         from ..report.study_terminal import count_outcomes, run_with_bar
         from ..report.text import print_whole
-        from ..study import use_all_cores
 
-    use_all_cores()
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
     dataset = run_with_bar(comparison(quick=quick), directory)
     print_whole(Console(highlight=False), error_table(dataset))

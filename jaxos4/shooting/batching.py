@@ -5,7 +5,9 @@ take as long as the slowest flight, its arrays do not fit the cache, and the pro
 one flight instead of one unknown of several flights.
 """
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +18,8 @@ from jaxtyping import Array, Bool
 
 # The most lanes of a block: two to four of the processor's vectors. In 64 lanes a flight takes up to twice as long.
 _BLOCK = 16
+# The flights of one thread's call. It does not depend on the number of cores, and so the results do not.
+_CHUNK = 4 * _BLOCK
 
 
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
@@ -94,3 +98,46 @@ def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) ->
     zeros = [jnp.zeros(value.shape, value.dtype) for value in jax.eval_shape(leaves)]
     values = jax.lax.cond(needed.any(), leaves, lambda: zeros)
     return jax.tree.unflatten(structure, values)
+
+
+def cores() -> int:
+    """The number of cores that this process may use, or as many as `JAX_NUM_CPU_DEVICES` says."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return int(os.environ.get("JAX_NUM_CPU_DEVICES") or usable)
+
+
+def on_all_cores(function: Callable) -> Callable:
+    """A batch on all cores of a CPU: threads run one compiled program. Results are the same on any number of cores.
+
+    The returned function takes a batch of `function`'s first argument, all arrays of which have the flights as their
+    first axis, and the other arguments as they are. Call it outside of `jax.jit`. On an accelerator it is one call.
+    """
+
+    @eqx.filter_jit
+    def chunk(many: Any, first: Array, size: int, shared: Any) -> Any:
+        part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), many)
+        return eqx.filter_vmap(lambda one: function(one, *shared))(part)
+
+    compiled = set()
+
+    def batch(many: Any, *shared: Any) -> Any:
+        leaves, structure = jax.tree.flatten((many, shared))
+        lanes, double = leaves[0].shape[0], bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+        size = min(lanes, _CHUNK) if jax.default_backend() == "cpu" else lanes
+
+        def run(first: int) -> Any:
+            with jax.enable_x64(double):  # a setting of each thread
+                return jax.block_until_ready(chunk(many, jnp.asarray(first), size, shared))
+
+        # All chunks are full: the last begins with flights of the one before it.
+        firsts, found = [min(first, lanes - size) for first in range(0, lanes, size)], []
+        key = structure, size, double, *(jnp.shape(leaf) for leaf in leaves)
+        if key not in compiled:
+            found.append(run(firsts.pop(0)))
+            compiled.add(key)
+        with ThreadPoolExecutor(cores()) as pool:
+            found += pool.map(run, firsts)
+        found[-1] = jax.tree.map(lambda leaf: leaf[-lanes % size :], found[-1])
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
+
+    return batch
