@@ -17,6 +17,7 @@ from small_study import COMMAND, environment, run_study, specification
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
+from jaxos4.shooting import cores
 from jaxos4.study import (
     OUTCOMES,
     Study,
@@ -69,7 +70,6 @@ def test_a_dry_run_writes_nothing_and_counts(tmp_path):
     text = "airframes = ['voos']\ntruth = 'drawn'\nflights = 1000\nbatch = 100\nestimators = ['ibss', 'kalman']\n"
     specification(tmp_path, text)
     command = [sys.executable, "-c", COMMAND, "study", "spec.toml", "--out", "out", "--dry-run"]
-    # In its own process: the devices must be chosen before the airframe's table is computed.
     env = {name: value for name, value in environment().items() if name != "JAX_NUM_CPU_DEVICES"} | {"COLUMNS": "100"}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")

@@ -24,9 +24,8 @@ def study(
 ) -> None:
     """Run a noise study, or resume it: finished cells are kept."""
     with stages("loading the library"):
-        from ..study import load_study, run_on_cluster, use_all_cores
+        from ..study import load_study, run_on_cluster
 
-        use_all_cores()  # before anything is computed
         wanted = load_study(specification)
     if dry_run:
         _print_plan(wanted, out)
@@ -97,9 +96,7 @@ def compare(
         from ..report import error_table, write_report
         from ..report.study_terminal import count_outcomes, run_with_bar
         from ..report.text import print_whole
-        from ..study import use_all_cores
 
-    use_all_cores()
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
     dataset = run_with_bar(comparison(quick=quick), directory)
     print_whole(Console(highlight=False), error_table(dataset))

@@ -5,11 +5,10 @@ each of its programs, on one device. Last digits depend on the length of a batch
 a program; with whole cells they are the same in any order and in any process.
 """
 
-import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator
+import threading
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,6 +50,8 @@ _KEPT = ("parameters", "std", "cost", "rollouts", "initial_state", "result", "se
 _FEW_FLIGHTS = 2000
 # The largest offset of a bracket from the parameters that all flights have, as a share of its half-width.
 _LARGEST_OFFSET = 0.8
+# Programs that all estimators share are compiled once: the second thread waits for the first.
+_ONE_THREAD = threading.Lock()
 
 
 Lanes = Float[Array, "lanes samples 12"]
@@ -175,7 +176,7 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
     """Identifies the flights of a cell on the default device; `network`: that of `Study.job`."""
     scenario = cell.scenario
     with jax.enable_x64(True):
-        with one_core():
+        with _ONE_THREAD:
             fleet = fleet_of(study, scenario)
             flights = fly(study, fleet, cell)
             blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
@@ -183,14 +184,6 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
             bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
         found = _answers(study, cell, fleet, blank, flights.measured, network)
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
-
-
-@contextlib.contextmanager
-def one_core() -> Iterator[None]:
-    """Computes on the first core of a CPU: a program that all estimators share is compiled once, not for each core."""
-    first = jax.local_devices()[0]
-    with jax.default_device(first) if first.platform == "cpu" else contextlib.nullcontext():
-        yield
 
 
 def programs_of(study: Study, scenario: Scenario) -> list[tuple]:
@@ -211,8 +204,7 @@ def _answers(
         network = eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
     estimator, channels = make_estimator(cell.scenario.estimator, network), study.seed_channels(cell.scenario)
     if isinstance(estimator, Hybrid):
-        with one_core():
-            looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
+        looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
         _, seeds = identify(estimator.network, looked_at, fleet.bracket, states)
         return search(estimator.ibss, blank, fleet.bracket, states, seeds) | {"brackets": None}
     if isinstance(estimator, IBSS):

@@ -1,4 +1,4 @@
-"""Runs a study from its specification to its Dataset: on the devices of this process, or on a Dask cluster.
+"""Runs a study from its specification to its Dataset: in this process, or on a Dask cluster.
 
 The results are the same bit for bit. Workers of a cluster need only this package. If a worker is lost, another worker
 repeats its tasks.
@@ -7,13 +7,11 @@ repeats its tasks.
 import concurrent.futures
 import contextlib
 import ctypes
-import dataclasses
 import functools
 import io
 import itertools
-import os
 from collections import defaultdict, deque
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,6 +21,7 @@ import xarray as xr
 
 from ..errors import InputError, TrainingError
 from ..networks import TrainedNetwork, encode_network, load_network
+from ..shooting import cores
 from .cell import blank_problem, fleet_of, key_of, programs_of, run_cell
 from .dataset import assemble, save_dataset
 from .specification import Cell, Job, Study
@@ -36,8 +35,6 @@ Trained = bytes | str | None
 
 # Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
-# A device joins the program of another device if at least this number of cells waits: it must compile the program too.
-_WORTH_COMPILING = 8
 # How often a task that raises an unexpected exception is repeated. The cluster itself counts lost workers.
 _RETRIES = 2
 
@@ -49,18 +46,18 @@ class Step(NamedTuple):
     label: str
 
 
-def use_all_cores() -> None:
-    """Makes each core a device, or as many as `JAX_NUM_CPU_DEVICES` says. Call it before any computation."""
-    if os.environ.get("JAX_NUM_CPU_DEVICES"):
-        return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", cores)  # noqa: TID251  # only entry points call this
+def workers() -> list[Any]:
+    """The device of each cell that this process computes at a time.
+
+    A CPU is one device for all its cores: their threads share compiled programs, and so the results' last digits.
+    """
+    devices = jax.local_devices()
+    return devices if devices[0].platform != "cpu" else devices[:1] * cores()
 
 
 def device_name() -> str:
-    """The devices of this process, in words."""
-    devices = jax.local_devices()
-    return f"{len(devices)} x {devices[0].device_kind}"
+    """What computes in this process, in words."""
+    return f"{len(workers())} x {jax.local_devices()[0].device_kind}"
 
 
 def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
@@ -72,39 +69,45 @@ def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
     return rows
 
 
-@dataclasses.dataclass
-class _Program:
-    """A program: the devices that run it, and the waiting cells that end with it."""
-
-    devices: set[Any] = dataclasses.field(default_factory=set)
-    waiting: deque[Cell] = dataclasses.field(default_factory=deque)
-
-
 def run_here(store: Store) -> Iterator[Step]:
-    """Computes the remaining cells, each on one device: a divided program gives other last digits.
+    """Computes the remaining cells, each by one worker: a divided program gives other last digits.
 
     A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
     study, cells = store.study, [store.study.cell(index) for index in store.missing()]
-    done, programs = study.count - len(cells), defaultdict(_Program)
+    done, waiting = study.count - len(cells), defaultdict[tuple, deque[Cell]](deque)
     # Cells of IBSS first: those of the hybrid, which end with the same program, wait for a network.
     for cell in sorted(cells, key=lambda cell: study.job(cell.scenario) is not None):
-        programs[programs_of(study, cell.scenario)[-1]].waiting.append(cell)
+        waiting[programs_of(study, cell.scenario)[-1]].append(cell)
     untrained = deque(dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None))
     # A cell without a network never waits for one.
     networks: dict[Job | None, Trained] = {None: None}
-    free = deque(jax.local_devices())
+    free = deque(workers())
+    # Whether each program is compiled on a device, or its first cell is still running there.
+    compiled: dict[tuple[tuple, Any], bool] = {}
     running: dict[concurrent.futures.Future, tuple[Any, Job | Cell]] = {}
     pool = concurrent.futures.ThreadPoolExecutor(len(free))
+
+    def next_cell(device: Any) -> Cell | None:
+        """Of a program that is not compiled yet, else of one that waits for no compiler, else of any."""
+        ready = [p for p, cells in waiting.items() if cells and study.job(cells[0].scenario) in networks]
+        ready = [p for p in ready if compiled.get((p, device), True)]
+        started = {program for program, _ in compiled}
+        program = min(ready, key=lambda p: (p in started, (p, device) not in compiled), default=None)
+        if program is None:
+            return None
+        compiled.setdefault((program, device), False)
+        return waiting[program].popleft()
+
     try:
         while True:
             for device in tuple(free):
                 if untrained:
                     task = untrained.popleft()
                     future = pool.submit(_train, store, task, device)
-                elif task := _next_cell(study, list(programs.values()), networks, device):
+                elif task := next_cell(device):
                     future = pool.submit(compute, study, task, networks[study.job(task.scenario)], device)
-                else:  # all remaining cells wait for networks
+                else:  # all remaining cells wait for networks or programs
                     continue
                 free.remove(device)
                 running[future] = device, task
@@ -119,24 +122,12 @@ def run_here(store: Store) -> Iterator[Step]:
                 if isinstance(task, Job):
                     networks[task] = future.result()
                 else:
+                    compiled[programs_of(study, task.scenario)[-1], device] = True
                     write_file(store.cell_file(task.number), future.result())
                     done += 1
     finally:
         # An interrupt does not wait for running tasks, which may last minutes; their results are lost.
         pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _next_cell(study: Study, programs: list[_Program], networks: Container[Job | None], device: Any) -> Cell | None:
-    """A cell of the program that the device runs already, else of one that no device runs, else of the longest."""
-    ready = [p for p in programs if p.waiting and study.job(p.waiting[0].scenario) in networks]
-    own = [p for p in ready if device in p.devices]
-    new = [p for p in ready if not p.devices]
-    long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
-    program = next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
-    if program is None:
-        return None
-    program.devices.add(device)
-    return program.waiting.popleft()
 
 
 def _give_memory_back() -> None:
