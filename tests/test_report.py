@@ -21,7 +21,7 @@ from jaxos4.report.style import drawing, grid, log_axis
 from jaxos4.report.text import percent, plain
 from jaxos4.study import metrics
 
-OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage"}
+OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
 OF_EXAMPLE = {"trajectories", "deviations", "search", "training"}
 
 
@@ -90,7 +90,7 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
     xr.testing.assert_equal(read_results(tmp_path), study)
     code, out, err = run("report", str(tmp_path))
     assert (code, err) == (0, "")
-    assert "9 figures" in out
+    assert "8 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
@@ -140,6 +140,7 @@ def test_trouble_is_named(report):
     shown = words(report[0].read_text(encoding="utf-8"))
     for said in (
         "Incomplete: 1 of 12 cells",
+        "Most accurate, within Monte-Carlo error: ",
         "1 of 12 cells failed",
         "scale 10.0, estimator svsf: FloatingPointError: <b>the filter's covariance</b> is not",
         "noise x 0.1, ibss, flight 1: at bound",

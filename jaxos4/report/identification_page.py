@@ -92,9 +92,7 @@ def _text(x: Any) -> str:
     return MISSING if x is None else json.dumps(x, ensure_ascii=False)
 
 
-def vehicle(
-    airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style
-) -> Figure:
+def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:
     """The vehicle as it was identified: left from above, front up, right its moments of inertia with 95 % intervals."""
     figure, (above, bars) = grid(2, columns=2, height=3.4)
     x, y = 1e3 * np.asarray(airframe.rotor_positions, dtype=float).T

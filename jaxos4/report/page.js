@@ -45,8 +45,8 @@
           { label: "time [s]", value: text },
           { label: "measured", value: text, stroke: ink, width: 1, dash: [3, 3], points: { show: false } },
           { label: "predicted", value: text, stroke: given.color, width: 2, points: { show: false } },
-          edge(`${given.band} from`),
-          edge("to"),
+          edge(`${given.band} low`),
+          edge("high"),
         ],
         bands: [{ series: [4, 3], fill: `${given.color}38` }],
       };

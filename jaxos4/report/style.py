@@ -52,7 +52,7 @@ _STYLES = {
     "filter-error": Style("#5448fc", "v", (0, (9, 2))),
     "equation-error": Style("#54783c", "P", (0, (3, 1, 1, 1, 1, 1))),
     "rls": Style("#549cc0", "X", (0, (2, 1))),
-    "svsf": Style("#846084", "*", (0, (1, 3))),
+    "svsf": Style("#846084", "*", (0, (1, 2.2))),
     "kalman": Style("#d80030", "<", (0, (10, 2, 2, 2))),
     "ant-colony": Style("#4884fc", "p", (0, (5, 1, 2, 1))),
 }
