@@ -39,6 +39,7 @@ from jaxos4.report.identification_page import (
     inertias_by_sample_time,
     predicted_rates,
     vehicle,
+    verdict,
 )
 from jaxos4.report.style import drawing, pdf, styles, svg
 from jaxos4.report.text import MISSING, Listing, plain
@@ -65,7 +66,8 @@ def says(text, *parts):
 
 
 def test_the_page_says_what_was_found(tmp_path):
-    _, shown = written(tmp_path / "flight.html")
+    text, shown = written(tmp_path / "flight.html")
+    assert text.index("Nothing speaks against this estimate") < text.index("<main>")
     says(
         shown,
         "ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230",
@@ -147,10 +149,8 @@ DOUBTS = (Doubt("not_physical", "Ix is negative", "check the arms"),)
         ({"result": "nonfinite_trajectory"}, "There is no answer: "),
     ],
 )
-def test_the_page_opens_with_a_verdict(tmp_path, changes, said):
-    text, shown = written(tmp_path / "flight.html", **changes)
-    says(shown, said)
-    assert text.index("verdict") < text.index("<main>")
+def test_the_verdict_is_one_sentence(changes, said):
+    says(verdict(identified_vehicle(**changes)), said)
 
 
 def test_the_inertias_of_all_sample_times_are_shown(tmp_path):

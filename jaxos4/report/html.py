@@ -22,12 +22,12 @@ class Drawing(NamedTuple):
     """A figure as SVG, and the boxes of its panels, see `panel_boxes`."""
 
     svg: bytes
-    boxes: np.ndarray
+    boxes: list[list[float]]
 
 
 def draw(figure: Figure) -> Drawing:
     """Draws a figure for a page."""
-    return Drawing(svg(figure), panel_boxes(figure))
+    return Drawing(svg(figure), panel_boxes(figure).tolist())
 
 
 def render(template: str, **values: Any) -> str:
@@ -80,7 +80,7 @@ def inline(drawing: Drawing, stem: str, description: str, estimators: Sequence[s
         text = text.replace(color, themed)
     panels = re.findall(r'^  <g id="\S+--axes_\d+">$.*?^  </g>$', text, flags=re.DOTALL | re.MULTILINE)
     panels[-1] += text[text.rindex("<defs>") : text.rindex("</svg>")]
-    width, columns = _PIXELS * drawing.boxes[0, 2], len({round(x) for x in drawing.boxes[:, 0]})
+    width, columns = _PIXELS * drawing.boxes[0][2], len({round(box[0]) for box in drawing.boxes})
     style = f"--least: {_SHRINKS * width:.0f}px; --most: {_GROWS * width:.0f}px; --columns: {columns}"
     shown = [
         f'<svg viewBox="{" ".join(f"{x:.1f}" for x in box)}">{panel}</svg>'
@@ -93,7 +93,7 @@ def inline(drawing: Drawing, stem: str, description: str, estimators: Sequence[s
 def swatch(look: Style) -> Markup:
     """A line of 32 x 16 pixels with a mark, as a figure draws a series: the content of an element `<svg>`."""
     marker, (_, dash) = MarkerStyle(look.marker), look.dash
-    (points, *_) = marker.get_path().transformed(marker.get_transform()).to_polygons()
+    points = np.asarray(marker.get_path().transformed(marker.get_transform()).to_polygons()[0])
     mark = " ".join(f"{16 + 9 * x:.1f},{8 - 9 * y:.1f}" for x, y in points)
     dashes = " ".join(f"{1.6 * length:g}" for length in dash)
     line = f'<path d="M0 8H32" stroke="{look.color}" stroke-width="1.6" stroke-dasharray="{dashes}"/>'

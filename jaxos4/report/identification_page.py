@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MultipleLocator
+from scipy.spatial.distance import pdist
 
 from .._files import check_writable, write_atomically
 from ..airframe import Airframe
@@ -95,9 +96,8 @@ def _text(x: Any) -> str:
 def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:
     """The vehicle as it was identified: left from above, front up, right its moments of inertia with 95 % intervals."""
     figure, (above, bars) = grid(2, columns=2, height=3.4)
-    x, y = 1e3 * np.asarray(airframe.rotor_positions, dtype=float).T
-    apart = [math.dist(a, b) for i, a in enumerate(zip(x, y, strict=True)) for b in list(zip(x, y, strict=True))[:i]]
-    radius = 0.42 * min(apart)
+    positions = 1e3 * np.asarray(airframe.rotor_positions, dtype=float)
+    (x, y), radius = positions.T, 0.42 * pdist(positions).min()
     for i, spin in enumerate(np.asarray(airframe.rotor_spins)):
         end = 1 - 0.25 * radius / math.hypot(x[i], y[i])  # leaves room for the number
         above.plot([0, -end * y[i]], [0, end * x[i]], color=FAINT, linewidth=3, zorder=1)
@@ -148,7 +148,7 @@ def predicted_rates(predicted: Predictions, sample_time: float, look: Style) -> 
     start = np.insert(start.astype(float), breaks, start[breaks - 1] + usual)
     arrays = {"start": start * sample_time, "measured": measured, "predicted": values, "half": half}
     return json.dumps(
-        {name: array.round(4).tolist() for name, array in arrays.items()}
+        {name: np.where(np.isfinite(array), array.round(4), np.nan).tolist() for name, array in arrays.items()}
         | {"horizons": [f"{x:.3g}" for x in predicted.horizons], "color": look.color, "band": f"{100 * BAND:g} %"}
         | {"shown": int(np.argmin(np.abs(predicted.horizons - _SHOWN)))}
     ).replace("NaN", "null")

@@ -131,7 +131,7 @@ def coverage(data: xr.Dataset) -> Figure | None:
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
         panel.grid(axis="x", visible=False)
     label(figure, x="level claimed", y="intervals that hold the truth")
-    legend(figure, estimators, lines=False)
+    legend(figure, estimators)
     return figure
 
 
@@ -237,7 +237,7 @@ def trajectories(data: xr.Dataset, *, minus_truth: bool = False) -> Figure | Non
                 panel.plot(one["time"], y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=gid)
         panel.set_title(f"{one['state'].item()} [{one['state_unit'].item()}]")
     label(figure, x="time [s]")
-    legend(figure, names(data, "estimator"), markers=False)
+    legend(figure, names(data, "estimator"))
     return figure
 
 

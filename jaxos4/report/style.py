@@ -156,28 +156,17 @@ def ticks_at(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def legend(
-    figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] = (), lines: bool = True, markers: bool = True
-) -> None:
-    """Adds a legend below the figure: an entry for each bound and each estimator, with lines, markers or both.
-
-    The page hides the entry of an estimator together with the estimator.
-    """
+def legend(figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] = ()) -> None:
+    """Adds a legend below the figure: an entry for each bound and each estimator. A page has its bar instead."""
     handles = [
         Line2D([], [], color=INK, linestyle=d, linewidth=1.1) for d, _ in zip(BOUND_DASHES, bounds, strict=False)
     ]
     labels = [f"bound, {name}" for name in bounds[: len(handles)]]
-    first = len(handles)
-    for name, look in styles(estimators).items():
-        marker, dash = look.marker if markers else None, look.dash if lines else "none"
-        handles.append(Line2D([], [], color=look.color, marker=marker, linestyle=dash))
-        labels.append(name)
+    handles += [Line2D([], [], **look.line) for look in styles(estimators).values()]
+    labels += estimators
     rows = -(-len(labels) // int(figure.get_figwidth() / _LEGEND_WIDTH))
     columns = -(-len(labels) // rows)
-    box = figure.legend(handles, labels, loc="outside lower center", ncols=columns, handlelength=3)
-    for place, pair in enumerate(zip(box.legend_handles[first:], box.get_texts()[first:], strict=True)):
-        for part in filter(None, pair):
-            part.set_gid(estimator_gid(place))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, handlelength=3)
 
 
 def svg(figure: Figure) -> bytes:
@@ -193,7 +182,8 @@ def panel_boxes(figure: Figure) -> np.ndarray:
     The margins around all panels are the same, so that panels of one size have boxes of one size.
     """
     resolution, figure.dpi = figure.dpi, 72  # of SVG: a pixel is a point
-    inner, outer = (np.array([box(x).extents for x in figure.axes]) for box in (lambda x: x.bbox, Axes.get_tightbbox))
+    inner = np.array([panel.bbox.extents for panel in figure.axes])
+    outer = np.array([(panel.get_tightbbox() or panel.bbox).extents for panel in figure.axes])
     figure.set_dpi(resolution)
     margin = np.abs(outer - inner).max(axis=0) * [-1, -1, 1, 1] + [-2, -2, 2, 2]
     left, bottom, right, top = (inner + margin).T
