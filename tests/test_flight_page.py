@@ -144,7 +144,7 @@ DOUBTS = (Doubt("not_physical", "Ix is negative", "check the arms"),)
     ("changes", "said"),
     [
         ({}, "Nothing speaks against this estimate: Ix 1.73e-5 ± 2.9e-7 kg m² (95 %); Iy is not identified; Iz is not"),
-        ({"result": "implausible", "doubts": DOUBTS}, "Not to be trusted: Ix is negative."),
+        ({"result": "implausible", "doubts": DOUBTS}, "Not to be trusted: Ix is negative; check the arms."),
         ({"result": "max_sweeps"}, "Not to be trusted: the search did not converge"),
         ({"result": "nonfinite_trajectory"}, "There is no answer: "),
     ],

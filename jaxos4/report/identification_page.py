@@ -75,7 +75,7 @@ def verdict(found: Identification) -> str:
     if not found.has_answer:
         return f"There is no answer: {meaning(found.result)}."
     if not found.successful:
-        return f"Not to be trusted: {found.doubts[0].cause if found.doubts else meaning(found.result)}."
+        return f"Not to be trusted: {found.doubts[0] if found.doubts else meaning(found.result)}."
     every = found.rigid_body.constants
     known = [f"{name} {_plus_minus(every[name].estimate, every[name].std)}" for name in _INERTIAS if name in every]
     missing = [f"{name} is not identified" for name in _INERTIAS if name not in every]
