@@ -19,6 +19,7 @@
   // Body rates as uPlot draws them: measured, predicted, and the band of the errors. All plots zoom together.
   const box = document.getElementById("rates"), list = document.getElementById("horizon");
   let plots = [];
+  const size = () => ({ width: box.clientWidth, height: 170 });
   const color = (name) => {
     box.style.color = `var(${name})`;
     return getComputedStyle(box).color;
@@ -30,7 +31,6 @@
     const time = given.start.map((start) => start + Number(given.horizons[at]));
     const text = (_, value) => (value == null ? "–" : value.toFixed(3));
     const axis = { stroke: soft, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 } };
-    const size = () => ({ width: box.clientWidth, height: 170 });
     plots.forEach((plot) => plot.destroy());
     plots = ["p", "q", "r"].map((name, rate) => {
       const y = given.predicted[at][rate], half = given.half[at][rate];
@@ -52,13 +52,13 @@
       };
       return new uPlot(options, [time, given.measured[at][rate], y, moved(-half), moved(half)], box);
     });
-    addEventListener("resize", () => plots.forEach((plot) => plot.setSize(size())));
   }
   if (box) {
     const { horizons, shown } = JSON.parse(box.dataset.rates);
     list.replaceChildren(...horizons.map((name, i) => new Option(`${name} s`, i, i === shown, i === shown)));
     list.addEventListener("change", drawRates);
     drawRates();
+    addEventListener("resize", () => plots.forEach((plot) => plot.setSize(size())));
   }
 
   const dark = matchMedia("(prefers-color-scheme: dark)");
