@@ -25,7 +25,7 @@ from jaxos4.report.text import percent, plain
 from jaxos4.study import metrics
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
-OF_EXAMPLE = {"trajectories", "deviations", "search", "training"}
+OF_EXAMPLE = {"deviations", "search"}
 
 
 def few(study):
@@ -93,7 +93,7 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
     xr.testing.assert_equal(read_results(tmp_path), study)
     code, out, err = run("report", str(tmp_path))
     assert (code, err) == (0, "")
-    assert "8 figures" in out
+    assert "6 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 

@@ -170,7 +170,7 @@ def test_it_follows_the_theme(opened, name, scheme):
 def test_a_checkbox_hides_an_estimator_everywhere(opened):
     page = opened()
     assert page.locator("tr[data-estimator='1']").count() == 5 * 2
-    for figure in ("overview", "error", "efficiency", "coverage", "trajectories", "deviations"):
+    for figure in ("overview", "error", "efficiency", "coverage", "deviations"):
         assert page.locator(f"#figure-{figure} [data-estimator='1']").count() > 1, figure
     shown = """place => [...document.querySelectorAll(`[data-estimator="${place}"]`)]
         .map(element => getComputedStyle(element).display !== "none")"""

@@ -23,11 +23,8 @@ from .html import draw, render
 from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
 
-BAND = 0.95
-"""The share of the errors that the band of the predictions holds."""
-
-# The horizon that the page shows first [s].
-_SHOWN = 0.25
+# The horizon that the page shows first [s], and the share of the errors that the band of the predictions holds.
+_SHOWN, _BAND = 0.25, 0.95
 _INERTIAS = ("Ix", "Iy", "Iz")
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
@@ -60,7 +57,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         ninety_five=NINETY_FIVE,
         rates=None if found.predictions is None else predicted_rates(found.predictions, used.sample_time, look),
         agreement={} if found.response is None else {n: _agreement(x) for n, x in found.response._asdict().items()},
-        band=f"{100 * BAND:g}",
+        band=f"{100 * _BAND:g}",
         drawings=drawings,
         command=used.command or "",
         notes=[*used.notes, *filter(None, [found.motor_clock])],
@@ -141,7 +138,7 @@ def predicted_rates(predicted: Predictions, sample_time: float, look: Style) -> 
     start, errors = predicted.start, np.abs(predicted.predicted - predicted.measured)
     usual = np.median(np.diff(start)) if start.size > 1 else 1
     breaks = np.flatnonzero(np.diff(start) > 1.5 * usual) + 1
-    half = np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), BAND, axis=0)
+    half = np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), _BAND, axis=0)
     measured, values = (
         np.insert(each, breaks, np.nan, axis=0).transpose(1, 2, 0) for each in (predicted.measured, predicted.predicted)
     )
@@ -149,7 +146,7 @@ def predicted_rates(predicted: Predictions, sample_time: float, look: Style) -> 
     arrays = {"start": start * sample_time, "measured": measured, "predicted": values, "half": half}
     return json.dumps(
         {name: np.where(np.isfinite(array), array.round(4), np.nan).tolist() for name, array in arrays.items()}
-        | {"horizons": [f"{x:.3g}" for x in predicted.horizons], "color": look.color, "band": f"{100 * BAND:g} %"}
+        | {"horizons": [f"{x:.3g}" for x in predicted.horizons], "color": look.color, "band": f"{100 * _BAND:g} %"}
         | {"shown": int(np.argmin(np.abs(predicted.horizons - _SHOWN)))}
     ).replace("NaN", "null")
 

@@ -1,4 +1,4 @@
-"""Figures of a study: of one scenario, of the example flight, and of the training.
+"""Figures of a study: of one scenario, and of the example flight.
 
 Each function returns `None` if its data are absent.
 """
@@ -13,20 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from ..study import metrics
 from .study_data import accuracy, bounds, error_unit, names, positive_scales
-from .style import (
-    BOUND_DASHES,
-    FAINT,
-    INK,
-    Style,
-    estimator_gid,
-    grid,
-    label,
-    legend,
-    log_axis,
-    scale_axis,
-    style,
-    styles,
-)
+from .style import BOUND_DASHES, INK, Style, estimator_gid, grid, label, legend, log_axis, scale_axis, style, styles
 from .text import plain
 
 _COLUMNS = 4
@@ -210,11 +197,8 @@ def search(data: xr.Dataset) -> Figure | None:
     return figure
 
 
-def trajectories(data: xr.Dataset, *, minus_truth: bool = False) -> Figure | None:
-    """The example flight: measured, true, and simulated with each estimate; or the simulations minus the truth.
-
-    A panel for each state that was measured.
-    """
+def deviations(data: xr.Dataset) -> Figure | None:
+    """The example flight simulated with each estimate, minus its truth: a panel for each state that was measured."""
     if "example_measured" not in data:
         return None
     known = data["example_measured"].notnull() & data["example_true"].notnull()
@@ -224,37 +208,13 @@ def trajectories(data: xr.Dataset, *, minus_truth: bool = False) -> Figure | Non
     figure, axes = grid(len(shown), columns=3, height=1.75)
     for panel, state in zip(axes, shown, strict=True):
         one = data.isel(state=state)
-        simulated = one["example_simulated"]
-        if minus_truth:
-            simulated = simulated - one["example_true"]
-            panel.axhline(0, color=INK, linewidth=0.8)
-        else:
-            panel.plot(one["time"], one["example_measured"], ".", color=FAINT, markersize=2)
-            panel.plot(one["time"], one["example_true"], color=INK, linewidth=1.0)
+        panel.axhline(0, color=INK, linewidth=0.8)
         for row, look in _looks(data):
-            y, gid = simulated.isel(estimator=row).values, estimator_gid(row)
+            y = (one["example_simulated"].isel(estimator=row) - one["example_true"]).values
             if np.isfinite(y).any():
-                panel.plot(one["time"], y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=gid)
+                line = {"color": look.color, "linestyle": look.dash, "linewidth": 1.1, "gid": estimator_gid(row)}
+                panel.plot(one["time"], y, **line)
         panel.set_title(f"{one['state'].item()} [{one['state_unit'].item()}]")
     label(figure, x="time [s]")
     legend(figure, names(data, "estimator"))
-    return figure
-
-
-def training(data: xr.Dataset) -> Figure | None:
-    """The training loss and the validation loss of each network."""
-    if "training_loss" not in data:
-        return None
-    titles = names(data, "training")
-    figure, axes = grid(len(titles), columns=3, width=3.2 * min(len(titles), 3) + 0.6, height=2.6)
-    for place, (panel, title) in enumerate(zip(axes, titles, strict=True)):
-        one = data.isel(training=place)
-        losses = np.stack([one["training_loss"].values, one["validation_loss"].values])
-        for row, name in enumerate(("training", "validation")):
-            panel.plot(one["training_step"].values, losses[row], label=name, markersize=3.5, **style(row).line)
-        if not (losses <= 0).any() and np.isfinite(losses).any():
-            log_axis(panel, "y")
-        panel.set_title(title)
-        panel.legend()
-    label(figure, x="step", y="loss")
     return figure

@@ -1,7 +1,6 @@
 """The report of a study: its figures with their captions, and one HTML page that needs no other file."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ MOST_DRAWN = 12
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
 
 
-# The figures of each scenario, and those of the example flight and of the networks. Each draws nothing if its data are
+# The figures of each scenario, and those of the example flight. Each draws nothing if its data are
 # absent. `study.html.j2` has their titles and captions.
 SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "overview": study_figures.overview,
@@ -30,10 +29,8 @@ SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "coverage": study_figures.coverage,
 }
 EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
-    "trajectories": study_figures.trajectories,
-    "deviations": partial(study_figures.trajectories, minus_truth=True),
+    "deviations": study_figures.deviations,
     "search": study_figures.search,
-    "training": study_figures.training,
 }
 
 
@@ -88,7 +85,6 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
     attributes = {name: str(value) for name, value in dataset.attrs.items()}
     estimators = names(dataset, "estimator")
     missing, cells = study_tables.cells_not_run(dataset)
-
     return render(
         "study.html.j2",
         title=attributes.get("title", "") or "A study",
