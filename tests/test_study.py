@@ -17,7 +17,6 @@ from small_study import COMMAND, environment, run_study, specification
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
-from jaxos4.shooting import cores
 from jaxos4.study import (
     OUTCOMES,
     Study,
