@@ -23,7 +23,7 @@ from jaxos4.noise import AbstractNoise
 from jaxos4.report.study_terminal import run_with_bar
 from jaxos4.report.style import Style, drawing, pdf, svg
 from jaxos4.shooting import ShootingProblem
-from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset, use_all_cores as use_all_cores
+from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""

@@ -116,5 +116,10 @@ from .noise import (
 )
 from .recording import Recording as Recording, join as join
 from .results import RESULTS as RESULTS, result_names as result_names
-from .shooting import InnovationsProblem as InnovationsProblem, ShootingProblem as ShootingProblem, Unknowns as Unknowns
+from .shooting import (
+    InnovationsProblem as InnovationsProblem,
+    ShootingProblem as ShootingProblem,
+    Unknowns as Unknowns,
+    on_all_cores as on_all_cores,
+)
 from .simulation import simulate as simulate

@@ -205,17 +205,11 @@ def _guesses(constants: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> None:
-    for name in _POSITIVE & constants.keys():
-        least, most = (0.0, np.inf) if name == "max_rotor_speed" else (1e-15, 1e6)
-        if not np.all((constants[name] > least) & (constants[name] <= most)):
-            raise InputError(
-                f"`{name}` must be positive and of a quadrotor's size in SI units, got {_short(table[name])}."
-            )
-    if constants.get("rotor_inertia", np.zeros(())) < 0:
-        raise InputError(f"`rotor_inertia` must not be negative, got {table['rotor_inertia']}.")
-    for name in ("rotor_positions", "rotor_inertia"):
-        if name in constants and np.any(np.abs(constants[name]) > 1e3):
-            raise InputError(f"`{name}` must be of a quadrotor's size in SI units, got {_short(table[name])}.")
+    for name, values in constants.items():
+        least, most = _SIZES.get(name, (1e-15, 1e6))
+        if not ((values >= least) & (values <= most)).all():
+            sign = "" if least < 0 else "not negative and " if least == 0 else "positive and "
+            raise InputError(f"`{name}` must be {sign}of a quadrotor's size in SI units, got {_short(table[name])}.")
     if np.any(np.abs(constants["rotor_spins"]) != 1):
         raise InputError(f"`rotor_spins` must be 1 (counter-clockwise) or -1, got {_short(table['rotor_spins'])}.")
     inertia = constants.get("inertia")
@@ -229,7 +223,9 @@ _VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
 _SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
 _OPTIONAL = {"gravity", "max_rotor_speed"}
 _GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
-_POSITIVE = _SHAPES.keys() - {"rotor_positions", "rotor_spins", "rotor_inertia"}
+# The least and the largest value, if they are not those of the other constants.
+_SIZES = {"rotor_positions": (-1e3, 1e3), "rotor_spins": (-1e3, 1e3), "rotor_inertia": (0.0, 1e3)}
+_SIZES["max_rotor_speed"] = (1e-15, math.inf)
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:

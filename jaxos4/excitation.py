@@ -19,6 +19,7 @@ STANDARD_TONES = ((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), (0.5, 0.9, 1.7))
 DOUBLET = (1.0, -1.0)
 STEP_3211 = (0.8, 0.8, 0.8, -1.2, -1.2, 1.1, -1.1)
 TAPER = 0.2
+_CHIRP = (0.6, 3.0)  # [Hz]
 
 Amplitude = float | Sequence[float] | Float[Numeric, "3"]
 
@@ -64,23 +65,21 @@ def doublet(
     duration: float = 5.0,
     dt: float = 0.01,
     amplitude: Amplitude = 1.0,
-    width: float = 0.3,
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
     """A doublet of torque about one axis after another.
 
-    The pulses + - end at rate zero and an angle of amplitude x width. The mirror image - + brings the angle back, and a
-    rest follows: five widths for an axis. The sequence repeats as often as it fits, then the quadrotor hovers. Only one
-    axis turns at a time, so alpha1, alpha4 and alpha7 are not excited.
+    The pulses + - of 0.3 s end at rate zero and an angle of amplitude x 0.3 s. The mirror image - + brings the angle
+    back, and a rest follows. The sequence repeats as often as it fits, then the quadrotor hovers. Only one axis turns
+    at a time, so alpha1, alpha4 and alpha7 are not excited.
 
     **Arguments:** those of `multisine`, and:
 
-    - `width`: length of one pulse [s], rounded to samples.
     - `axes`: some of `"roll"`, `"pitch"`, `"yaw"`, in the order in which they are excited.
 
     **Raises:** as `multisine`, and if the duration is too short.
     """
-    return _pulses(airframe, DOUBLET, duration, dt, amplitude, width, axes)
+    return _pulses(airframe, DOUBLET, 0.3, duration, dt, amplitude, axes)
 
 
 def step3211(
@@ -89,15 +88,14 @@ def step3211(
     duration: float = 5.0,
     dt: float = 0.01,
     amplitude: Amplitude = 1.0,
-    width: float = 0.1,
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
-    """Pulses of 3, 2, 1 and 1 widths and alternating sign about one axis after another; otherwise as `doublet`.
+    """Pulses of 0.3, 0.2, 0.1 and 0.1 s and alternating sign about one axis after another; otherwise as `doublet`.
 
-    Heights of 0.8, 1.2, 1.1 and 1.1 end at rest: 3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 = 0. The angle is then 2.96
-    amplitude x width. With its mirror image and a rest an axis takes 15 widths.
+    Heights of 0.8, 1.2, 1.1 and 1.1 end at rest: 3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 = 0. The angle is then amplitude x
+    0.296 s.
     """
-    return _pulses(airframe, STEP_3211, duration, dt, amplitude, width, axes)
+    return _pulses(airframe, STEP_3211, 0.1, duration, dt, amplitude, axes)
 
 
 def chirp(
@@ -106,29 +104,25 @@ def chirp(
     duration: float = 5.0,
     dt: float = 0.01,
     amplitude: Amplitude = (1.0, 1.0, 0.5),
-    frequencies: tuple[float, float] = (0.6, 3.0),
     axes: Sequence[str] = AXES,
 ) -> RotorSpeeds:
-    """A linear frequency sweep about one axis after another, faded in and out. The axes share the duration equally.
+    """A sweep from 0.6 to 3 Hz about one axis after another, faded in and out. The axes share the duration equally.
 
     As with `doublet`, alpha1, alpha4 and alpha7 are not excited.
 
-    **Arguments:** those of `multisine` and the `axes` of `doublet`, and:
-
-    - `amplitude`: the default yaw rate is half the others, because the yaw torque of rotors is small.
-    - `frequencies`: first and last [Hz], below half the sample rate.
+    **Arguments:** those of `doublet`. The yaw rate is half the others, because the yaw torque of rotors is small.
 
     **Raises:** as `multisine`, and if an axis gets less than one cycle.
     """
     intervals, order = _intervals(duration, dt), _axis_indices(axes)
-    _check_frequencies("frequencies", frequencies, dt)
-    first, last = frequencies
+    _check_frequencies("dt", _CHIRP, dt)
+    first, last = _CHIRP
     samples = intervals // len(order)
     span = (samples - 1) * dt
     if span * (first + last) / 2 < 1:
         least = len(order) * (2 / (first + last) + 2 * dt)
         raise ValueError(f"`duration` must be at least {least:.3g} s for one cycle on each axis, got {duration:g} s.")
-    sine, frequency = _sweep(samples, span, frequencies)
+    sine, frequency = _sweep(samples, span, _CHIRP)
     angle = np.pad(sine / (2 * math.pi * frequency), 1)
     rate = np.diff(angle) / dt
     shape = np.diff(rate) / dt / np.abs(rate).max()
@@ -139,18 +133,17 @@ Excite = Callable[..., RotorSpeeds]
 EXCITATIONS: dict[str, Excite] = {"multisine": multisine, "doublet": doublet, "3211": step3211, "chirp": chirp}
 
 
-def _pulses(airframe, heights, duration, dt, amplitude, width, axes) -> RotorSpeeds:
+def _pulses(airframe, heights, width, duration, dt, amplitude, axes) -> RotorSpeeds:
     intervals, order = _intervals(duration, dt), _axis_indices(axes)
-    if not math.isfinite(width) or round(width / dt) < 1:
-        raise ValueError(f"`width` must be at least one sample of {dt:g} s, got {width}.")
+    if round(width / dt) < 1:
+        raise ValueError(f"`dt` must be at most the width of a pulse, {width:g} s, got {dt:g} s.")
     once = np.repeat(heights, round(width / dt))
     shape = np.concatenate([once, -once, np.zeros(round(width / dt))])
     shape = shape / (np.abs(np.cumsum(shape)).max() * dt)
     sequence = len(order) * len(shape)
     if sequence > intervals:
         raise ValueError(
-            f"`duration` must be at least {sequence * dt:.6g} s for pulses of `width` {width:g} s on "
-            f"{len(order)} axes, got {duration:g} s."
+            f"`duration` must be at least {sequence * dt:.6g} s for pulses on {len(order)} axes, got {duration:g} s."
         )
     return _about_axes(airframe, shape, intervals, order, amplitude, dt)
 
@@ -207,9 +200,8 @@ def _axis_indices(axes: Sequence[str]) -> list[int]:
 
 def _check_frequencies(name: str, frequencies: Sequence[float], dt: float) -> None:
     if not all(0 < frequency < 0.5 / dt for frequency in frequencies):
-        raise ValueError(
-            f"`{name}` must lie between 0 and half the sample rate, {0.5 / dt:g} Hz, got {list(frequencies)} Hz."
-        )
+        most, got = 0.5 / dt, list(frequencies)
+        raise ValueError(f"`{name}`: frequencies must lie between 0 and half the sample rate, {most:g} Hz, got {got}.")
 
 
 # Pulses of a reference last about 0.3 periods of the controlled vehicle's attitude [s]. Each is as high as the others.

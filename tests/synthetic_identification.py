@@ -1,7 +1,10 @@
 """Identifications that nobody computed, of a flight and of a vehicle, with everything that a page can show."""
 
+from types import SimpleNamespace
+
 import msgspec
 import numpy as np
+from helpers import CRAZYFLIE
 
 from jaxos4 import AxisResponse, FrequencyResponse, Predictions
 from jaxos4.identification.results import (
@@ -14,6 +17,7 @@ from jaxos4.identification.results import (
     Provenance,
     RateSkill,
     RigidBody,
+    SampleTime,
     Validation,
 )
 
@@ -26,8 +30,14 @@ COLOURED = msgspec.structs.replace(WHITE, percent=81.26, level=4.0, correlation=
 CONSTANTS = {"Ix": Constant(1.733e-5, 1.5e-7, "kg m^2"), "J_R": Constant(1e-8, 1e-7, "kg m^2")}
 NOTED = {"Ix": msgspec.structs.replace(CONSTANTS["Ix"], note="if arms and mass are right"), "J_R": CONSTANTS["J_R"]}
 COMMON = {"estimator": "ibss", "result": "successful", "rollouts": 812, "cost": 1234.5, "seconds": 35.4}
-COMMON |= dict.fromkeys(("covariance", "estimate", "problem"))
+COMMON |= dict.fromkeys(("covariance", "estimate"))
+COMMON |= {"problem": SimpleNamespace(model=SimpleNamespace(airframe=CRAZYFLIE))}
 VERSIONS = {"airframe": "os4", "version": "0", "jax": "0", "device": "cpu", "precision": "float64"}
+
+SAMPLE_TIMES = tuple(
+    SampleTime(step, {"Ix": Constant(ix, 2e-7, "kg m^2"), "Iy": Constant(1.8e-5, 3e-7, "kg m^2")}, 0.1)
+    for step, ix in ((0.004, 1.64e-5), (0.008, 1.78e-5), (0.016, 1.8e-5))
+)
 
 
 def identified_flight(*, provenance=None, **changes) -> Identification:

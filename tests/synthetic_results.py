@@ -1,11 +1,10 @@
-"""Result files of `jaxos4 estimate` that nobody computed: an OS4's and a vehicle's, as dictionaries."""
+"""Result files of `jaxos4 estimate` that nobody computed, as dictionaries."""
 
 import numpy as np
 from helpers import CRAZYFLIE
 
-from jaxos4.airframe import OS4, airframe_table, alpha_from_inertia
+from jaxos4.airframe import airframe_table
 
-INERTIA = {"Ix": 7.7e-3, "Iy": 7.4e-3, "Iz": 1.29e-2, "J_R": 6.2e-5}
 # A Crazyflie whose rotors do not stand symmetrically.
 POSITIONS = [[0.028, -0.03], [-0.026, -0.03], [-0.028, 0.03], [0.028, 0.029]]
 AIRFRAME = airframe_table(CRAZYFLIE) | {"rotor_positions": POSITIONS}
@@ -17,26 +16,16 @@ VALUES |= {"rotor_reaction": 7e-4, "thrust_curve": 0.8, "thrust_gain": 1.1, "x_d
 SHARE = 0.01
 
 
-def os4_result(**changes):
-    """A corrected OS4, identified from one flight. Every alpha has a standard deviation of 1 %."""
-    *inertia, rotor = INERTIA.values()
-    alpha = np.asarray(alpha_from_inertia(np.array(inertia), np.array(rotor)))
-    constants = {name: {"estimate": value, "std": SHARE * value} for name, value in INERTIA.items()}
-    fixed = {"estimator": "ibss", "model": "corrected", "constants": constants, "airframe": airframe_table(OS4)}
-    return _result({f"alpha{i}": value for i, value in enumerate(alpha, start=1)}) | fixed | changes
-
-
 def vehicle_result(values=VALUES, **changes):
     """A vehicle, identified by filter error. Every parameter has a standard deviation of 1 %."""
     fixed = {"estimator": "filter-error", "model": "flight", "constants": {}, "airframe": AIRFRAME}
-    return _result(values) | fixed | {"held": {"alpha1": {"value": -0.7}}} | changes
-
-
-def _result(values):
     std = {name: SHARE * abs(value) for name, value in values.items()}
     return {
         "result": "successful",
         "parameters": {name: {"estimate": value, "std": std[name]} for name, value in values.items()},
         "provenance": {"version": "0.5.0"},
         "covariance": np.diag(np.square(list(std.values()))).tolist(),
+        "held": {"alpha1": {"value": -0.7}},
+        **fixed,
+        **changes,
     }

@@ -167,12 +167,4 @@ def _example(rng, estimators):
         variables["search_half_width"] = (("sweep", "parameter"), HALF_WIDTH * shrink)
         errors = HALF_WIDTH * 0.4 * 0.3 ** sweeps[:, None] * rng.standard_normal((9, 8)) + BOUND["all"]
         variables["search_estimate"] = (("sweep", "parameter"), TRUTH + errors)
-    if "network" in estimators:
-        steps = np.arange(0, 3001, 250.0)
-        loss = 0.02 + np.exp(-steps / 700)
-        pad = np.where(np.arange(13) < 10, 1.0, np.nan)
-        pairs = {"training_step": (steps, steps), "training_loss": (loss, 1.5 * loss)}
-        pairs |= {"validation_loss": (1.1 * loss, 1.7 * loss)}
-        variables |= {name: (("training", "check"), np.stack([a, b * pad])) for name, (a, b) in pairs.items()}
-        coordinates["training"] = ["network, rates", "hybrid, all"]
     return xr.Dataset(variables, coords=coordinates)

@@ -10,7 +10,7 @@ from test_inspect import LOGS
 from test_signs import flown, turned
 
 import jaxos4
-from jaxos4.logs import LogFacts, write_flight
+from jaxos4.logs import LogFacts
 from jaxos4.recording.drafting import FULL_SCALE, airframe_draft
 from jaxos4.recording.motion import RotorSigns, rotor_signs
 
@@ -111,13 +111,12 @@ def test_the_median_thrust_carries_the_mass(commanded, felt, tmp_path):
 
 def test_settings_of_the_autopilot_are_taken():
     positions = ((0.15, -0.2), (-0.15, 0.2), (0.15, 0.2), (-0.15, -0.2))
-    facts = LogFacts(rotor_positions=positions, rotor_spins=(1.0, 1.0, -1.0, -1.0), cells=4)
-    draft = airframe_draft(flown(CRAZYFLIE, 0)._replace(voltage=np.full(3750, 15.2), facts=facts))
+    facts = LogFacts(rotor_positions=positions, rotor_spins=(1.0, 1.0, -1.0, -1.0))
+    draft = airframe_draft(flown(CRAZYFLIE, 0)._replace(facts=facts))
     found = tomlkit.parse(draft.text)
     assert draft.missing == ("mass",)
     assert found["rotor_positions"] == [list(each) for each in positions]
     assert found["rotor_spins"] == [1, 1, -1, -1]
-    assert "# Battery: 4 cells, 15.2 V (median)." in draft.text
 
 
 def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
@@ -135,40 +134,12 @@ def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
     refused(run("inspect", "log", "--airframe", "mine.toml"), "`rotor_spins` must be finite numbers of shape [4]")
 
 
-def test_a_draft_starts_from_an_airframe(run, tmp_path):
-    write_flight(with_force(flown(CRAZYFLIE, 0), CRAZYFLIE).flight, tmp_path / "flight.csv", CRAZYFLIE)
-    own = "mass = 0.027  # weighed\narm = 0.04\nhover_speed = 900.0\n" + "".join(
-        f'{key} = "guess"\n' for key in ("inertia", "drag_coefficient", "rotor_inertia")
-    )
-    (tmp_path / "own.toml").write_text(own)
-    code, out, err = run("inspect", "flight.csv", "--airframe", "own.toml", "--airframe-out", "mine.toml")
-    assert (code, err) == (0, "")
-    text = (tmp_path / "mine.toml").read_text()
-    assert text.startswith(own)
-    airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
-    # Full scale is such that the flight hovers at the given speed; the spins come from the flight.
-    hover = float(CRAZYFLIE.hover_speed / CRAZYFLIE.max_rotor_speed)
-    assert float(airframe.max_rotor_speed) == pytest.approx(900.0 / hover, rel=1e-3)
-    np.testing.assert_array_equal(airframe.rotor_spins, CRAZYFLIE.rotor_spins)
-    code, _, _ = run("inspect", "flight.csv", "--airframe", "mine.toml", "--airframe-out", "again.toml")
-    assert code == 0
-    assert (tmp_path / "again.toml").read_text() == text  # nothing to add
-    (tmp_path / "other.toml").write_text(text.replace("900.0", "600.0"))
-    code, _, err = run("inspect", "flight.csv", "--airframe", "other.toml", "--airframe-out", "again.toml")
-    assert code == 2  # what somebody measured is not overwritten
-    assert "again.toml: exists" in err
-    assert (tmp_path / "again.toml").read_text() == text
-    assert run("inspect", "flight.csv", "--airframe", "other.toml", "--airframe-out", "third.toml")[0] == 0
-    assert "# The log says otherwise: hover_speed = 900" in (tmp_path / "third.toml").read_text()
-    assert run("inspect", "flight.csv", "--airframe", "os4", "--airframe-out", "os4.toml")[0] == 0
-    from_preset = jaxos4.load_airframe(tmp_path / "os4.toml")
-    assert float(from_preset.mass) == 0.65
-    assert float(from_preset.hover_speed / from_preset.max_rotor_speed) == pytest.approx(hover, rel=1e-3)
-
-
 def test_an_airframe_overwrites_no_input(run, tmp_path):
     (tmp_path / "log").write_bytes(LOGS["Crazyflie"])
     refused(run("inspect", "log", "--airframe-out", "log"), "would overwrite an input")
     refused(run("inspect", "log", "--out", "a", "--airframe-out", "a"), "--out and --airframe-out name one file")
     refused(run("inspect", "log", "--airframe-out", "none/mine.toml"), "none/mine.toml")
+    refused(run("inspect", "log", "--airframe-out", "log2", "--airframe", "os4"), "leave out --airframe")
+    (tmp_path / "mine.toml").write_text("mass = 1")
+    refused(run("inspect", "log", "--airframe-out", "mine.toml"), "mine.toml: exists")
     assert (tmp_path / "log").read_bytes() == LOGS["Crazyflie"]

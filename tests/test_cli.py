@@ -208,7 +208,6 @@ REFUSED = {
     "train flight.csv --out a.net --seed -1": ["--seed"],
     "train flight.csv --out flight.csv": ["would overwrite an input"],
     "train flight.csv --out missing/a.net": ["no such folder"],
-    "train flight.csv --out a.net --features raw --approximator cmac": ["`approximator`", "score"],
     "estimate x.csv --model none": ["'published', 'corrected'"],
     "simulate": ["'--out'; see `jaxos4 simulate --help`"],
     "simulate --out x.csv --duration five": ["'--duration'"],

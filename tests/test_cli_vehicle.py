@@ -151,7 +151,7 @@ def test_a_log_shows_whether_its_vehicle_is_real(vehicle, tmp_path):
 
 def test_each_measurement_is_either_fitted_or_held_out(vehicle):
     airframe = jaxos4.load_airframe(str(vehicle / "airframe.toml"))
-    prepared = prepare([read_recording(vehicle / f"flight{i}.csv", airframe) for i in (1, 2)], airframe)
+    prepared, *_ = prepare([read_recording(vehicle / f"flight{i}.csv", airframe) for i in (1, 2)], airframe)
     assert prepared.tested is not None
     fitted, held_out = (~np.isnan(np.asarray(f.states)[:, 7]) for f in (prepared.fitted, prepared.tested))
     assert (fitted ^ held_out).all()
@@ -170,7 +170,7 @@ def test_no_window_reaches_from_one_stretch_into_the_next(vehicle, tmp_path, ste
 
     original = tmp_path / "flight1.csv"
     paths = [rewritten(original, f"{i}.csv", partial(sampled, dt=dt)) for i, dt in enumerate(steps)]
-    prepared = prepare([read_recording(path, airframe) for path in paths], airframe, holdout=0.0)
+    prepared, *_ = prepare([read_recording(path, airframe) for path in paths], airframe, holdout=0.0)
     flight, windows = prepared.fitted, prepared.windows
     assert flight.time.shape[0] == windows * prepared.length
     assert flight.stretch is not None

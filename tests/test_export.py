@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 from helpers import refused
-from synthetic_results import AIRFRAME, INERTIA, VALUES, os4_result, vehicle_result
+from synthetic_results import AIRFRAME, VALUES, vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table
@@ -28,20 +28,9 @@ def test_the_table_of_an_airframe_can_be_read_again():
         assert airframe_table(airframe_from_table(table)) == table
 
 
-def test_an_estimate_is_exported_to_each_simulator(run, tmp_path):
-    code, _, err = run("simulate", "--duration", "2", "--noise", "1", "--out", "flight.csv")
-    assert code == 0, err
-    code, _, err = run("estimate", "flight.csv", "--channels", "rates", "--out", "found.json")
-    assert code == 0, err
-    written = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
-    found = read_result(tmp_path / "found.json")
-    assert found.successful
-    assert found.drawn == ("Ix", "Iy", "Iz")
-    np.testing.assert_allclose(found.vehicle.inertia, [written["constants"][name]["estimate"] for name in found.drawn])
+def test_an_estimate_is_exported_to_each_simulator(run, tmp_path, write):
+    write(vehicle_result())
     assert list(Simulator) == list(TARGETS) == list(CURVES)
-    std = np.sqrt(np.diagonal(found.covariance))
-    # `constants` are fitted to the estimate, and the export to alphas that one rigid body has: the slopes differ a bit.
-    np.testing.assert_allclose(std, [written["constants"][name]["std"] for name in found.drawn], rtol=0.02)
     for target, (_, suffix, *_) in TARGETS.items():
         code, out, err = run("export", "found.json", "--to", target, "--out", f"vehicle{suffix}", "--samples", "2")
         assert code == 0, err
@@ -172,17 +161,22 @@ def inertial(link):
 
 
 def test_samples_have_the_covariance_of_the_estimate(write):
-    found = read_result(write(os4_result()))
-    assert found.drawn == ("Ix", "Iy", "Iz", "J_R")
+    names = ("alpha3", "alpha6", "alpha8")
+    result = vehicle_result({name: VALUES[name] for name in names})
+    std = np.array([row["std"] for row in result["parameters"].values()])
+    result["covariance"] = (np.outer(std, std) * (0.5 + 0.5 * np.eye(3))).tolist()
+    found = read_result(write(result))
+    assert found.drawn == names
     count = 2000
     draws = [found.draw(number, seed=3)[0] for number in range(count)]
-    drawn = np.array([[*vehicle.inertia, vehicle.rotor_inertia] for vehicle in draws])
-    error = np.sqrt(np.diagonal(found.covariance))
-    np.testing.assert_array_less(np.abs(drawn.mean(axis=0) - list(INERTIA.values())), 4 * error / np.sqrt(count))
-    deviation = (drawn - drawn.mean(axis=0)) / error
-    wanted = found.covariance / np.outer(error, error)
+    drawn = np.array([1 / vehicle.inertia for vehicle in draws])
+    np.testing.assert_array_less(
+        np.abs(drawn.mean(axis=0) - [VALUES[name] for name in names]), 4 * std / np.sqrt(count)
+    )
+    deviation = (drawn - drawn.mean(axis=0)) / std
+    wanted = found.covariance / np.outer(std, std)
     np.testing.assert_array_less(np.abs(deviation.T @ deviation / count - wanted), 4 * np.sqrt(2 / count))
-    assert all(vehicle.mass == 0.65 for vehicle in draws)
+    assert all(vehicle.mass == AIRFRAME["mass"] for vehicle in draws)
 
 
 def test_a_sample_depends_on_its_number_and_on_the_seed_alone_and_has_its_own_notes(write):
@@ -250,17 +244,18 @@ def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tm
     [
         ("not JSON", ("found.json: not a result", "jaxos4 estimate --out")),
         ({"log": "flight.csv"}, ("found.json: not a result", "estimator")),
-        ({k: v for k, v in os4_result().items() if k != "airframe"}, ("found.json: not a result", "this version's")),
-        (os4_result(result="nonfinite_trajectory", covariance=None), ("nonfinite_trajectory", "no estimate")),
-        (os4_result(result="unheard"), ("`result` unheard",)),
-        (os4_result(model="other"), ("`model` other", "published, corrected, flight")),
-        (os4_result(constants={}), ("no moments of inertia", "more excitation")),
-        (os4_result(constants={name: {} for name in INERTIA}), ("found.json: not a result", "estimate")),
-        (os4_result(covariance=8 * [[1.0], []]), ("`covariance`",)),
-        (os4_result(covariance=(-np.eye(8)).tolist()), ("`covariance`", "run `jaxos4 estimate` again")),
+        (
+            {k: v for k, v in vehicle_result().items() if k != "airframe"},
+            ("found.json: not a result", "this version's"),
+        ),
+        (vehicle_result(result="nonfinite_trajectory", covariance=None), ("nonfinite_trajectory", "no estimate")),
+        (vehicle_result(result="unheard"), ("`result` unheard",)),
+        (vehicle_result(model="corrected"), ("`model` corrected", "--model flight")),
+        (vehicle_result(covariance=8 * [[1.0], []]), ("`covariance`",)),
+        (vehicle_result(covariance=(-np.eye(len(VALUES))).tolist()), ("`covariance`", "run `jaxos4 estimate` again")),
         (vehicle_result({}), ("holds no estimate",)),
         (vehicle_result(VALUES | {"alpha6": 0.0}), ("alpha6 is 0",)),
-        (os4_result(airframe={"mass": 1.0}), ("found.json", "`inertia` is missing")),
+        (vehicle_result(airframe={"mass": 1.0}), ("found.json", "`inertia` is missing")),
         (vehicle_result(VALUES | {"alpha8": 1e4}), ("Iz = 0.00011 kg m^2 exceeds", "correct the airframe")),
         (vehicle_result(VALUES | {"alpha3": -6e4}), ("Ix", "not positive")),
         (vehicle_result(VALUES | {"thrust_gain": -1.0}), ("found.json: no vehicle is like this",)),
@@ -290,7 +285,7 @@ def test_results_that_cannot_be_exported_are_refused(run, tmp_path, write, resul
     ],
 )
 def test_wrong_options_are_refused(run, tmp_path, write, options, fragments):
-    before = write(os4_result()).read_bytes()
+    before = write(vehicle_result()).read_bytes()
     (tmp_path / "taken-samples").mkdir()
     refused(run("export", "found.json", "--to", "mujoco", *options), *fragments)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "taken-samples"]
@@ -302,7 +297,7 @@ def test_wrong_options_are_refused(run, tmp_path, write, options, fragments):
 
 def test_names_of_files_cannot_break_a_file(write):
     name = "a---b\n'''-->.json"
-    found = read_result(write(os4_result(), name))
+    found = read_result(write(vehicle_result(), name))
     for target in ("mujoco", "sdf"):
         ElementTree.fromstring(export_vehicle(found, target).text)
     compile(export_vehicle(found, "rotorpy").text, "vehicle.py", "exec")

@@ -1,11 +1,13 @@
 """An identification as a page and as text; numbers and tables as text: no digit and no cell is lost."""
 
 import io
+import json
 import math
 
 import msgspec
 import numpy as np
 import pytest
+from helpers import CRAZYFLIE
 from hypothesis import given, strategies as st
 from jinja2 import UndefinedError
 from matplotlib.figure import Figure
@@ -13,6 +15,7 @@ from rich.console import Console
 from synthetic_identification import (
     COLOURED,
     CONSTANTS,
+    SAMPLE_TIMES,
     WHITE,
     identified_flight,
     identified_vehicle,
@@ -21,18 +24,23 @@ from synthetic_identification import (
 )
 from test_report import stands_alone, words
 
+from jaxos4.analysis.inertia import CenterOfMass
 from jaxos4.identification.results import (
-    Constant,
     Disturbance,
     Doubt,
     HeldParameter,
     ParameterEstimate,
     RigidBody,
-    SampleTime,
     Validation,
 )
 from jaxos4.report import print_identification, write_flight_page
-from jaxos4.report.identification_page import frequency_responses, inertias_by_sample_time, predicted_rates
+from jaxos4.report.identification_page import (
+    frequency_responses,
+    inertias_by_sample_time,
+    predicted_rates,
+    vehicle,
+    verdict,
+)
 from jaxos4.report.style import drawing, pdf, styles, svg
 from jaxos4.report.text import MISSING, Listing, plain
 
@@ -58,7 +66,8 @@ def says(text, *parts):
 
 
 def test_the_page_says_what_was_found(tmp_path):
-    _, shown = written(tmp_path / "flight.html")
+    text, shown = written(tmp_path / "flight.html")
+    assert text.index("Nothing speaks against this estimate") < text.index("<main>")
     says(
         shown,
         "ibss, flight model, successful, 812 rollouts, 35.4 s, cost 1230",
@@ -69,50 +78,79 @@ def test_the_page_says_what_was_found(tmp_path):
         "p = 0.21",
         "377 starts",
         "0.248 0.73 ± 0.14 0.41 0.400 0.800",
-        "0.5 s ahead",
-        "Frequency response Measured angular acceleration over",
+        "Predicted ahead",
+        "where the coherence exceeds 0.6",
         "jaxos4 estimate flight.csv --model flight --report flight.html",
         "t is not uniform",
         "sample time 0.004",
     )
 
 
-def test_the_figure_holds_the_predictions_and_a_band_of_95_percent():
+def test_the_rates_are_the_predictions_with_a_band_of_95_percent():
     predicted = synthetic_predictions()
-    figure = predicted_rates(predicted, 0.004, 1, styles(["ibss"])["ibss"])
-    line, measured = (line.get_xydata() for line in figure.axes[1].lines)
+    drawn = json.loads(predicted_rates(predicted, 0.004, styles(["ibss"])["ibss"]))
+    assert drawn["horizons"][drawn["shown"]] == "0.248"
     # A break between the stretches, and each prediction at the time that it is of.
-    assert np.flatnonzero(np.isnan(line[:, 0])).tolist() == [80]
-    keep = ~np.isnan(line[:, 0])
-    np.testing.assert_allclose(line[keep, 0], 0.004 * predicted.start + 0.248)
-    np.testing.assert_array_equal(line[keep, 1], predicted.predicted[:, 1, 1])
-    np.testing.assert_array_equal(measured[keep, 1], predicted.measured[:, 1, 1])
-    band = np.concatenate([path.vertices for path in figure.axes[1].collections[0].get_paths()])
-    half = band[:, 1].max() - np.nanmax(line[:, 1])
-    errors = np.abs(predicted.predicted - predicted.measured)[:, 1, 1]
-    assert (errors <= half + 1e-9).mean() == pytest.approx(0.95, abs=0.015)
+    assert drawn["measured"][1][1][80] is drawn["predicted"][1][1][80] is None
+    assert drawn["start"] == sorted(drawn["start"])
+    for name, values in (("predicted", predicted.predicted), ("measured", predicted.measured)):
+        kept = np.delete(np.array(drawn[name], dtype=float), 80, axis=2)
+        np.testing.assert_allclose(kept.transpose(2, 0, 1), values, atol=5.1e-5)
+    np.testing.assert_allclose(np.delete(drawn["start"], 80), 0.004 * predicted.start, atol=1e-9)
+    errors = np.abs(predicted.predicted - predicted.measured)
+    np.testing.assert_allclose(drawn["half"], np.nanquantile(errors, 0.95, axis=0), atol=5.1e-5)
 
 
-def test_the_figure_says_how_strongly_each_axis_answers():
+def test_the_figure_says_how_strongly_each_axis_answers(tmp_path):
     found = synthetic_response()
     with drawing():
         figure = frequency_responses(found, styles(["ibss"])["ibss"])
     low, high = found.roll.agreement().interval
-    titles = [panel.get_title(loc="left") for panel in figure.axes[:3]]
-    assert titles[0] == f"roll: 1.25 ({low:.2f} to {high:.2f}) times the model"
-    assert titles[1].startswith("pitch: 0.50 (")
-    assert titles[2] == "yaw: no clear response"
-    for row, values in ((0, found.roll.gain), (3, np.degrees(found.roll.phase)), (6, found.roll.coherence)):
-        np.testing.assert_allclose(figure.axes[row].lines[0].get_ydata(), values)
+    _, shown = written(tmp_path / "flight.html")
+    says(shown, f"roll: 1.25 ({low:.2f} to {high:.2f}) times the model; pitch: 0.50 (", "yaw: no clear response.")
+    for panel, values in ((0, found.roll.gain), (1, np.degrees(found.roll.phase)), (2, found.roll.coherence)):
+        np.testing.assert_allclose(figure.axes[panel].lines[0].get_ydata(), values)
     # What is not clear has no band and no strong line.
-    assert not figure.axes[2].collections[0].get_paths()
-    assert np.isnan(np.asarray(figure.axes[2].lines[1].get_ydata(), dtype=float)).all()
+    assert not figure.axes[6].collections[0].get_paths()
+    assert np.isnan(np.asarray(figure.axes[6].lines[1].get_ydata(), dtype=float)).all()
 
 
-SAMPLE_TIMES = tuple(
-    SampleTime(step, {"Ix": Constant(ix, 2e-7, "kg m^2"), "Iy": Constant(1.8e-5, 3e-7, "kg m^2")}, 0.1)
-    for step, ix in ((0.004, 1.64e-5), (0.008, 1.78e-5), (0.016, 1.8e-5))
+def test_the_vehicle_is_drawn_as_it_was_identified(tmp_path):
+    names = ("alpha3", "alpha6", "roll_thrust", "pitch_thrust")
+    values = dict(zip(names, (6e4, 5e4, -1.62, 2.7), strict=True))
+    rows = {name: ParameterEstimate(x, 0.0, None, (x, x), "", "") for name, x in values.items()}
+    covariance = np.diag(np.square([0.0, 0.0, 0.162, 0.27])).tolist()
+    _, shown = written(tmp_path / "flight.html", parameters=rows, covariance=covariance)
+    says(shown, "centre of mass, x 2.00 ± 0.39 mm, y 1.00 ± 0.20 mm (95 %)")
+    with drawing():
+        place = (CenterOfMass("x", 2e-3, 2e-4), CenterOfMass("y", 1e-3, 1e-4))
+        above, bars = vehicle(CRAZYFLIE, CONSTANTS, place, styles(["ibss"])["ibss"]).axes
+    # Rotor 1 is at the front on the right. The centre of mass is at the front on the left.
+    assert [text.get_position() for text in above.texts if text.get_text() == "1"] == [(28.0, 28.0)]
+    cross = next(line for line in above.lines if line.get_marker() == "P")
+    np.testing.assert_allclose(cross.get_xydata(), [[-1.0, 2.0]])
+    # Seen from above, rotor 1 turns counter-clockwise and rotor 2 clockwise.
+    for arc, center, spin in ((above.lines[1], (28, 28), 1), (above.lines[3], (28, -28), -1)):
+        (x, y), (u, v) = (arc.get_xydata()[:-1] - center).T, np.diff(arc.get_xydata(), axis=0).T
+        assert (np.sign(x * v - y * u) == spin).all()
+    assert [bar.get_width() for bar in bars.patches] == [CONSTANTS["Ix"].estimate]
+    assert [text.get_text().strip() for text in bars.texts] == ["not identified"] * 2
+
+
+DOUBTS = (Doubt("not_physical", "Ix is negative", "check the arms"),)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "Nothing speaks against this estimate: Ix 1.73e-5 ± 2.9e-7 kg m² (95 %); Iy is not identified; Iz is not"),
+        ({"result": "implausible", "doubts": DOUBTS}, "Not to be trusted: Ix is negative; check the arms."),
+        ({"result": "max_sweeps"}, "Not to be trusted: the search did not converge"),
+        ({"result": "nonfinite_trajectory"}, "There is no answer: "),
+    ],
 )
+def test_the_verdict_is_one_sentence(changes, said):
+    says(verdict(identified_vehicle(**changes)), said)
 
 
 def test_the_inertias_of_all_sample_times_are_shown(tmp_path):
@@ -125,10 +163,11 @@ def test_the_inertias_of_all_sample_times_are_shown(tmp_path):
     says(shown, "Moment of inertia against sample time")
     with drawing():
         figure = inertias_by_sample_time(SAMPLE_TIMES, 0.008, styles(["ibss"])["ibss"])
-    drawn = np.asarray(figure.axes[0].lines[0].get_ydata(), dtype=float)
-    np.testing.assert_allclose(drawn, np.array([1.64, 1.78, 1.8]) / 1.78)
+    chosen, line, *_ = figure.axes[0].lines
+    np.testing.assert_allclose(chosen.get_ydata(), 1.78e-5)
+    np.testing.assert_allclose(np.asarray(line.get_ydata(), dtype=float), [1.64e-5, 1.78e-5, 1.8e-5])
     bar = figure.axes[0].collections[0].get_segments()[1]
-    assert np.ptp(bar[:, 1]) == pytest.approx(2 * 1.96 * 2e-7 / 1.78e-5, rel=1e-3)
+    assert np.ptp(bar[:, 1]) == pytest.approx(2 * 1.96 * 2e-7, rel=1e-3)
     assert figure.axes[2].get_title(loc="left") == "Iz: not identified"
     svg(figure)
 
@@ -144,7 +183,7 @@ def test_motors_that_are_recorded_late_are_named(tmp_path):
 def test_without_predictions_and_constants_the_page_leaves_them_out(tmp_path):
     changes = {"predictions": None, "skill": None, "response": None, "rigid_body": RigidBody()}
     text, shown = written(tmp_path / "flight.html", **changes)
-    absent = ("Measured against predicted", "Skill", "Constants", "Frequency response")
+    absent = ("Measured and predicted", "Skill", "Constants", "Frequency response")
     assert not any(said in shown for said in absent)
     assert len(text) < 100_000
 
@@ -164,7 +203,7 @@ def test_an_older_page_is_kept_if_the_new_one_cannot_be_made(tmp_path):
     path = tmp_path / "flight.html"
     path.write_text("of before")
     with pytest.raises(UndefinedError):
-        write_flight_page(path, msgspec.structs.replace(identified_vehicle(), rigid_body=None), title="")
+        write_flight_page(path, msgspec.structs.replace(identified_vehicle(), held=None), title="")
     assert path.read_text() == "of before"
     with pytest.raises(FileNotFoundError):
         write_flight_page(tmp_path / "none" / "a.html", identified_vehicle(), title="")

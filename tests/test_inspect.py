@@ -26,7 +26,7 @@ def test_each_format_is_inspected(kind, run, tmp_path):
     code, out, err = run("inspect", "log", "--airframe", "vehicle.toml", "--out", "log.json")
     assert (code, err) == (0, "")
     assert len(out.splitlines()) < 40  # a screen
-    for words in ("p q r: ", "rad/s", "usable", "good (", "identifiable: alpha1, "):
+    for words in ("p q r: ", "rad/s", "usable", "good ("):
         assert words in out
     report = json.loads((tmp_path / "log.json").read_text())
     assert report["format"] == kind
@@ -34,26 +34,18 @@ def test_each_format_is_inspected(kind, run, tmp_path):
     (part,) = report["parts"]
     assert part["usable"]
     assert part["excitation"]["roll"]["verdict"] == "good"
-    assert list(report["identifiable"]["parameters"]) == [f"alpha{i}" for i in range(1, 9)]
-    code, out, err = run("inspect", "log")
-    assert (code, err) == (0, "")
-    assert "give --airframe to see which parameters are identifiable" in out
 
 
 def test_a_simulated_flight_and_what_it_cannot_tell(run, tmp_path):
     assert run("simulate", "--duration", "3", "--noise", "1", "--out", "flight.csv")[0] == 0
-    code, out, err = run("inspect", "flight.csv", "--airframe", "os4", "--out", "f.json")
+    code, out, err = run("inspect", "flight.csv", "--airframe", "os4")
     assert (code, err) == (0, "")
     assert "flight CSV, 0.00 to 3.00 s, 301 samples, one every 10 ms" in out
-    found = json.loads((tmp_path / "f.json").read_text())["identifiable"]["parameters"]
-    assert found["alpha3"] == {"identifiable": True, "note": ""}
-    assert "%" not in out.split("identifiable: ")[1]  # no bound that a fit of a real vehicle does not reach
     rows = [f"{0.01 * k:.2f},226,226,226,226,0,0,0" for k in range(200)]
     (tmp_path / "hover.csv").write_text("\n".join(["t,omega1,omega2,omega3,omega4,p,q,r", *rows]))
     code, out, err = run("inspect", "hover.csv", "--airframe", "os4")
     assert (code, err) == (0, "")
-    for words in ("none (0)", "identifiable: nothing", "alpha3: not identifiable: not excited"):
-        assert words in out
+    assert "none (0)" in out
 
 
 def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
@@ -69,7 +61,7 @@ def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
 BAD = {
     "missing": (None, "there is no such file"),
     "empty": (b"", "is empty"),
-    "ulog": (LOGS["ULog"][:14], "ends within its header"),
+    "ulog": (LOGS["ULog"][:14], "Header too short"),
     "nothing flown": (crazyflie([("e", ["a.b(f)"], [0.0, 1.0], np.zeros((2, 1)))]), "no body rates"),
 }
 

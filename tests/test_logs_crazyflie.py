@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from helpers import CRAZYFLIE
 from recorded_logs import GRAVITY, RPM, attitude, check, crazyflie, force, position, rates, speeds, velocity
-from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError
 from jaxos4.logs import read_log
@@ -45,13 +44,11 @@ def one_event(t, **options):
 T = 0.004 * np.arange(750) + 3.0
 
 
-def test_events_of_other_rates_and_a_quaternion(save):
+def test_events_of_other_rates(save):
     slow, commands = T[::5] + 0.001, T[::2] - 0.003
-    q = Rotation.from_matrix(attitude(slow)).as_quat()
     events = [
         ("gyros", GYRO, T, sensors(T)),
-        ("estimate", [f"stateEstimate.q{axis}(f)" for axis in "xyzw"] + ["stateEstimate.z(e)"], slow,
-         np.column_stack([q, position(slow)[:, 2]])),
+        ("estimate", [*STATE[:3], "stateEstimate.z(e)"], slow, np.column_stack([angles(slow), position(slow)[:, 2]])),
         ("motors", MOTORS + ["pm.vbat(f)"], commands, np.column_stack([ratios(commands), 4.0 - 0.1 * commands])),
         ("never", ["a.b(B)"], np.zeros(0), np.zeros((0, 1))),
     ]  # fmt: skip

@@ -7,7 +7,6 @@ from hypothesis.extra import numpy as hnp
 from recorded_logs import rates
 from test_flight_csv import csv, read_flight_and_notes
 from test_logs_ulog import grid
-from test_logs_values import columns
 
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import LogFacts, Sampling, Table
@@ -75,6 +74,12 @@ def test_rows_that_are_missing_from_a_grid_are_not_measured(save):
     assert len(notes) == 1
     assert "17 rows were resampled to 20 samples, one every 10 ms" in notes[0]
     assert "2 gaps of up to 30 ms: the 3 samples in gaps hold the rotor speeds" in notes[0]
+
+
+def columns(names, t, *values):
+    """A file of some columns, with rotors that turn at 9 rad/s."""
+    rows = [",".join(map(repr, [row[0], 9, 9, 9, 9, *row[1:]])) for row in np.column_stack([t, *values]).tolist()]
+    return csv(",".join(["t,omega1,omega2,omega3,omega4", *names]), rows)
 
 
 @pytest.mark.parametrize("offset", [0.004, 0.009])

@@ -8,62 +8,10 @@ import test_logs_crazyflie as crazyflie
 import test_logs_ulog as ulog
 from helpers import CRAZYFLIE, refused
 from recorded_logs import RPM, VEHICLE, blackbox_csv, outcome, rates, speeds, table_csv
-from test_flight_csv import csv, read_flight_and_notes, refusal
+from test_flight_csv import csv, read_flight_and_notes
 
-import jaxos4.logs.assemble as assemble_module
 from jaxos4.flight import STATE_NAMES
-from jaxos4.logs import Sampling, read_flight, read_log, read_recording
-
-# Angles against rates
-
-
-def columns(names, t, *values):
-    """A file of some columns, with rotors that turn at 9 rad/s."""
-    rows = [",".join(map(repr, [row[0], 9, 9, 9, 9, *row[1:]])) for row in np.column_stack([t, *values]).tolist()]
-    return csv(",".join(["t,omega1,omega2,omega3,omega4", *names]), rows)
-
-
-def spin(scale_angle=1.0, scale_rate=1.0, rate=3.0, noise=0.0, names=("phi", "p")):
-    """A file of five seconds of one angle and its rate, in units of choice."""
-    rng = np.random.default_rng(0)
-    t = np.arange(500) * 0.01
-    angle = 0.4 * np.sin(rate * t) + noise * 0.005 * rng.normal(size=500)
-    speed = 0.4 * rate * np.cos(rate * t) + noise * 0.01 * rng.normal(size=500)
-    return columns(names, t, scale_angle * angle, scale_rate * speed)
-
-
-@pytest.mark.parametrize("names", [("phi", "p"), ("theta", "q"), ("psi", "r")])
-def test_an_angle_at_odds_with_its_rate_is_refused(names, save):
-    degrees = 180 / np.pi
-    assert read_flight_and_notes(save(spin(names=names, noise=1)))[1] == ()
-    message = refusal(save(spin(degrees, names=names, noise=1)))
-    assert message.startswith(f"column {names[0]}: ")
-    assert "degrees" in message
-    message = refusal(save(spin(scale_rate=degrees, rate=2.0, names=names, noise=1)))
-    assert message.startswith(f"column {names[1]}: ")
-    assert "deg/s" in message
-    for scale in ((20.0, 1.0), (1.0, 15.0), (1.5, -1.0)) if names[0] == "psi" else ():  # other disagreements
-        read_flight(save(spin(*scale, rate=2.0, names=names)))
-
-
-def test_noise_alone_is_no_degrees(save):
-    """Hovering: over 0.2 s, noise in the angle is some 57 times the integral of noise in the rate, by chance."""
-    rng = np.random.default_rng(1)
-    angle, rate = 0.005 * rng.normal(size=500), 2.8e-3 * rng.normal(size=500)
-    path = save(columns(("psi", "r"), 0.01 * np.arange(500), angle, rate))
-    assert read_flight_and_notes(path)[1] == ()
-    with pytest.MonkeyPatch.context() as patch:  # without the check that the two are similar
-        patch.setattr(assemble_module, "_SIMILARITY", -1.0)
-        assert "looks like degrees" in refusal(path)
-
-
-def test_a_flip_is_no_degree(save):
-    """Three turns of roll are 19 rad, as the roll rate says; without it they are refused."""
-    t = np.arange(200) * 0.01
-    flight = read_flight(save(columns(("phi", "p"), t, 10 * t, 10.0 + 0 * t)))
-    assert flight.states[-1, STATE_NAMES.index("phi")] == 10 * t[-1]
-    message = refusal(save(columns(("phi", "q"), t, 10 * t, 10.0 + 0 * t)))
-    assert message.startswith("row 65, column phi: is 6.3 rad")
+from jaxos4.logs import Sampling, read_log, read_recording
 
 
 def test_an_accelerometer_that_never_changes_is_off(save):

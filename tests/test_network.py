@@ -96,7 +96,6 @@ def test_training_learns_and_comes_near_the_bound():
 OTHER_NETWORKS = [
     {},
     {"features": "raw", "steps": 1},
-    {"approximator": "cmac", "steps": 50, "learning_rate": 0.005},
     {"noise": (1.0, 1.0), "steps": 50},
     {"channels": "attitude", "steps": 1},
 ]
@@ -121,7 +120,7 @@ def test_intervals_hold_whatever_the_networks_quality(changes):
 
 def test_the_same_key_gives_the_same_network_and_another_another():
     small = jaxos4.NetworkEstimator(**SHORT)
-    a, b, c = (small.fit(problem_of(), BRACKET, key=jax.random.key(k), progress=k == 1) for k in (0, 0, 1))
+    a, b, c = (small.fit(problem_of(), BRACKET, key=jax.random.key(k)) for k in (0, 0, 1))
     assert same(a, b)
     assert not same(a.regressor, c.regressor)
 
@@ -169,7 +168,6 @@ def test_a_training_that_cannot_succeed_says_why(changes, off, message):
     ("changes", "bracket", "message"),
     [
         ({"features": "fourier"}, BRACKET, r"`features` must be one of score, raw, got 'fourier'"),
-        ({"features": "raw", "approximator": "cmac"}, BRACKET, r"needs `features` \"score\""),
         ({"steps": 0}, BRACKET, r"`steps` must be an integer of at least 1"),
         ({"held_out": 10}, BRACKET, r"`held_out` must be an integer of at least 1000"),
         ({"learning_rate": np.nan}, BRACKET, r"`learning_rate` must be positive"),

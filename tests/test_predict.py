@@ -12,7 +12,7 @@ from helpers import CRAZYFLIE, compiled_programs, refused
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from small_experiments import report_of
-from synthetic_results import os4_result, vehicle_result
+from synthetic_results import vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_table
@@ -113,15 +113,16 @@ def reference(begin, squares, steps):
     return np.array(states)
 
 
-@pytest.mark.parametrize("pitch", [0.2, np.pi / 2, 2.0])
-def test_a_prediction_is_the_solution_of_newton_and_euler(write, pitch):
-    """From any attitude, that at which Euler angles are singular too."""
+@pytest.mark.parametrize(("pitch", "turning"), [(0.2, 0.0), (1.5, 3.0)])
+def test_a_prediction_is_the_solution_of_newton_and_euler(write, pitch, turning):
+    """Through any attitude, that at which Euler angles are singular too."""
     flight, terms = flown(1), ("damping", "accelerometer", "inflow", "drag")
     generator = np.random.default_rng(3)
     hover = float(CRAZYFLIE.hover_speed)
     omega = hover * (1 + 0.02 * generator.standard_normal(np.shape(flight.omega)))
     states = np.array(flight.states)
     states[:, [6, 8, 10]] = [0.5, pitch, -2.0]
+    states[::300, 9] += turning
     states[np.arange(len(states)) % 300 > 0, 1:6:2] = (
         np.nan
     )  # no changes of velocity that the model would have to learn
@@ -269,11 +270,12 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
 @pytest.mark.parametrize(
     ("content", "options", "fragments"),
     [
-        (os4_result(), (), ("found.json", "holds no vehicle, but a corrected OS4")),
+        (result(model="corrected"), (), ("found.json", "`model` corrected: only a vehicle")),
         (result(disturbances={}), (), ("found.json", "does not say its disturbances")),
         (result(provenance={"terms": ["warp"], "sample_time": DT}), (), ("found.json", "cannot have its terms, warp")),
         (result(covariance=None), (), ("holds no estimate",)),
         (result(), ("--horizon", "30"), ("log.csv", "--horizon", "give at most")),
+        (result(), ("--sample-time", "0.001"), ("--sample-time 0.001", "one sample every 0.01 s")),
         (result(), ("--horizon", "nan"), ("--horizon", "positive")),
         (result(), ("--spacing", "-1"), ("--spacing", "at least 0")),
         (result(), ("--seed", "-1"), ("--seed",)),

@@ -8,21 +8,24 @@ import re
 from xml.etree import ElementTree
 
 import h5py
+import matplotlib.colors
 import matplotlib.figure
 import numpy as np
 import pytest
 import xarray as xr
 from helpers import refused
 from rich.console import Console
+from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
+from jaxos4.estimators import ESTIMATORS as REGISTRY
 from jaxos4.report import error_table, read_results, study_page, write_report
-from jaxos4.report.style import drawing, grid, log_axis
+from jaxos4.report.style import drawing, grid, log_axis, styles
 from jaxos4.report.text import percent, plain
 from jaxos4.study import metrics
 
-OF_SCENARIO = {"error", "efficiency", "distribution", "rollouts", "coverage"}
-OF_EXAMPLE = {"trajectories", "deviations", "search", "training"}
+OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
+OF_EXAMPLE = {"deviations", "search"}
 
 
 def few(study):
@@ -90,7 +93,7 @@ def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_p
     xr.testing.assert_equal(read_results(tmp_path), study)
     code, out, err = run("report", str(tmp_path))
     assert (code, err) == (0, "")
-    assert "9 figures" in out
+    assert "6 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
@@ -140,6 +143,7 @@ def test_trouble_is_named(report):
     shown = words(report[0].read_text(encoding="utf-8"))
     for said in (
         "Incomplete: 1 of 12 cells",
+        "Most accurate, within Monte-Carlo error: ",
         "1 of 12 cells failed",
         "scale 10.0, estimator svsf: FloatingPointError: <b>the filter's covariance</b> is not",
         "noise x 0.1, ibss, flight 1: at bound",
@@ -230,6 +234,33 @@ def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
         settings = dict(matplotlib.rcParams)
         assert study_page.draw(study_page.EXAMPLE_FIGURES, study) == before
         assert dict(matplotlib.rcParams) == settings
+
+
+# What linear red, green and blue become for a reader without red or green cones (Machado et al. 2009, severity 1).
+VISIONS = {
+    "all cones": np.eye(3),
+    "no red cones": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+    "no green cones": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+}
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def cielab(linear):
+    f = np.cbrt(np.clip(linear @ TO_XYZ.T, 1e-4, None) / [0.9505, 1.0, 1.089])
+    return np.stack([116 * f[:, 1] - 16, 500 * (f[:, 0] - f[:, 1]), 200 * (f[:, 1] - f[:, 2])], axis=1)
+
+
+@pytest.mark.parametrize("vision", VISIONS.values(), ids=VISIONS)
+def test_estimators_differ_in_colour_mark_and_line_for_every_reader(vision):
+    looks = styles(list(REGISTRY)).values()
+    for kind in zip(*looks, strict=True):
+        assert len(set(kind)) == len(REGISTRY)
+    linear = np.array([matplotlib.colors.to_rgb(look.color) for look in looks])
+    linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
+    luminance = linear @ TO_XYZ[1]
+    assert (1.05 / (luminance + 0.05)).min() > 3  # on white paper
+    assert ((luminance + 0.05) / (0.0097 + 0.05)).min() > 3  # on dark paper
+    assert pdist(cielab(np.clip(linear @ np.transpose(vision), 0, 1))).min() > 17
 
 
 @pytest.mark.parametrize("low", [0.04, 0.3, 0.62, 0.84, 0.95, 0.99])

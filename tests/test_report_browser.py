@@ -1,31 +1,103 @@
-"""The reports as a reader sees them: in chromium, on a desktop and on a phone, in light and in dark."""
+"""The reports as a reader sees them: in chromium, on a phone, a tablet and a desktop, in light and in dark."""
 
 import os
 import shutil
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from synthetic_identification import identified_vehicle
-from synthetic_study import synthetic_study
+from synthetic_identification import SAMPLE_TIMES, identified_flight, identified_vehicle
+from synthetic_study import ESTIMATORS, synthetic_study
 
+from jaxos4 import PublishedOS4
+from jaxos4.design import Design
+from jaxos4.design.task import Designed
 from jaxos4.report import write_flight_page, write_report
+from jaxos4.report.design_page import write_design
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-# The width and an attribute of each element, in one question to the browser.
-WIDTHS = "(all, name) => all.map(element => [element.getBoundingClientRect().width, element.getAttribute(name)])"
 BACKGROUND = {"light": "rgb(255, 255, 255)", "dark": "rgb(22, 25, 29)"}
+# The width of each element, and the pixels that it needs for letters of a readable size, in one question.
+WIDTHS = "all => all.map(one => [one.getBoundingClientRect().width, one.viewBox.baseVal.width])"
+# The texts that a reader sees, with their boxes: lines of HTML, and texts of figures, which are outlines.
+TEXTS = r"""() => {
+  const found = [];
+  const seen = (element) => element.checkVisibility({visibilityProperty: true});
+  const add = (text, box) => box.width > 1 && found.push([text, box.left, box.top, box.right, box.bottom]);
+  const walk = document.createTreeWalker(document.body ?? document.documentElement, NodeFilter.SHOW_TEXT);
+  while (walk.nextNode()) {
+    const node = walk.currentNode, holder = node.parentElement;
+    if (!node.data.trim() || !seen(holder) || holder.closest("svg, script, style, option, noscript")) continue;
+    const range = document.createRange();
+    range.selectNodeContents(node);
+    for (const box of range.getClientRects()) add(node.data.trim().slice(0, 30), box);
+  }
+  for (const group of document.querySelectorAll('g[id*="text_"]')) {
+    if (seen(group)) add(group.id, group.getBoundingClientRect());
+  }
+  return found;
+}"""
+# The texts of figures that are not completely inside their panel, which cuts them.
+CUT = """() => [...document.querySelectorAll('svg g[id*="text_"]')].filter(text => {
+  const box = text.getBoundingClientRect(), panel = text.ownerSVGElement.getBoundingClientRect();
+  return box.width && (box.left < panel.left - 1 || box.right > panel.right + 1
+    || box.top < panel.top - 1 || box.bottom > panel.bottom + 1);
+}).map(text => text.id)"""
+WIDE = """() => [...document.querySelectorAll("*")]
+  .filter(element => element.checkVisibility() && element.scrollWidth > element.clientWidth + 1
+    && /auto|scroll/.test(getComputedStyle(element).overflowX)).map(element => element.outerHTML.slice(0, 80))"""
+
+
+def overlapping(texts, *, by=1.0):
+    """Pairs of texts that share more than `by` pixels in both directions."""
+    texts = sorted(texts, key=lambda text: text[1])
+    found = []
+    for i, (name, left, top, right, bottom) in enumerate(texts):
+        for other, left2, top2, right2, bottom2 in texts[i + 1 :]:
+            if left2 >= right - by:
+                break
+            if min(right, right2) - max(left, left2) > by and min(bottom, bottom2) - max(top, top2) > by:
+                found.append((name, other))
+    return found
+
+
+def synthetic_design(kind, names, units, history):
+    """A design of four inputs that nobody computed, for `names` with `units`, beside a multisine."""
+    count, time = len(names), np.arange(501)[:, None]
+    inputs = 200 + 40 * np.sin(0.05 * time * np.arange(1, 5))
+    root = np.sqrt(np.maximum(time, 1))
+    made = [Designed(inputs + k, 0.01, (1 + k) * bounds, {}, 5.0, history and (1 + k) * bounds * 22 / root)
+            for k, bounds in enumerate(2 * [np.geomspace(1e-6, 1e3, count)])]  # fmt: skip
+    scale, unexcited = 50 * np.geomspace(1e-6, 1e3, count), np.full(count, 1e9)
+    task = SimpleNamespace(kind=kind, names=names, units=units, scale=scale, unexcited=unexcited, vehicles=8)
+    return Design(task, made[0], {"multisine": made[1]})
+
+
+ALPHAS = tuple(f"alpha{i}" for i in range(1, 9))
+DESIGNS = {
+    "design": ("rotor speeds", ALPHAS, PublishedOS4().parameter_units, True),
+    "references": ("references", ("Ix", "Iy", "Iz"), ("kg m^2",) * 3, None),
+}
 
 
 @pytest.fixture(scope="module")
 def addresses(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    study = synthetic_study(flights=12, estimators=("ibss", "network", "svsf"), scales=(0.1, 1.0))
-    report = write_report(study.isel(state=[0, 2, 4, 7]), folder, with_pdf=False)[0]  # the page has the SVG
-    flight, bare = folder / "flight.html", folder / "bare.html"
-    write_flight_page(flight, identified_vehicle(), title="A flight")
-    write_flight_page(bare, identified_vehicle(predictions=None), title="A flight")
-    return {"study": report.as_uri(), "flight": flight.as_uri(), "without predictions": bare.as_uri()}
+    study = synthetic_study(flights=12, estimators=tuple(ESTIMATORS), scales=(0.1, 1.0))
+    files = {"study": write_report(study.isel(state=[0, 7]), folder, with_pdf=False)[0]}  # the page has the SVG
+    for name, found in {
+        "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
+        "without predictions": identified_vehicle(predictions=None),
+        "os4": identified_flight(),
+    }.items():
+        files[name] = folder / f"{name}.html"
+        write_flight_page(files[name], found, title="A_flight_with_a_long_name_of_2026-11-24.csv")
+    for name, given in DESIGNS.items():
+        files[name] = folder / f"{name}.svg"
+        write_design(synthetic_design(*given), 0.01, files[name])
+    return {name: path.as_uri() for name, path in files.items()}
 
 
 @pytest.fixture(scope="module")
@@ -60,19 +132,35 @@ def opened(browser, addresses):
     assert said == []
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (390, "dark"), (1280, "light"), (1280, "dark")])
-@pytest.mark.parametrize("name", ["study", "flight", "without predictions"])
-def test_it_fits_the_screen_and_follows_the_theme(opened, name, width, scheme):
-    page = opened(name, width, scheme)
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    # What is wider scrolls inside its own box, and can be reached by the keyboard.
-    wide = page.locator(".scroll:visible, .drawing:visible").evaluate_all(WIDTHS, "tabindex")
-    assert len(wide) >= 2
-    for pixels, place in wide:
-        assert pixels <= width
-        assert place == "0"
-    for pixels, box in page.locator(".drawing:visible svg").evaluate_all(WIDTHS, "viewBox"):
-        assert pixels >= float(box.split()[2])  # letters of 8 points keep at least 8 pixels
+@pytest.mark.parametrize("width", [390, 768, 1280])
+@pytest.mark.parametrize("name", ["study", "vehicle", "os4", *DESIGNS])
+def test_nothing_overlaps_or_scrolls_sideways(opened, name, width):
+    page = opened(name, width)
+    page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true; })")
+    assert page.evaluate("document.scrollingElement.scrollWidth") <= width
+    assert page.evaluate(WIDE) == []
+    texts = page.evaluate(TEXTS)
+    assert len(texts) > 20
+    assert all(-1 <= left and right <= width + 1 for _, left, _, right, _ in texts)
+    assert overlapping(texts) == []
+    assert page.evaluate(CUT) == []
+    for drawn, natural in page.locator(".panels svg").evaluate_all(WIDTHS):
+        assert drawn >= natural  # letters of 8 points keep at least 8 pixels
+
+
+def test_texts_that_overlap_are_found(opened):
+    page = opened("os4")
+    page.evaluate("document.querySelector('h2').style.marginBottom = '-1.5rem'")
+    assert overlapping(page.evaluate(TEXTS))
+    page = opened("vehicle")
+    page.evaluate("(text => text.after(text.cloneNode(true)))(document.querySelector('#figure-response [id*=text_]'))")
+    assert overlapping(page.evaluate(TEXTS))
+
+
+@pytest.mark.parametrize("name", ["study", "vehicle", "without predictions"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_follows_the_theme(opened, name, scheme):
+    page = opened(name, scheme=scheme)
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == BACKGROUND[scheme]
     page.get_by_role("button").filter(has_text="Dark" if scheme == "light" else "Light").click()
     other = {"light": "dark", "dark": "light"}[scheme]
@@ -82,7 +170,7 @@ def test_it_fits_the_screen_and_follows_the_theme(opened, name, width, scheme):
 def test_a_checkbox_hides_an_estimator_everywhere(opened):
     page = opened()
     assert page.locator("tr[data-estimator='1']").count() == 5 * 2
-    for figure in ("error", "efficiency", "distribution", "rollouts", "coverage", "trajectories", "deviations"):
+    for figure in ("overview", "error", "efficiency", "coverage", "deviations"):
         assert page.locator(f"#figure-{figure} [data-estimator='1']").count() > 1, figure
     shown = """place => [...document.querySelectorAll(`[data-estimator="${place}"]`)]
         .map(element => getComputedStyle(element).display !== "none")"""
@@ -94,21 +182,29 @@ def test_a_checkbox_hides_an_estimator_everywhere(opened):
     assert all(page.evaluate(shown, 1))
 
 
-def test_a_list_chooses_what_a_figure_shows(opened):
-    page = opened("flight")
-    shown, choice = page.locator("#figure-predictions .drawing:visible"), page.get_by_label("Shown:")
-    assert choice.locator("option:checked").text_content() == "0.248 s ahead"
-    assert shown.count() == 1
-    before = shown.get_attribute("aria-label")
-    choice.select_option(label="0.5 s ahead")
-    assert shown.count() == 1
-    assert before.endswith("0.248 s ahead")
-    assert shown.get_attribute("aria-label").endswith("0.5 s ahead")
+def test_rates_can_be_zoomed_and_say_their_values(opened):
+    page = opened("vehicle")
+    values = page.locator("#rates .u-value")
+    page.locator("#rates").scroll_into_view_if_needed()
+    assert page.locator("#horizon option:checked").text_content() == "0.248 s"
+    ticks = "() => [...document.querySelectorAll('#rates canvas')].map(canvas => canvas.toDataURL())"
+    before, box = page.evaluate(ticks), page.locator("#rates .u-over").first.bounding_box()
+    assert len(before) == 3
+    across = [box["x"] + share * box["width"] for share in (0.2, 0.4)]
+    page.mouse.move(across[0], box["y"] + 20)
+    assert all(any(digit.isdigit() for digit in text) for text in values.all_text_contents())
+    page.mouse.down()
+    page.mouse.move(across[1], box["y"] + 20, steps=4)
+    page.mouse.up()
+    page.wait_for_function("before => document.querySelector('#rates canvas').toDataURL() !== before", arg=before[0])
+    zoomed = page.evaluate(ticks)
+    assert not set(zoomed) & set(before)  # all three
+    page.locator("#horizon").select_option(label="0.5 s")
+    page.wait_for_function("before => document.querySelector('#rates canvas').toDataURL() !== before", arg=zoomed[0])
 
 
 def test_figures_tell_names_and_values_as_tooltips(opened):
     page = opened()
     title = "#figure-{} [data-estimator='0'] > title"
     assert page.locator(title.format("error")).first.text_content() == "ibss"
-    assert any("rollouts" in text for text in page.locator(title.format("rollouts")).all_text_contents())
-    assert any("median" in text for text in page.locator(title.format("distribution")).all_text_contents())
+    assert any("rollouts" in text for text in page.locator(title.format("overview")).all_text_contents())

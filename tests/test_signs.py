@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from jaxos4.errors import InputError
 from jaxos4.logs import read_recording, write_flight
 from jaxos4.recording import Recording, cut, usable_stretches
-from jaxos4.recording.motion import motor_clock_note, opposite_axes as opposites, refused_note, yaw_doubt
+from jaxos4.recording.motion import opposite_axes as opposites, refused_note, yaw_doubt
 from jaxos4.recording.preparation import at_limit, prepare
 
 DT = 0.004
@@ -79,14 +79,14 @@ def test_a_vehicle_that_does_not_turn_is_not_judged():
 def test_a_fit_is_refused_with_the_remedy():
     recording = flown(CRAZYFLIE, 0)
     # Opposite yaw is only doubted.
-    ((cause, remedy),) = prepare([recording], turned(CRAZYFLIE, "rotor_spins")).doubts
+    ((cause, remedy),) = prepare([recording], turned(CRAZYFLIE, "rotor_spins"))[0].doubts
     assert cause.startswith("a.bbl: yaw answers the rotors with the opposite sign (torque and angular acceleration ")
     assert "change all four signs" in remedy
     with pytest.raises(
         InputError, match=r"a.bbl: roll and pitch answer .* are in another order .* correct one of them"
     ):
         prepare([recording], turned(CRAZYFLIE, "rotor_positions"))
-    prepared = prepare([recording], CRAZYFLIE)
+    prepared, *_ = prepare([recording], CRAZYFLIE)
     assert (prepared.windows > 0, prepared.doubts) == (True, ())
 
 
@@ -112,27 +112,6 @@ def test_inspect_questions_the_spins(run, tmp_path):
     assert "cannot identify" not in out
 
 
-@pytest.mark.parametrize(("shift", "words"), [(-9, "ms early"), (0, ""), (6, "ms late")])
-def test_clocks_of_motors_and_gyro_are_compared(shift, words):
-    """Measured rotor speeds, later than they were by `shift` samples of 4 ms."""
-    flight = flown(CRAZYFLIE, 0, gust=5.0, lag=0.004)._replace(commanded=False)
-    moved = flight._replace(omega=np.roll(flight.omega, shift, axis=0))
-    note = motor_clock_note([moved], CRAZYFLIE)
-    assert words in note
-    assert bool(note) == bool(words)
-    if note:
-        assert float(note.split("about ")[1].split()[0]) == pytest.approx(
-            abs(4 - 4 * shift), abs=2
-        )  # the rotors lag by 4 ms
-
-
-def test_the_lag_of_commands_is_no_error_of_clocks(shared_flights):
-    for path in sorted(shared_flights.glob("*/*.csv")):
-        flight = read_recording(path, CRAZYFLIE)
-        parts = [cut(flight, stretch) for stretch in usable_stretches(flight, CRAZYFLIE)]
-        assert motor_clock_note(parts, CRAZYFLIE) == ""
-
-
 def test_rotors_at_their_limit_are_named(shared_flights):
     limits = {"B2_circle_fast_rep2": "rotor 4 is at its limit for 8 %", "B3_figure8_fast_rep1": None}
     for name, words in limits.items():
@@ -155,8 +134,8 @@ def test_messages_about_a_flight_to_predict_name_no_option_of_the_fit():
     for error in (predicted, slower):
         assert "`begin`" not in str(error.value)
     partly = flight._replace(omega=flight.omega * (flight.time[:, None] > 2))
-    assert "(`begin` and `end` override)" in prepare([partly], CRAZYFLIE, **options).notes[-1]
-    assert "override" not in prepare([partly], CRAZYFLIE, **options, predicted=True).notes[-1]
+    assert "(`begin` and `end` override)" in prepare([partly], CRAZYFLIE, **options)[0].notes[-1]
+    assert "override" not in prepare([partly], CRAZYFLIE, **options, predicted=True)[0].notes[-1]
 
 
 @pytest.mark.parametrize("name", ["arpl_crazyflie_yaw_a.csv", "nanobench/B2_circle_fast_rep2.csv"])
@@ -164,7 +143,7 @@ def test_single_precision_rounds_the_cleaned_data_once(name, shared_flights):
     """Reading, cutting, averaging and joining compute in double precision; only the flight to fit is rounded."""
 
     def cleaned():
-        prepared = prepare([read_recording(shared_flights / name, CRAZYFLIE)], CRAZYFLIE, begin=1.0, end=6.0)
+        prepared, *_ = prepare([read_recording(shared_flights / name, CRAZYFLIE)], CRAZYFLIE, begin=1.0, end=6.0)
         return jax.tree.leaves((prepared.fitted, prepared.tested)), prepared.seconds
 
     double, seconds = cleaned()

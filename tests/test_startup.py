@@ -21,7 +21,7 @@ from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import EXCITATIONS
 from jaxos4.models import MODELS
 from jaxos4.models.state import CHANNELS
-from jaxos4.networks import APPROXIMATORS, FEATURES, NetworkEstimator
+from jaxos4.networks import FEATURES, NetworkEstimator
 from jaxos4.simulation import METHODS
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -133,11 +133,11 @@ import diffrax
 
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables():
     tables = {"Estimator": ESTIMATORS, "Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
-    tables |= {"Channels": CHANNELS, "Features": FEATURES, "Approximator": APPROXIMATORS}
+    tables |= {"Channels": CHANNELS, "Features": FEATURES}
     for name, table in tables.items():
         assert list(getattr(_options, name)) == list(table)
     defaults = {name: argument.default for name, argument in inspect.signature(train.train).parameters.items()}
-    for name in ("noise", "steps", "features", "approximator"):
+    for name in ("noise", "steps", "features"):
         assert defaults[name] == getattr(NetworkEstimator, name)
 
 

@@ -60,7 +60,6 @@ CASES = {
     "clipped below full speed": (changed(at(5, 5.4), omega=(2, 2300.0)), ["", "rotor 3 at full speed", ""]),
     "full speed for a moment": (changed(at(12, 12.05), omega=(2, 2500.0)), [""]),
     "constant rotors": (changed(slice(None), omega=(slice(None), HOVER)), [""]),
-    "clipped gyro": (changed(slice(1000, 1020), states=(R, -34.9)), ["", "the gyro is clipped", ""]),
     "fast gyro": (changed(slice(1000, 1020), states=(R, RAMP)), [""]),
     "a gap": (changed(slice(1000, 1100), states=(slice(None), np.nan)), ["", "nothing was measured", ""]),
     "a gap of a moment": (changed(slice(2000, 2004), states=(P, np.nan)), [""]),
@@ -248,21 +247,21 @@ def test_a_part_beyond_the_flight_is_refused():
 
 def test_excitation_is_the_spread_of_torque_and_rate():
     flight = hovering()
-    roll, pitch, yaw = excitation(flight, CRAZYFLIE)
+    roll, pitch, yaw = excitation(flight, CRAZYFLIE).values()
     assert (roll.verdict, pitch.verdict, yaw.verdict) == ("good", "weak", "none")
     assert roll.rate == pytest.approx(1 / np.sqrt(2), rel=0.02)
     assert roll.noise == pytest.approx(0.01, rel=0.1)
     y = np.asarray(CRAZYFLIE.rotor_positions)[:, 1]
     torque = CRAZYFLIE.thrust_coefficient * (np.asarray(flight.omega) ** 2 * y).sum(axis=1)
     assert roll.torque == pytest.approx(float(np.std(torque)), rel=1e-3)
-    assert np.isnan(excitation(flight)[0].torque)
+    assert excitation(flight)["roll"].torque is None
 
 
 def test_angles_stand_in_for_rates():
     flight = hovering()
     flight.states[:] = np.nan
     flight.states[::4, PHI] = -0.2 * np.cos(5 * flight.time[::4])
-    roll, pitch, _ = excitation(flight, CRAZYFLIE)
+    roll, pitch, _ = excitation(flight, CRAZYFLIE).values()
     assert roll.rate == pytest.approx(1 / np.sqrt(2), rel=0.02)
     assert pitch.verdict == "not measured"
 
@@ -295,6 +294,6 @@ def test_real_flights(name, usable, axes, shared_flights):
     assert all("at rest" in part.reason or "less than" in part.reason for part in parts if part.reason)
     longest = max(kept, key=lambda part: part.length)
     found = excitation(cut(flight, longest), CRAZYFLIE)
-    assert tuple(each.verdict for each in found) == axes
+    assert tuple(each.verdict for each in found.values()) == axes
     bare = read_recording(shared_flights / f"arpl_crazyflie_{name}.csv", full_scale=1.0)
     assert len(usable_stretches(bare)) == len(kept)

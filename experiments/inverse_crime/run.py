@@ -15,7 +15,7 @@ from jaxos4.study import load_study
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from shared import run_studies, use_all_cores
+from shared import run_studies
 
 
 def main(
@@ -35,5 +35,4 @@ def main(
 
 
 if __name__ == "__main__":
-    use_all_cores()
     typer.run(main)

@@ -74,7 +74,6 @@ CASES = {
 NETWORKS = {
     "score, mlp": {},
     "raw, mlp": {"features": "raw", "steps": 3000},
-    "score, cmac": {"approximator": "cmac", "learning_rate": 0.005, "steps": 10_000},
 }
 
 
@@ -218,7 +217,7 @@ def main(
         begin = time.perf_counter()
         settings = settings if steps is None else {**settings, "steps": steps}
         trained = jaxos4.NetworkEstimator(**settings).fit(
-            case.problem(case.flight, 1.0), case.bracket, key=jax.random.key(0), progress=True
+            case.problem(case.flight, 1.0), case.bracket, key=jax.random.key(0)
         )
         return trained, time.perf_counter() - begin
 

@@ -55,14 +55,11 @@ def _usable_folder() -> Path | None:
 
 
 def _remove_oldest(folder: Path, most_bytes: int) -> None:
-    """Removes the programs that were not used for the longest time, until the others take half of `most_bytes`."""
-    with os.scandir(folder) as entries:
-        files = [(entry.stat(), entry.path) for entry in entries if entry.is_file()]
+    """If the programs take more than `most_bytes`, removes those that were not used last, until half is left."""
+    files = [(path.stat(), path) for path in folder.iterdir() if path.is_file()]
     size = sum(status.st_size for status, _ in files)
-    if size <= most_bytes:
-        return
+    most = most_bytes if size <= most_bytes else most_bytes / 2
     for status, path in sorted(files, key=lambda file: max(file[0].st_atime, file[0].st_mtime)):
-        if size <= most_bytes / 2:
-            return
-        Path(path).unlink(missing_ok=True)  # another process may remove the same one
-        size -= status.st_size
+        if size > most:
+            path.unlink(missing_ok=True)  # another process may remove the same one
+            size -= status.st_size

@@ -25,7 +25,6 @@ InitialState = StrEnum("InitialState", ["free", "known"])
 Estimator = StrEnum("Estimator", list(ESTIMATORS))
 Simulator = StrEnum("Simulator", list(("mujoco", "rotorpy", "sdf")))
 Features = StrEnum("Features", list(("score", "raw")))
-Approximator = StrEnum("Approximator", list(("mlp", "cmac")))
 
 VehicleModel = StrEnum("VehicleModel", list((*Model, "flight")))
 

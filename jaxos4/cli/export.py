@@ -15,7 +15,7 @@ MOST_SAMPLES = 100_000
 
 
 def export(
-    result: Annotated[Path, Argument(metavar="RESULT.json", help="A file of `jaxos4 estimate --out`.")],
+    result: Annotated[Path, Argument(metavar="RESULT.json", help="A file of `jaxos4 estimate --out`, of a vehicle.")],
     to: Annotated[options.Simulator, Option(help="MuJoCo (MJCF), RotorPy (Python) or SDF (Gazebo).")],
     out: Annotated[Path | None, Option(help="The file to write. Default: standard output.")] = None,
     samples: Annotated[

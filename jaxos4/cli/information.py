@@ -1,4 +1,4 @@
-"""`jaxos4 inspect` and `jaxos4 identifiability`: what a log contains, and which parameters it can identify."""
+"""`jaxos4 inspect` and `jaxos4 identifiability`: what a log contains, and which parameters a flight can identify."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,7 +24,7 @@ def inspect(
     log: Annotated[Path, Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox or Crazyflie.")],
     airframe: Annotated[
         str | None,
-        Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Needed for torques and parameters."),
+        Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Needed to compare torques and motion."),
     ] = None,
     airframe_out: Annotated[
         Path | None,
@@ -32,13 +32,12 @@ def inspect(
     ] = None,
     out: options.OutOption = None,
 ) -> None:
-    """Show what a log contains, which parts of it can be used, and which parameters they identify."""
+    """Show what a log contains, which parts of it can be used, and how much they excite each axis."""
     check_outputs(log, airframe, out=out, airframe_out=airframe_out)
     if airframe_out is not None and airframe_out.exists():
-        raise InputError(
-            f"{airframe_out}: exists, and may hold what you measured; give another name, and --airframe {airframe_out} "
-            "to keep its values."
-        )
+        raise InputError(f"{airframe_out}: exists, and may hold what you measured; give another name.")
+    if airframe is not None and airframe_out is not None:
+        raise InputError("--airframe-out: begins an airframe from the log alone; leave out --airframe.")
     with stages("loading the library") as progress:
         from rich.console import Console
 
@@ -50,11 +49,9 @@ def inspect(
 
         progress("reading")
         vehicle = None if airframe is None else load_airframe(airframe)
-        if vehicle is not None:
-            progress("reading, and finding the identifiable parameters")
         recording = read_recording(log, vehicle, full_scale=1.0)
         found = inspect_log(recording, vehicle)
-        draft = None if airframe_out is None else airframe_draft(recording, airframe)
+        draft = None if airframe_out is None else airframe_draft(recording)
     console = Console(highlight=False, markup=False)
     if out is not None:
         write_json(found.to_dict(), out)
@@ -62,21 +59,6 @@ def inspect(
         write_text(draft.text, airframe_out)
     _print_contents(console, found, log_format(log).label)
     _print_parts(console, found)
-    if (known := found.identifiable) is not None:
-        which = f"From the body rates between {known.begin:.2f} and {known.end:.2f} s, with the corrected model"
-        console.print(f"{which} (how well: see jaxos4 estimate):")
-        names = [name for name, row in known.parameters.items() if row.identifiable]
-        console.print(f"  identifiable: {', '.join(names) or 'nothing'}")
-        for name, row in known.parameters.items():
-            if row.note:
-                console.print(f"  {name}: {row.note}")
-    elif found.findings:
-        console.print("no parameter is identifiable, see the first lines.")
-    elif vehicle is None:
-        begins = "" if draft is not None else " (--airframe-out begins one)"
-        console.print(f"give --airframe to see which parameters are identifiable{begins}.", soft_wrap=True)
-    else:
-        console.print("identifiable parameters are computed only if p, q and r were measured.")
     if draft is not None:
         still = f"; weigh or measure, and fill in: {', '.join(draft.missing)}" if draft.missing else ""
         console.print(f"airframe: {airframe_out}{still}", soft_wrap=True)

@@ -1,7 +1,6 @@
 """`jaxos4 study`, `report` and `compare`: a noise study, its report, and the paper's comparison of methods in one."""
 
 import time
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,23 +15,17 @@ from ._output import stages
 if TYPE_CHECKING:
     from ..study import Study
 
-Executor = StrEnum("Executor", ["local", "dask"])
-
 
 def study(
     specification: Annotated[Path, Argument(metavar="SPEC.toml", help="The specification of the study.")],
     out: Annotated[Path, Option(help="Folder of the study: a new one, or one to resume.")],
     dry_run: Annotated[bool, Option("--dry-run", help="Only show the plan.")] = False,
-    executor: Annotated[Executor, Option(help="local: this machine; dask: a cluster.")] = Executor["local"],
-    scheduler: Annotated[str | None, Option(help="Address of the Dask scheduler, for dask.")] = None,
+    scheduler: Annotated[str | None, Option(help="Address of a Dask scheduler. Default: this machine.")] = None,
 ) -> None:
     """Run a noise study, or resume it: finished cells are kept."""
-    if (executor is Executor["dask"]) != (scheduler is not None):
-        raise InputError("--executor dask and --scheduler ADDRESS: give both, or neither.")
     with stages("loading the library"):
-        from ..study import load_study, run_on_cluster, use_all_cores
+        from ..study import load_study, run_on_cluster
 
-        use_all_cores()  # before anything is computed
         wanted = load_study(specification)
     if dry_run:
         _print_plan(wanted, out)
@@ -53,21 +46,18 @@ def _print_plan(wanted: "Study", out: Path) -> None:
     from ..report.text import Listing
     from ..study import device_name, plan
 
-    rows, numbers = plan(wanted, out), ("cells", "flights", "programs", "networks", "time [min]")
-    cells = [(*map(str, counts), "-" if seconds is None else f"{seconds / 60:.1f}") for *counts, seconds in rows]
-    Listing(("estimator", *numbers), cells, numbers).print_on(Console(highlight=False))
-    cells, flights = sum(row.cells for row in rows), sum(row.flights for row in rows)
-    typer.echo(
-        f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}. The time "
-        "is known for estimators with finished cells. It does not include the training of networks."
-    )
+    rows = plan(wanted, out)
+    table = [(estimator, *map(str, counts)) for estimator, counts in rows.items()]
+    Listing(("estimator", "cells", "flights"), table, ("cells", "flights")).print_on(Console(highlight=False))
+    cells, flights = (sum(column) for column in zip(*rows.values(), strict=True))
+    typer.echo(f"{cells} of {wanted.count} cells to be run, {flights} flights to be identified, on {device_name()}.")
 
 
 def _connected(address: str):
     try:
         from distributed import Client
     except ImportError:
-        raise InputError("--executor dask: the package distributed is missing; install jaxos4[dask].") from None
+        raise InputError("--scheduler: the package distributed is missing; install jaxos4[dask].") from None
     try:
         return Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError) as error:
@@ -106,9 +96,7 @@ def compare(
         from ..report import error_table, write_report
         from ..report.study_terminal import count_outcomes, run_with_bar
         from ..report.text import print_whole
-        from ..study import use_all_cores
 
-    use_all_cores()
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out
     dataset = run_with_bar(comparison(quick=quick), directory)
     print_whole(Console(highlight=False), error_table(dataset))

@@ -23,7 +23,6 @@ def train(
     bracket: options.BracketOption = None,
     initial_state: options.InitialStateOption = options.InitialState["free"],
     features: Annotated[options.Features, Option(help="What the network sees.")] = options.Features["score"],
-    approximator: Annotated[options.Approximator, Option(help="The kind of network.")] = options.Approximator["mlp"],
     noise: Annotated[
         tuple[float, float],
         Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
@@ -47,9 +46,7 @@ def train(
         from ..recording import read_recording
 
         try:
-            settings = NetworkEstimator(
-                features=features.value, approximator=approximator.value, noise=noise, steps=steps
-            )
+            settings = NetworkEstimator(features=features.value, noise=noise, steps=steps)
         except ValueError as error:
             raise InputError(f"options: {error}") from None
         check_outputs(flight, airframe, bracket, out=out)
@@ -59,7 +56,7 @@ def train(
     for note in recording.notes:
         typer.echo(f"note: {note}")
     begin = time.perf_counter()
-    with option_names(bracket=bracket):
+    with stages("training the network"), option_names(bracket=bracket):
         network = train_network(
             recording,
             subject,

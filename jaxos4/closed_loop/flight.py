@@ -24,13 +24,14 @@ References = Float[Array, "samples 4"]
 
 # The controller tilts the thrust no further than this to carry the weight: the cosine of 60 degrees.
 _STEEPEST = 0.5
+# The time between two steps of a random reference [s].
+_HOLD = 0.5
 
 
 def random_references(
     *,
     duration: float = 20.0,
     dt: float = 0.004,
-    hold: float = 0.5,
     amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5),
     key: Key,
 ) -> References:
@@ -38,19 +39,19 @@ def random_references(
 
     **Arguments:**
 
-    - `duration`, `dt`: length and sample time [s]. `hold`: the time between two steps of one reference [s].
+    - `duration`, `dt`: length and sample time [s].
     - `amplitude`: levels are uniform between -amplitude and amplitude: roll, pitch, yaw [rad], acceleration [m/s^2].
 
     **Returns:** the references in round(duration / dt) + 1 rows. The first and the last second are level.
 
     **Raises:** `ValueError` that names the argument.
     """
-    for name, value in (("duration", duration), ("dt", dt), ("hold", hold)):
+    for name, value in (("duration", duration), ("dt", dt)):
         setting(name, positive=True)(value)
     if len(amplitude) != 4 or not np.all(np.isfinite(amplitude)):
         raise ValueError(f"`amplitude` must be four finite numbers, got {amplitude}.")
     time = dt * np.arange(round(duration / dt) + 1)
-    steps = (time[:, None] / hold + np.arange(4) / 4).astype(int)
+    steps = (time[:, None] / _HOLD + np.arange(4) / 4).astype(int)
     flown = (time >= 1) & (time <= duration - 1)
     return _levels(key, steps, int(steps[-1, -1]) + 1, flown[:, None] * np.asarray(amplitude, dtype=float))
 

@@ -56,10 +56,8 @@ class Envelope(eqx.Module):
         """The limits that flights just keep. `dt`: of the rotor speeds; the states may be sampled more often."""
         return cls(**_needs(omega, states, dt))
 
-    def limited(self, limits: "Envelope | Mapping[str, float]") -> "Envelope":
-        """This envelope with some limits replaced, or all. Raises `InputError` if one of them is impossible."""
-        if isinstance(limits, Envelope):
-            return limits
+    def limited(self, limits: Mapping[str, float]) -> "Envelope":
+        """This envelope with some limits replaced. Raises `InputError` if one of them is impossible."""
         try:
             return Envelope(**vars(self) | dict(limits))
         except ValueError as error:

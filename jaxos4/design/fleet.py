@@ -185,7 +185,7 @@ class Fleet(eqx.Module):
             states[_STILL:, :, [*POSITION, *VELOCITY]] = 0
         return np.asarray(flights.omega), states, self.dt
 
-    def envelope(self, references: Inputs, limits: Envelope | Mapping[str, float]) -> Envelope:
+    def envelope(self, references: Inputs, limits: Mapping[str, float]) -> Envelope:
         """The limits that these references need, with some replaced. Limits of rotors are those of the airframe.
 
         Raises `InputError` for a limit that is not positive, or if a vehicle turns over or cannot hover.

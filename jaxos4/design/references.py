@@ -196,7 +196,7 @@ def design_references(
     *,
     angle: float = 0.3,
     acceleration: float = 1.5,
-    limits: Envelope | Mapping[str, float] | None = None,
+    limits: Mapping[str, float] | None = None,
     bracket: Bracket | None = None,
     duration: float = 20.0,
     dt: float = 0.004,
@@ -217,14 +217,11 @@ def design_references(
     - `loop`: the vehicle, its controller, its gusts and its sensors.
     - `angle`, `acceleration`: the largest reference of roll, pitch and yaw [rad] and of the vertical acceleration
       [m/s^2].
-    - `limits`: an `Envelope`, or some of its limits by name, but not `slew`. The others are those that 3-2-1-1
-      references with the same largest values need; those of rotor speeds are the airframe's.
+    - `limits`: some limits of an `Envelope`, by name, but not `slew`. The others are those that 3-2-1-1 references with
+      the same largest values need; those of rotor speeds are the airframe's.
     - `bracket`: the knowledge of the parameters of a `FlightModel` before the flight; by default the model's.
-    - `duration`, `dt`: length and sample time [s].
     - `criterion`: as of `design_input`, for the logarithms of Ix, Iy and Iz.
-    - `bandwidth`: the highest frequency [Hz].
-    - `compare`: whether to judge the standard references too.
-    - `key`: for the draws, the gusts and the starts, or a seed. `progress`: called with the name of each stage.
+    - The others: as of `design_input`.
 
     **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
     """

@@ -244,19 +244,12 @@ def fly_finely(
     return jax.vmap(lambda a: simulate(model, a, held, dt=dt / finer).states)(vehicles)
 
 
-def envelope_of(
-    model: AbstractModel, *, bracket: Bracket | None = None, duration: float = 5.0, dt: float = 0.01, key: Key
-) -> Envelope:
-    """The envelope that the standard multisine needs, for all vehicles of a bracket.
-
-    **Raises:** `InputError` if it cannot be flown.
-    """
-    bracket = Bracket.default(model) if bracket is None else bracket
+def _standard_envelope(model: AbstractModel, vehicles: Array, duration: float, dt: float) -> Envelope:
     try:
         omega = multisine(model.airframe, duration=duration, dt=dt)
     except ValueError as error:
         raise InputError(f"the standard multisine, which sets the envelope: {error}") from None
-    states = np.asarray(fly_finely(model, drawn(bracket, key, VEHICLES), omega, as_float(dt)))
+    states = np.asarray(fly_finely(model, vehicles, omega, as_float(dt)))
     if not np.isfinite(states).all():
         raise InputError("`bracket`: some of its vehicles turn over in the standard multisine; narrow it.")
     return Envelope.of(omega, states, dt)
@@ -265,12 +258,11 @@ def envelope_of(
 def design_input(
     model: AbstractModel,
     *,
-    limits: Envelope | Mapping[str, float] | None = None,
+    limits: Mapping[str, float] | None = None,
     bracket: Bracket | None = None,
     duration: float = 5.0,
     dt: float = 0.01,
     channels: str = "all",
-    sigma: Float[Numeric, "12"] = SENSOR_SIGMA,
     start_is_known: bool = False,
     criterion: str = "D",
     bandwidth: float = 4.0,
@@ -286,11 +278,11 @@ def design_input(
 
     **Arguments:**
 
-    - `limits`: an `Envelope`, or some of its limits by name. The others are those that the standard multisine needs
-      (`envelope_of`).
+    - `limits`: some limits of an `Envelope`, by name. The others are those that the standard multisine needs, for all
+      vehicles of the bracket.
     - `bracket`: the knowledge of the parameters before the flight; by default the model's.
     - `duration`, `dt`: length and sample time [s].
-    - `channels`: what will be measured: `"rates"`, `"attitude"` or `"all"`. `sigma`: its noise, as `STATE_NAMES`.
+    - `channels`: what will be measured, with the noise of the standard sensors: `"rates"`, `"attitude"` or `"all"`.
     - `start_is_known`: whether the flight starts exactly at rest. If not, the initial state will be estimated too.
     - `criterion`: `"D"`: the volume of the confidence ellipsoid; `"A"`: the mean squared bound; `"worst"`: the largest
       bound. Bounds are shares of the bracket's half-widths.
@@ -308,19 +300,19 @@ def design_input(
     progress("envelope")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
-    if not isinstance(limits, Envelope):
-        limits = envelope_of(model, bracket=bracket, duration=duration, dt=dt, key=key).limited(limits or {})
+    vehicles = drawn(bracket, key, VEHICLES)
+    envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
     center, others = np.asarray(bracket.center)[None], drawn(bracket, jax.random.fold_in(key, 1), _DRAWS - 1)
-    make = Multisine.within(model.airframe, limits, round(duration / dt) + 1, dt, bandwidth)
+    make = Multisine.within(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
     rotor_speeds = RotorSpeeds(
-        envelope=limits,
+        envelope=envelope,
         scale=np.asarray(bracket.half_width),
         unexcited=np.asarray(model.half_width),
         model=model,
         make=make,
-        fleet=drawn(bracket, key, VEHICLES),
+        fleet=vehicles,
         draws=jnp.concatenate([center, others]),
-        weights=as_float(1 / np.asarray(sigma)[CASCADE_ORDER[: CHANNELS[channels]]]),
+        weights=as_float(1 / SENSOR_SIGMA[CASCADE_ORDER[: CHANNELS[channels]]]),
         dt=as_float(dt),
         size=make.scale.size,
         names=model.parameter_names,

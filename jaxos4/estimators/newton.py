@@ -240,7 +240,10 @@ class FilterError(AbstractEstimator):
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters.
         """
-        problem = problem.within(bracket)
+        return in_blocks(self._identify, problem.within(bracket))
+
+    def _identify(self, problem: ShootingProblem | InnovationsProblem) -> Estimate:
+        """One flight, or a block of flights."""
         if isinstance(problem, InnovationsProblem):
             return self._search(problem)
         found, count = self._search(InnovationsProblem(problem)), problem.unknowns.count

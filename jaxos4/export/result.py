@@ -11,15 +11,12 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import Airframe, airframe_from_table, alpha_from_inertia
-from ..analysis.inertia import fit_inertia
+from ..airframe import Airframe, airframe_from_table
 from ..errors import InputError
-from ..models import MODELS
-from ..models.abstract import PARAMETER_NAMES
 from ..results import NAMES, meaning
 from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
 
-VEHICLE = "flight"
+_VEHICLE = "flight"
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
 # differs from 1 by as many.
 _SIGNIFICANT = 3.0
@@ -41,10 +38,6 @@ _MOST_DRAWS = 1000
 class _Row(msgspec.Struct):
     estimate: float | None
     std: float | None
-
-
-class _Constant(msgspec.Struct):
-    estimate: float
 
 
 class _Held(msgspec.Struct):
@@ -189,10 +182,11 @@ def _named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def checked(file: ResultFile) -> ResultFile:
-    """The result. Raises `InputError` if it has no estimate, or is not of this version."""
-    for key, value, known in (("result", file.result, NAMES), ("model", file.model, (*MODELS, VEHICLE))):
-        if value not in known:
-            raise InputError(f"`{key}` {value[:40]}: must be one of {', '.join(known)}; run `jaxos4 estimate` again.")
+    """The result. Raises `InputError` if it has no vehicle or no estimate, or is not of this version."""
+    if file.model != _VEHICLE:
+        raise InputError(f"`model` {file.model[:40]}: only a vehicle (--model flight) can be exported or can predict.")
+    if file.result not in NAMES:
+        raise InputError(f"`result` {file.result[:40]}: is not a result code; run `jaxos4 estimate` again.")
     if not file.covariance or file.airframe is None:
         raise InputError(f"{file.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
     count = len(file.parameters)
@@ -204,10 +198,7 @@ def checked(file: ResultFile) -> ResultFile:
 
 def _identified(name: str, file: ResultFile) -> Identified:
     airframe, covariance = airframe_from_table(file.airframe or {}), np.array(file.covariance)
-    if file.model == VEHICLE:
-        values, drawn, covariance, notes = _vehicle_parts(file, covariance)
-    else:
-        values, drawn, covariance, notes = _flight_parts(file, airframe, covariance)
+    values, drawn, covariance, notes = _parts(file, covariance)
     negative = [each for each in _NOT_NEGATIVE if values.get(each, 0.0) < 0]
     kept = [place for place, each in enumerate(drawn) if each not in negative]
     notes += [f"{each}: came out negative, which is impossible; it is 0 here" for each in negative]
@@ -234,33 +225,8 @@ def _clipped(values: dict[str, float]) -> dict[str, float]:
     return {name: max(value, 0.0) if name in _NOT_NEGATIVE else value for name, value in values.items()}
 
 
-# Values by name, the names that are drawn, their covariance, and notes.
-_Parts = tuple[dict[str, float], tuple[str, ...], np.ndarray, list[str]]
-
-
-def _flight_parts(file: ResultFile, airframe: Airframe, covariance: np.ndarray) -> _Parts:
-    """Ix, Iy, Iz and J_R: the rigid body that explains the alphas of a flight best."""
-    names = ("Ix", "Iy", "Iz", "J_R")
-    if not file.constants.keys() >= set(names) or tuple(file.parameters) != PARAMETER_NAMES:
-        raise InputError("no moments of inertia were identified; fly with more excitation.")
-    values = {name: msgspec.convert(file.constants[name], _Constant).estimate for name in names}
-    model, (*inertia, rotor) = MODELS[file.model](airframe), values.values()
-    alpha = alpha_from_inertia(np.array(inertia), np.asarray(rotor * float(model.gyroscopic_factor)))
-    spread = fit_inertia(model, np.asarray(alpha), covariance).covariance
-    if not np.isfinite(spread).all():
-        raise InputError("no moments of inertia explain the estimate; fly with more excitation.")
-    known = 4 if rotor > _SIGNIFICANT * np.sqrt(spread[3, 3]) else 3
-    notes = []
-    if known == 3:
-        del values["J_R"]
-        notes.append("J_R: below noise; the inertia of the rotors is the airframe's")
-    if file.model == "published":
-        notes.append("the printed equations of translation are not those of a rigid body; a simulator has the latter")
-    return values, names[:known], spread[:known, :known], notes
-
-
-def _vehicle_parts(file: ResultFile, covariance: np.ndarray) -> _Parts:
-    """The parameters of a `FlightModel`."""
+def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], tuple[str, ...], np.ndarray, list[str]]:
+    """Values by name, the names that are drawn, their covariance, and notes."""
     rows, notes = file.parameters, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
     for moment, name in INERTIAS.items():

@@ -119,15 +119,13 @@ class RigidVehicle(NamedTuple):
 def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehicle:
     """The vehicle with an airframe and the parameters that were identified.
 
-    **Arguments:** `values`: by name, `Ix`, `Iy`, `Iz`, `J_R`, or the parameters of a `FlightModel`. The airframe gives
-    the constants that are missing. Offsets of several recordings are averaged.
+    **Arguments:** `values`: the parameters of a `FlightModel`, by name. The airframe gives the constants that are
+    missing. Offsets of several recordings are averaged.
     """
     mass, gain = float(airframe.mass), values.get("thrust_gain", 1.0)
     inertia = np.array(airframe.inertia, dtype=float)
-    for axis, (name, inverse) in enumerate(INERTIAS.items()):
-        if name in values:
-            inertia[axis] = values[name]
-        elif inverse in values:
+    for axis, inverse in enumerate(INERTIAS.values()):
+        if inverse in values:
             # Torques exceed the airframe's by the same factor as thrust.
             inertia[axis] = gain / values[inverse]
     offsets = ([x for name, x in values.items() if name.startswith(f"{axis}_offset")] for axis in AXES)
@@ -138,9 +136,8 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     named = slopes | {"alpha3": gain / inertia[0], "alpha6": gain / inertia[1]}
     found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)
     center = np.array([coordinate.value for coordinate in found])
-    rotor_inertia = values.get("J_R", float(airframe.rotor_inertia))
-    if "rotor_reaction" in values:
-        rotor_inertia = values["rotor_reaction"] * inertia[2]
+    reaction = values.get("rotor_reaction")
+    rotor_inertia = float(airframe.rotor_inertia) if reaction is None else reaction * inertia[2]
     speed = float(airframe.max_rotor_speed)
     vehicle = RigidVehicle(
         mass=mass,

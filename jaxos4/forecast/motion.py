@@ -13,7 +13,7 @@ from ..flight import Flight
 from ..models.state import CASCADE_ORDER, Forcing, Rates, State
 from ..models.vehicle import FlightModel
 from ..shooting import FASTEST
-from ..shooting.gains import Covariance, LogNoise, Observed, first_covariance, gains_after, transition
+from ..shooting.gains import Covariance, LogNoise, first_covariance, next_gains, step_of, transition
 from ..simulation import rk4_step
 
 _Samples = Float[Numeric, "*samples"]
@@ -252,19 +252,13 @@ def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[
     **Returns:** the covariance of rate and disturbance after a measurement; what a step adds to it; and the share of a
     constant acceleration that the disturbance absorbs.
     """
-    channels = noise.strength.shape[0]
-
-    def rows(value: float, count: int) -> Observed:
-        never = jnp.zeros((count, 1), dtype=bool)
-        return Observed(jnp.full((count, channels, 1), value), never, never)
-
-    known, unknown = rows(0.0, _SETTLED), rows(jnp.nan, 1)
-    p, gains = gains_after(first_covariance(known, noise, dt), noise, known, dt)
-    rate, disturbance = 1 - gains.rate[-1], gains.disturbance[-1]
+    step = step_of(noise, dt)
+    measured, never = jnp.ones(step.variance.shape, dtype=bool), jnp.zeros(1, dtype=bool)
+    p, gains = jax.lax.scan(
+        lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=_SETTLED
+    )
+    is_rate, rate, disturbance = step.reach > 0, 1 - gains.rate[-1], gains.disturbance[-1]
     of_rate = p.disturbance - p.cross * disturbance
-    is_rate = jnp.arange(channels)[:, None] < len(Rates._fields)
     after = Covariance(p.rate * rate, p.cross * rate, jnp.where(is_rate, of_rate, p.disturbance * (1 - disturbance)))
-    added = gains_after(jax.tree.map(jnp.zeros_like, p), noise, unknown, dt)[0]
-    lost = 1 - transition(jnp.exp(noise.time_constant), dt)[0][:, None]
-    absorbed = disturbance * dt / (disturbance * dt + lost * gains.rate[-1])
-    return jax.tree.map(lambda x: x[:, 0], (after, added, absorbed))
+    absorbed = disturbance * dt / (disturbance * dt + (1 - step.kept) * gains.rate[-1])
+    return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

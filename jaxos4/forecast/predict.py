@@ -16,7 +16,7 @@ from ..flight import Flight
 from ..identification import Identification
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording import preparation
-from ..recording.preparation import SAMPLE_TIME, Prepared
+from ..recording.preparation import Prepared
 from ..recording.reading import Recording, as_recording
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
@@ -114,11 +114,10 @@ def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) 
     name, airframe = recording.name, vehicle.model.airframe
     if np.isnan(recording.states[:, [6, 8, 10]]).all(axis=0).any():
         raise InputError(f"{name}: a prediction begins with the attitude; log phi, theta and psi.")
-    usable = preparation.usable_parts(
-        [recording], airframe, begin=None, end=None, sample_time=sample_time, holdout=0.0, predicted=True
-    )
-    step = max(vehicle.sample_time, SAMPLE_TIME, usable.slowest) if sample_time is None else sample_time
-    prepared = preparation.sampled(usable, airframe, sample_time=step, holdout=0.0)
+    if sample_time is not None and not sample_time >= 0.99 * recording.dt:
+        raise InputError(f"`sample_time` {sample_time:g}: {name} has one sample every {recording.dt:.4g} s; give that.")
+    step = max(vehicle.sample_time, recording.dt) if sample_time is None else sample_time
+    (prepared,) = preparation.prepare([recording], airframe, sample_time=step, holdout=0.0, predicted=True)
     for term in vehicle.model.terms:
         if lacking := (TERMS[term].needs & _INPUTS) - prepared.available:
             raise InputError(f"{name}: has no {' and '.join(sorted(lacking))}, which the term {term} needs; log it.")

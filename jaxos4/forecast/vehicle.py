@@ -14,7 +14,7 @@ from .._custom_types import Parameters
 from .._xla import quick_jit
 from ..airframe import airframe_from_table
 from ..errors import InputError
-from ..export.result import VEHICLE, ResultFile, checked, read_file
+from ..export.result import ResultFile, checked, read_file
 from ..flight import FORCE_NAMES
 from ..identification import Identification
 from ..models.vehicle import FlightModel
@@ -72,8 +72,6 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
 
 def _vehicle(file: ResultFile, name: str) -> Vehicle:
     used = file.provenance
-    if file.model != VEHICLE:
-        raise InputError(f"holds no vehicle, but a {file.model} OS4; use a result of `jaxos4 estimate --model flight`.")
     if not file.disturbances or used.sample_time is None:
         raise InputError("does not say its disturbances and its sample time; run `jaxos4 estimate` again.")
     airframe = airframe_from_table(file.airframe or {})

@@ -35,7 +35,7 @@ def train_network(
     initial_state: str = "free",
     seed: int = 0,
 ) -> TrainedNetwork:
-    """Train a network that identifies any flight with the inputs of this one, with a bar. Arguments as of `identify`.
+    """Train a network that identifies any flight with the inputs of this one. Arguments as of `identify`.
 
     - `settings`: of the training, except the channels.
     - `channels`: what the network looks at; by default the rates, and the attitude if a rate was not measured.
@@ -43,7 +43,7 @@ def train_network(
     where = bracket_of(bracket, model)
     problem = flight_problem(recording, model, where, channels=channels, initial_state=initial_state)
     settings = dataclasses.replace(settings, channels=channels or _seen_channels(problem))
-    return _train(settings, problem, where, recording.name, seed, progress=True)
+    return _train(settings, problem, where, recording.name, seed)
 
 
 def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
@@ -78,9 +78,9 @@ def _seen_channels(problem: ShootingProblem) -> str:
 
 
 def _train(
-    settings: NetworkEstimator, problem: ShootingProblem, bracket: Bracket, name: str, seed: int, progress: bool = False
+    settings: NetworkEstimator, problem: ShootingProblem, bracket: Bracket, name: str, seed: int
 ) -> TrainedNetwork:
     try:
-        return settings.fit(problem, bracket, key=jax.random.key(seed), progress=progress)
+        return settings.fit(problem, bracket, key=jax.random.key(seed))
     except ValueError as error:
         raise InputError(f"{name}: {error}") from None

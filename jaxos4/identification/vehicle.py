@@ -63,11 +63,9 @@ def prepare_vehicle(
     if network is not None:
         raise InputError("`network`: a vehicle's network is trained for its own flights; leave it out.")
     holdout = settings.share(validated=validate is not None)
-    usable = preparation.usable_parts(
+    prepared = preparation.prepare(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
-    times = usable.sample_times if settings.sample_time is None else (settings.sample_time,)
-    prepared = [preparation.sampled(usable, airframe, sample_time=step, holdout=holdout) for step in times]
     # All sample times share one program, with room for the shortest.
     return [
         _case(recordings, airframe, settings, each, prepared[0], name, bracket=bracket, validate=validate)
@@ -238,7 +236,7 @@ def _prepare_other(
             f"{validate.name}: `validate` is fitted already; leave it out: a part of the flight is held out by default."
         )
     step = float(prepared.fitted.dt)
-    other = preparation.prepare([validate], model.airframe, sample_time=step, holdout=0.0, predicted=True)
+    (other,) = preparation.prepare([validate], model.airframe, sample_time=step, holdout=0.0, predicted=True)
     for term in model.terms:
         if TERMS[term].changes_rates and not TERMS[term].needs <= other.available:
             raise InputError(

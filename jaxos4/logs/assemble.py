@@ -1,25 +1,17 @@
-"""Columns of a log become a `Recording`: checks of time and units, rotor speeds from commands, a uniform grid.
+"""Columns of a log become a `Recording`: checks of time and units, rotor speeds from commands, a uniform grid."""
 
-A wrong unit can give numbers within `LIMITS`, so each angle is also compared with the integral of its rate, if both
-were measured.
-"""
-
-import math
 import os
-import re
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES, FORCE_NAMES, STATE_NAMES
-from .sampling import UNIFORM, Series, grid_size, held_regularly, integral, logged_rate, resample, unwrap
+from .sampling import UNIFORM, grid_size, held_regularly, logged_rate, resample, unwrap
 from .table import (
     COMMAND_NAMES as COMMAND_NAMES,
     LIMITS,
     MAX_ROWS,
-    PITCH,
-    ROLL,
     SPEED_NAMES as SPEED_NAMES,
     Recording,
     Sampling,
@@ -30,47 +22,33 @@ from .table import (
 
 COLUMN_NAMES = ("t", *SPEED_NAMES, *COMMAND_NAMES, *CHANNEL_NAMES, "voltage")
 
-_OTHER_NAMES = {  # names that other loggers use, for the question "should 'time' be t?"
-    **dict.fromkeys(("time", "timestamp", "times"), "t"),
-    **{"roll": "phi", "pitch": "theta", "yaw": "psi"},
-    **{"gyrox": "p", "gyroy": "q", "gyroz": "r", "accx": "ax", "accy": "ay", "accz": "az"},
-    **dict.fromkeys(("vbat", "vbatt", "batteryvoltage"), "voltage"),
-}
 _MOST_SAMPLES = 10_000  # plus ten for each row: a log that consists mostly of gaps is more than one flight
 _STILL = 100  # samples of an accelerometer that never change: it is off
 _REPEATED = 0.9  # values that change at less than this share of the rate of their rows were repeated
 _SHORTEST_STEP, _LONGEST_STEP = 1e-6, 2.0  # [s], limits of the median time between rows
-_DEGREES = 180 / math.pi
-_ANGLES = (("phi", "p"), ("theta", "q"), ("psi", "r"))
-_WINDOW = 0.2  # [s]: increments of an angle over this time are compared with the integral of its rate
-_FEWEST = 8  # windows that a comparison needs
-_SIMILARITY = 0.7  # smallest cosine between increments and integrals at which their ratio is used
-_SPREAD = 1.6  # a ratio within this factor of 57.3 counts as 57.3
 
 
 def recording_of(
     table: Table, notes: tuple[str, ...] = (), airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> Recording:
     """Make a recording from the columns of a log and the `notes` of its reader; see `read_log`."""
-    found = [*notes, *([_unknown_note(table.unknown)] if table.unknown else [])]
+    shown = ", ".join(map(quoted, table.unknown[:8])) + ", ..." * (len(table.unknown) > 8)
+    found = [*notes, *([f"unknown columns are ignored: {shown}"] if table.unknown else [])]
     table = table._replace(columns={n: column for n, column in table.columns.items() if not np.isnan(column).all()})
     if not table.holds("t"):
-        table.refuse(_missing("there is no time", ("t",), table) + "; each row needs its time [s]", column="t")
+        table.refuse("there is no time; each row needs its time [s]", column="t")
     if not any(map(table.holds, STATE_NAMES)):
-        what = _missing("no state was measured", STATE_NAMES, table)
-        table.refuse(f"{what}; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
+        table.refuse(f"no state was measured; a flight needs at least one of the columns {', '.join(STATE_NAMES)}")
     # Cells that hold no value were not logged, also those of a rotor.
     motors = SPEED_NAMES if any(map(table.holds, SPEED_NAMES)) else COMMAND_NAMES
     rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
     facts = table.facts._replace(**{name: getattr(table.facts, name) or found for name, found in rarest.items()})
     dt = _check_time(table)
-    table = _check_units(table.without_impossible())
+    table = table.without_impossible()
+    _check_heading(table)
     if table.impossible:
         found.append(table.impossible_note)
     omega = _rotor_speeds(table, airframe, full_scale, found)
-    if airframe is not None:
-        thrust = np.median((omega**2).sum(axis=1)) * airframe.thrust_coefficient
-        found += _thrust_note(float(thrust / (airframe.mass * airframe.gravity)))
     channels, voltage = _channels(table, found), _voltage(table)
     with_force = any(map(table.holds, FORCE_NAMES))
     commanded = motors is COMMAND_NAMES
@@ -94,23 +72,6 @@ def recording_of(
     states, force = np.split(channels, [len(STATE_NAMES)], axis=1)
     about = {"commanded": commanded, "name": os.fspath(table.path), "notes": tuple(found), "facts": facts}
     return Recording(time, omega, states, force if with_force else None, voltage, **about)
-
-
-def _missing(what: str, wanted: tuple[str, ...], table: Table) -> str:
-    hints = [f"{quoted(name)} be {_meant(name)}" for name in table.unknown if _meant(name) in wanted]
-    return f"{what} (should {hints[0]}?)" if hints else what
-
-
-def _meant(name: str) -> str | None:
-    """The column that an unknown name may mean: in another case, with other separators, or as other loggers say."""
-    plain = re.sub(r"[\W_]", "", name).lower()
-    return _OTHER_NAMES.get(plain, plain if plain in COLUMN_NAMES else None)
-
-
-def _unknown_note(unknown: tuple[str, ...]) -> str:
-    shown = [quoted(name) + (f" (did you mean {_meant(name)}?)" if _meant(name) else "") for name in unknown[:8]]
-    more = f" and {len(unknown) - 8} more" if len(unknown) > 8 else ""
-    return f"unknown columns are ignored: {', '.join(shown)}{more}"
 
 
 def _slowest(table: Table, names: tuple[str, ...]) -> Sampling | None:
@@ -152,30 +113,13 @@ def _check_time(table: Table) -> float:
     return dt
 
 
-def _check_units(table: Table) -> Table:
-    """Refuse angles that contradict their rates or jump by 360. Returns the table without impossible angles.
-
-    Roll may pass 2 pi if its rate agrees: the vehicle made a flip.
-    """
-    columns, limits = table.columns, ROLL | PITCH
-    for name, rate in _ANGLES:
-        ratio = _scale_ratio(columns["t"], columns[name], columns[rate]) if table.holds(name, rate) else None
-        if ratio is None:
-            continue
-        if name == "phi" and 1 / 3 < ratio < 3:
-            limits = PITCH
-        for wrong, unit, off, what in (
-            (name, "degrees", ratio / _DEGREES, f"changes {ratio:.3g} times as fast as {rate}"),
-            (rate, "deg/s", ratio * _DEGREES, f"is {1 / ratio:.3g} times as fast as {name} changes"),
-        ):
-            if 1 / _SPREAD < off < _SPREAD:
-                table.refuse(f"{what}: {table.remedy or f'it looks like {unit}, divide by 57.3'}", column=wrong)
+def _check_heading(table: Table) -> None:
+    """Refuse a heading that jumps by 360."""
     if table.holds("psi"):
-        measured = np.flatnonzero(np.isfinite(columns["psi"]))
-        jumps = np.zeros(columns["psi"].size, dtype=bool)
-        jumps[measured[1:]] = np.abs(np.abs(np.diff(columns["psi"][measured])) - 360) < 20
+        psi = table.columns["psi"]
+        measured, jumps = np.flatnonzero(np.isfinite(psi)), np.zeros(psi.size, dtype=bool)
+        jumps[measured[1:]] = np.abs(np.abs(np.diff(psi[measured])) - 360) < 20
         _refuse_any(table, "psi", jumps, "jumps by about 360: it looks like degrees, divide by 57.3")
-    return table.without_impossible(limits)
 
 
 def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
@@ -185,35 +129,6 @@ def _refuse_any(table: Table, name: str, wrong: np.ndarray, what: str) -> None:
         table.refuse(what.format(table.columns[name][index]), index=index, column=name)
 
 
-def _scale_ratio(t: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> float | None:
-    """How much faster an angle changes than its rate, or None if the flight does not show it.
-
-    Increments of the angle over 0.2 s are compared with the integral of the rate, so that noise averages out. In a
-    steep attitude the axes are coupled, and the increments no longer resemble the integral: the result is then None.
-    """
-    with_rate = np.isfinite(rate)
-    if np.count_nonzero(with_rate) < 2:
-        return None
-    rates = Series(t[with_rate], rate[with_rate, None])
-    with_angle = np.isfinite(angle) & (t >= rates.t[0]) & (t <= rates.t[-1])
-    instants, angle = t[with_angle], angle[with_angle]
-    knots = np.empty(0, dtype=int)
-    if instants.size > _FEWEST:
-        windows = np.arange(1 + min((instants[-1] - instants[0]) / _WINDOW, instants.size))
-        knots = np.unique(np.searchsorted(instants, instants[0] + _WINDOW * windows))
-        knots = knots[knots < instants.size]
-    if knots.size <= _FEWEST:
-        return None
-    steps = np.diff(angle)
-    turn = 360.0 if np.abs(steps).max() > 3 * math.pi else 2 * math.pi
-    increments = np.diff(np.concatenate([[0.0], np.cumsum(steps - turn * np.rint(steps / turn))])[knots])
-    expected = np.diff(integral(rates, instants[knots], linear=True)[:, 0])
-    sizes = float(np.linalg.norm(increments)), float(np.linalg.norm(expected))
-    if min(sizes) == 0 or increments @ expected < _SIMILARITY * sizes[0] * sizes[1]:
-        return None
-    return sizes[0] / sizes[1]
-
-
 def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | None, notes: list[str]) -> np.ndarray:
     """Measured speeds, or commands times the speed of full command [rad/s], shape (rows, 4)."""
     speeds, commands = (list(filter(table.holds, names)) for names in (SPEED_NAMES, COMMAND_NAMES))
@@ -221,8 +136,8 @@ def _rotor_speeds(table: Table, airframe: Airframe | None, full_scale: float | N
     if len(names) < 4:
         wanted = COMMAND_NAMES if commands and not speeds else SPEED_NAMES
         lacking = next(name for name in wanted if name not in names)
-        what = _missing("is missing", wanted, table)
-        table.refuse(f"{what}; a flight needs omega1..4 [rad/s] or command1..4 [0..1], all four", column=lacking)
+        what = "is missing; a flight needs omega1..4 [rad/s] or command1..4 [0..1], all four"
+        table.refuse(what, column=lacking)
     if speeds and commands:
         notes.append(f"measured {speeds[0]}..{speeds[-1]} are used; {', '.join(commands)} are ignored")
     omega = np.column_stack([_held(table, name, notes) for name in names])
@@ -253,17 +168,6 @@ def _held(table: Table, name: str, notes: list[str]) -> np.ndarray:
     return column[last]
 
 
-def _thrust_note(ratio: float) -> list[str]:
-    """A note, if the median thrust is `ratio` times the weight, and rpm or rev/s would explain it."""
-    if 1 / 25 < ratio < 25:
-        return []
-    if ratio == 0:
-        return ["the rotors do not turn for at least half of the flight: keep only the part in the air"]
-    unit = "rpm, divide by 9.549" if ratio > 1 else "rev/s, multiply by 6.283"
-    advice = f"check the airframe, and whether rotor speeds are in {unit}"
-    return [f"the median thrust of the rotors is {ratio:.2g} times the airframe's weight: {advice}"]
-
-
 def _channels(table: Table, notes: list[str]) -> np.ndarray:
     """States and specific force, shape (rows, 15), with unwrapped angles."""
     nothing = np.full(table.columns["t"].size, np.nan)
@@ -279,10 +183,6 @@ def _channels(table: Table, notes: list[str]) -> np.ndarray:
     if len(measured) >= _STILL and measured.size and (np.nanmax(measured, 0) == np.nanmin(measured, 0)).all():
         notes.append("the accelerometer does not change at all: it is off, and counts as not measured")
         force[:] = np.nan
-    size = np.sqrt((force**2).sum(axis=1))
-    size = size[np.isfinite(size)]
-    if size.size and 0.5 < (median := np.median(size)) < 2:
-        notes.append(f"ax, ay, az have a median magnitude of {median:.2g} m/s^2: if they are in g, multiply by 9.80665")
     return channels
 
 

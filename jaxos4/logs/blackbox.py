@@ -2,32 +2,26 @@
 
 | column | column of the log | unit in the log |
 | --- | --- | --- |
-| `t` | `time (us)`, `time (ms)`, `time (s)`, or Explorer's `time`; 0 at the first row | as named; Explorer: us |
-| `p, q, r` | `gyroUnfilt[0..2]`, or `gyroADC[0..2]` | deg/s, or as named: `(deg/s)`, `(rad/s)` |
-| `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g, or as named: `(g)`, `(m/s2)` |
+| `t` | `time (us)`, or Explorer's `time`; 0 at the first row | us |
+| `p, q, r` | `gyroUnfilt[0..2]`, or `gyroADC[0..2]` | deg/s |
+| `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g |
 | `omega1..4` | `eRPM[0..3]`, measured | 100 electrical revolutions a minute |
 | `command1..4` | `motor[0..3]`, if there is no `eRPM` | DShot 48..2047, or PWM 1000..2000 |
-| `voltage` | `vbatLatest` of Betaflight 4, INAV's `vbat` | 0.01 V |
-| `phi, theta, psi` | INAV's `attitude[0..2]` | 0.1 deg |
-| `x, y, z` | INAV's `navPos[0..2]` | cm |
-| `vx, vy, vz` | INAV's `navVel[0..2]` | cm/s |
+| `voltage` | `vbatLatest` of Betaflight 4 | 0.01 V |
 
 The unfiltered gyro is preferred: the filters of the flight controller delay the rates by some milliseconds, which the
 estimators would attribute to the vehicle. Commands count as fractions of the airframe's `max_rotor_speed`.
 
 **Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
-reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle`, `gyro_scale` and
-`blackbox_high_resolution` (rates are in tenths of a deg/s). For the CSV of `blackbox_decode` they are taken from the
-`.bbl` or `.BFL` file beside it (`LOG00001.02.csv`: second session of `LOG00001.BFL`). Without settings, the reader
-assumes 14 poles, deg/s, 1 g from the accelerometer's median, the protocol from the commands' range, and notes it.
+reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle` and
+`blackbox_high_resolution` (rates are in tenths of a deg/s). The CSV of `blackbox_decode` has no settings. Then the
+reader assumes 14 poles, deg/s, 1 g from the accelerometer's median and the protocol from the range, and notes it.
 
 **Sessions.** A vehicle writes one session each time that it is armed. The sessions of a file follow each other in one
 flight, with an unmeasured second between them.
 
 **Frames.** Gyro and accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose
 down, yaw counter-clockwise seen from above. (The firmware's own telemetry has the opposite signs of pitch and yaw.)
-INAV's `attitude` is roll to the right, pitch nose down, and heading clockwise from north, so psi = -heading. INAV's
-`navPos` is north, east, up; ours is north, west, up.
 
 **Rotors.** They keep the log's numbers (Betaflight's quad X: 1 rear right, 2 front right, 3 rear left, 4 front left).
 The airframe's `rotor_positions` and `rotor_spins` must have the same order.
@@ -39,10 +33,7 @@ import contextlib
 import csv
 import itertools
 import math
-import os
 import re
-import struct
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -61,31 +52,21 @@ _BETWEEN = 1.0  # [s], put between sessions
 _DEGREE, _GRAVITY = math.pi / 180, 9.80665
 _POLES = 14
 _COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
-_TIMES = {"time (us)": 1e-6, "time (ms)": 1e-3, "time (s)": 1.0, "time": 1e-6}
+_TIMES = ("time (us)", "time")
 _RATES = ("gyroUnfilt", "gyroADC")
-_RATE_UNITS = {"": _DEGREE, " (deg/s)": _DEGREE, " (rad/s)": 1.0}
-_FORCE_UNITS = {"": math.nan, " (g)": _GRAVITY, " (m/s2)": 1.0, " (m/s/s)": 1.0}
 _DSHOT, _PWM = (48.0, 2047.0), (1000.0, 2000.0)
-_TENTH = _DEGREE / 10
-_INAV = {  # column: column of the log, unit in our frame
-    **{"phi": ("attitude[0]", _TENTH), "theta": ("attitude[1]", _TENTH), "psi": ("attitude[2]", -_TENTH)},
-    **{"x": ("navPos[0]", 0.01), "y": ("navPos[1]", -0.01), "z": ("navPos[2]", 0.01)},
-    **{"vx": ("navVel[0]", 0.01), "vy": ("navVel[1]", -0.01), "vz": ("navVel[2]", 0.01)},
-}
-_VOLTAGES = {"vbatLatest": r"Betaflight ([4-9]|\d{2,})\.", "vbat": "INAV"}  # the firmware whose unit is known
+_VOLTAGE, _KNOWN_UNIT = "vbatLatest", re.compile(r"Betaflight ([4-9]|\d{2,})\.")
 _EXPORT = "export it as CSV by Blackbox Explorer"
 _DECODE = "decode it by blackbox_decode (of blackbox-tools), and give its CSV"
 _REMEDY = f"its unit is not the one that this reader assumes, or the log is corrupt: {_EXPORT}"
 _KNOWN = (
     *_TIMES,
-    *(f"{name}[{i}]{unit}" for name in _RATES for i in range(3) for unit in _RATE_UNITS),
-    *(f"accSmooth[{i}]{unit}" for i in range(3) for unit in _FORCE_UNITS),
-    *(name for name, _ in _INAV.values()),
-    *_VOLTAGES,
+    *(f"{name}[{i}]" for name in (*_RATES, "accSmooth") for i in range(3)),
+    _VOLTAGE,
     *(f"{name}[{i}]" for name in ("eRPM", "motor") for i in range(8)),
 )
 # A session is read with the longest one only if they agree in these settings.
-_USED = ("acc_1G", "gyro_scale", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
+_USED = ("acc_1G", "blackbox_high_resolution", "maxthrottle", "motorOutput", "motor_poles")
 
 Settings = dict[str, str]
 Columns = dict[str, np.ndarray]
@@ -110,14 +91,6 @@ class _Log(NamedTuple):
         self.names.update(names)
         self.columns.update((column, self.raw[name] * factor) for column, name in names.items())
 
-    def vector(self, fields: Iterable[str], units: Iterable[str]) -> tuple[str, str, list[str]] | None:
-        """The first field with three columns in one of the units, the unit, and the columns."""
-        for field, unit in itertools.product(fields, units):
-            names = [f"{field}[{i}]{unit}" for i in range(3)]
-            if self.raw.keys() >= set(names):
-                return field, unit, names
-        return None
-
     def setting(self, name: str, least: float, most: float) -> float | None:
         """A setting, or the last of several, if it is a number within these limits."""
         try:
@@ -134,16 +107,13 @@ def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
         refuse(path, "there is no time: export the column 'time (us)'", row=log.header)
-    log.names["t"], log.columns["t"] = time, (raw[time] - np.nan_to_num(raw[time][0])) * _TIMES[time]
+    log.names["t"], log.columns["t"] = time, (raw[time] - np.nan_to_num(raw[time][0])) * 1e-6
     _add_rates(log)
     _add_rotors(log)
     _add_force(log)
-    for column, (name, unit) in _INAV.items():
-        log.add({column: name} if name in raw else {}, unit)
-    for name, firmware in _VOLTAGES.items():
-        if name in raw and re.match(firmware, log.settings.get("Firmware revision", "")):
-            log.add({"voltage": name}, 1.0)
-            log.columns["voltage"] /= 100
+    if _VOLTAGE in raw and _KNOWN_UNIT.match(log.settings.get("Firmware revision", "")):
+        log.add({"voltage": _VOLTAGE}, 1.0)
+        log.columns["voltage"] /= 100
     log.notes.append(order_note(log.names.get("omega1", log.names.get("command1", ""))))
     return Table(path, log.columns, first_row=first_row, names=log.names, remedy=_REMEDY), tuple(log.notes)
 
@@ -157,15 +127,11 @@ BLACKBOX = LogFormat("blackbox", "blackbox", _recognises, read_blackbox)
 
 
 def _csv(path: Path) -> _Log:
-    """A CSV, with the settings above its header, or with those of the `.bbl` or `.BFL` file beside it."""
+    """A CSV, with the settings above its header, if there are any."""
     settings, skip = _settings_above(path)
-    notes = []
-    if not settings:
-        settings, beside = _settings_beside(path)
-        notes += [f"settings are taken from {beside} beside it"] * bool(settings)
     table = read_table(path, _KNOWN, skip=skip, missing=("NaN", "nan"))
     raw = {name: column for name, column in table.columns.items() if not np.isnan(column).all()}
-    return _Log(path, skip + 1, settings, raw, {}, {}, notes)
+    return _Log(path, skip + 1, settings, raw, {}, {}, [])
 
 
 def _is_header(line: str) -> bool:
@@ -189,21 +155,6 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
 
 
-def _settings_beside(path: Path) -> tuple[Settings, str]:
-    """The settings of the log that a CSV of `blackbox_decode` was made from, if it lies beside it, and its name."""
-    folder, name = os.path.split(os.fspath(path))
-    match = re.fullmatch(r"(.+?)(?:\.(\d{2}))?\.csv", name, re.IGNORECASE)
-    if match is None:
-        return {}, ""
-    for ending in ("bbl", "BBL", "bfl", "BFL", "txt", "TXT"):
-        beside = os.path.join(folder, f"{match[1]}.{ending}")
-        every = _sessions(beside) if os.path.isfile(beside) else []
-        number = int(match[2]) if match[2] else 1 if len(every) == 1 else 0
-        if 0 < number <= len(every):
-            return every[number - 1][0], os.path.basename(beside)
-    return {}, ""
-
-
 def _is_raw(path: Path) -> bool:
     """Whether a file is a blackbox log that was not decoded."""
     with opened(path, "rb") as file:
@@ -211,11 +162,11 @@ def _is_raw(path: Path) -> bool:
 
 
 def _sessions(path: Path) -> list[tuple[Settings, bytes]]:
-    """The settings and the frames of the sessions of a file, in order; none if it is no blackbox log.
+    """The settings and the frames of the sessions of a file, in order.
 
     A header ends at the first line that does not begin with `H `, or is not text.
     """
-    content, found = read_bytes(path, _LARGEST) if _is_raw(path) else b"", []
+    content, found = read_bytes(path, _LARGEST), []
     places = [match.start() for match in re.finditer(_MAGIC, content)]
     for at, end in itertools.pairwise([*places, len(content)]):
         settings: Settings = {}
@@ -277,26 +228,13 @@ def _session(settings: Settings, frames: bytes) -> tuple[Columns | None, str]:
 
 
 def _add_rates(log: _Log) -> None:
-    found = log.vector(_RATES, _RATE_UNITS)
-    if found is None:
+    field = next((name for name in _RATES if log.raw.keys() >= {f"{name}[{i}]" for i in range(3)}), None)
+    if field is None:
         refuse(log.path, "there are no body rates, gyroADC[0..2] or gyroUnfilt[0..2]; log the gyro", row=log.header)
-    field, unit, names = found
-    factor = _RATE_UNITS[unit]
-    if unit == "":
-        factor *= _gyro_unit(log.settings) / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
-        fine = "with blackbox_high_resolution its unit is 0.1 deg/s"
-        remedy = "give the .bbl or .BFL file, or keep it beside this one"
-        log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}; {remedy}"])
-    log.add(dict(zip("pqr", names, strict=True)), factor)
-
-
-def _gyro_unit(settings: Settings) -> float:
-    """The unit of the gyro [deg/s], by the setting `gyro_scale`, as `0x3f800000`; 1 if there is none."""
-    text = settings.get("gyro_scale", "")
-    if not re.fullmatch("0x[0-9a-fA-F]{1,8}", text):
-        return 1.0
-    (value,) = struct.unpack("<f", int(text, 16).to_bytes(4, "little"))
-    return value if 1e-3 <= value <= 1 else 1.0
+    fine = "with blackbox_high_resolution its unit is 0.1 deg/s; give the .bbl or .BFL file"
+    log.notes.extend([] if log.settings else [f"{field} is taken as deg/s: {fine}"])
+    unit = _DEGREE / (10.0 if log.setting("blackbox_high_resolution", 1, 1) else 1.0)
+    log.add({name: f"{field}[{i}]" for i, name in enumerate("pqr")}, unit)
 
 
 def _add_rotors(log: _Log) -> None:
@@ -326,22 +264,18 @@ def _add_rotors(log: _Log) -> None:
 
 
 def _add_force(log: _Log) -> None:
-    found = log.vector(("accSmooth",), _FORCE_UNITS)
-    if found is None:
+    names = [f"accSmooth[{i}]" for i in range(3)]
+    if not log.raw.keys() >= set(names):
         return
-    _, unit, names = found
     if log.setting("acc_1G", 0, 0) is not None or not any(np.ptp(_finite(log.raw[name])) for name in names):
         log.notes.append("the accelerometer is off (accSmooth does not change): switch it on, thrust is then checked")
         return
-    factor = _FORCE_UNITS[unit]
-    if unit == "":
-        one = log.setting("acc_1G", 1, 65535)
-        if one is None:
-            median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
-            one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
-            log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
-        factor = _GRAVITY / one
-    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), factor)
+    one = log.setting("acc_1G", 1, 65535)
+    if one is None:
+        median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
+        one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
+        log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
+    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), _GRAVITY / one)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

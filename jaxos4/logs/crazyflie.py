@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | `p, q, r` | `gyro.x, y, z` | deg/s |
 | `ax, ay, az` | `acc.x, y, z` | g |
-| `phi, theta, psi` | `stateEstimate.roll, pitch, yaw`, or `stateEstimate.qw, qx, qy, qz` | deg |
+| `phi, theta, psi` | `stateEstimate.roll, pitch, yaw` | deg |
 | `x, y, z` | `stateEstimate.x, y, z` | m |
 | `vx, vy, vz` | `stateEstimate.vx, vy, vz` | m/s |
 | `omega1..4` | `rpm.m1..m4`, measured, interpolated linearly in the square | rpm |
@@ -16,7 +16,7 @@ one, and counts as a fraction of the airframe's `max_rotor_speed`. `t` is 0 at t
 the body rates are the rows; samples at other rates are brought to them (`jaxos4.logs.sampling`).
 
 **Frames.** The body has x forward, y left, z up, as ours, and rates follow the right hand. `stateEstimate.pitch` is
-positive nose up, so theta is its negative. The quaternion needs no correction.
+positive nose up, so theta is its negative.
 
 **Rotors.** They keep the firmware's numbers (1 front right, 2 rear right, 3 rear left, 4 front left). The airframe's
 `rotor_positions` and `rotor_spins` must have the same order.
@@ -36,7 +36,7 @@ import zlib
 
 import numpy as np
 
-from .sampling import Series, attitude_of, gyro_rows, in_order, logged_rate, unwrapped
+from .sampling import Series, gyro_rows, in_order, logged_rate, unwrapped
 from .table import LogFacts, LogFormat, Path, Sampling, Table, needed, quoted, read_bytes, refuse
 
 _MAGIC = b"\xbc"
@@ -58,7 +58,6 @@ _ANGLES = {
     "theta": ("stateEstimate.pitch", -_DEGREE),
     "psi": ("stateEstimate.yaw", _DEGREE),
 }
-_QUATERNION = {axis: (f"stateEstimate.q{axis}", 1.0) for axis in "wxyz"}
 _ROTORS = (("omega", "rpm.m{}", _RPM), ("command", "motor.m{}", 1 / _FULL), ("command", "pwm.m{}_pwm", 1 / _FULL))
 _AGAIN = "copy it again from the card"
 _REMEDY = f"the log is corrupt there: {_AGAIN}, or choose another"
@@ -78,7 +77,8 @@ def read_crazyflie(path: Path) -> tuple[Table, tuple[str, ...]]:
     rates = needed(path, _series(variables, _RATES, names), "body rates", remedy)
     remedy = "add motor.m1 to motor.m4, or rpm.m1 to rpm.m4, to config.txt"
     rotors, first = needed(path, _rotors(variables, names), "rotor speeds or commands", remedy)
-    others: dict[tuple[str, ...], Series | None] = {tuple(_ANGLES): _attitude(variables, names)}
+    angles = _series(variables, _ANGLES, names)
+    others = {tuple(_ANGLES): None if angles is None else unwrapped(angles.t, angles.values)}
     others |= {(name,): _series(variables, {name: source}, names) for name, source in _OTHERS.items()}
     if first == "command1":
         notes.append(f"commands are {names[first]}.., taken as fractions of full-scale rotor speed")
@@ -195,12 +195,3 @@ def _rotors(variables: Variables, names: dict[str, str]) -> tuple[Series, str] |
             values = series.values[finite]
             return Series(series.t[finite], values if measured else np.clip(values, 0.0, 1.0)), f"{prefix}1"
     return None
-
-
-def _attitude(variables: Variables, names: dict[str, str]) -> Series | None:
-    if (series := _series(variables, _ANGLES, names)) is not None:
-        return unwrapped(series.t, series.values)
-    if (series := _series(variables, _QUATERNION, {})) is None:
-        return None
-    names |= dict.fromkeys(_ANGLES, "stateEstimate.q")
-    return attitude_of(series.t, series.values)

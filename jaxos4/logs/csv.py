@@ -16,16 +16,15 @@ The first row holds the names of the columns, in any order. Cells are separated 
 
 A missing column or an empty cell means that the value was not measured. Voltage is interpolated over empty cells. A
 flight needs `t`, all four rotors (speeds or commands), and at least one of the twelve states of Eq. (14).
-
-The parser is our own, because those of NumPy give neither the row of the file nor the name of the column.
 """
 
+import array
 import contextlib
 import csv
 import itertools
 import math
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from typing import IO
 
 import numpy as np
@@ -36,9 +35,9 @@ from ..flight import FORCE_NAMES, STATE_NAMES, Flight
 from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES
 from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, quoted, refuse
 
-_ROWS_AT_ONCE = 8192  # the whole text never has to fit in memory
 _LONGEST_LINE = 1 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)  # float() also reads "nan", "1_0" and the digits of other scripts
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
@@ -57,25 +56,26 @@ def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Co
 
     **Raises:** `InputError`, one line with file, row and column, whatever the file contains.
     """
-    first_row = skip + 2
+    first_row, values = skip + 2, array.array("d")
     with opened(path) as file:
         for _ in range(skip):
             file.readline(_LONGEST_LINE)
         header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
-        parts: dict[str, list[np.ndarray]] = {name: [] for name in header if name in known}
-        rows, row = _rows(path, file, len(header), first_row), first_row
-        while block := list(itertools.islice(rows, _ROWS_AT_ONCE)):
-            for name, cells in zip(header, zip(*block, strict=True), strict=True):
-                if name in parts:
-                    given = ["" if cell.strip() in missing else cell for cell in cells] if missing else cells
-                    parts[name].append(_numbers(path, name, given, row))
-            row += len(block)
-            if row - first_row > MAX_ROWS:
+        wanted = [name for name in header if name in known]
+        places = [header.index(name) for name in wanted]
+        count = 0
+        for count, cells in enumerate(_rows(path, file, len(header), first_row), start=1):
+            given = [cells[place] for place in places]
+            if missing:
+                given = ["" if cell.strip() in missing else cell for cell in given]
+            values.extend(_numbers(path, wanted, given, first_row + count - 1))
+            if count > MAX_ROWS:
                 refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
-    if row - first_row < 2:
-        refuse(path, f"has a header and {['no data', 'one row of data'][row - first_row]}; a flight needs two rows")
-    columns = {name: np.concatenate(parts.pop(name)) for name in list(parts)}
-    return Table(path, columns, tuple(name for name in header if name not in known), first_row)
+    if count < 2:
+        refuse(path, f"has a header and {['no data', 'one row of data'][count]}; a flight needs two rows")
+    columns = np.asarray(values).reshape(count, len(wanted)).T.copy()
+    unknown = tuple(name for name in header if name not in known)
+    return Table(path, dict(zip(wanted, columns, strict=True)), unknown, first_row)
 
 
 def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
@@ -111,10 +111,8 @@ def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -
     with write_atomically(path) as beside, open(beside, "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        for start in range(0, flight.time.shape[0], _ROWS_AT_ONCE):
-            rows = slice(start, start + _ROWS_AT_ONCE)
-            cells = [np.where(np.isnan(c[rows]), "", c[rows].astype(str)).tolist() for c in columns.values()]
-            writer.writerows(zip(*cells, strict=True))
+        rows = np.column_stack([*columns.values()])
+        writer.writerows(["" if math.isnan(x) else x for x in row.tolist()] for row in rows)
 
 
 def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str]:
@@ -141,18 +139,16 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
 
 def _rows(path: Path, file: IO[str], width: int, first_row: int) -> Iterator[list[str]]:
     """The cells of each line, without the blank lines at the end of the file."""
-    blank = 0
+    blank = None
     for row in itertools.count(first_row):
         line = file.readline(_LONGEST_LINE)
         if not line:
             return
         if line.isspace():
-            blank += 1
-            if blank > _LONGEST_LINE:
-                refuse(path, "and a million rows before it are blank; delete them", row=row)
+            blank = blank or row
             continue
         if blank:
-            refuse(path, "is blank; delete it", row=row - blank)
+            refuse(path, "is blank; delete it", row=blank)
         cells = _cells(path, line.rstrip("\n"), row)
         if len(cells) != width:
             what = f"has {counted(len(cells), 'cell')}, but the header has {width}; repair or delete the row"
@@ -170,22 +166,21 @@ def _cells(path: Path, line: str, row: int) -> list[str]:
         refuse(path, "contains a cell that is too long; repair or delete the row", row=row)
 
 
-def _numbers(path: Path, column: str, cells: Sequence[str], row: int) -> np.ndarray:
-    text = "".join(cells)
-    if text.isascii() and "_" not in text:  # float() also reads "1_0" and the digits of other scripts
+def _numbers(path: Path, columns: list[str], cells: list[str], row: int) -> list[float]:
+    if _PLAIN.fullmatch("".join(cells)):
         with contextlib.suppress(ValueError):
-            values = np.array([float(cell) if cell else math.nan for cell in cells])
-            if np.count_nonzero(np.isfinite(values)) + cells.count("") == len(cells):
+            values = [float(cell) if cell else math.nan for cell in cells]
+            if max(values) < math.inf > -min(values):
                 return values
-    values = np.empty(len(cells))
-    for i, cell in enumerate(map(str.strip, cells)):
+    values = []
+    for column, cell in zip(columns, map(str.strip, cells), strict=True):
         number = _NUMBER.fullmatch(cell) is not None
-        values[i] = float(cell) if number else math.nan
-        if cell and not math.isfinite(values[i]):
+        values.append(float(cell) if number else math.nan)
+        if cell and not math.isfinite(values[-1]):
             fault = ", which is too large for a number;" if number else ", which is not a number; correct it, or"
             fault = ";" if cell.lower().lstrip("+-") in _NO_NUMBER else fault
             what = f"contains {quoted(cell)}{fault} leave the cell empty if it was not measured"
-            refuse(path, what if _readable(cell) else _NOT_UTF8, row=row + i, column=column)
+            refuse(path, what if _readable(cell) else _NOT_UTF8, row=row, column=column)
     return values
 
 

@@ -49,7 +49,6 @@ class LogFacts(NamedTuple):
     - `landed`: from when to when the vehicle itself says that it is on the ground [s], in the flight's time.
     - `rotor_positions`: x forward and y left of each rotor [m], in the order of the rotors in the flight.
     - `rotor_spins`: +1 for counter-clockwise seen from above, -1 for clockwise.
-    - `cells`: number of the battery's cells in series.
     """
 
     motors: Sampling | None = None
@@ -58,7 +57,6 @@ class LogFacts(NamedTuple):
     landed: tuple[tuple[float, float], ...] = ()
     rotor_positions: tuple[tuple[float, float], ...] | None = None
     rotor_spins: tuple[float, ...] | None = None
-    cells: int | None = None
 
     @property
     def too_slow(self) -> str:
@@ -84,7 +82,6 @@ class Limit(NamedTuple):
     below: str = ""
 
 
-_ANGLE = Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")
 _TIME = "t is in seconds: if these are milli-, micro- or nanoseconds, divide"
 _COMMAND = "commands are fractions 0..1: divide by full scale (100, 65535)"
 _SPEED = "rotor speeds are in rad/s: if these are rpm, divide by 9.549"
@@ -102,13 +99,12 @@ LIMITS = {
     **dict.fromkeys("xyz", Limit(-1e6, 1e6, "m", _POSITION)),
     **dict.fromkeys(("vx", "vy", "vz"), Limit(-1e3, 1e3, "m/s", _VELOCITY)),
     **dict.fromkeys("pqr", Limit(-60.0, 60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
-    **dict.fromkeys(("phi", "theta", "psi"), _ANGLE),
+    **dict.fromkeys(("phi", "psi"), Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")),
+    "theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH),
     **dict.fromkeys(FORCE_NAMES, Limit(-1e3, 1e3, "m/s^2", _FORCE)),
     "voltage": Limit(-200.0, 200.0, "V", _VOLTAGE),
 }
 """A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
-ROLL = {"phi": Limit(-2 * math.pi, 2 * math.pi, "rad", _ANGLE.advice)}  # without a flip
-PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
 
 
 class Table(NamedTuple):
@@ -151,13 +147,13 @@ class Table(NamedTuple):
         what = [f"{self.names.get(name, name)}: {k} (first {first})" for name, (k, first) in self.impossible.items()]
         return f"impossible values count as not measured, in {', '.join(what)}"
 
-    def without_impossible(self, limits: Mapping[str, Limit] = LIMITS) -> "Table":
-        """The table without the values outside of `limits`: they count as not measured.
+    def without_impossible(self) -> "Table":
+        """The table without the values outside of `LIMITS`: they count as not measured.
 
         **Raises:** `InputError` if they are more than 1 % of the values of a column.
         """
         columns, impossible = dict(self.columns), dict(self.impossible)
-        for name, limit in limits.items():
+        for name, limit in LIMITS.items():
             values = columns.get(name, np.empty(0))
             wrong = (values < limit.least) | (values > limit.largest)
             if name == "t" or not wrong.any():

@@ -2,8 +2,8 @@
 
 | column | topic and field of the log | unit in the log |
 | --- | --- | --- |
-| `p, q, r` | the fastest of `vehicle_angular_velocity`, `sensor_combined.gyro_rad`, `sensor_gyro` | rad/s |
-| `ax, ay, az` | the fastest of `sensor_combined.accelerometer_m_s2`, `vehicle_acceleration`, `sensor_accel` | m/s^2 |
+| `p, q, r` | the faster of `vehicle_angular_velocity.xyz`, `sensor_combined.gyro_rad` | rad/s |
+| `ax, ay, az` | the faster of `sensor_combined.accelerometer_m_s2`, `vehicle_acceleration.xyz` | m/s^2 |
 | `phi, theta, psi` | `vehicle_attitude.q`: w, x, y, z, from the body to the earth | |
 | `x, y, z` | `vehicle_local_position.x, y, z`, while `xy_valid` and `z_valid` | m |
 | `vx, vy, vz` | `vehicle_local_position.vx, vy, vz`, while `v_xy_valid` and `v_z_valid` | m/s |
@@ -57,20 +57,12 @@ import numpy as np
 
 from .sampling import Series, attitude_of, gyro_rows, logged_rate
 from .table import LIMITS, LogFacts, LogFormat, Path, Sampling, Table, fast_enough, needed, order_note, refuse
-from .ulog_file import HALF_TURN, MAGIC, Source, Topics, decoded
+from .ulog_file import HALF_TURN, MAGIC, Topics, decoded
 
-_RATES = (
-    Source("vehicle_angular_velocity", ("xyz[0]", "xyz[1]", "xyz[2]")),
-    Source("sensor_combined", ("gyro_rad[0]", "gyro_rad[1]", "gyro_rad[2]")),
-    Source("sensor_gyro", ("x", "y", "z"), "CAL_GYRO"),
-)
-_FORCES = (
-    Source("sensor_combined", ("accelerometer_m_s2[0]", "accelerometer_m_s2[1]", "accelerometer_m_s2[2]")),
-    Source("vehicle_acceleration", ("xyz[0]", "xyz[1]", "xyz[2]")),
-    Source("sensor_accel", ("x", "y", "z"), "CAL_ACC"),
-)
+_RATES = {"vehicle_angular_velocity": "xyz", "sensor_combined": "gyro_rad"}
+_FORCES = {"sensor_combined": "accelerometer_m_s2", "vehicle_acceleration": "xyz"}
 _TOPICS = (
-    *(source.topic for source in (*_RATES, *_FORCES)),
+    *(*_RATES, *_FORCES),
     *("esc_status", "actuator_motors", "actuator_outputs"),
     *("vehicle_attitude", "vehicle_local_position", "vehicle_status", "vehicle_land_detected", "battery_status"),
 )
@@ -78,19 +70,9 @@ _ANGLES = ("phi", "theta", "psi")
 _FLAGS = {"x": "xy_valid", "y": "xy_valid", "z": "z_valid", "vx": "v_xy_valid", "vy": "v_xy_valid", "vz": "v_z_valid"}
 _REMEDY = "the log is corrupt there, or a sensor failed: choose another log"
 _MOTORS = 12  # the most that PX4 can drive
-_VTOL = "a VTOL"
-# Types of MAVLink (MAV_TYPE), and of PX4's control allocation (CA_AIRFRAME). Types that are missing here can be quads.
-_MAV_TYPES = {
-    **{1: "a fixed wing", 3: "a coaxial helicopter", 4: "a helicopter", 7: "an airship", 10: "a rover", 11: "a boat"},
-    **{12: "a submarine", 13: "a hexarotor", 14: "an octorotor", 15: "a tricopter", 29: "a dodecarotor"},
-    **dict.fromkeys(range(19, 26), _VTOL),
-    35: "a decarotor",
-}
-_CA_AIRFRAMES = {
-    **{1: "a fixed wing", 2: _VTOL, 3: _VTOL, 4: _VTOL, 5: "a rover", 6: "a rover", 8: "a multirotor that tilts"},
-    **{10: "a helicopter", 11: "a helicopter", 12: "a coaxial helicopter"},
-}
-_VEHICLE_TYPES = {2: "a fixed wing", 3: "a rover", 4: "an airship"}  # of the topic vehicle_status
+# Types of MAVLink, of PX4's control allocation and of its state that are no quadrotors. Others can be quadrotors.
+_OTHER_MAV_TYPES = {1, 3, 4, 7, *range(10, 16), *range(19, 26), 29, 35}
+_OTHER_AIRFRAMES, _OTHER_VEHICLES = {1, 2, 3, 4, 5, 6, 8, 10, 11, 12}, {2, 3, 4}
 _GROUND = ("landed", "maybe_landed", "ground_contact")
 _FIRST_MOTOR = 101  # PX4's number of the output function "Motor 1"
 _RPM = 2 * math.pi / 60
@@ -134,24 +116,22 @@ ULOG = LogFormat("ULog", "PX4 ULog", lambda begin: begin.startswith(MAGIC[:4]), 
 
 def _check_vehicle(log: Topics) -> None:
     """Refuse a vehicle that is not a quadrotor: servos and more motors would be read as rotors. Raises `InputError`."""
-    status, parameter = "vehicle_status", log.parameters.get
-    motors, rotors = log.fields("actuator_motors"), int(parameter("CA_ROTOR_COUNT", 0.0))
-    others = [i for i in range(4, _MOTORS) if np.nan_to_num(motors.get(f"control[{i}]", np.zeros(1))).any()]
-    is_vtol = float(log.fields(status).get("is_vtol", np.zeros(1)).any())
-    counts = {} if rotors in (0, 4) else {rotors: f"a vehicle with {rotors} rotors"}
-    for value, kinds, name in (
-        (is_vtol, {1: _VTOL}, f"{status}.is_vtol"),
-        (log.latest(status, "system_type"), _MAV_TYPES, f"{status}.system_type"),
-        (parameter("MAV_TYPE"), _MAV_TYPES, "MAV_TYPE"),
-        (log.latest(status, "vehicle_type"), _VEHICLE_TYPES, f"{status}.vehicle_type"),
-        (parameter("CA_AIRFRAME"), _CA_AIRFRAMES, "CA_AIRFRAME"),
-        (rotors, counts, "CA_ROTOR_COUNT"),
-        (len(others), {n: f"a vehicle that drives {4 + n} motors" for n in range(1, _MOTORS)}, "actuator_motors"),
-    ):
-        if value is not None and int(value) in kinds:
-            what = f"this is {kinds[int(value)]}; only a quadrotor can be identified: give the log of one"
-            name += f".control[{others[0]}]" if name == "actuator_motors" else ""
-            refuse(log.path, what, column=name, kind="parameter" if name.isupper() else "field")
+    status, get, motors = "vehicle_status", log.parameters.get, log.fields("actuator_motors")
+    more = [i for i in range(4, _MOTORS) if np.nan_to_num(motors.get(f"control[{i}]", np.zeros(1))).any()]
+    others = {
+        f"field {status}.is_vtol": log.fields(status).get("is_vtol", np.zeros(1)).any(),
+        f"field {status}.system_type": log.latest(status, "system_type") in _OTHER_MAV_TYPES,
+        f"field {status}.vehicle_type": log.latest(status, "vehicle_type") in _OTHER_VEHICLES,
+        "parameter MAV_TYPE": get("MAV_TYPE") in _OTHER_MAV_TYPES,
+        "parameter CA_AIRFRAME": get("CA_AIRFRAME") in _OTHER_AIRFRAMES,
+        "parameter CA_ROTOR_COUNT": get("CA_ROTOR_COUNT", 0.0) not in (0.0, 4.0),
+        f"field actuator_motors.control[{more[0] if more else 4}]": bool(more),
+    }
+    for place, other in others.items():
+        if other:
+            refuse(
+                log.path, f"{place}: this is no quadrotor, and only a quadrotor can be identified; give the log of one"
+            )
 
 
 def _attitude(log: Topics) -> Series | None:
@@ -176,14 +156,12 @@ def _position(log: Topics) -> Series | None:
 
 
 def _voltage(log: Topics) -> Series | None:
-    """The battery's voltage [V]."""
-    for name in ("voltage_v", "voltage_filtered_v"):
-        series = log.series("battery_status", (name,))
-        if series is not None:
-            log.names["voltage"] = f"battery_status.{name}"
-            possible = (series.values > 0) & (series.values < LIMITS["voltage"].largest)
-            return Series(series.t, np.where(possible, series.values, np.nan))
-    return None
+    series = log.series("battery_status", ("voltage_v",))
+    if series is None:
+        return None
+    log.names["voltage"] = "battery_status.voltage_v"
+    possible = (series.values > 0) & (series.values < LIMITS["voltage"].largest)
+    return Series(series.t, np.where(possible, series.values, np.nan))
 
 
 def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
@@ -195,7 +173,6 @@ def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
     # PX4's y points to the right. Generic airframes say 1 m, because only the directions of the rotors matter to PX4.
     placed = known and np.isfinite(positions).all() and not np.isin(np.abs(positions), (0.0, 1.0)).all()
     spun = known and all(moment != 0 and math.isfinite(moment) for moment in moments)
-    cells = (log.latest("battery_status", "cell_count"), get("BAT1_N_CELLS"), get("BAT_N_CELLS"))
     profile, high_rate = int(get("SDLOG_PROFILE", 1.0)), 16  # `add_high_rate_topics`
     faster = f"set SDLOG_PROFILE to {profile | high_rate} (which includes {high_rate}, 'high rate'), and fly again"
     if profile & high_rate:
@@ -205,7 +182,6 @@ def _facts(log: Topics, rows: np.ndarray) -> LogFacts:
         landed=_landed(log, rows),
         rotor_positions=tuple((float(x), -float(y)) for x, y in positions) if placed else None,
         rotor_spins=tuple(math.copysign(1.0, moment) for moment in moments) if spun else None,
-        cells=next((int(each) for each in cells if each and each > 0), None),
     )
 
 

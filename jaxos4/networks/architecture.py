@@ -1,7 +1,6 @@
 """From features to unknowns: a linear map, a learnt correction, the learnt size of the error, calibrated intervals."""
 
 import functools
-import itertools
 import math
 import statistics
 from typing import Any, NamedTuple
@@ -17,7 +16,6 @@ from .._custom_types import Key, Scalar, as_float
 # Features grow linearly up to this size and logarithmically beyond: flights that nearly diverge have huge features.
 _LINEAR = 4.0
 _DRAWN = 1024  # random numbers at once, for the first weights
-_TILINGS, _CELLS = 8, 20  # of tile coding: grids, and cells along each side
 _SILU = jax.nn.silu
 # The perceptron that predicts the size of the error: its width and depth, and the limit of its logarithm.
 _SPREAD_WIDTH, _SPREAD_DEPTH, _LARGEST_LOGARITHM = 32, 2, 7.0
@@ -33,7 +31,7 @@ class Scaling(eqx.Module):
 
     - `width`: the typical size of each feature.
     - `unit`: the Cramer-Rao bound of each unknown at the bracket's center, in bracket coordinates.
-    - `gain`: the correction of each unknown when the approximator returns 1, in bracket coordinates.
+    - `gain`: the correction of each unknown when the perceptron returns 1, in bracket coordinates.
     - `span`: the largest logarithm of a noise scale.
     """
 
@@ -53,26 +51,6 @@ class NetworkOutput(NamedTuple):
 
     u: Float[Array, " unknowns"]
     log_spread: Float[Array, " unknowns"]
-
-
-class CMAC(eqx.Module):
-    """Tile coding (cerebellar model articulation controller): shifted grids of cells cover every pair of inputs.
-
-    A pair contributes the mean, over its grids, of the entry of the cell that holds the two inputs.
-    """
-
-    tables: Float[Array, "pairs tilings cells cells out"]
-
-    def __init__(self, in_size: int, out_size: int):
-        self.tables = jnp.zeros((in_size * (in_size - 1) // 2, _TILINGS, _CELLS, _CELLS, out_size))
-
-    def __call__(self, x: Float[Array, " in"]) -> Float[Array, " out"]:
-        """The output for inputs `x`. The cells cover -3 to 3; the outermost cells also cover everything beyond."""
-        place = jnp.clip(x / 6 + 0.5, 0, 1) * (_CELLS - 1)
-        cell = jnp.floor(place[:, None] + jnp.arange(_TILINGS) / _TILINGS).astype(int)
-        first, second = np.array(list(itertools.combinations(range(x.shape[0]), 2))).T
-        entries = self.tables[jnp.arange(first.size)[:, None], jnp.arange(_TILINGS), cell[first], cell[second]]
-        return entries.mean(axis=1).sum(axis=0)
 
 
 class GatedPerceptron(eqx.Module):
@@ -98,24 +76,23 @@ class GatedPerceptron(eqx.Module):
 
 
 class Regressor(eqx.Module):
-    """The trained part of a network: a linear map `skip`, an approximator that corrects it, and the error's spread."""
+    """The trained part of a network: a linear map `skip`, a perceptron that corrects it, and the error's spread."""
 
     skip: Float[Array, "unknowns features"]
-    approximator: GatedPerceptron | CMAC
+    perceptron: GatedPerceptron
     spread: eqx.nn.MLP
 
-    def __init__(self, skip: Float[Array, "unknowns features"], approximator: str, *, width: int, depth: int, key: Key):
+    def __init__(self, skip: Float[Array, "unknowns features"], *, width: int, depth: int, key: Key):
         self.skip, sizes = skip, (skip.shape[1] + 1, skip.shape[0])
         first, second = jax.random.split(key)
-        is_cmac = approximator == "cmac"
-        self.approximator = CMAC(*sizes) if is_cmac else GatedPerceptron(*sizes, width, depth, key=first)
+        self.perceptron = GatedPerceptron(*sizes, width, depth, key=first)
         self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=second)
 
     def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> NetworkOutput:
         """Unknowns of one flight, from its features and its noise scale."""
         compressed = compress(features / scaling.width)
         inputs = jnp.concatenate([compressed, (jnp.log(scale) / scaling.span)[None]])
-        u = self.skip @ compressed + scaling.gain * self.approximator(inputs)
+        u = self.skip @ compressed + scaling.gain * self.perceptron(inputs)
         return NetworkOutput(u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM))
 
 

@@ -26,8 +26,6 @@ from .architecture import LEVELS, ErrorTable, Regressor, Scaling, calibrated_sca
 from .features import FEATURES, Coordinates, Features
 from .training import calibrate, train, untrained
 
-APPROXIMATORS = ("mlp", "cmac")
-
 # The first linear map is a matrix of features times features: more features than this do not fit in memory.
 _MOST_FEATURES = 6000
 _MOST_STEPS = 1_000_000
@@ -58,12 +56,11 @@ class NetworkEstimator(eqx.Module):
 
     - `features`: `"score"`: one Gauss-Newton step at the bracket's center, a number for each unknown; `"raw"`: the
       normalised trajectory, as in the paper.
-    - `approximator`: what corrects the linear map: `"mlp"`, a multilayer perceptron, or `"cmac"`, tile coding.
     - `channels`: the channels that the network looks at. Rates are nearly linear in the parameters over a whole
       bracket; attitude and position hold more information, but are far from linear.
     - `noise`: the lowest and highest noise scale of training, in multiples of the problem's sigma. Scales are drawn
       log-uniformly, and the scale is an input of the network.
-    - `width`, `depth`: of the perceptron.
+    - `width`, `depth`: of the perceptron that corrects a linear map.
     - `steps`, `batch`, `learning_rate`: of the training, by Muon with a cosine schedule; a step uses `batch` flights,
       and each flight is used four times with new noise.
     - `patience`: training stops early after this many checks, of 250 steps each, without a better validation loss.
@@ -73,7 +70,6 @@ class NetworkEstimator(eqx.Module):
     """
 
     features: str = eqx.field(static=True, default="score")
-    approximator: str = eqx.field(static=True, default="mlp")
     channels: str = eqx.field(static=True, default="rates")
     noise: tuple[float, float] = eqx.field(static=True, default=(0.1, 10.0))
     width: int = eqx.field(static=True, default=128)
@@ -85,11 +81,9 @@ class NetworkEstimator(eqx.Module):
     held_out: int = eqx.field(static=True, default=20_000)
 
     def __check_init__(self):
-        for name, choices in (("features", FEATURES), ("approximator", APPROXIMATORS), ("channels", CHANNELS)):
+        for name, choices in (("features", FEATURES), ("channels", CHANNELS)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
-        if self.features == "raw" and self.approximator == "cmac":
-            raise ValueError('`approximator` "cmac" tiles every pair of features: it needs `features` "score".')
         smallest = {"width": 1, "depth": 1, "steps": 1, "batch": 1, "patience": 1, "held_out": 1000}
         for name, least in smallest.items():
             check_count(name, getattr(self, name), least)
@@ -99,7 +93,7 @@ class NetworkEstimator(eqx.Module):
         if not (len(self.noise) == 2 and 0 < self.noise[0] <= self.noise[1] < np.inf):
             raise ValueError(f"`noise` must be (lowest, highest), positive and finite, got {self.noise}.")
 
-    def fit(self, problem: ShootingProblem, bracket: Bracket, *, key: Key, progress: bool = False) -> "TrainedNetwork":
+    def fit(self, problem: ShootingProblem, bracket: Bracket, *, key: Key) -> "TrainedNetwork":
         """Trains a network for the inputs, sampling, start and missing samples of a problem, and calibrates it.
 
         **Arguments:**
@@ -107,7 +101,6 @@ class NetworkEstimator(eqx.Module):
         - `problem`: its measured values are not used, except the first if the initial state is free.
         - `bracket`: parameters of the simulated flights are uniform in it.
         - `key`: the random key: the same key gives the same network.
-        - `progress`: whether to show a bar in the terminal.
 
         **Raises:** `ValueError` for a bracket without width or channels that the problem lacks; `TrainingError` if
         training diverges, or if the flights of the bracket diverge.
@@ -115,10 +108,8 @@ class NetworkEstimator(eqx.Module):
         self._check(problem, bracket)
         scales = np.asarray(self.noise, float)
         features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
-        shape = {"approximator": self.approximator, "width": self.width, "depth": self.depth}
-        scaling, regressor = untrained(features, scales, key, shape)
-        pace: dict[str, Any] = {"batch": self.batch, "steps": self.steps, "patience": self.patience}
-        pace |= {"learning_rate": self.learning_rate, "progress": progress}
+        scaling, regressor = untrained(features, scales, key, {"width": self.width, "depth": self.depth})
+        pace: dict[str, Any] = {name: getattr(self, name) for name in ("batch", "steps", "patience", "learning_rate")}
         regressor, history = train(regressor, scaling, features, scales, **pace, key=key)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))

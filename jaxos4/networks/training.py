@@ -79,12 +79,10 @@ def train(
     learning_rate: float,
     patience: int,
     key: Key,
-    progress: bool,
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
 
-    Between two checks, training simulates new flights. Each step takes some of them, with new noise. `progress`:
-    whether to show a bar on the error output, if that is a terminal.
+    Between two checks, training simulates new flights. Each step takes some of them, with new noise.
 
     **Returns:** the regressor as it was at the check with the best validation loss, and the losses of training and
     validation at every check.
@@ -99,34 +97,27 @@ def train(
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
-    import rich.console
-    import rich.progress
-
     state, rates = _first_state(regressor), _learning_rates(learning_rate, steps)
     flown = batch * CHECK // _USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
-    console = rich.console.Console(stderr=True)
-    with rich.progress.Progress(console=console, transient=True, disable=not (progress and console.is_terminal)) as bar:
-        task = bar.add_task("training the network", total=steps)
-        for number, first in enumerate(range(0, steps, CHECK)):
-            place = number * math.ceil(flown / CHUNK)
-            flights = draw_chunks(features, flown, key=key, purpose=Purpose.FLIGHTS, first=place)
-            count = min(CHECK, steps - first)
-            places = place_of(Purpose.STEPS, first + np.arange(CHECK))
-            rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
-            regressor, state, *losses = _advance(
-                regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
-            )
-            history.append([float(value) for value in losses])
-            value, current = history[-1]
-            if not np.less(history[-1], _DIVERGED).all():
-                raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
-            bar.update(task, completed=first + count, description=f"training the network, loss {current:.4g}")
-            without_improvement += 1
-            if current < lowest - _IMPROVEMENT * abs(current):
-                best, lowest, without_improvement = regressor, current, 0
-            if without_improvement >= patience:
-                break
+    for number, first in enumerate(range(0, steps, CHECK)):
+        place = number * math.ceil(flown / CHUNK)
+        flights = draw_chunks(features, flown, key=key, purpose=Purpose.FLIGHTS, first=place)
+        count = min(CHECK, steps - first)
+        places = place_of(Purpose.STEPS, first + np.arange(CHECK))
+        rate = np.resize(rates[first : first + count], CHECK)  # of one shape: the last steps need no other program
+        regressor, state, *losses = _advance(
+            regressor, state, data, flights, held_out, key, places, rate, np.asarray(count), batch
+        )
+        history.append([float(value) for value in losses])
+        value, current = history[-1]
+        if not np.less(history[-1], _DIVERGED).all():
+            raise TrainingError(f"training diverged after {first} steps (loss {value:g}): lower `learning_rate`.")
+        without_improvement += 1
+        if current < lowest - _IMPROVEMENT * abs(current):
+            best, lowest, without_improvement = regressor, current, 0
+        if without_improvement >= patience:
+            break
     whole = jax.tree.map(lambda x: as_float(np.asarray(x)) if eqx.is_inexact_array_like(x) else x, best)
     return whole, np.asarray(history)
 

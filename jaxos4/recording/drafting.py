@@ -1,15 +1,13 @@
 """An airframe's file with everything that a log knows of its vehicle, and with marks at what must be measured."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tomlkit
-from tomlkit import TOMLDocument
 
-from ..airframe import GUESS, PRESETS, Airframe, load_airframe
-from ..models.terms import has_full_scale
+from ..airframe import GUESS
 from .motion import RotorSigns, rotor_signs
 from .pieces import cut
 from .reading import Recording
@@ -20,9 +18,6 @@ FULL_SCALE = 1000.0
 
 _GRAVITY = 9.81
 _PLAUSIBLE = (0.5, 2.0)  # [g], the median of the accelerometer in flight
-_ANOTHER = 0.1  # a hover speed that differs by this share is another one
-_CENTIMETRE = 0.01
-_OTHERWISE = "The log says otherwise:"
 
 
 class AirframeDraft(NamedTuple):
@@ -40,25 +35,55 @@ class _Hover(NamedTuple):
     felt: bool
 
 
-def airframe_draft(recording: Recording, source: str | None = None) -> AirframeDraft:
+def airframe_draft(recording: Recording) -> AirframeDraft:
     """Begin the file of an airframe with what a log knows: spins, hover speed, sometimes the rotors' positions.
 
     What must be weighed or measured is a comment, so that `load_airframe` names the first of these keys as missing.
 
-    **Arguments:**
-
-    - `recording`: read with the airframe of `source`, if that is given, and with `full_scale=1.0`.
-    - `source`: the name of a preset or a file to start from. Its values and comments stay. Where the log says something
-      else, a comment at the end says so.
+    **Arguments:** `recording`: read without an airframe, and with `full_scale=1.0`.
     """
-    facts, airframe = recording.facts, None if source is None else load_airframe(source)
-    found = stretches(recording, airframe, landed=facts.landed)
-    parts = [cut(recording, part) for part in found if not part.reason]
+    facts, lines, missing = recording.facts, [], ["mass"]
+
+    def say(*texts: str) -> None:
+        lines.extend(f"# {text}" for text in texts)
+
+    def add(key: str, value: Any, comment: str) -> None:
+        lines.append(f"{key} = {json.dumps(value)} # {comment}")
+
+    parts = [cut(recording, part) for part in stretches(recording, landed=facts.landed) if not part.reason]
     signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
     spins = facts.rotor_spins or (None if signs is None else signs.spins)
-    if source is not None and airframe is not None:
-        return AirframeDraft(_continued(recording, source, airframe, spins, hover), ())
-    return _begun(recording, signs, spins, hover)
+    say(f"The airframe of {Path(recording.name).name}. SI units.")
+    lines.extend(["", "# Weigh and measure: write the numbers, and remove the # in front."])
+    say("mass =   # kg, with battery: all inertias are proportional to it")
+    if facts.rotor_positions is None:
+        missing.append("rotor_positions")
+        say(*_positions_to_measure(signs))
+    lines.extend(["", "# From the log."])
+    if facts.rotor_positions is not None:
+        add("rotor_positions", _short(facts.rotor_positions), "m, x forward and y left: check")
+        say("(settings of the autopilot, which needs only their ratios; inertias need the true distances)")
+    if spins is None:
+        missing.append("rotor_spins")
+        add("rotor_spins", [], "fill in, such as [1, -1, 1, -1]; 1: counter-clockwise seen from above")
+    else:
+        how = "settings of the autopilot" if facts.rotor_spins else "as the vehicle yaws in this flight"
+        add("rotor_spins", [int(spin) for spin in spins], f"1: counter-clockwise seen from above; {how}")
+    full = FULL_SCALE if recording.commanded else 1.0
+    if hover is None:
+        missing.append("hover_speed")
+        say("hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
+    else:
+        add("hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
+        if not hover.felt:
+            say("Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
+    if recording.commanded:
+        add("max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
+    lines.extend(["", "# Guesses from mass and positions, where the search begins. Numbers are better."])
+    add("inertia", GUESS, "kg m^2, as [Ix, Iy, Iz]")
+    add("drag_coefficient", GUESS, "N m s^2/rad^2: Iz is proportional to it")
+    add("rotor_inertia", GUESS, "kg m^2, of a propeller with its motor's bell")
+    return AirframeDraft("\n".join(lines) + "\n", tuple(missing))
 
 
 def _hover(parts: Sequence[Recording]) -> _Hover | None:
@@ -75,90 +100,6 @@ def _hover(parts: Sequence[Recording]) -> _Hover | None:
     share = float(np.median(vertical[np.isfinite(vertical)])) / _GRAVITY if np.isfinite(vertical).any() else np.nan
     felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
     return _Hover(float(np.sqrt(np.median(squares) / (share if felt else 1.0))), seconds, felt)
-
-
-def _begun(
-    recording: Recording, signs: RotorSigns | None, spins: tuple[float, ...] | None, hover: _Hover | None
-) -> AirframeDraft:
-    """A file from nothing but the log."""
-    facts, document, missing = recording.facts, tomlkit.document(), ["mass"]
-    _say(document, f"The airframe of {Path(recording.name).name}. SI units.", *_battery(recording))
-    _head(document, "Weigh and measure: write the numbers, and remove the # in front.")
-    _say(document, "mass =   # kg, with battery: all inertias are proportional to it")
-    if facts.rotor_positions is None:
-        missing.append("rotor_positions")
-        _say(document, *_positions_to_measure(signs))
-    _head(document, "From the log.")
-    if facts.rotor_positions is not None:
-        _add(document, "rotor_positions", _short(facts.rotor_positions), "m, x forward and y left: check")
-        _say(document, "(settings of the autopilot, which needs only their ratios; inertias need the true distances)")
-    if spins is None:
-        missing.append("rotor_spins")
-        _add(document, "rotor_spins", [], "fill in, such as [1, -1, 1, -1]; 1: counter-clockwise seen from above")
-    else:
-        _add_spins(document, recording, spins)
-    full = FULL_SCALE if recording.commanded else 1.0
-    if hover is None:
-        missing.append("hover_speed")
-        _say(document, "hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
-    else:
-        _add(document, "hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
-        if not hover.felt:
-            _say(document, "Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
-    if recording.commanded:
-        _add(document, "max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
-    _head(document, "Guesses from mass and positions, where the search begins. Numbers are better.")
-    _add(document, "inertia", GUESS, "kg m^2, as [Ix, Iy, Iz]")
-    _add(document, "drag_coefficient", GUESS, "N m s^2/rad^2: Iz is proportional to it")
-    _add(document, "rotor_inertia", GUESS, "kg m^2, of a propeller with its motor's bell")
-    return AirframeDraft(tomlkit.dumps(document), tuple(missing))
-
-
-def _continued(
-    recording: Recording, source: str, airframe: Airframe, spins: tuple[float, ...] | None, hover: _Hover | None
-) -> str:
-    """A file that starts from another: added is what it lacks, and as comments what the log says otherwise."""
-    facts = recording.facts
-    if source in PRESETS:
-        document = tomlkit.document()
-        for name, value in vars(airframe).items():
-            if np.isfinite(value).all():
-                document.add(name, np.asarray(value).tolist())
-    else:
-        document = tomlkit.parse(Path(source).read_text(encoding="utf-8"))
-    begin, given = tomlkit.dumps(document), set(document)
-    _head(document, f"What {Path(recording.name).name} adds.")
-    before = tomlkit.dumps(document)
-    if recording.commanded and not has_full_scale(airframe):
-        full = FULL_SCALE if hover is None else float(airframe.hover_speed) / hover.speed
-        how = "a convention" if hover is None else f"the rotors then carry the weight, {_how(hover)}"
-        _add(document, "max_rotor_speed", _short(full), f"rad/s at command 1; {how}")
-    elif hover is not None and abs(hover.speed / float(airframe.hover_speed) - 1) > _ANOTHER:
-        thrust = float(airframe.mass * airframe.gravity) / (4 * hover.speed**2)
-        name, value = ("hover_speed", hover.speed) if "hover_speed" in given else ("thrust_coefficient", thrust)
-        _say(document, f"{_OTHERWISE} {name} = {_short(value)}  # {_how(hover)}")
-    if spins is not None and "rotor_spins" not in given:
-        _add_spins(document, recording, spins)
-    elif facts.rotor_spins is not None and not np.array_equal(facts.rotor_spins, airframe.rotor_spins):
-        _say(document, f"{_OTHERWISE} rotor_spins = {[int(spin) for spin in facts.rotor_spins]}")
-    positions = facts.rotor_positions
-    if positions is not None and np.abs(np.subtract(positions, airframe.rotor_positions)).max() > _CENTIMETRE:
-        _say(document, f"{_OTHERWISE} rotor_positions = {_short(positions)}")
-    text = tomlkit.dumps(document)
-    return begin if text == before else text
-
-
-def _add_spins(document: TOMLDocument, recording: Recording, spins: tuple[float, ...]) -> None:
-    how = "settings of the autopilot" if recording.facts.rotor_spins else "as the vehicle yaws in this flight"
-    _add(document, "rotor_spins", [int(spin) for spin in spins], f"1: counter-clockwise seen from above; {how}")
-
-
-def _battery(recording: Recording) -> list[str]:
-    """The cells and the voltage, if the log has them: the model takes the voltage from each log."""
-    cells, voltage = recording.facts.cells, recording.voltage
-    words = [] if cells is None else [f"{cells} cells"]
-    words += [] if voltage is None else [f"{float(np.median(voltage)):.3g} V (median)"]
-    return [f"Battery: {', '.join(words)}."] if words else []
 
 
 def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:
@@ -185,17 +126,3 @@ def _short(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_short(each) for each in value]
     return float(f"{value:.4g}")
-
-
-def _head(document: TOMLDocument, text: str) -> None:
-    document.add(tomlkit.nl())
-    document.add(tomlkit.comment(text))
-
-
-def _say(document: TOMLDocument, *lines: str) -> None:
-    for line in lines:
-        document.add(tomlkit.comment(line))
-
-
-def _add(document: TOMLDocument, key: str, value: Any, comment: str) -> None:
-    document.add(key, tomlkit.item(value).comment(comment))

@@ -1,26 +1,17 @@
-"""Inspection of a log: its contents, the stretches in flight, their excitation, and the identifiable parameters."""
+"""Inspection of a log: its contents, the stretches in flight, and their excitation."""
 
-import math
-from typing import Any, SupportsFloat
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from ..airframe import Airframe
-from ..analysis.identifiability import identifiability
-from ..bracket import Bracket
 from ..flight import CHANNEL_NAMES
 from ..logs import log_format
-from ..models.os4 import CorrectedOS4
-from ..noise import SENSOR_SIGMA
-from ..shooting import ShootingProblem
-from .motion import RATE_COLUMNS, WEAK, excitation, motor_clock_note, opposite_axes, refused_note, yaw_doubt
+from .motion import Excitation, excitation, opposite_axes, refused_note, yaw_doubt
 from .pieces import cut
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
-
-# The identifiability is computed from this much of a stretch [s], in windows of this length [s].
-_LONGEST, _WINDOW = 20.0, 0.5
 
 
 class Channel(msgspec.Struct, frozen=True):
@@ -32,15 +23,6 @@ class Channel(msgspec.Struct, frozen=True):
     most: float
 
 
-class AxisExcitation(msgspec.Struct, frozen=True):
-    """Excitation about one axis, see `jaxos4.recording.Excitation`; `None`: not known."""
-
-    torque: float | None
-    rate: float | None
-    noise: float | None
-    verdict: str
-
-
 class Part(msgspec.Struct, frozen=True):
     """A stretch of the log [s]: whether it can be used, why not, and the excitation by axis if it can."""
 
@@ -48,25 +30,7 @@ class Part(msgspec.Struct, frozen=True):
     end: float
     usable: bool
     reason: str
-    excitation: dict[str, AxisExcitation]
-
-
-class IdentifiableParameter(msgspec.Struct, frozen=True):
-    """Whether one alpha is identifiable, and why not."""
-
-    identifiable: bool
-    note: str
-
-
-class IdentifiableParameters(msgspec.Struct, frozen=True):
-    """Which of alpha_1..8 are identifiable from the body rates of one stretch [s], at the gyro's noise.
-
-    How well depends on what the vehicle does beside the model, which only a fit shows.
-    """
-
-    begin: float
-    end: float
-    parameters: dict[str, IdentifiableParameter]
+    excitation: dict[str, Excitation]
 
 
 class Inspection(msgspec.Struct, frozen=True):
@@ -78,7 +42,6 @@ class Inspection(msgspec.Struct, frozen=True):
     - `findings`: why no vehicle can be identified from the log, and what to do, most important first.
     - `notes`: remarks of the reader.
     - `parts`: the stretches in order of time.
-    - `identifiable`: `None` without an airframe, without p, q and r, or if a finding excludes it.
     """
 
     log: str
@@ -91,7 +54,6 @@ class Inspection(msgspec.Struct, frozen=True):
     findings: tuple[str, ...]
     notes: tuple[str, ...]
     parts: tuple[Part, ...]
-    identifiable: IdentifiableParameters | None
 
     def to_dict(self) -> dict[str, Any]:
         """Dictionaries, lists, numbers and strings, ready for JSON."""
@@ -99,7 +61,7 @@ class Inspection(msgspec.Struct, frozen=True):
 
 
 def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspection:
-    """Describe a log. Without an airframe, torques and parameters are unknown.
+    """Describe a log. Without an airframe, torques are unknown.
 
     **Arguments:**
 
@@ -107,18 +69,15 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     """
     facts = recording.facts
     found = stretches(recording, airframe, landed=facts.landed)
-    longest = max((part for part in found if not part.reason), key=lambda part: part.length, default=None)
-    rates_measured = not np.isnan(recording.states[:, RATE_COLUMNS]).all(axis=0).any()
-    parts = tuple(_part(recording, stretch, airframe) for stretch in found)
-    nothing = "" if longest is not None else f"{nothing_usable(found)}; give the log of a flight"
-    usable = [cut(recording, part) for part in found if not part.reason]
+    usable, parts = [], []
+    for begin, end, reason in found:
+        if not reason:
+            usable.append(cut(recording, Stretch(begin, end)))
+        parts.append(Part(begin, end, not reason, reason, {} if reason else excitation(usable[-1], airframe)))
+    nothing = "" if usable else f"{nothing_usable(found)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(usable, airframe)
     doubt = yaw_doubt(opposite)
-    clock = "" if airframe is None else motor_clock_note(usable, airframe)
-    findings = tuple(filter(None, (nothing, facts.too_slow, _too_little(parts), refused_note(opposite))))
-    identifiable = None
-    if longest is not None and not facts.too_slow and airframe is not None and rates_measured:
-        identifiable = _identifiable(recording, longest, airframe)
+    findings = tuple(filter(None, (nothing, facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
         format=log_format(recording.name).name,
@@ -128,9 +87,8 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         measured=_measured(recording),
         findings=findings,
-        notes=(*recording.notes, *filter(None, ("; ".join(doubt or ()), clock))),
-        parts=parts,
-        identifiable=identifiable,
+        notes=(*recording.notes, *(["; ".join(doubt)] if doubt else [])),
+        parts=tuple(parts),
     )
 
 
@@ -148,43 +106,3 @@ def _measured(recording: Recording) -> dict[str, Channel]:
             gaps = np.diff(np.concatenate([time[:1], time[at], time[-1:]]))
             channels[name] = Channel(rate, float(gaps.max()), float(values[at].min()), float(values[at].max()))
     return channels
-
-
-def _too_little(parts: tuple[Part, ...]) -> str:
-    """A finding, if the vehicle hardly turns in its usable parts."""
-    usable = [part for part in parts if part.usable]
-    rates = [axis.rate for part in usable for axis in part.excitation.values() if axis.rate is not None]
-    if not rates or max(rates) >= WEAK:
-        return ""
-    seconds = sum(part.end - part.begin for part in usable)
-    return (
-        f"too little flight: in the {seconds:.1f} s that can be used, the vehicle turns with at most {max(rates):.2g} "
-        "rad/s (standard deviation); fly rolls, pitches and turns"
-    )
-
-
-def _part(recording: Recording, stretch: Stretch, airframe: Airframe | None) -> Part:
-    axes = () if stretch.reason else excitation(cut(recording, stretch), airframe)
-    excited = {a.axis: AxisExcitation(_finite(a.torque), _finite(a.rate), _finite(a.noise), a.verdict) for a in axes}
-    return Part(stretch.begin, stretch.end, not stretch.reason, stretch.reason, excited)
-
-
-def _identifiable(recording: Recording, stretch: Stretch, airframe: Airframe) -> IdentifiableParameters:
-    stretch = Stretch(stretch.begin, min(stretch.end, stretch.begin + _LONGEST))
-    part, model = cut(recording, stretch), CorrectedOS4(airframe)
-    sigma = np.asarray(SENSOR_SIGMA, dtype=float).copy()
-    for axis, column in zip(excitation(part), RATE_COLUMNS, strict=True):
-        sigma[column] = max(float(np.nan_to_num(axis.noise)), sigma[column])
-    windows = min(max(round(stretch.length / _WINDOW), 1), part.time.size // 2)
-    problem = ShootingProblem(model, part.flight, sigma=sigma, channels="rates", windows=windows)
-    known = identifiability(problem, Bracket.default(model), model.alpha)
-    notes = known.notes(model.parameter_names)
-    parameters = {
-        name: IdentifiableParameter(name not in notes and math.isfinite(known.std[i]), notes.get(name, ""))
-        for i, name in enumerate(model.parameter_names)
-    }
-    return IdentifiableParameters(stretch.begin, stretch.end, parameters)
-
-
-def _finite(x: SupportsFloat) -> float | None:
-    return float(x) if math.isfinite(float(x)) else None

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -24,9 +25,7 @@ _ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi
 _STEP = 0.008  # [s]
 _SMOOTH, _SLOW = 3, 63  # samples: differences of these means are the motion between about 2 and 20 Hz
 # Motors against gyro [s]: lag and delay of rotors; and the same with clocks that may be shifted either way.
-_CAUSAL, _SHIFTED, _WIDE = (0.0, 0.048), (-0.04, 0.06), (-0.08, 0.08)
-# Motors are late or early beyond these delays [s]; rotors that were measured act at once.
-_LATE, _EARLY, _SEEN = -0.005, 0.02, 0.6
+_CAUSAL, _SHIFTED = (0.0, 0.048), (-0.04, 0.06)
 _LEAST_SECONDS = 3.0
 _OPPOSITE, _CLEAR = 0.4, 1.5  # correlation, and by how much it exceeds that of another sign or pair of rotors
 # The same before a sign of the airframe is called wrong, by axis. A controller turns the sign at negative shifts.
@@ -38,20 +37,18 @@ _PAIRS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0], [1.0, -1.0, -
 Signs = tuple[float, ...]
 
 
-class Excitation(NamedTuple):
-    """How much a flight excites one axis.
+class Excitation(msgspec.Struct, frozen=True):
+    """How much a flight excites one axis. `None`: not known.
 
-    - `axis`: roll, pitch or yaw.
-    - `torque`: standard deviation of the rotors' torque [N m]; NaN without an airframe.
-    - `rate`: standard deviation of the body rate [rad/s]; NaN if neither it nor its angle was measured.
+    - `torque`: standard deviation of the rotors' torque [N m]; it needs an airframe.
+    - `rate`: standard deviation of the body rate [rad/s].
     - `noise`: standard deviation of the gyro's white noise [rad/s], see `gyro_noise`.
     - `verdict`: "good", "weak", "none" or "not measured".
     """
 
-    axis: str
-    torque: float
-    rate: float
-    noise: float
+    torque: float | None
+    rate: float | None
+    noise: float | None
     verdict: str
 
 
@@ -66,17 +63,29 @@ class RotorSigns(NamedTuple):
     spins: Signs | None
 
 
-def excitation(
-    flight: Flight | Recording, airframe: Airframe | None = None
-) -> tuple[Excitation, Excitation, Excitation]:
-    """The excitation of roll, pitch and yaw over the whole flight; the torque needs an airframe."""
-    recording = as_recording(flight)
+def excitation(flight: Flight | Recording, airframe: Airframe | None = None) -> dict[str, Excitation]:
+    """The excitation of roll, pitch and yaw over the whole flight. Without a rate, it is the slope of the angle."""
+    recording, found = as_recording(flight), {}
     torque = np.full(3, math.nan)
     if airframe is not None:
         mixer = np.asarray(airframe.mixer, dtype=float)[:3]
         torque = (recording.omega[:-1] ** 2 @ mixer.T).std(axis=0)
-    roll, pitch, yaw = (_excitation(recording, i, float(torque[i])) for i in range(3))
-    return roll, pitch, yaw
+    for i, axis in enumerate(AXES):
+        rate, angle = recording.states[:, RATE_COLUMNS[i]], recording.states[:, _ANGLE_COLUMNS[i]]
+        noise = gyro_noise(rate)
+        if np.count_nonzero(np.isfinite(rate)) < 3:
+            seen = np.isfinite(angle)
+            measured = np.count_nonzero(seen) > 2
+            rate = np.gradient(angle[seen], recording.time[seen]) if measured else np.full(1, math.nan)
+        size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
+        verdict = "good" if size >= _GOOD else "weak"
+        if math.isnan(size):
+            verdict = "not measured"
+        elif size < WEAK or size < OVER_NOISE * noise:
+            verdict = "none"
+        known = [x if math.isfinite(x) else None for x in (float(torque[i]), size, noise)]
+        found[axis] = Excitation(known[0], known[1], known[2], verdict)
+    return found
 
 
 def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
@@ -97,7 +106,11 @@ def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> dict[str, 
 
     **Arguments:** usable stretches of flights, each of one vehicle.
     """
-    _, found = _torque_correlations(pieces, airframe, _SHIFTED)
+    mixer = np.asarray(airframe.mixer, dtype=float)[:3]
+    found = np.diagonal(_correlations(pieces, mixer, _SHIFTED), axis1=1, axis2=2)
+    torques = [(piece.omega[:-1] ** 2 @ mixer.T).std(axis=0) for piece in pieces]
+    least = _LEAST_TORQUE * float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
+    found = np.where(np.max(torques, axis=0, initial=0.0) < least, np.nan, found)
     ends = zip(_WRONG.items(), -found.min(axis=0), found.max(axis=0), strict=True)
     return {axis: float(wrong) for (axis, (least, times)), wrong, right in ends if wrong > max(least, times * right)}
 
@@ -134,7 +147,7 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
 
     **Arguments:** usable stretches of flights, each of one vehicle, with motors and gyro logged fast.
     """
-    _, found = _correlations(pieces, _PAIRS, _CAUSAL)
+    found = _correlations(pieces, _PAIRS, _CAUSAL)
     roll, pitch = (_pair(found[:, :, axis]) for axis in (0, 1))
     if roll is None or pitch is None or roll == pitch:
         return None
@@ -146,75 +159,20 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
     return RotorSigns(tuple(forward.tolist()), tuple(left.tolist()), spins)
 
 
-def _excitation(recording: Recording, i: int, torque: float) -> Excitation:
-    """The excitation of one axis. Without a measured rate, it is the slope of the angle."""
-    rate, angle = recording.states[:, RATE_COLUMNS[i]], recording.states[:, _ANGLE_COLUMNS[i]]
-    noise = gyro_noise(rate)
-    if np.count_nonzero(np.isfinite(rate)) < 3:
-        seen = np.isfinite(angle)
-        rate = np.gradient(angle[seen], recording.time[seen]) if np.count_nonzero(seen) > 2 else np.full(1, math.nan)
-    size = float(np.nanstd(rate)) if np.isfinite(rate).any() else math.nan
-    if math.isnan(size):
-        verdict = "not measured"
-    elif size < WEAK or size < OVER_NOISE * noise:
-        verdict = "none"
-    else:
-        verdict = "good" if size >= _GOOD else "weak"
-    return Excitation(AXES[i], torque, size, noise, verdict)
-
-
-def motor_clock_note(pieces: Sequence[Recording], airframe: Airframe) -> str:
-    """By how much motors are recorded late or early against the gyro, if roll and pitch show it clearly; else empty.
-
-    Commands precede the motion by an unknown lag of the rotors: they are never called early, and late by at least the
-    answer.
-    """
-    delays, found = _torque_correlations(pieces, airframe, _WIDE)
-    peaks = []
-    for row in found[:, :2].T:
-        best = int(np.argmax(row)) if np.isfinite(row).all() else 0
-        if 0 < best < row.size - 1 and row[best] > _SEEN and row[best] > -row.min():
-            before, at, after = row[best - 1 : best + 2]
-            between = 0.5 * (before - after) / (before - 2 * at + after)
-            # Accelerations are those of the end of a sample, torques those of its middle.
-            peaks.append(delays[best] + (between + 0.5) * (delays[1] - delays[0]))
-    if not peaks:
-        return ""
-    if max(peaks) < _LATE:
-        least = "at least " if pieces[0].commanded else "about "
-        return f"motors are recorded {least}{-1e3 * np.mean(peaks):.0f} ms late, or the gyro early (term `delay`)"
-    if min(peaks) > _EARLY and not pieces[0].commanded:
-        return f"motors are recorded about {1e3 * np.mean(peaks):.0f} ms early, or the gyro late (term `delay`)"
-    return ""
-
-
-def _torque_correlations(
-    pieces: Sequence[Recording], airframe: Airframe, between: tuple[float, float]
-) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, "delays 3"]]:
-    """How the torque about each axis correlates with its angular acceleration, by delay [s]. NaN: too little torque."""
-    mixer = np.asarray(airframe.mixer, dtype=float)[:3]
-    delays, found = _correlations(pieces, mixer, between)
-    hover = float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
-    torques = [(piece.omega[:-1] ** 2 @ mixer.T).std(axis=0) for piece in pieces]
-    weak = np.max(torques, axis=0, initial=0.0) < _LEAST_TORQUE * hover
-    return delays, np.where(weak, np.nan, np.diagonal(found, axis1=1, axis2=2))
-
-
 def _correlations(
     pieces: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"], between: tuple[float, float]
-) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, "delays rows 3"]]:
+) -> Float[np.ndarray, "delays rows 3"]:
     """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
 
     A controller that answers gusts does not change the sign. One number for each delay, each row of `mixer` (the weight
-    of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion. Also the delays [s].
+    of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion.
 
     **Arguments:** `between`: the first and the last delay of the gyro after the motors [s].
     """
     pieces = [piece for piece in pieces if np.ptp(piece.time) > _SLOW * _STEP * 2]
     step = max([_STEP, *(piece.dt for piece in pieces)])
     pairs = [_response(piece, mixer, step) for piece in pieces]
-    first, last = (round(end / step) for end in between)
-    shifts = range(first, last + 1)
+    shifts = range(round(between[0] / step), round(between[1] / step) + 1)
     found = np.full((len(shifts), mixer.shape[0], len(AXES)), np.nan)
     for place, shift in enumerate(shifts if pairs else ()):
         early, late = max(-shift, 0), max(shift, 0)
@@ -227,7 +185,7 @@ def _correlations(
             x, y = torque[measured] - torque[measured].mean(axis=0), along[measured] - along[measured].mean()
             spreads = x.std(axis=0) * y.std()
             found[place, :, i] = np.where(spreads > 0, y @ x / y.size, np.nan) / np.where(spreads > 0, spreads, 1.0)
-    return step * np.array(shifts), found
+    return found
 
 
 def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
@@ -250,7 +208,7 @@ def _response(piece: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndar
     """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
     _, omega, rates = average(piece.time, piece.omega, piece.states[:, RATE_COLUMNS], step)
     acceleration = np.diff(rates, axis=0) / step
-    for i, axis in enumerate(excitation(piece)):
+    for i, axis in enumerate(excitation(piece).values()):
         if axis.verdict not in ("good", "weak"):
             acceleration[:, i] = np.nan
     return _between((omega**2 @ mixer.T)[:-1]), _between(acceleration)

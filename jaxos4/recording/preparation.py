@@ -25,7 +25,7 @@ from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
-from .velocity import Motion, motion_of
+from .velocity import Motion, motion_of, with_smooth_drag
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -82,76 +82,27 @@ class Prepared(NamedTuple):
         return None if self.fitted.voltage is None else float(np.median(self.fitted.voltage))
 
 
-class Usable(NamedTuple):
-    """The usable parts of one vehicle's recordings.
-
-    - `parts`: each with the number of its recording, from 0.
-    - `recordings`: whole.
-    - `notes`: what the reader changed, and which stretches are not used.
-    - `doubts`: cause and remedy of each doubt about the logs.
-    """
-
-    parts: tuple[tuple[int, Recording], ...]
-    recordings: tuple[Recording, ...]
-    notes: tuple[str, ...]
-    doubts: tuple[tuple[str, str], ...]
-
-    @property
-    def slowest(self) -> float:
-        """The longest sample of the logs [s]."""
-        return max(piece.dt for _, piece in self.parts)
-
-    @property
-    def sample_times(self) -> tuple[float, ...]:
-        """The sample times at which an answer is to be compared [s], from the shortest on: each is twice the last."""
-        shortest = max(SAMPLE_TIME, self.slowest)
-        doublings = max(math.floor(math.log2(LONGEST_SAMPLE_TIME * _NEARLY_EQUAL / shortest)), 0)
-        return tuple(shortest * 2**k for k in range(doublings + 1))
-
-
 def prepare(
     recordings: Sequence[Recording],
     airframe: Airframe,
     *,
     begin: float | None = None,
     end: float | None = None,
-    window: float = WINDOW,
     sample_time: float | None = None,
     holdout: float = HOLDOUT,
     predicted: bool = False,
-) -> Prepared:
+) -> tuple[Prepared, ...]:
     """Make one flight of the usable stretches of one vehicle's recordings. Arguments as of `jaxos4.identify`.
 
     `predicted`: the recordings are not fitted, but only predicted: then the gyro may be slow, but not the motors, and
     messages do not name options of the fit.
 
+    **Returns:** the flight, averaged to `sample_time`; without it, to each sample time at which an answer is compared
+    with the others, the shortest first.
+
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
-    usable = usable_parts(
-        recordings, airframe, begin=begin, end=end, window=window, sample_time=sample_time, holdout=holdout,
-        predicted=predicted,
-    )  # fmt: skip
-    if predicted and sample_time is not None and usable.slowest > sample_time * _NEARLY_EQUAL:
-        raise InputError(
-            f"{recordings[0].name}: has one sample every {usable.slowest:.4g} s, the fitted logs one every "
-            f"{sample_time:.4g} s; give `sample_time` {usable.slowest:.4g}, or another `validate`."
-        )
-    return sampled(usable, airframe, window=window, sample_time=sample_time, holdout=holdout)
-
-
-def usable_parts(
-    recordings: Sequence[Recording],
-    airframe: Airframe,
-    *,
-    begin: float | None,
-    end: float | None,
-    window: float = WINDOW,
-    sample_time: float | None,
-    holdout: float,
-    predicted: bool = False,
-) -> Usable:
-    """The parts of recordings that can be used, see `prepare`."""
-    _check_options(begin, end, window, sample_time, holdout)
+    _check_options(begin, end, sample_time, holdout)
     _check_recordings(recordings)
     notes: list[str] = []
     parts: list[tuple[int, Recording]] = []
@@ -169,12 +120,24 @@ def usable_parts(
         if doubt := yaw_doubt(opposite):
             doubts.append((f"{recording.name}: {doubt[0]}", doubt[1]))
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
-        parts += [(number, piece) for piece in pieces]
+        parts += [(number, with_smooth_drag(piece)) for piece in pieces]
     if len({piece.commanded for _, piece in parts}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."
         )
-    return Usable(tuple(parts), tuple(recordings), tuple(notes), tuple(doubts))
+    slowest = max(piece.dt for _, piece in parts)
+    if sample_time is not None and slowest > sample_time * _NEARLY_EQUAL:
+        if predicted:
+            raise InputError(
+                f"{recordings[0].name}: has one sample every {slowest:.4g} s, the fitted logs one every "
+                f"{sample_time:.4g} s; give `sample_time` {slowest:.4g}, or another `validate`."
+            )
+        raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
+    shortest = max(SAMPLE_TIME if sample_time is None else sample_time, slowest)
+    doublings = math.floor(math.log2(LONGEST_SAMPLE_TIME * _NEARLY_EQUAL / shortest)) if sample_time is None else 0
+    steps = [shortest * 2**k for k in range(max(doublings, 0) + 1)]
+    about = tuple(notes), tuple(doubts), slowest
+    return tuple(_sampled(recordings, parts, airframe, step, holdout, about) for step in steps)
 
 
 def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None:
@@ -186,30 +149,30 @@ def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None
     return (f"{recording.name}: {', '.join(often)}", "fly gentler, or with a fuller battery") if often else None
 
 
-def sampled(
-    usable: Usable,
+def _sampled(
+    recordings: Sequence[Recording],
+    parts: Sequence[tuple[int, Recording]],
     airframe: Airframe,
-    *,
-    window: float = WINDOW,
-    sample_time: float | None,
+    step: float,
     holdout: float,
+    about: tuple,
 ) -> Prepared:
-    """One flight of the usable parts, with samples of `sample_time` [s]."""
-    step, length = _sampling(usable.slowest, window, sample_time)
-    coarse = [(number, whole_windows(averaged(piece, step), length)) for number, piece in usable.parts]
+    """One flight of the usable parts with samples of `step` [s]. `about`: the last fields of the result."""
+    length = round(WINDOW / step)
+    if length < _FEWEST_SAMPLES:
+        least = WINDOW / _FEWEST_SAMPLES
+        raise InputError(f"`sample_time` {step:g}: too long for a vehicle; give at most {least:g}, or log faster.")
+    coarse = [(number, whole_windows(averaged(piece, step), length)) for number, piece in parts]
     numbers = tuple(number for number, piece in coarse if piece.time.size)
     pieces = [piece for _, piece in coarse if piece.time.size]
-    unused = [recording for i, recording in enumerate(usable.recordings) if i not in numbers]
-    if unused:
-        remedy = "leave this log out, or give a shorter `window`" if pieces else "give a shorter `window`"
-        raise InputError(f"{unused[0].name}: no part is as long as a window, {window:g} s; {remedy}.")
+    if unused := [recording for i, recording in enumerate(recordings) if i not in numbers]:
+        raise InputError(f"{unused[0].name}: no part is as long as a window, {WINDOW:g} s; leave this log out.")
     motions = [motion for piece in pieces if (motion := motion_of(piece)) is not None]
     moved = len(motions) == len(pieces)
     if moved:
         pieces = [piece._replace(body_velocity=motion.velocity) for piece, motion in zip(pieces, motions, strict=True)]
     whole, whole_time = joined(pieces), np.concatenate([piece.time for piece in pieces])
     fitted, tested = hold_out(whole, length, holdout)
-    seconds = _seconds(fitted), 0.0 if tested is None else _seconds(tested)
     return Prepared(
         fitted.flight,
         None if tested is None else tested.flight,
@@ -219,10 +182,8 @@ def sampled(
         _available_inputs(whole, pieces, airframe, motions if moved else []),
         np.concatenate([motion.up[:, 2] for motion in motions]) if moved else None,
         _mean([motion.drag_lift for motion in motions]) if moved else math.nan,
-        seconds,
-        usable.notes,
-        usable.doubts,
-        usable.slowest,
+        (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
+        *about,
     )
 
 
@@ -251,18 +212,6 @@ def _mean(series: Sequence[np.ndarray]) -> float:
 
 def _seconds(recording: Recording) -> float:
     return float(np.count_nonzero(~np.isnan(recording.states[:, CASCADE_ORDER[0]])) * recording.dt)
-
-
-def _sampling(slowest: float, window: float, sample_time: float | None) -> tuple[float, int]:
-    """The sample time [s], and how many samples make a window. `slowest`: the longest sample of the logs [s]."""
-    step = max(SAMPLE_TIME if sample_time is None else sample_time, slowest)
-    if sample_time is not None and step > sample_time * _NEARLY_EQUAL:
-        raise InputError(f"`sample_time` {sample_time:g}: the logs have one sample every {slowest:.4g} s; give that.")
-    length = round(window / step)
-    if length < _FEWEST_SAMPLES:
-        least = _FEWEST_SAMPLES * step
-        raise InputError(f"`window` {window:g}: less than four samples of {step:g} s; give at least {least:g}.")
-    return step, length
 
 
 def _usable_parts(
@@ -303,12 +252,9 @@ def _check_recordings(recordings: Sequence[Recording]) -> None:
             raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
 
 
-def _check_options(
-    begin: float | None, end: float | None, window: float, sample_time: float | None, holdout: float
-) -> None:
-    for name, value in (("window", window), ("sample_time", sample_time)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise InputError(f"`{name}`: must be a positive number of seconds, got {value:g}.")
+def _check_options(begin: float | None, end: float | None, sample_time: float | None, holdout: float) -> None:
+    if sample_time is not None and not 0 < sample_time < math.inf:
+        raise InputError(f"`sample_time`: must be a positive number of seconds, got {sample_time:g}.")
     if not 0 <= holdout <= 0.5:
         raise InputError(f"`holdout`: must be a share from 0 to 0.5, got {holdout:g}.")
     if begin is not None and end is not None and not begin < end:

@@ -1,8 +1,8 @@
 """Which parts of a flight can be used for identification, and why not the others.
 
-A part is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, the gyro
-is not clipped, no samples are lost, and the vehicle does not crash. The rotors do not carry it if they are idle, or if
-the accelerometer does not feel them.
+A part is usable if the rotors carry the vehicle, no rotor rests or is at its limit for longer than a moment, no samples
+are lost, and the vehicle does not crash. The rotors do not carry it if they are idle, or if the accelerometer does not
+feel them.
 """
 
 import itertools
@@ -28,8 +28,6 @@ _GAP = 0.05  # [s], the longest without a measurement
 _LIMIT = 1e-3  # share of a rotor's largest speed; smaller differences count as none
 _LEAST_HOVER = 0.2  # share of full command; no vehicle has a thrust of 25 times its weight
 _FULL = 0.995  # share of the airframe's `max_rotor_speed`
-_CLIPPED = 5  # samples in a row at the gyro's largest value
-_SLOWEST_CLIP = 3.0  # [rad/s]: no gyro's range ends below 4.3 (250 deg/s)
 _IMPACT_FORCE, _IMPACT_RATE = 50.0, 15.0  # [m/s^2], and [rad/s] within `_IMPACT_TIME`
 _IMPACT_TIME = 0.02  # [s]
 _AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s], until the rotors stop; not trusted before the impact
@@ -41,11 +39,10 @@ _UNFELT = 0.1  # relative change of the vertical force for a relative change of 
 _STEADY, _ONE_G = 0.1, 0.15  # [g], standard deviation of the force of a resting vehicle; error of an accelerometer
 _TILTED, _STILL, _SHORTEST_REST = 0.5, 0.2, 1.0  # [g] along z, [rad/s], [s]
 
-_USABLE, _SHORT, _CLIPPING, _SATURATED, _LOST, _CRASHED, _GROUND = range(7)  # the last one that applies counts
+_USABLE, _SHORT, _SATURATED, _LOST, _CRASHED, _GROUND = range(6)  # the last one that applies counts
 _NAMES = {
     _USABLE: "",
     _SHORT: f"less than {SHORTEST:g} s between others",
-    _CLIPPING: "the gyro is clipped",
     _LOST: "nothing was measured",
     _CRASHED: "an impact",
     _GROUND: ON_GROUND,
@@ -90,7 +87,6 @@ def stretches(
     saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
     for label, where in (
-        (_CLIPPING, _clipped(rates)),
         (_SATURATED, np.any([where.any(axis=1) for where in saturations.values()], axis=0)),
         (_LOST, _lost(recording.states, dt)),
         (_CRASHED, _crashed(rates, force, share, ground, dt)),
@@ -152,18 +148,6 @@ def _ground(share: np.ndarray, dt: float) -> np.ndarray:
     for begin, end in _runs(~carried):
         ground[max(begin - margin, 0) : end + margin] = True
     return ground
-
-
-def _clipped(rates: np.ndarray) -> np.ndarray:
-    out = np.zeros(rates.shape[0], dtype=bool)
-    for rate in np.abs(rates.T):
-        largest = np.nanmax(rate) if np.isfinite(rate).any() else 0.0
-        if largest < _SLOWEST_CLIP:
-            continue
-        for begin, end in _runs(rate >= (1 - _LIMIT) * largest):
-            if end - begin >= _CLIPPED and np.ptp(rate[begin:end]) <= 1e-6 * largest:
-                out[begin:end] = True
-    return out
 
 
 def _saturations(omega: np.ndarray, airframe: Airframe | None, dt: float) -> dict[str, np.ndarray]:

@@ -83,7 +83,7 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
 
     A line shows the wanted accuracy of references, or half of the bracket of rotor speeds.
     """
-    from .style import INK, drawing, grid, label_edges, log_axis, styles, svg  # a second that the table does not need
+    from .style import INK, drawing, grid, label, log_axis, styles, svg  # a second that the table does not need
 
     task, designed, in_percent = found.task, found.designed, found.task.kind == "references"
     every, targets = {"designed": designed, **found.standard}, task.scale.size
@@ -112,11 +112,9 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
                 log_axis(panel, "x")
             log_axis(panel, "y")
             panel.set_title(f"{task.names[i]}: bound [{'%' if in_percent else task.units[i]}]")
-        if in_percent:
-            for i, panel in enumerate(panels):
-                panel.set_xlabel("time [s]" if i < _COLUMNS else "flight [s]")
-        else:
-            label_edges(panels, _COLUMNS, x="time [s]")
+        label(figure, x="time [s]")
+        for panel in panels[_COLUMNS:] if in_percent else ():
+            panel.set_xlabel("flight [s]")
         handles = panels[_COLUMNS].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=len(every))
         content = svg(figure)

@@ -1,41 +1,69 @@
-"""HTML pages that need no other file: their templates, and SVG drawings that follow a page's theme and width."""
+"""HTML pages that need no other file: their templates, and the panels of SVG drawings in a page's theme and width."""
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jinja2
+import numpy as np
 from markupsafe import Markup, escape
+from matplotlib.figure import Figure
+from matplotlib.markers import MarkerStyle
 
-from .style import FAINT, GRID, INK, PAPER
+from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
+from .text import MISSING, plain
 
-# CSS pixels in a point, and how much a drawing may grow to reach the width of the page's text.
-_PIXELS, _GROWTH = 4 / 3, 4 / 3
+# CSS pixels in a point, and by how much a panel may shrink and grow.
+_PIXELS, _SHRINKS, _GROWS = 4 / 3, 0.78, 1.5
 _THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)", PAPER: "none"}
 
 
-def render(template: str, *, filters: Mapping[str, Any], **values: Any) -> str:
-    """The page that a template in this folder makes of `values`. `filters`: functions for the template, by name."""
+class Drawing(NamedTuple):
+    """A figure as SVG, and the boxes of its panels, see `panel_boxes`."""
+
+    svg: bytes
+    boxes: list[list[float]]
+
+
+def draw(figure: Figure) -> Drawing:
+    """Draws a figure for a page."""
+    return Drawing(svg(figure), panel_boxes(figure).tolist())
+
+
+def render(template: str, **values: Any) -> str:
+    """The page that a template in this folder makes of `values`."""
     loader, undefined = jinja2.PackageLoader("jaxos4.report", "."), jinja2.StrictUndefined
     environment = jinja2.Environment(
         loader=loader, undefined=undefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= filters
+    environment.filters |= {"inline": inline, "plain": plain, "number": _number, "interval": _interval, "share": _share}
     return environment.get_template(template).render(**values)
 
 
-def inline(svg: bytes, stem: str, description: str, *, estimators: Sequence[str] = ()) -> Markup:
-    """The element `<svg>` for a page, from an SVG file.
+def _number(value: float | None, digits: int = 4) -> str:
+    return MISSING if value is None else plain(value, digits)
+
+
+def _interval(ends: tuple[float, float] | None) -> str:
+    return "" if ends is None else f"{_number(ends[0])} to {_number(ends[1])}"
+
+
+def _share(value: float | None) -> str:
+    return MISSING if value is None else f"{value:.2f}"
+
+
+def inline(drawing: Drawing, stem: str, description: str, estimators: Sequence[str] = ()) -> Markup:
+    """The panels of a drawing, each as an element `<svg>`: the page puts as many side by side as its width allows.
+
+    What belongs to no panel, such as a legend, is left out: the page says it.
 
     **Arguments:**
 
-    - `stem`: the ids in the element begin with this text.
+    - `stem`: the ids in the elements begin with this text.
     - `description`: what a screen reader says.
     - `estimators`: their names, for tooltips.
     """
-    text = svg.decode()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = drawing.svg.decode()
     # Coordinates to a hundredth of a point: a third of the bytes.
     text = re.sub(r'(?<= )(d|x|y)="[^"]*"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), text)
 
@@ -50,10 +78,23 @@ def inline(svg: bytes, stem: str, description: str, *, estimators: Sequence[str]
     text = re.sub(r"url\(#([^)]+)\)", rf"url(#{stem}--\1)", text)
     for color, themed in _THEMED.items():
         text = text.replace(color, themed)
-    head, rest = text.split(">", 1)
-    width = re.search(r' width="([\d.]+)pt"', head)
-    pixels = _PIXELS * float(width[1]) if width else 0.0
-    head = re.sub(r' (width|height)="[^"]*"', "", head)
-    style = f"min-width: {0.8 * pixels:.0f}px; max-width: {_GROWTH * pixels:.0f}px"
-    text = f'{head} role="img" aria-label="{escape(description)}" style="{style}">{rest}'
-    return Markup(text)  # noqa: S704  # text in our SVG is outlines
+    panels = re.findall(r'^  <g id="\S+--axes_\d+">$.*?^  </g>$', text, flags=re.DOTALL | re.MULTILINE)
+    panels[-1] += text[text.rindex("<defs>") : text.rindex("</svg>")]
+    width, columns = _PIXELS * drawing.boxes[0][2], len({round(box[0]) for box in drawing.boxes})
+    style = f"--least: {_SHRINKS * width:.0f}px; --most: {_GROWS * width:.0f}px; --columns: {columns}"
+    shown = [
+        f'<svg viewBox="{" ".join(f"{x:.1f}" for x in box)}">{panel}</svg>'
+        for box, panel in zip(drawing.boxes, panels, strict=True)
+    ]
+    label = escape(" ".join(description.split()))
+    return Markup(f'<div class="panels" role="img" aria-label="{label}" style="{style}">{"".join(shown)}</div>')  # noqa: S704  # text in our SVG is outlines
+
+
+def swatch(look: Style) -> Markup:
+    """A line of 32 x 16 pixels with a mark, as a figure draws a series: the content of an element `<svg>`."""
+    marker, (_, dash) = MarkerStyle(look.marker), look.dash
+    points = np.asarray(marker.get_path().transformed(marker.get_transform()).to_polygons()[0])
+    mark = " ".join(f"{16 + 9 * x:.1f},{8 - 9 * y:.1f}" for x, y in points)
+    dashes = " ".join(f"{1.6 * length:g}" for length in dash)
+    line = f'<path d="M0 8H32" stroke="{look.color}" stroke-width="1.6" stroke-dasharray="{dashes}"/>'
+    return Markup(f'{line}<polygon points="{mark}" fill="{look.color}"/>')  # noqa: S704  # text of our own

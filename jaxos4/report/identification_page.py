@@ -7,29 +7,27 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import MultipleLocator
+from scipy.spatial.distance import pdist
 
 from .._files import check_writable, write_atomically
+from ..airframe import Airframe
 from ..analysis.frequency_response import AxisResponse, FrequencyResponse
+from ..analysis.inertia import CenterOfMass, center_of_mass
 from ..analysis.prediction import Predictions
-from ..identification.results import Identification, SampleTime
-from ..results import NINETY_FIVE
-from .html import inline, render
-from .style import BOUND_DASHES, FAINT, INK, Style, drawing, grid, styles, svg, ticks_at
+from ..identification.results import Constant, Identification, SampleTime
+from ..results import NINETY_FIVE, meaning
+from .html import draw, render
+from .style import BOUND_DASHES, FAINT, INK, PAPER, Style, drawing, grid, label, styles, ticks_at
 from .text import MISSING, plain
 
-BAND = 0.95
-"""The share of the errors that the band of the predictions holds."""
-
-# The horizon that the page shows first [s], and the digits of its estimates.
-_SHOWN, _DIGITS = 0.25, 4
+# The horizon that the page shows first [s], and the share of the errors that the band of the predictions holds.
+_SHOWN, _BAND = 0.25, 0.95
+_INERTIAS = ("Ix", "Iy", "Iz")
 # The page shows these entries of the provenance in a place of their own.
 _ELSEWHERE = ("command", "notes")
-# Width of the figure of predictions by the time that it shows [inch/s], and its limits [inch].
-_INCHES_A_SECOND, _NARROWEST, _WIDEST = 0.25, 9.0, 30.0
 # The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
 _HIGHEST, _GAINS = 40.0, (0.2, 5.0)
 _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
@@ -38,29 +36,29 @@ _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 def write_flight_page(path: str | os.PathLike[str], found: Identification, *, title: str) -> None:
     """Writes the page of an identified vehicle, completely or not at all. Raises `OSError` if it cannot be written."""
     check_writable(path)
-    look = styles([found.estimator])[found.estimator]
-    predicted, used = found.predictions, found.provenance
-    rates, response, inertias, chosen = {}, {}, {}, 0
+    look, used = styles([found.estimator])[found.estimator], found.provenance
+    airframe, count = found.problem.model.airframe, len(found.parameters)
+    values = np.array([math.nan if row.estimate is None else row.estimate for row in found.parameters.values()])
+    covariance = np.zeros((count, count)) if found.covariance is None else np.asarray(found.covariance)
+    center = [x for x in center_of_mass(tuple(found.parameters), values, covariance, airframe) if math.isfinite(x.std)]
+    drawings = {}
     with drawing():
-        if predicted is not None:
-            chosen = int(np.argmin(np.abs(predicted.horizons - _SHOWN)))
-            for i, horizon in enumerate(predicted.horizons):
-                rates[f"{horizon:.3g} s ahead"] = svg(predicted_rates(predicted, used.sample_time, i, look))
-        if found.response is not None:
-            response[""] = svg(frequency_responses(found.response, look))
+        drawings["vehicle"] = draw(vehicle(airframe, found.rigid_body.constants, center, look))
         if found.sample_times:
-            inertias[""] = svg(inertias_by_sample_time(found.sample_times, used.sample_time, look))
+            drawings["sample times"] = draw(inertias_by_sample_time(found.sample_times, used.sample_time, look))
+        if found.response is not None:
+            drawings["response"] = draw(frequency_responses(found.response, look))
     text = render(
         "identification.html.j2",
-        filters={"number": _number, "interval": _interval, "share": _share, "plain": plain, "inline": inline},
         title=title,
         found=found,
+        verdict=verdict(found),
+        center=[f"{each.axis} {_plus_minus(1e3 * each.value, 1e3 * each.std)} mm" for each in center],
         ninety_five=NINETY_FIVE,
-        predictions=rates,
-        chosen=chosen,
-        band=f"{100 * BAND:g}",
-        responses=response,
-        sample_times=inertias,
+        rates=None if found.predictions is None else predicted_rates(found.predictions, used.sample_time, look),
+        agreement={} if found.response is None else {n: _agreement(x) for n, x in found.response._asdict().items()},
+        band=f"{100 * _BAND:g}",
+        drawings=drawings,
         command=used.command or "",
         notes=[*used.notes, *filter(None, [found.motor_clock])],
         provenance=[(name.replace("_", " "), _text(x)) for name, x in used.to_dict().items() if name not in _ELSEWHERE],
@@ -69,16 +67,21 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         beside.write_text(text, encoding="utf-8")
 
 
-def _number(value: float | None, digits: int = _DIGITS) -> str:
-    return MISSING if value is None else plain(value, digits)
+def verdict(found: Identification) -> str:
+    """Whether to trust the identification, and its moments of inertia, in one sentence."""
+    if not found.has_answer:
+        return f"There is no answer: {meaning(found.result)}."
+    if not found.successful:
+        return f"Not to be trusted: {found.doubts[0] if found.doubts else meaning(found.result)}."
+    every = found.rigid_body.constants
+    known = [f"{name} {_plus_minus(every[name].estimate, every[name].std)}" for name in _INERTIAS if name in every]
+    missing = [f"{name} is not identified" for name in _INERTIAS if name not in every]
+    values = [f"{', '.join(known)} kg m² (95 %)"] if known else []
+    return f"Nothing speaks against this estimate: {'; '.join(values + missing)}."
 
 
-def _interval(ends: tuple[float, float] | None) -> str:
-    return "" if ends is None else f"{_number(ends[0])} to {_number(ends[1])}"
-
-
-def _share(value: float | None) -> str:
-    return MISSING if value is None else f"{value:.2f}"
+def _plus_minus(value: float, std: float) -> str:
+    return f"{plain(value)} ± {plain(NINETY_FIVE * std, 2)}"
 
 
 def _text(x: Any) -> str:
@@ -87,115 +90,123 @@ def _text(x: Any) -> str:
     return MISSING if x is None else json.dumps(x, ensure_ascii=False)
 
 
-def predicted_rates(predicted: Predictions, sample_time: float, horizon: int, look: Style) -> Figure:
-    """Measured and predicted p, q, r against the time that is predicted, with a band that holds 95 % of the errors.
-
-    **Arguments:**
-
-    - `sample_time`: of the flight [s].
-    - `horizon`: index into `predicted.horizons`.
-    """
-    time = predicted.start * sample_time + predicted.horizons[horizon]
-    # Lines break between stretches.
-    usual = np.median(np.diff(predicted.start)) if predicted.start.size > 1 else 1
-    breaks = np.flatnonzero(np.diff(predicted.start) > 1.5 * usual) + 1
-    width = float(np.clip(_INCHES_A_SECOND * np.ptp(time), _NARROWEST, _WIDEST))
-    figure, panels = grid(3, columns=1, width=width, height=1.9)
-    for rate, (panel, name) in enumerate(zip(panels, "pqr", strict=True)):
-        y, measured = predicted.predicted[:, horizon, rate], predicted.measured[:, horizon, rate]
-        errors = np.abs(y - measured)
-        errors = errors[np.isfinite(errors)]
-        half = float(np.quantile(errors, BAND)) if errors.size else math.nan
-        x, y, measured = (np.insert(values.astype(float), breaks, np.nan) for values in (time, y, measured))
-        band = panel.fill_between(x, y - half, y + half, color=look.color, alpha=0.22, linewidth=0)
-        (line,) = panel.plot(x, y, color=look.color)
-        (dots,) = panel.plot(x, measured, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
-        panel.set_title(f"{name} [rad/s]")
-        panel.margins(x=0.01)
-        panel.tick_params(labelbottom=rate == 2)
-        if rate == 2:
-            panel.set_xlabel("time [s]")
-            labels = ("measured", f"predicted {predicted.horizons[horizon]:.3g} s ahead", f"{100 * BAND:g} % of errors")
-            figure.legend([dots, line, band], labels, loc="outside lower left", ncols=3)
+def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence[CenterOfMass], look: Style) -> Figure:
+    """The vehicle as it was identified: left from above, front up, right its moments of inertia with 95 % intervals."""
+    figure, (above, bars) = grid(2, columns=2, height=3.4)
+    positions = 1e3 * np.asarray(airframe.rotor_positions, dtype=float)
+    (x, y), radius = positions.T, 0.42 * pdist(positions).min()
+    for i, spin in enumerate(np.asarray(airframe.rotor_spins)):
+        end = 1 - 0.25 * radius / math.hypot(x[i], y[i])  # leaves room for the number
+        above.plot([0, -end * y[i]], [0, end * x[i]], color=FAINT, linewidth=3, zorder=1)
+        above.add_patch(Circle((-y[i], x[i]), radius, facecolor=PAPER, edgecolor=INK, linewidth=1.1))
+        turn = np.radians(np.linspace(200, 200 + 280 * spin, 60))
+        arc = 0.72 * radius * np.stack([np.cos(turn), np.sin(turn)], axis=1) + [-y[i], x[i]]
+        above.plot(*arc.T, color=look.color, linewidth=1.2)
+        above.annotate("", arc[-1], arc[-6], arrowprops={"arrowstyle": "-|>", "color": look.color, "shrinkA": 0})
+        above.text(-y[i], x[i], f"{i + 1}", ha="center", va="center", fontsize=10, fontweight="bold")
+    place = {each.axis: (1e3 * each.value, 1e3 * NINETY_FIVE * each.std) for each in center}
+    (cx, ex), (cy, ey) = (place.get(axis, (0.0, 0.0)) for axis in "xy")
+    above.errorbar(-cy, cx, xerr=ey or None, yerr=ex or None, color=INK, marker="P", markersize=6, capsize=2, zorder=4)
+    above.margins(0.08)
+    above.set_aspect("equal", adjustable="datalim")
+    above.set_title("from above [mm], front up")
+    for row, (name, given) in enumerate(zip(_INERTIAS, np.asarray(airframe.inertia, dtype=float), strict=True)):
+        bars.plot([given, given], [row - 0.36, row + 0.36], color=INK, linewidth=1.4, linestyle=BOUND_DASHES[2])
+        if name not in constants:
+            bars.text(0, row, "  not identified", va="center")
+            continue
+        value, half = constants[name].estimate, NINETY_FIVE * constants[name].std
+        bars.barh(row, value, height=0.5, color=look.color, alpha=0.35)
+        bars.errorbar(value, row, xerr=half, color=look.color, capsize=4, marker=look.marker)
+    bars.set_yticks(range(3), _INERTIAS)
+    bars.set_ylim(2.6, -0.6)
+    bars.set_xlim(left=0)
+    bars.grid(axis="y", visible=False)
+    bars.set_title("moments of inertia [kg m²], 95 %")
     return figure
 
 
-def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
-    """Gain, phase and coherence of roll, pitch and yaw, with 95 % bands, and the model as a line.
+def predicted_rates(predicted: Predictions, sample_time: float, look: Style) -> str:
+    """Measured and predicted p, q, r for every horizon as JSON, from which the page draws; null between stretches.
 
-    The title of an axis says by how much the measured response exceeds the model's from 4 to 20 Hz. A frequency without
-    a clear response is drawn faintly.
+    - `start`: when each prediction starts [s]. `horizons`: [s]; `shown`: the index of the first one to show.
+    - `measured`, `predicted`: by horizon, rate and start [rad/s].
+    - `half`: half the width of the band that holds 95 % of the errors, by horizon and rate [rad/s].
+
+    **Arguments:** `sample_time`: of the flight [s].
     """
-    figure, panels = grid(9, columns=3, width=9.0, height=1.75)
+    start, errors = predicted.start, np.abs(predicted.predicted - predicted.measured)
+    usual = np.median(np.diff(start)) if start.size > 1 else 1
+    breaks = np.flatnonzero(np.diff(start) > 1.5 * usual) + 1
+    half = np.nanquantile(np.where(np.isnan(errors).all(axis=0), 0.0, errors), _BAND, axis=0)
+    measured, values = (
+        np.insert(each, breaks, np.nan, axis=0).transpose(1, 2, 0) for each in (predicted.measured, predicted.predicted)
+    )
+    start = np.insert(start.astype(float), breaks, start[breaks - 1] + usual)
+    arrays = {"start": start * sample_time, "measured": measured, "predicted": values, "half": half}
+    return json.dumps(
+        {name: np.where(np.isfinite(array), array.round(4), np.nan).tolist() for name, array in arrays.items()}
+        | {"horizons": [f"{x:.3g}" for x in predicted.horizons], "color": look.color, "band": f"{100 * _BAND:g} %"}
+        | {"shown": int(np.argmin(np.abs(predicted.horizons - _SHOWN)))}
+    ).replace("NaN", "null")
+
+
+def frequency_responses(found: FrequencyResponse, look: Style) -> Figure:
+    """Gain, phase and coherence of roll, pitch and yaw, with 95 % bands; dashed: the model.
+
+    A frequency without a clear response is drawn faintly.
+    """
+    figure, panels = grid(9, columns=3, height=1.9)
     top = min(_HIGHEST, max(float(axis.frequency[-1]) if axis.frequency.size else 1.0 for axis in found))
-    shown: list[Artist] = []
-    for column, (name, axis) in enumerate(zip(found._fields, found, strict=True)):
-        gain, phase, coherence = panels[column::3]
-        drawn = _response(gain, axis, axis.gain, axis.gain * np.exp([-axis.half_width, axis.half_width]), look)
+    for row, (name, axis) in enumerate(found._asdict().items()):
+        gain, phase, coherence = panels[3 * row : 3 * row + 3]
         degrees, spread = np.degrees(axis.phase), np.degrees(np.minimum(axis.half_width, math.pi))
-        _response(phase, axis, degrees, degrees + np.array([-spread, spread]), look)
+        bands = axis.gain * np.exp([-axis.half_width, axis.half_width]), degrees + np.array([-spread, spread])
+        for panel, values, band, model in zip((gain, phase), (axis.gain, degrees), bands, (1.0, 0.0), strict=True):
+            panel.plot(axis.frequency, values, color=FAINT, linewidth=0.8)
+            low, high = np.where(axis.clear, band, np.nan)
+            panel.fill_between(axis.frequency, low, high, color=look.color, alpha=0.25, linewidth=0)
+            panel.plot(axis.frequency, np.where(axis.clear, values, np.nan), color=look.color)
+            panel.axhline(model, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
         coherence.plot(axis.frequency, axis.coherence, color=look.color)
-        model = gain.axhline(1.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
-        phase.axhline(0.0, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[2])
         coherence.axhline(0.6, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[1])
-        shown = [*drawn, model]
-        gain.set_title(f"{name}: {_agreement(axis)}")
         gain.set_yscale("log")
         gain.set_ylim(_GAINS)
         ticks_at(gain.yaxis, _GAIN_TICKS)
         phase.set_ylim(-180, 180)
         phase.yaxis.set_major_locator(MultipleLocator(90))
         coherence.set_ylim(0, 1.03)
-        coherence.set_xlabel("frequency [Hz]")
-        for panel in (gain, phase, coherence):
+        for panel, title in ((gain, "gain"), (phase, "phase [degrees]"), (coherence, "coherence")):
+            panel.set_title(f"{name}: {title}")
             panel.set_xscale("log")
             panel.set_xlim(1.0, top)
             ticks_at(panel.xaxis, _FREQUENCY_TICKS)
-            panel.tick_params(labelbottom=panel is coherence, labelleft=column == 0)
-    for panel, label in zip(panels[::3], ("gain", "phase [degrees]", "coherence"), strict=True):
-        panel.set_ylabel(label)
-    labels = ("measured over modelled", "95 %", "coherence below 0.6", "the model")
-    figure.legend(shown, labels, loc="outside lower left", ncols=4)
+    label(figure, x="frequency [Hz]")
     return figure
 
 
 def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: Style) -> Figure:
-    """Ix, Iy and Iz at each sample time, relative to those of the chosen one, with 95 % intervals.
+    """Ix, Iy and Iz at each sample time with 95 % intervals. Lines: the chosen one, and its moments of inertia.
 
     **Arguments:** `chosen`: the sample time of the estimate [s].
     """
-    own = next((each.constants for each in answers if math.isclose(each.sample_time, chosen)), {})
-    figure, panels = grid(3, columns=3, width=9.0, height=2.4)
+    figure, panels = grid(3, columns=3, height=2.4)
     ticks = [1e3 * each.sample_time for each in answers]
-    shown: list[Any] = []
-    for panel, name in zip(panels, ("Ix", "Iy", "Iz"), strict=True):
-        rows = [(1e3 * each.sample_time, each.constants[name]) for each in answers if name in each.constants]
-        scale = own[name].estimate if name in own else math.nan
-        times = [time for time, _ in rows]
-        values, errors = ([getattr(row, field) / scale for _, row in rows] for field in ("estimate", "std"))
-        errors = [NINETY_FIVE * error for error in errors]
-        line = panel.errorbar(times, values, yerr=errors, color=look.color, marker="o", markersize=4, capsize=3)
-        mark = panel.axvline(1e3 * chosen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
-        level = panel.axhline(1.0, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[2])
-        shown = [line, mark, level]
-        panel.set_title(f"{name} / chosen" if rows and name in own else f"{name}: not identified")
+    for panel, name in zip(panels, _INERTIAS, strict=True):
+        rows = {each.sample_time: each.constants[name] for each in answers if name in each.constants}
+        for sample_time, row in rows.items():
+            if math.isclose(sample_time, chosen):
+                panel.axhline(row.estimate, color=FAINT, linewidth=0.9, linestyle=BOUND_DASHES[2])
+        times, values = [1e3 * sample_time for sample_time in rows], [row.estimate for row in rows.values()]
+        errors = [NINETY_FIVE * row.std for row in rows.values()]
+        panel.errorbar(times, values, yerr=errors, markersize=4, capsize=3, **look.line)
+        panel.axvline(1e3 * chosen, color=INK, linewidth=0.9, linestyle=BOUND_DASHES[1])
+        panel.set_title(f"{name} [kg m²]" if rows else f"{name}: not identified")
         panel.set_xscale("log")
         panel.set_xlim(0.8 * ticks[0], 1.25 * ticks[-1])
         ticks_at(panel.xaxis, ticks)
-        panel.set_xlabel("sample time [ms]")
-    labels = ("moment of inertia, 95 %", "chosen sample time", "chosen moment of inertia")
-    figure.legend(shown, labels, loc="outside lower left", ncols=3)
+    label(figure, x="sample time [ms]")
     return figure
-
-
-def _response(panel: Axes, axis: AxisResponse, values: np.ndarray, band: np.ndarray, look: Style) -> list[Artist]:
-    """A line with its band: strong for a clear response, else faint."""
-    (faint,) = panel.plot(axis.frequency, values, color=FAINT, linewidth=0.8)
-    shown = np.where(axis.clear, values, np.nan)
-    low, high = np.where(axis.clear, band, np.nan)
-    filled = panel.fill_between(axis.frequency, low, high, color=look.color, alpha=0.25, linewidth=0)
-    (line,) = panel.plot(axis.frequency, shown, color=look.color)
-    return [line, filled, faint]
 
 
 def _agreement(axis: AxisResponse) -> str:

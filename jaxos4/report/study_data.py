@@ -101,8 +101,21 @@ def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
     return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
 
 
-def nearest_scale(data: xr.Dataset) -> int:
-    """The index of the noise scale nearest 1 (by ratio). Figures of one scale show it."""
-    scales = data["scale"].values
-    positive = np.where(scales > 0, scales, np.finfo(float).tiny)
-    return int(np.argmin(np.abs(np.log(positive))))
+def accuracy(data: xr.Dataset) -> xr.Dataset:
+    """`metrics.accuracy` by scale and estimator, with the Monte-Carlo interval of one parameter: a conservative one.
+
+    The mean of several parameters varies less, by how much their errors correlate.
+    """
+    found, value = metrics.efficiency(data), metrics.accuracy(data)
+    low, high = (value * (found[end] / found["efficiency"]).mean("parameter").fillna(1) for end in ("low", "high"))
+    return xr.Dataset({"accuracy": value, "low": low, "high": high}).transpose("scale", "estimator")
+
+
+def best_estimators(data: xr.Dataset) -> dict[str, str]:
+    """The estimators that are as accurate as the best one, within Monte-Carlo error, by the noise scales in words."""
+    found, best = accuracy(data), {}
+    for scale, one in zip(scale_labels(data), (found.isel(scale=i) for i in range(data.sizes["scale"])), strict=True):
+        good = (one["low"] <= one["accuracy"].min()).values
+        if good.any():
+            best.setdefault(", ".join(np.array(names(data, "estimator"))[good]), []).append(scale)
+    return {", ".join(scales) if len(best) > 1 else "every noise": names for names, scales in best.items()}

@@ -1,4 +1,4 @@
-"""Figures of a study: of one scenario, of the example flight, and of the training.
+"""Figures of a study: of one scenario, and of the example flight.
 
 Each function returns `None` if its data are absent.
 """
@@ -9,32 +9,16 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
-from ..results import NINETY_FIVE
 from ..study import metrics
-from .study_data import bounds, error_unit, names, nearest_scale, positive_scales
-from .style import (
-    BOUND_DASHES,
-    FAINT,
-    INK,
-    Style,
-    estimator_gid,
-    grid,
-    label_edges,
-    legend,
-    log_axis,
-    scale_axis,
-    style,
-    styles,
-)
+from .study_data import accuracy, bounds, error_unit, names, positive_scales
+from .style import BOUND_DASHES, INK, Style, estimator_gid, grid, label, legend, log_axis, scale_axis, style, styles
 from .text import plain
 
 _COLUMNS = 4
 # The markers of all estimators are spread over this share of the gap between two noise scales.
 _DODGE = 0.3
-# The quantiles that a box shows. The whiskers hold 95 % of the flights.
-_QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 # The place on a logarithmic axis for an estimator without rollouts.
 _NO_ROLLOUTS = 0.5
 
@@ -82,7 +66,7 @@ def efficiency(data: xr.Dataset) -> Figure | None:
 def _against_noise(
     data: xr.Dataset,
     values: list[xr.DataArray],
-    label: str,
+    quantity: str,
     *,
     interval: xr.Dataset | None = None,
     bounds: Sequence[str] = (),
@@ -105,42 +89,8 @@ def _against_noise(
         scale_axis(panel, scales)
         panel.set_yscale("log")
         panel.set_title(name)
-    label_edges(axes, _COLUMNS, x="noise scale", y=label)
+    label(figure, x="noise scale", y=quantity)
     legend(figure, names(data, "estimator"), bounds=bounds)
-    return figure
-
-
-def distribution(data: xr.Dataset) -> Figure | None:
-    """Boxes of error / bound of each parameter and estimator at the noise scale nearest 1."""
-    every = metrics.normalised_error(data.isel(scale=nearest_scale(data)))
-    some = every.notnull().any("flight")
-    if not some.any():
-        return None
-    found = every.where(some, 0.0).quantile(list(_QUANTILES), dim="flight").where(some)
-    estimators = names(data, "estimator")
-    figure, axes = grid(data.sizes["parameter"], columns=_COLUMNS, height=0.28 * len(estimators) + 0.75)
-    # Wide enough for the boxes, but limited in case one estimator is very bad.
-    reach = float(np.clip(1.08 * np.nanmax(np.abs(found.values), initial=0.0), 3.0, 12.0))
-    for place, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
-        for x in (-NINETY_FIVE, NINETY_FIVE):
-            panel.axvline(x, color=FAINT, linestyle="dashed", linewidth=0.8)
-        panel.axvline(0, color=INK, linewidth=0.8)
-        for row, look in _looks(data):
-            low, first, middle, third, high = found.isel(parameter=place, estimator=row).values
-            if not np.isfinite(middle):
-                panel.text(0, row, "no estimates", va="center", ha="center", fontsize=7, gid=estimator_gid(row))
-                continue
-            tip = f"median {middle:.2g}, quartiles {first:.2g} to {third:.2g}, 95 % {low:.2g} to {high:.2g}"
-            marks: dict[str, Any] = {"color": look.color, "gid": estimator_gid(row, tip)}
-            panel.plot([low, high], [row, row], linewidth=1.2, solid_capstyle="butt", **marks)
-            panel.plot([first, third], [row, row], linewidth=7, solid_capstyle="butt", alpha=0.55, **marks)
-            panel.plot([middle], [row], marker=look.marker, markersize=4.5, **marks)
-        panel.set_title(name)
-        panel.set_xlim(-reach, reach)
-        panel.set_ylim(len(estimators) - 0.4, -0.6)
-        panel.set_yticks(range(len(estimators)), estimators if place % _COLUMNS == 0 else [])
-        panel.grid(axis="y", visible=False)
-    label_edges(axes, _COLUMNS, x="error / bound")
     return figure
 
 
@@ -167,41 +117,50 @@ def coverage(data: xr.Dataset) -> Figure | None:
         panel.set_ylim(lowest, 1.02)
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
         panel.grid(axis="x", visible=False)
-        panel.set_xlabel("level claimed")
-    for panel in axes[::_COLUMNS]:
-        panel.set_ylabel("intervals that hold the truth")
-    legend(figure, estimators, lines=False)
+    label(figure, x="level claimed", y="intervals that hold the truth")
+    legend(figure, estimators)
     return figure
 
 
-def rollouts(data: xr.Dataset) -> Figure | None:
-    """RMSE / least bound (mean of all parameters) against rollouts; a line joins the noise scales of an estimator."""
+def overview(data: xr.Dataset) -> Figure | None:
+    """RMSE / least bound, the mean of all parameters: left against the noise scale, right against the rollouts."""
     data = positive_scales(data)
-    x, y = (of(data).transpose("scale", "estimator") for of in (metrics.mean_rollouts, metrics.accuracy))
-    known = (x.notnull() & y.notnull()).values
+    found, rollouts = accuracy(data), metrics.mean_rollouts(data).transpose("scale", "estimator").values
+    values, low, high = (found[name].values for name in ("accuracy", "low", "high"))
+    known = np.isfinite(values) & np.isfinite(rollouts)
     if not known.any():
         return None
-    figure, (panel,) = grid(1, columns=1, width=7.0, height=3.6)
-    panel.axhline(1, color=INK, linewidth=1.1)
+    figure, (by_noise, by_rollouts) = grid(2, columns=2, height=3.6)
+    spent = np.maximum(rollouts, _NO_ROLLOUTS)
     for row, look in _looks(data):
-        at = known[:, row]
-        across, up = np.maximum(x.isel(estimator=row).values[at], _NO_ROLLOUTS), y.isel(estimator=row).values[at]
-        panel.plot(across, up, color=look.color, linestyle=look.dash, linewidth=1.0, gid=estimator_gid(row))
-        marks = {"color": look.color, "marker": look.marker, "alpha": 0.8, "linewidths": 0}
-        for place, a, b in zip(np.flatnonzero(at), across, up, strict=True):
-            tip = f"noise x {data['scale'].values[place]:g}: {plain(float(x[place, row]))} rollouts, {plain(float(b))}"
-            panel.scatter(a, b, s=26 + 30 * place, gid=estimator_gid(row, tip), **marks)
-    log_axis(panel, "x")
-    log_axis(panel, "y")
-    spent = x.values[x.notnull().values]
-    top = int(np.ceil(np.log10(max(float(spent.max()), 10.0))))
-    ticks = {_NO_ROLLOUTS: "none"} if (spent <= 0).any() else {}
-    ticks |= {10.0**power: f"{10**power:,}" for power in range(top + 1)}
-    panel.set_xticks(list(ticks), list(ticks.values()))
-    panel.set_xlim(min(ticks) / 1.5 if 0 in np.floor(spent) else None, max(ticks) * 1.2)
-    scales = ", ".join(f"{scale:g}" for scale in data["scale"].values)
-    panel.set_xlabel(f"rollouts for one flight (larger markers: larger noise scale of {scales})")
-    panel.set_ylabel("RMSE / least bound, mean of all parameters")
+        at, line = known[:, row], {"color": look.color, "linestyle": look.dash, "gid": estimator_gid(row)}
+        x, y, across = dodged(data["scale"].values, row, data.sizes["estimator"])[at], values[at, row], spent[at, row]
+        by_noise.plot(x, y, **line)
+        by_noise.vlines(x, low[at, row], high[at, row], color=look.color, linewidth=1.0, gid=estimator_gid(row))
+        by_rollouts.plot(across, y, linewidth=1.0, **{**line, "zorder": 1.5})
+        for size, (place, a, b, c) in enumerate(zip(np.flatnonzero(at), x, across, y, strict=True)):
+            tip = f"noise x {data['scale'].values[place]:g}: {plain(c)} ({plain(low[place, row])} to "
+            tip += f"{plain(high[place, row])}), {plain(rollouts[place, row])} rollouts"
+            marks: dict[str, Any] = {"color": look.color, "marker": look.marker, "linewidths": 0}
+            marks["gid"] = estimator_gid(row, f"{names(data, 'estimator')[row]}, {tip}")
+            by_noise.scatter(a, c, s=30, **marks)
+            by_rollouts.scatter(b, c, s=26 + 30 * size, alpha=0.8, **marks)
+    for panel in (by_noise, by_rollouts):
+        panel.axhline(1, color=INK, linewidth=1.1, zorder=1.4)
+        panel.set_ylim(min(0.9, 0.9 * np.nanmin(low[known])), 1.15 * np.nanmax(high[known]))
+        log_axis(panel, "y")
+    by_noise.set_title("RMSE / least bound, by noise")
+    scale_axis(by_noise, data["scale"].values)
+    by_noise.set_xlabel("noise scale")
+    by_rollouts.set_title("RMSE / least bound, by rollouts")
+    by_rollouts.set_xscale("log")
+    powers = 10.0 ** np.arange(np.ceil(np.log10(max(spent[known].max(), 10.0))) + 1)
+    ticks = {_NO_ROLLOUTS: "none"} if (rollouts[known] <= 0).any() else {}
+    ticks |= {power: f"{power:,.0f}" for power in powers}
+    by_rollouts.set_xticks(list(ticks), list(ticks.values()))
+    by_rollouts.xaxis.set_minor_locator(NullLocator())
+    by_rollouts.set_xlim(min(ticks) / 1.5, max(ticks) * 1.2)
+    by_rollouts.set_xlabel("rollouts for one flight; larger marks: more noise")
     legend(figure, names(data, "estimator"))
     return figure
 
@@ -231,19 +190,15 @@ def search(data: xr.Dataset) -> Figure | None:
             y = values.isel(parameter=place).values
             panel.plot(data["sweep"].values, np.where(y > 0, y, np.nan), label=name, markersize=4, **style(place).line)
         panel.set_title(title)
-        panel.set_xlabel("sweep")
         panel.xaxis.set_major_locator(MaxNLocator(integer=True))
         log_axis(panel, "y")
-    axes[0].set_ylabel("in first half-widths")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=8, handlelength=2.5)
+    label(figure, x="sweep", y="in first half-widths")
+    axes[0].legend(loc="lower left", ncols=2, handlelength=2.5, fontsize=7)
     return figure
 
 
-def trajectories(data: xr.Dataset, *, minus_truth: bool = False) -> Figure | None:
-    """The example flight: measured, true, and simulated with each estimate; or the simulations minus the truth.
-
-    A panel for each state that was measured.
-    """
+def deviations(data: xr.Dataset) -> Figure | None:
+    """The example flight simulated with each estimate, minus its truth: a panel for each state that was measured."""
     if "example_measured" not in data:
         return None
     known = data["example_measured"].notnull() & data["example_true"].notnull()
@@ -253,39 +208,13 @@ def trajectories(data: xr.Dataset, *, minus_truth: bool = False) -> Figure | Non
     figure, axes = grid(len(shown), columns=3, height=1.75)
     for panel, state in zip(axes, shown, strict=True):
         one = data.isel(state=state)
-        simulated = one["example_simulated"]
-        if minus_truth:
-            simulated = simulated - one["example_true"]
-            panel.axhline(0, color=INK, linewidth=0.8)
-        else:
-            panel.plot(one["time"], one["example_measured"], ".", color=FAINT, markersize=2)
-            panel.plot(one["time"], one["example_true"], color=INK, linewidth=1.0)
+        panel.axhline(0, color=INK, linewidth=0.8)
         for row, look in _looks(data):
-            y, gid = simulated.isel(estimator=row).values, estimator_gid(row)
+            y = (one["example_simulated"].isel(estimator=row) - one["example_true"]).values
             if np.isfinite(y).any():
-                panel.plot(one["time"], y, color=look.color, linestyle=look.dash, linewidth=1.1, gid=gid)
+                line = {"color": look.color, "linestyle": look.dash, "linewidth": 1.1, "gid": estimator_gid(row)}
+                panel.plot(one["time"], y, **line)
         panel.set_title(f"{one['state'].item()} [{one['state_unit'].item()}]")
-    label_edges(axes, 3, x="time [s]")
-    legend(figure, names(data, "estimator"), markers=False)
-    return figure
-
-
-def training(data: xr.Dataset) -> Figure | None:
-    """The training loss and the validation loss of each network."""
-    if "training_loss" not in data:
-        return None
-    labels = names(data, "training")
-    figure, axes = grid(len(labels), columns=3, width=3.2 * min(len(labels), 3) + 0.6, height=2.6)
-    for place, (panel, label) in enumerate(zip(axes, labels, strict=True)):
-        one = data.isel(training=place)
-        losses = np.stack([one["training_loss"].values, one["validation_loss"].values])
-        for row, name in enumerate(("training", "validation")):
-            panel.plot(one["training_step"].values, losses[row], label=name, markersize=3.5, **style(row).line)
-        if not (losses <= 0).any() and np.isfinite(losses).any():
-            log_axis(panel, "y")
-        panel.set_title(label)
-        panel.set_xlabel("step")
-    for panel in axes[::3]:
-        panel.set_ylabel("loss")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    label(figure, x="time [s]")
+    legend(figure, names(data, "estimator"))
     return figure

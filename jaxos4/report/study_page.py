@@ -1,7 +1,6 @@
 """The report of a study: its figures with their captions, and one HTML page that needs no other file."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,9 +9,9 @@ from matplotlib.figure import Figure
 
 from .._files import check_writable, write_atomically
 from . import study_figures, study_tables
-from .html import inline, render
-from .study_data import Scenario, names, scenarios
-from .style import drawing, pdf, styles, svg
+from .html import Drawing, draw as draw_panels, render, swatch
+from .study_data import Scenario, best_estimators, bounds, names, scenarios
+from .style import BOUND_DASHES, drawing, pdf, styles
 
 MOST_DRAWN = 12
 """At most so many scenarios have figures. All scenarios have tables."""
@@ -21,28 +20,26 @@ MOST_DRAWN = 12
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
 
 
-# The figures of each scenario, and those of the example flight and of the networks. Each draws nothing if its data are
+# The figures of each scenario, and those of the example flight. Each draws nothing if its data are
 # absent. `study.html.j2` has their titles and captions.
 SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
+    "overview": study_figures.overview,
     "error": study_figures.errors,
     "efficiency": study_figures.efficiency,
-    "distribution": study_figures.distribution,
-    "rollouts": study_figures.rollouts,
     "coverage": study_figures.coverage,
 }
 EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
-    "trajectories": study_figures.trajectories,
-    "deviations": partial(study_figures.trajectories, minus_truth=True),
+    "deviations": study_figures.deviations,
     "search": study_figures.search,
-    "training": study_figures.training,
 }
 
 
 class Drawn(NamedTuple):
-    """A figure of a study: the name of its files without the suffix, and their bytes by suffix."""
+    """A figure of a study: the name of its files without the suffix, the drawing for the page, and the PDF, if any."""
 
     stem: str
-    files: dict[str, bytes]
+    drawing: Drawing
+    pdf: bytes | None
 
 
 def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
@@ -62,7 +59,8 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
     example = draw(EXAMPLE_FIGURES, dataset, with_pdf=with_pdf)
     files = {target: _page(dataset, sections, example).encode()}
     for drawn in [drawn for figures in (*(of for _, of in sections), example) for drawn in figures.values()]:
-        files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in drawn.files.items()}
+        contents = {"svg": drawn.drawing.svg, "pdf": drawn.pdf}
+        files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in contents.items() if content}
     folder.mkdir(exist_ok=True)
     for path, content in reversed(files.items()):  # the page last
         with write_atomically(path) as beside:
@@ -78,8 +76,7 @@ def draw(
     for name, draw_figure in figures.items():
         with drawing():
             if (figure := draw_figure(data)) is not None:
-                files = {"svg": svg(figure)} | ({"pdf": pdf(figure)} if with_pdf else {})
-                made[name] = Drawn(f"{name}{suffix}", files)
+                made[name] = Drawn(f"{name}{suffix}", draw_panels(figure), pdf(figure) if with_pdf else None)
     return made
 
 
@@ -88,19 +85,19 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
     attributes = {name: str(value) for name, value in dataset.attrs.items()}
     estimators = names(dataset, "estimator")
     missing, cells = study_tables.cells_not_run(dataset)
-
     return render(
         "study.html.j2",
-        filters={"inline": partial(inline, estimators=estimators)},
         title=attributes.get("title", "") or "A study",
         command=attributes.get("command", ""),
         specification=attributes.get("specification", ""),
         provenance=[(label, attributes[name]) for name, label in _PROVENANCE.items() if name in attributes],
-        estimators=[(place, name, look.color) for place, (name, look) in enumerate(styles(estimators).items())],
+        estimators=estimators,
+        bounds=list(bounds(dataset))[: len(BOUND_DASHES)],
+        swatches=[swatch(look) for look in styles(estimators).values()],
         sections=[
             scenario._asdict()
             | {"figures": drawn, "tables": study_tables.scenario_tables(scenario.data)}
-            | {"trouble": study_tables.troubled_flights(scenario.data)}
+            | {"trouble": study_tables.troubled_flights(scenario.data), "best": best_estimators(scenario.data)}
             for scenario, drawn in sections
         ],
         level=f"{100 * study_tables.shown_level(dataset):g} %",

@@ -41,18 +41,21 @@ class Style(NamedTuple):
         return {"color": self.color, "marker": self.marker, "linestyle": self.dash}
 
 
-# After Okabe and Ito (2008), some darkened. The contrast is at least 3:1 on white and on dark paper.
-_STYLES = (
-    Style("#0072b2", "o", _SOLID),
-    Style("#d55e00", "s", _DASHED),
-    Style("#009e73", "D", (0, (6.4, 1.6, 1, 1.6))),
-    Style("#c46a9b", "^", _DOTTED),
-    Style("#b97f00", "v", (0, (5, 1))),
-    Style("#3b97ce", "P", (0, (3, 1, 1, 1))),
-    Style("#7f7f7f", "X", (0, (1, 1))),
-    Style("#8e5ea8", "*", (0, (7, 2, 1, 2))),
-)
-_KNOWN = ("ibss", "network", "hybrid", "output-error", "equation-error", "rls", "svsf", "kalman")
+# Nine estimators and the ant colony, each with a colour, a mark and dashes of its own. The first colours are of Okabe
+# and Ito (2008). For readers with normal vision, without red cones and without green cones, the colours are at least
+# 17 apart in CIELAB; the contrast is at least 3:1 on white and on dark paper.
+_STYLES = {
+    "ibss": Style("#0072b2", "o", _SOLID),
+    "network": Style("#d55e00", "s", _DASHED),
+    "hybrid": Style("#009e73", "D", (0, (6.4, 1.6, 1, 1.6))),
+    "output-error": Style("#fc486c", "^", _DOTTED),
+    "filter-error": Style("#5448fc", "v", (0, (9, 2))),
+    "equation-error": Style("#54783c", "P", (0, (3, 1, 1, 1, 1, 1))),
+    "rls": Style("#549cc0", "X", (0, (2, 1))),
+    "svsf": Style("#846084", "*", (0, (1, 2.2))),
+    "kalman": Style("#d80030", "<", (0, (10, 2, 2, 2))),
+    "ant-colony": Style("#4884fc", "p", (0, (5, 1, 2, 1))),
+}
 BOUND_DASHES = (_SOLID, _DOTTED, _DASHED)
 _LEGEND_WIDTH = 1.4  # the width of one entry [inch]
 
@@ -93,15 +96,16 @@ def drawing() -> Iterator[None]:
 
 
 def styles(estimators: Sequence[str]) -> dict[str, Style]:
-    """A style for each estimator. Those in `_KNOWN` have always the same style, the others have an unused one."""
-    free = (place for place in itertools.count() if place >= len(_KNOWN) or _KNOWN[place] not in estimators)
-    return {name: style(_KNOWN.index(name) if name in _KNOWN else next(free)) for name in estimators}
+    """A style for each estimator: its own, or an unused one if the table does not have the estimator."""
+    known = list(_STYLES)
+    free = (place for place in itertools.count() if place >= len(known) or known[place] not in estimators)
+    return {name: _STYLES[name] if name in _STYLES else style(next(free)) for name in estimators}
 
 
 def style(place: int) -> Style:
     """Style number `place`. Beyond the table, a colour comes with the marker and dashes of another row."""
-    count = len(_STYLES)
-    return _STYLES[(place + place // count) % count]._replace(color=_STYLES[place % count].color)
+    table, count = list(_STYLES.values()), len(_STYLES)
+    return table[(place + place // count) % count]._replace(color=table[place % count].color)
 
 
 def estimator_gid(place: int, tip: str = "") -> str:
@@ -117,12 +121,12 @@ def grid(panels: int, *, columns: int, width: float = 9.0, height: float = 2.1) 
     return figure, [figure.add_subplot(rows, columns, i + 1) for i in range(panels)]
 
 
-def label_edges(panels: list[Axes], columns: int, *, x: str, y: str = "") -> None:
-    """Labels the x axes of the lowest panel in each column of a grid, and the y axes of its first column."""
-    for panel in panels[-columns:]:
+def label(figure: Figure, *, x: str, y: str = "") -> None:
+    """Labels the x axis of every panel, so that a panel can stand alone, and y once beside all panels."""
+    for panel in figure.axes:
         panel.set_xlabel(x)
-    for panel in panels[::columns] if y else ():
-        panel.set_ylabel(y)
+    if y:
+        figure.supylabel(y, fontsize=_RC["axes.labelsize"])
 
 
 def log_axis(axes: Axes, which: str) -> None:
@@ -152,35 +156,38 @@ def ticks_at(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def legend(
-    figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] = (), lines: bool = True, markers: bool = True
-) -> None:
-    """Adds a legend below the figure: an entry for each bound and each estimator, with lines, markers or both.
-
-    The page hides the entry of an estimator together with the estimator.
-    """
+def legend(figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] = ()) -> None:
+    """Adds a legend below the figure: an entry for each bound and each estimator. A page has its bar instead."""
     handles = [
         Line2D([], [], color=INK, linestyle=d, linewidth=1.1) for d, _ in zip(BOUND_DASHES, bounds, strict=False)
     ]
     labels = [f"bound, {name}" for name in bounds[: len(handles)]]
-    first = len(handles)
-    for name, look in styles(estimators).items():
-        marker, dash = look.marker if markers else None, look.dash if lines else "none"
-        handles.append(Line2D([], [], color=look.color, marker=marker, linestyle=dash))
-        labels.append(name)
+    handles += [Line2D([], [], **look.line) for look in styles(estimators).values()]
+    labels += estimators
     rows = -(-len(labels) // int(figure.get_figwidth() / _LEGEND_WIDTH))
     columns = -(-len(labels) // rows)
-    box = figure.legend(handles, labels, loc="outside lower center", ncols=columns, handlelength=3)
-    for place, pair in enumerate(zip(box.legend_handles[first:], box.get_texts()[first:], strict=True)):
-        for part in filter(None, pair):
-            part.set_gid(estimator_gid(place))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, handlelength=3)
 
 
 def svg(figure: Figure) -> bytes:
-    """The figure as SVG. The same figure gives the same bytes."""
+    """The figure as SVG. The same figure gives the same bytes. A browser shrinks it to the width of its window."""
     drawn = _printed(figure, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None})
     figure.set_layout_engine("none")  # keeps the layout for the next format
-    return drawn
+    return drawn.replace(b"<svg ", b'<svg style="max-width: 100%; height: auto" ', 1)
+
+
+def panel_boxes(figure: Figure) -> np.ndarray:
+    """The box of each panel with its labels in the SVG of a figure that was just drawn: x, y, width, height [pt].
+
+    The margins around all panels are the same, so that panels of one size have boxes of one size.
+    """
+    resolution, figure.dpi = figure.dpi, 72  # of SVG: a pixel is a point
+    inner = np.array([panel.bbox.extents for panel in figure.axes])
+    outer = np.array([(panel.get_tightbbox() or panel.bbox).extents for panel in figure.axes])
+    figure.set_dpi(resolution)
+    margin = np.abs(outer - inner).max(axis=0) * [-1, -1, 1, 1] + [-2, -2, 2, 2]
+    left, bottom, right, top = (inner + margin).T
+    return np.stack([left, 72 * figure.get_figheight() - top, right - left, top - bottom], axis=1)
 
 
 def pdf(figure: Figure) -> bytes:

@@ -5,7 +5,9 @@ take as long as the slowest flight, its arrays do not fit the cache, and the pro
 one flight instead of one unknown of several flights.
 """
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +18,8 @@ from jaxtyping import Array, Bool
 
 # The most lanes of a block: two to four of the processor's vectors. In 64 lanes a flight takes up to twice as long.
 _BLOCK = 16
+# The flights of one thread's call. It does not depend on the number of cores, and so the results do not.
+_CHUNK = 4 * _BLOCK
 
 
 def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *arguments: Any) -> Any:
@@ -46,27 +50,36 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
     A slow flight then holds up its block only. The last lane is repeated until all blocks are full. An accelerator
     computes the whole batch at once. `function` may be a method; the arrays of its module are batched as arguments are.
     """
+    arrays, settings = eqx.partition((function, *arguments), eqx.is_array)
 
-    def call(function: Callable, *arguments: Any) -> Any:
+    @jax.jit  # traced once, although a batch calls it twice
+    def one(arrays: Any) -> Any:
+        function, *arguments = eqx.combine(arrays, settings)
         return function(*arguments)
 
-    def of_batch(lanes: int, many: Any, shared: Any) -> Any:
+    blocked = custom_vmap(one)
+
+    @blocked.def_vmap
+    def batch(lanes: int, is_batched: list, arrays: Any) -> tuple[Any, Any]:
+        many, shared = eqx.partition(arrays, is_batched[0])
         blocks = max(-(-lanes // _BLOCK), 1) if jax.default_backend() == "cpu" else 1
         size = -(-lanes // blocks)
 
         def block(many: Any) -> Any:
-            return jax.vmap(lambda one: call(*eqx.combine(one, shared)))(many)
+            return jax.vmap(lambda each: one(eqx.combine(each, shared)))(many)
 
         def cut(leaf: Array) -> Array:
             more = jnp.repeat(leaf[-1:], blocks * size - lanes, axis=0)
             return jnp.concatenate([leaf, more]).reshape(blocks, size, *leaf.shape[1:])
 
         if blocks == 1:
-            return block(many)
-        out = jax.lax.map(block, jax.tree.map(cut, many))
-        return jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
+            out = block(many)
+        else:
+            out = jax.lax.map(block, jax.tree.map(cut, many))
+            out = jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
+        return out, jax.tree.map(lambda _: True, out)
 
-    return with_batch(call, of_batch, function, *arguments)
+    return blocked(arrays)
 
 
 def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) -> Any:
@@ -85,3 +98,46 @@ def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) ->
     zeros = [jnp.zeros(value.shape, value.dtype) for value in jax.eval_shape(leaves)]
     values = jax.lax.cond(needed.any(), leaves, lambda: zeros)
     return jax.tree.unflatten(structure, values)
+
+
+def cores() -> int:
+    """The number of cores that this process may use, or as many as `JAX_NUM_CPU_DEVICES` says."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return int(os.environ.get("JAX_NUM_CPU_DEVICES") or usable)
+
+
+def on_all_cores(function: Callable) -> Callable:
+    """A batch on all cores of a CPU: threads run one compiled program. Results are the same on any number of cores.
+
+    The returned function takes a batch of `function`'s first argument, all arrays of which have the flights as their
+    first axis, and the other arguments as they are. Call it outside of `jax.jit`. On an accelerator it is one call.
+    """
+
+    @eqx.filter_jit
+    def chunk(many: Any, first: Array, size: int, shared: Any) -> Any:
+        part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), many)
+        return eqx.filter_vmap(lambda one: function(one, *shared))(part)
+
+    compiled = set()
+
+    def batch(many: Any, *shared: Any) -> Any:
+        leaves, structure = jax.tree.flatten((many, shared))
+        lanes, double = leaves[0].shape[0], bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+        size = min(lanes, _CHUNK) if jax.default_backend() == "cpu" else lanes
+
+        def run(first: int) -> Any:
+            with jax.enable_x64(double):  # a setting of each thread
+                return jax.block_until_ready(chunk(many, jnp.asarray(first), size, shared))
+
+        # All chunks are full: the last begins with flights of the one before it.
+        firsts, found = [min(first, lanes - size) for first in range(0, lanes, size)], []
+        key = structure, size, double, *(jnp.shape(leaf) for leaf in leaves)
+        if key not in compiled:
+            found.append(run(firsts.pop(0)))
+            compiled.add(key)
+        with ThreadPoolExecutor(cores()) as pool:
+            found += pool.map(run, firsts)
+        found[-1] = jax.tree.map(lambda leaf: leaf[-lanes % size :], found[-1])
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
+
+    return batch

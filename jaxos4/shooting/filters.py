@@ -7,8 +7,9 @@ Arrays have the axes (time, channels, segments). A segment is one part of the fl
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar
 from ..models.state import Forcing, Rates, State
+from .batching import with_batch
 from .gains import (
     RATES,
     Channels,
@@ -24,19 +26,18 @@ from .gains import (
     LogNoise,
     Observed,
     Series,
+    Step,
     basis,
     first_covariance,
-    gains_after,
-    transition,
+    next_gains,
+    step_of,
 )
 from .scans import FASTEST
 
 Segments = Float[Array, " segments"]
-Scalars = tuple[Scalar, ...]
+Scalars = tuple[Float[Array, "*#segments"], ...]
 Move = Callable[[State, Forcing, Scalars], State]
 Observe = Callable[[State, Forcing, Scalars], Scalars]
-# A row of `Observed`: measured, restart.
-_Row = tuple[Channels, Bool[Array, " segments"]]
 
 LAGS = 8
 """The largest lag at which innovations are compared, in samples."""
@@ -67,6 +68,19 @@ def _start(observed: Observed, zero: Channels) -> Channels:
     return zero if observed.known is None else zero.at[:RATES].set(observed.known)
 
 
+class _Row(NamedTuple):
+    """One sample of all segments.
+
+    - `measured`: 0 if `is_measured` is false.
+    - `restarts`, `restarts_next`: whether a segment forgets what it knew before this sample, or before the next.
+    """
+
+    measured: Channels
+    is_measured: Bool[Array, "channels segments"]
+    restarts: Bool[Array, " segments"]
+    restarts_next: Bool[Array, " segments"]
+
+
 class _Known(NamedTuple):
     """What the filters know before a measurement."""
 
@@ -75,43 +89,46 @@ class _Known(NamedTuple):
 
 
 class _Feedback(NamedTuple):
-    """What the noise changes in a filter: its gains, and the disturbance over one sample."""
+    """What the noise changes in a filter: its gains, and the disturbance over one sample. Each is a channel's."""
 
     rate: tuple[Segments, ...]
     disturbance: tuple[Segments, ...]
-    reach: tuple[Scalar, ...]
-    kept: tuple[Scalar, ...]
+    reach: tuple[Segments, ...]
+    kept: tuple[Segments, ...]
 
 
 def _advance(
     move: Move, observe: Observe, known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """What is known one sample later, and the innovations of this sample."""
-    y, restart = row
-    known = jax.tree.map(lambda leaf: jnp.where(restart, 0.0, leaf), known)
     outputs = observe(State(known.rates), forcing, scalars)
     force = (h + d for h, d in zip(outputs[RATES:], known.disturbance[RATES:], strict=True))
-    expected = (*outputs[:RATES], *force)
-    errors = tuple(jnp.where(jnp.isnan(z), 0.0, jnp.nan_to_num(z) - h) for z, h in zip(y, expected, strict=True))
+    # What was not measured has no gain.
+    errors = tuple(z - h for z, h in zip(row.measured, (*outputs[:RATES], *force), strict=True))
     disturbance = tuple(
         d + gain * e for d, gain, e in zip(known.disturbance, feedback.disturbance, errors, strict=True)
     )
-    rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors[:RATES], strict=True))
+    rates = (x + gain * e for x, gain, e in zip(known.rates, feedback.rate, errors[:RATES], strict=False))
     following = move(State(Rates(*rates)), forcing, scalars).rates
-    pushed = (x + a * d for x, a, d in zip(following, feedback.reach, disturbance[:RATES], strict=True))
+    pushed = (x + a * d for x, a, d in zip(following, feedback.reach, disturbance[:RATES], strict=False))
     faded = tuple(share * d for share, d in zip(feedback.kept, disturbance, strict=True))
-    return _Known(Rates(*pushed), faded), errors
+    return _emptied(_Known(Rates(*pushed), faded), row.restarts_next), errors
+
+
+def _emptied(known: _Known, where: Bool[Array, " segments"]) -> _Known:
+    return jax.tree.map(lambda leaf: jnp.where(where, 0.0, leaf), known)
 
 
 class _Carry(NamedTuple):
     """The state of the filters between blocks of rows, each part with its derivatives, and the sums so far.
 
-    - `covariance`: derivatives in the noise on the first axis. `known`: in all unknowns on the first axis.
+    - `covariance`: with its derivatives in the noise, on the first axis.
+    - `known`: with its derivatives in the parameters, and in the noise, on the first axis.
     - `last`: the last `LAGS` standardised innovations.
     """
 
     covariance: tuple[Covariance, Covariance]
-    known: tuple[_Known, _Known]
+    known: tuple[_Known, _Known, _Known]
     last: Float[Array, "lags channels segments"]
     sums: Innovations
 
@@ -143,12 +160,65 @@ def innovate(
     - `rows`: how many rows are filtered; the others are padding. It is data, so that flights of different lengths share
       a program.
     """
+    flight, at = (observed, forcing, forcing_tangents, rows, dt), (parameters, noise)
+    return with_batch(_innovate, _innovate_lanes, (move, observe), forcing_parameters, flight, at)
+
+
+def _innovate_lanes(lanes: int, many: Any, shared: Any) -> Innovations:
+    """The innovations of a batch, whose lanes become segments: each lane's segments stand next to each other."""
+    (moving, _, flight, at), (fixed, positions, fixed_flight, fixed_at) = many, shared
+    segments = eqx.combine(flight, fixed_flight)[0].measured.shape[-1]
+
+    def lanes_before_last(one: Any, same: Any) -> Any:
+        one = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -2), one)
+        same = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf[..., None, :], (*leaf.shape[:-1], lanes, segments)), same
+        )
+        return jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-2], lanes * segments), eqx.combine(one, same))
+
+    def repeated(leaf: Array) -> Array:
+        return jnp.repeat(leaf, segments, axis=0)
+
+    def in_each_segment(one: Any, same: Any) -> Any:
+        one = jax.tree.map(lambda leaf: jnp.moveaxis(repeated(leaf), 0, -1), one)
+        same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[..., None], (*leaf.shape, lanes * segments)), same)
+        return eqx.combine(one, same)
+
+    *series, rows, dt = flight
+    own = jax.tree.map(repeated, moving)
+
+    def each(which: int) -> Callable:
+        def function(*at: Any) -> Any:
+            return jax.vmap(lambda one, *at: eqx.combine(one, fixed[which])(*at))(own[which], *at)
+
+        return function
+
+    rows = fixed_flight[3] if rows is None else rows.max()  # in the rows of other lanes, nothing counts
+    dt = fixed_flight[4] if dt is None else repeated(dt)
+    flight = *lanes_before_last(tuple(series), tuple(fixed_flight[:3])), rows, dt
+    found = _filter((each(0), each(1)), positions, flight, in_each_segment(at, fixed_at))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], lanes, segments), -2, 0), found)
+
+
+def _innovate(functions: tuple[Move, Observe], positions: tuple[int, ...], flight: tuple, at: Any) -> Innovations:
+    """The innovations of one flight."""
+    move, observe = (jax.vmap(each, in_axes=(0, 0, None)) for each in functions)
+    return _filter((move, observe), positions, flight, at)
+
+
+def _filter(
+    functions: tuple[Callable, Callable], positions: tuple[int, ...], flight: tuple, at: tuple[Array, LogNoise]
+) -> Innovations:
+    """See `innovate`; functions of all segments. Parameters and noise may have an axis of segments, the last."""
+    (observed, forcing, forcing_tangents, rows, dt), (parameters, noise) = flight, at
     count, (time, channels, segments) = parameters.shape[0], observed.measured.shape
     unknowns = count + 3
-    first, push = jax.linearize(lambda noise: first_covariance(observed, noise, dt), noise)
+    step, push = jax.linearize(lambda noise: step_of(noise, dt), noise)
+    steps = step, jax.vmap(push)(basis(noise))
+    covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
     start = _start(observed, jnp.zeros((channels, segments), dtype=float))
     zero = jnp.zeros(segments, dtype=float)
-    known = _Known(Rates(*start[:RATES]), (zero,) * channels)
+    known = _emptied(_Known(Rates(*start[:RATES]), (zero,) * channels), observed.restart[0])
     nothing = Innovations(
         cost=zero,
         sound=jnp.ones(segments, dtype=bool),
@@ -156,16 +226,20 @@ def innovate(
         information=jnp.zeros((channels, unknowns, unknowns, segments), dtype=float),
         products=jnp.zeros((channels, LAGS + 1, segments), dtype=float),
     )
+    no_slopes = (
+        jax.tree.map(lambda _, some=some: jnp.broadcast_to(zero, (some, segments)), known) for some in (count, 3)
+    )
     carry = _Carry(
-        (first, jax.vmap(push)(basis(noise))),
-        (known, jax.tree.map(lambda leaf: jnp.zeros((unknowns, *leaf.shape), dtype=float), known)),
+        (covariance, jax.vmap(push)(steps[1])),
+        (known, *no_slopes),
         jnp.zeros((LAGS, channels, segments), dtype=float),
         nothing,
     )
-    filtered = functools.partial(
-        _filter_rows, move, observe, parameters, noise, dt, np.asarray(forcing_parameters, int)
-    )
-    data = observed._replace(known=None), forcing, forcing_tangents
+    advance = functools.partial(_advance, *functions)
+    filtered = functools.partial(_filter_rows, advance, parameters, steps, np.asarray(positions, int))
+    missing, following = jnp.isnan(observed.measured), jnp.roll(observed.restart, -1, axis=0)
+    row = _Row(jnp.where(missing, 0.0, observed.measured), ~missing, observed.restart, following)
+    data = row, observed.counts, forcing, forcing_tangents
     blocks = jax.tree.map(lambda leaf: leaf.reshape(time // BLOCK, BLOCK, *leaf.shape[1:]), data)
 
     def block(i: Count, carry: _Carry) -> _Carry:
@@ -175,65 +249,67 @@ def innovate(
 
 
 def _filter_rows(
-    move: Move,
-    observe: Observe,
-    parameters: Parameters,
-    noise: LogNoise,
-    dt: Scalar,
+    advance: Callable[..., Any],
+    parameters: Float[Array, "parameters *segments"],
+    steps: tuple[Step, Step],
     positions: np.ndarray,
     carry: _Carry,
-    observed: Observed,
+    row: _Row,
+    counts: Bool[Array, "time segments"],
     forcing: Forcing,
     forcing_tangents: Forcing | None,
 ) -> _Carry:
-    """The filters after some more rows. Other arguments as of `innovate`."""
-    count, segments = parameters.shape[0], observed.measured.shape[2]
-    scalars, units = tuple(parameters), tuple(np.eye(count + 3, count, dtype=parameters.dtype).T)
-    (at, gains), push = jax.linearize(lambda p, noise: gains_after(p, noise, observed, dt), carry.covariance[0], noise)
-    by_noise, gain_slopes = jax.vmap(push, out_axes=(0, 1))(carry.covariance[1], basis(noise))
-    covariance = at, by_noise
-    advance = functools.partial(_advance, *(jax.vmap(each, in_axes=(0, 0, None)) for each in (move, observe)))
+    """The filters after some more rows. `steps`: the disturbance over a sample, with its derivatives in the noise."""
+    count, segments = parameters.shape[0], counts.shape[1]
+    scalars, own = tuple(parameters), parameters.shape[1:]
+    units = tuple(np.eye(count, dtype=parameters.dtype))
 
-    def over_a_sample(noise: LogNoise) -> tuple[tuple[Scalar, ...], tuple[Scalar, ...]]:
-        kept, reach = transition(jnp.exp(noise.time_constant), dt)
-        return tuple(reach[:RATES]), tuple(kept)
+    def feedback(gains: Gains, step: Step) -> _Feedback:
+        return _Feedback(*map(tuple, (gains.rate, gains.disturbance, step.reach, step.kept)))
 
-    (reach, kept), push = jax.linearize(over_a_sample, noise)
-    by_noise = jax.vmap(push)(basis(noise))
-    by_noise = jax.tree.map(lambda slope: jnp.concatenate([jnp.zeros(count), slope]), by_noise)
-
-    def body(carry, row):
-        known, slopes, sound = carry
-        forcing, tangents, gain, gain_slope, row = row
+    def body(carry, rows):
+        (covariance, by_noise), (known, slopes, noise_slopes), sound = carry
+        forcing, tangents, row = rows
         for x in known.rates:
-            sound = sound & ((jnp.abs(x) < FASTEST) | row[1])
-        feedback = _Feedback(tuple(gain.rate[:RATES]), tuple(gain.disturbance), reach, kept)
-        by_gain = (tuple(jnp.moveaxis(leaf, 0, 1)) for leaf in (gain_slope.rate[:, :RATES], gain_slope.disturbance))
-        nothing = jnp.zeros((count, segments), dtype=float)
-        by_gain = (tuple(jnp.concatenate([nothing, slope]) for slope in each) for each in by_gain)
-        direction = _Feedback(*by_gain, *by_noise)
-        at, directions = (known, scalars, feedback), (slopes, units, direction)
+            sound = sound & (jnp.abs(x) < FASTEST)
+        (covariance, gains), push = jax.linearize(
+            lambda p, step: next_gains(p, step, row.is_measured, row.restarts), covariance, steps[0]
+        )
+        by_noise, gain_slopes = jax.vmap(push)(by_noise, steps[1])
+        fed = feedback(gains, steps[0])
+        # The noise acts by the feedback alone, and the parameters do not act on it.
+        _, push = jax.linearize(lambda known, fed: advance(known, forcing, scalars, fed, row), known, fed)
+        noise_slopes, by_noise_errors = jax.vmap(push)(noise_slopes, jax.vmap(feedback)(gain_slopes, steps[1]))
+
+        def filtered(known: _Known, scalars: tuple, forcing: Forcing = forcing):
+            return advance(known, forcing, scalars, fed, row)
+
+        def pushed(slopes: _Known, units: tuple, *others: Any) -> Any:
+            return push(slopes, tuple(jnp.broadcast_to(unit, own) for unit in units), *others)
+
+        at, directions = (known, scalars), (slopes, units)
         if tangents is not None:
-            wide = jax.tree.map(lambda t: jnp.zeros((count + 3, segments), dtype=float).at[positions].set(t), tangents)
+            wide = jax.tree.map(lambda t: jnp.zeros((count, segments), dtype=float).at[positions].set(t), tangents)
             at, directions = (*at, forcing), (*directions, wide)
+        (known, errors), push = jax.linearize(filtered, *at)
+        slopes, by_errors = jax.vmap(pushed)(*directions)
+        found = tuple(map(jnp.stack, (errors, by_errors, by_noise_errors))), gains.variance, gain_slopes.variance
+        return ((covariance, by_noise), (known, slopes, noise_slopes), sound), found
 
-        def step(known: _Known, scalars, feedback: _Feedback, forcing: Forcing = forcing):
-            return advance(known, forcing, scalars, feedback, row)
-
-        (known, errors), push = jax.linearize(step, *at)
-        slopes, by_errors = jax.vmap(push)(*directions)
-        return (known, slopes, sound), (jnp.stack(errors), jnp.stack(by_errors))
-
-    rows = forcing, forcing_tangents, gains, gain_slopes, (observed.measured, observed.restart)
-    (known, known_slopes, sound), (errors, slopes) = jax.lax.scan(body, (*carry.known, carry.sums.sound), rows)
-    found, last = _likelihood(observed, gains, gain_slopes.variance, carry.last, sound, errors, slopes)
+    first = carry.covariance, carry.known, carry.sums.sound
+    (covariance, known, sound), found = jax.lax.scan(body, first, (forcing, forcing_tangents, row))
+    (errors, *slopes), variance, variance_slopes = found
+    counts = row.is_measured & counts[:, None]
+    found, last = _likelihood(
+        counts, variance, variance_slopes, carry.last, sound, errors, jnp.concatenate(slopes, axis=2)
+    )
     sums = jax.tree.map(jnp.add, carry.sums, found)._replace(sound=sound)
-    return _Carry(covariance, (known, known_slopes), last, sums)
+    return _Carry(covariance, known, last, sums)
 
 
 def _likelihood(
-    observed: Observed,
-    gains: Gains,
+    counts: Bool[Array, "time channels segments"],
+    variance: Series,
     variance_slopes: Float[Array, "time 3 channels segments"],
     last: Float[Array, "lags channels segments"],
     sound: Bool[Array, " segments"],
@@ -242,9 +318,8 @@ def _likelihood(
 ) -> tuple[Innovations, Float[Array, "lags channels segments"]]:
     """The likelihood of innovations `errors` with the derivatives `slopes`, and the last standardised innovations."""
     count = slopes.shape[2] - 3
-    counts = ~jnp.isnan(observed.measured) & observed.counts[:, None]
-    weight = jnp.where(counts, 1 / gains.variance, 0.0)
-    logarithm = jnp.where(counts, jnp.log(gains.variance), 0.0)
+    weight = jnp.where(counts, 1 / variance, 0.0)
+    logarithm = jnp.where(counts, jnp.log(variance), 0.0)
     relative = jnp.moveaxis(variance_slopes * weight[:, None], 1, 2)  # (time, channels, 3, segments)
     gradient = jnp.einsum("tcul,tcl->cul", slopes, weight * errors)
     surprise = (weight > 0) * (1 - weight * errors**2) / 2

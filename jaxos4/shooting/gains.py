@@ -30,16 +30,16 @@ _SHORT = 0.03
 
 
 class LogNoise(NamedTuple):
-    """The logarithms of each channel's noise levels. Logarithms may have any sign.
+    """The logarithms of each channel's noise levels, in all segments or in each. Logarithms may have any sign.
 
     - `strength`: standard deviation of the disturbance, [rad/s^2] for rates and [m/s^2] for specific force.
     - `time_constant`: of the disturbance [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.
     """
 
-    strength: Float[Numeric, " channels"]
-    time_constant: Float[Numeric, " channels"]
-    sensor: Float[Numeric, " channels"]
+    strength: Float[Numeric, "channels *segments"]
+    time_constant: Float[Numeric, "channels *segments"]
+    sensor: Float[Numeric, "channels *segments"]
 
 
 class Observed(NamedTuple):
@@ -73,7 +73,7 @@ class Covariance(NamedTuple):
     disturbance: Channels
 
 
-class _Step(NamedTuple):
+class Step(NamedTuple):
     """The disturbance over one sample, of each channel.
 
     - `kept`: the share of it that remains. `reach`: what a unit of it adds to the rate.
@@ -99,9 +99,9 @@ def _is_rate(channels: int) -> Bool[np.ndarray, "channels 1"]:
     return np.arange(channels)[:, None] < RATES
 
 
-def _step_of(noise: LogNoise, dt: Scalar) -> _Step:
-    """Exact for an Ornstein-Uhlenbeck process."""
-    strength, time_constant, sensor = (leaf[:, None] for leaf in noise)
+def step_of(noise: LogNoise, dt: Scalar) -> Step:
+    """What one sample of this length adds, exact for an Ornstein-Uhlenbeck process."""
+    strength, time_constant, sensor = (leaf.reshape(leaf.shape[0], -1) for leaf in noise)
     variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
     share, (kept, reach) = dt / tau, transition(tau, dt)
     lost, lost_twice = -jnp.expm1(-share), -jnp.expm1(-2 * share)
@@ -112,10 +112,10 @@ def _step_of(noise: LogNoise, dt: Scalar) -> _Step:
     rate = jnp.where(is_rate, 2 * variance * tau**2 * spread, 0.0)
     cross = jnp.where(is_rate, variance * tau * lost**2, 0.0)
     reach = jnp.where(is_rate, reach, 0.0)
-    return _Step(kept, reach, Covariance(rate, cross, variance * lost_twice), variance, jnp.exp(2 * sensor))
+    return Step(kept, reach, Covariance(rate, cross, variance * lost_twice), variance, jnp.exp(2 * sensor))
 
 
-def _restart(p: Covariance, restart: Bool[Array, " segments"], step: _Step) -> Covariance:
+def _restart(p: Covariance, restart: Bool[Array, " segments"], step: Step) -> Covariance:
     is_rate = _is_rate(p.rate.shape[0])
     return Covariance(
         jnp.where(restart, jnp.where(is_rate, _UNKNOWN_RATE**2, 0.0), p.rate),
@@ -124,7 +124,7 @@ def _restart(p: Covariance, restart: Bool[Array, " segments"], step: _Step) -> C
     )
 
 
-def _measure(p: Covariance, is_measured: Bool[Array, "channels segments"], step: _Step) -> tuple[Covariance, "Gains"]:
+def _measure(p: Covariance, is_measured: Bool[Array, "channels segments"], step: Step) -> tuple[Covariance, "Gains"]:
     """The covariance after a measurement, and the gains that belong to it."""
     is_rate = _is_rate(p.rate.shape[0])
     variance = jnp.where(is_rate, p.rate, p.disturbance) + step.sensor
@@ -140,7 +140,7 @@ def _measure(p: Covariance, is_measured: Bool[Array, "channels segments"], step:
     return after, Gains(p.rate * weight, disturbance, jnp.where(is_measured, variance, 1.0))
 
 
-def _predict(p: Covariance, step: _Step) -> Covariance:
+def _predict(p: Covariance, step: Step) -> Covariance:
     """The covariance one sample later."""
     reach, kept, added = step.reach, step.kept, step.added
     return Covariance(
@@ -150,32 +150,33 @@ def _predict(p: Covariance, step: _Step) -> Covariance:
     )
 
 
+def first_covariance(step: Step, segments: int) -> Covariance:
+    """The covariance before the first measurement of a segment."""
+    zero = jnp.zeros((step.variance.shape[0], segments), dtype=float)
+    return Covariance(zero, zero, zero + step.variance)
+
+
+def next_gains(
+    p: Covariance, step: Step, is_measured: Bool[Array, "channels segments"], restart: Bool[Array, " segments"]
+) -> tuple[Covariance, Gains]:
+    """The covariance one sample later, and the gains of this sample, from the covariance before it."""
+    p, gains = _measure(_restart(p, restart, step), is_measured, step)
+    return _predict(p, step), gains
+
+
 def gains_of(observed: Observed, noise: LogNoise, dt: Scalar) -> Gains:
     """The gains of the filters of all channels."""
-    return gains_after(first_covariance(observed, noise, dt), noise, observed, dt)[1]
-
-
-def first_covariance(observed: Observed, noise: LogNoise, dt: Scalar) -> Covariance:
-    """The covariance before the first measurement of a segment."""
-    zero = jnp.zeros(observed.measured.shape[1:], dtype=float)
-    return Covariance(zero, zero, zero + _step_of(noise, dt).variance)
-
-
-def gains_after(p: Covariance, noise: LogNoise, observed: Observed, dt: Scalar) -> tuple[Covariance, Gains]:
-    """The gains of some rows, and the covariance after them, from that before them."""
-    step = _step_of(noise, dt)
-
-    def body(p: Covariance, row):
-        is_measured, restart = row
-        p, gain = _measure(_restart(p, restart, step), is_measured, step)
-        return _predict(p, step), gain
-
-    return jax.lax.scan(body, p, (~jnp.isnan(observed.measured), observed.restart))
+    step = step_of(noise, dt)
+    first = first_covariance(step, observed.measured.shape[-1])
+    return jax.lax.scan(
+        lambda p, row: next_gains(p, step, *row), first, (~jnp.isnan(observed.measured), observed.restart)
+    )[1]
 
 
 def basis(noise: LogNoise) -> LogNoise:
     """The three directions of `noise`: in each, the same logarithm of all channels changes."""
-    return LogNoise(*np.eye(3)[:, :, None] * np.ones(noise.strength.shape[0]))
+    shape = noise.strength.shape
+    return LogNoise(*np.eye(3).reshape(3, 3, *(1 for _ in shape)) * np.ones(shape))
 
 
 def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_constant: float) -> LogNoise:

@@ -3,14 +3,12 @@
 from .cell import OUTCOMES as OUTCOMES
 from .dataset import assemble as assemble, provenance as provenance, save_dataset as save_dataset
 from .run import (
-    Plan as Plan,
     Step as Step,
     carry_out as carry_out,
     device_name as device_name,
     plan as plan,
     run_here as run_here,
     run_on_cluster as run_on_cluster,
-    use_all_cores as use_all_cores,
 )
 from .specification import Study as Study, Training as Training, load_study as load_study
 from .store import RESULTS_FILE as RESULTS_FILE, Store as Store, open_store as open_store, read_store as read_store

@@ -5,11 +5,10 @@ each of its programs, on one device. Last digits depend on the length of a batch
 a program; with whole cells they are the same in any order and in any process.
 """
 
-import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator
+import threading
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from .._xla import quick_jit
+from ..airframe import PRESETS
 from ..analysis.covariance import cramer_rao_bound
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
@@ -50,6 +50,8 @@ _KEPT = ("parameters", "std", "cost", "rollouts", "initial_state", "result", "se
 _FEW_FLIGHTS = 2000
 # The largest offset of a bracket from the parameters that all flights have, as a share of its half-width.
 _LARGEST_OFFSET = 0.8
+# Programs that all estimators share are compiled once: the second thread waits for the first.
+_ONE_THREAD = threading.Lock()
 
 
 Lanes = Float[Array, "lanes samples 12"]
@@ -74,8 +76,8 @@ class Flights(NamedTuple):
 
 def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
     """Model, bracket and rotor speeds of a scenario or of a network's job."""
-    with jax.enable_x64(study.double):
-        model = MODELS[scenario.model](study.vehicle(scenario.airframe))
+    with jax.enable_x64(True):
+        model = MODELS[scenario.model](PRESETS[scenario.airframe])
         offset = study.truth == "airframe"
         bracket = _bracket(model, np.asarray(scenario.width), key_of(study.seed, 0), offset=offset)
         omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)
@@ -121,7 +123,7 @@ def fly(study: Study, fleet: Fleet, cell: Cell) -> Flights:
     """Simulates the flights of a cell. Flights of one number have the same random numbers in all scenarios."""
     scenario, numbers = cell.scenario, cell.first + np.arange(study.batch)
     kinds = {"method": scenario.method, "kind": scenario.noise, "drawn": study.truth == "drawn"}
-    with jax.enable_x64(study.double):
+    with jax.enable_x64(True):
         return _fly(fleet, numbers, key_of(study.seed, 1), as_float(scenario.scale), **kinds)
 
 
@@ -160,7 +162,7 @@ def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "la
 
 def fly_again(study: Study, scenario: Scenario, results: dict[str, np.ndarray]) -> Float[np.ndarray, "samples 12"]:
     """A scenario's first flight as simulated with the estimate in the `results` of its cell; NaN without one."""
-    with jax.enable_x64(study.double):
+    with jax.enable_x64(True):
         fleet, start = fleet_of(study, scenario), np.zeros(12)
         parameters, known = results["estimate"][0], results["initial_state"][0]
         if not np.isfinite(parameters).all():
@@ -173,8 +175,8 @@ def fly_again(study: Study, scenario: Scenario, results: dict[str, np.ndarray]) 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
     """Identifies the flights of a cell on the default device; `network`: that of `Study.job`."""
     scenario = cell.scenario
-    with jax.enable_x64(study.double):
-        with one_core():
+    with jax.enable_x64(True):
+        with _ONE_THREAD:
             fleet = fleet_of(study, scenario)
             flights = fly(study, fleet, cell)
             blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
@@ -182,14 +184,6 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
             bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
         found = _answers(study, cell, fleet, blank, flights.measured, network)
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
-
-
-@contextlib.contextmanager
-def one_core() -> Iterator[None]:
-    """Computes on the first core of a CPU: a program that all estimators share is compiled once, not for each core."""
-    first = jax.local_devices()[0]
-    with jax.default_device(first) if first.platform == "cpu" else contextlib.nullcontext():
-        yield
 
 
 def programs_of(study: Study, scenario: Scenario) -> list[tuple]:
@@ -210,8 +204,7 @@ def _answers(
         network = eqx.tree_at(lambda n: n.history, network, as_float(np.zeros((0, 2))))
     estimator, channels = make_estimator(cell.scenario.estimator, network), study.seed_channels(cell.scenario)
     if isinstance(estimator, Hybrid):
-        with one_core():
-            looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
+        looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
         _, seeds = identify(estimator.network, looked_at, fleet.bracket, states)
         return search(estimator.ibss, blank, fleet.bracket, states, seeds) | {"brackets": None}
     if isinstance(estimator, IBSS):

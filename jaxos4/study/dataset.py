@@ -13,6 +13,7 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
+from ..airframe import PRESETS
 from ..errors import InputError
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
@@ -111,7 +112,7 @@ def save_dataset(dataset: xr.Dataset, directory: Path) -> None:
 
 
 def _coordinates(study: Study) -> dict[str, tuple]:
-    model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
+    model = MODELS[study.models[0]](PRESETS[study.airframes[0]])
     values = {dim: list(getattr(study, axis)) for dim, axis in zip(SCENARIO, AXES, strict=True)}
     values |= {"flight": np.arange(study.flights), "parameter": list(model.parameter_names), "level": list(LEVELS)}
     units = {"duration": "s"}
@@ -126,7 +127,7 @@ def provenance(study: Study, device: str) -> dict[str, str | int]:
         "specification": tomlkit.dumps(msgspec.to_builtins(study)),
         "version": importlib.metadata.version("jaxos4"),
         "jax": jax.__version__,
-        "precision": study.precision,
+        "precision": "float64",
         "device": device,
         "seed": study.seed,
     }

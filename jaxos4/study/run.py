@@ -1,4 +1,4 @@
-"""Runs a study from its specification to its Dataset: on the devices of this process, or on a Dask cluster.
+"""Runs a study from its specification to its Dataset: in this process, or on a Dask cluster.
 
 The results are the same bit for bit. Workers of a cluster need only this package. If a worker is lost, another worker
 repeats its tasks.
@@ -7,14 +7,11 @@ repeats its tasks.
 import concurrent.futures
 import contextlib
 import ctypes
-import dataclasses
 import functools
 import io
 import itertools
-import os
-import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,23 +21,20 @@ import xarray as xr
 
 from ..errors import InputError, TrainingError
 from ..networks import TrainedNetwork, encode_network, load_network
+from ..shooting import cores
 from .cell import blank_problem, fleet_of, key_of, programs_of, run_cell
 from .dataset import assemble, save_dataset
 from .specification import Cell, Job, Study
-from .store import Store, check_store, open_store
+from .store import Store, check_store, open_store, write_file
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client
 
 # The bytes of a network's file, or a message that says why there is none; `None` for an estimator without a network.
 Trained = bytes | str | None
 
 # Exceptions of a cell that cannot be computed: the cell is kept as failed, with the message, and the study goes on.
 FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError)
-# A device joins the program of another device if at least this number of cells waits: it must compile the program too.
-_WORTH_COMPILING = 8
-# Cells that wait on a cluster for each of its threads: enough to keep it busy.
-_AHEAD = 3
 # How often a task that raises an unexpected exception is repeated. The cluster itself counts lost workers.
 _RETRIES = 2
 
@@ -52,88 +46,68 @@ class Step(NamedTuple):
     label: str
 
 
-class Plan(NamedTuple):
-    """The remaining work of an estimator: programs to be compiled, networks to be trained.
+def workers() -> list[Any]:
+    """The device of each cell that this process computes at a time.
 
-    `seconds`: of the cells on this process's devices, from the mean time of this estimator's finished cells, or `None`.
+    A CPU is one device for all its cores: their threads share compiled programs, and so the results' last digits.
     """
-
-    estimator: str
-    cells: int
-    flights: int
-    programs: int
-    networks: int
-    seconds: float | None
-
-
-def use_all_cores() -> None:
-    """Makes each core a device, or as many as `JAX_NUM_CPU_DEVICES` says. Call it before any computation."""
-    if os.environ.get("JAX_NUM_CPU_DEVICES"):
-        return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", cores)  # noqa: TID251  # only entry points call this
+    devices = jax.local_devices()
+    return devices if devices[0].platform != "cpu" else devices[:1] * cores()
 
 
 def device_name() -> str:
-    """The devices of this process, in words."""
-    devices = jax.local_devices()
-    return f"{len(devices)} x {devices[0].device_kind}"
+    """What computes in this process, in words."""
+    return f"{len(workers())} x {jax.local_devices()[0].device_kind}"
 
 
-def plan(study: Study, directory: Path) -> list[Plan]:
-    """A row for each estimator. Programs and networks count for the first that needs them. Raises as `open_store`."""
-    store, seconds, rows = check_store(directory, study), defaultdict(list), []
-    for entry in store.read_log():
-        if "cell" in entry:
-            seconds[study.cell(entry["cell"]).scenario.estimator].append(entry["seconds"])
-    remaining = [study.cell(index) for index in store.missing()]
-    trained = {job for job, number in study.jobs().items() if store.network_file(number).exists()}
-    compiled: set[tuple] = set()
-    for estimator in study.estimators:
-        cells, times = [cell for cell in remaining if cell.scenario.estimator == estimator], seconds[estimator]
-        flights = sum(min(study.batch, study.flights - cell.first) for cell in cells)
-        programs = {program for cell in cells for program in programs_of(study, cell.scenario)} - compiled
-        networks = {job for cell in cells if (job := study.job(cell.scenario))} - trained
-        compiled |= programs
-        trained |= networks
-        expected = sum(times) / len(times) * len(cells) / len(jax.local_devices()) if times else None
-        rows.append(Plan(estimator, len(cells), flights, len(programs), len(networks), expected))
+def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
+    """The numbers of cells and flights that remain, by estimator. Raises as `open_store`."""
+    rows: dict[str, tuple[int, int]] = dict.fromkeys(study.estimators, (0, 0))
+    for cell in map(study.cell, check_store(directory, study).missing()):
+        cells, flights = rows[cell.scenario.estimator]
+        rows[cell.scenario.estimator] = cells + 1, flights + min(study.batch, study.flights - cell.first)
     return rows
 
 
-@dataclasses.dataclass
-class _Program:
-    """A program: the devices that run it, and the waiting cells that end with it."""
-
-    devices: set[Any] = dataclasses.field(default_factory=set)
-    waiting: deque[Cell] = dataclasses.field(default_factory=deque)
-
-
 def run_here(store: Store) -> Iterator[Step]:
-    """Computes the remaining cells, each on one device: a divided program gives other last digits.
+    """Computes the remaining cells, each by one worker: a divided program gives other last digits.
 
     A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
     study, cells = store.study, [store.study.cell(index) for index in store.missing()]
-    done, programs = study.count - len(cells), defaultdict(_Program)
+    done, waiting = study.count - len(cells), defaultdict[tuple, deque[Cell]](deque)
     # Cells of IBSS first: those of the hybrid, which end with the same program, wait for a network.
     for cell in sorted(cells, key=lambda cell: study.job(cell.scenario) is not None):
-        programs[programs_of(study, cell.scenario)[-1]].waiting.append(cell)
+        waiting[programs_of(study, cell.scenario)[-1]].append(cell)
     untrained = deque(dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None))
     # A cell without a network never waits for one.
     networks: dict[Job | None, Trained] = {None: None}
-    free = deque(jax.local_devices())
+    free = deque(workers())
+    # Whether each program is compiled on a device, or its first cell is still running there.
+    compiled: dict[tuple[tuple, Any], bool] = {}
     running: dict[concurrent.futures.Future, tuple[Any, Job | Cell]] = {}
     pool = concurrent.futures.ThreadPoolExecutor(len(free))
+
+    def next_cell(device: Any) -> Cell | None:
+        """Of a program that is not compiled yet, else of one that waits for no compiler, else of any."""
+        ready = [p for p, cells in waiting.items() if cells and study.job(cells[0].scenario) in networks]
+        ready = [p for p in ready if compiled.get((p, device), True)]
+        started = {program for program, _ in compiled}
+        program = min(ready, key=lambda p: (p in started, (p, device) not in compiled), default=None)
+        if program is None:
+            return None
+        compiled.setdefault((program, device), False)
+        return waiting[program].popleft()
+
     try:
         while True:
             for device in tuple(free):
                 if untrained:
                     task = untrained.popleft()
                     future = pool.submit(_train, store, task, device)
-                elif task := _next_cell(study, list(programs.values()), networks, device):
+                elif task := next_cell(device):
                     future = pool.submit(compute, study, task, networks[study.job(task.scenario)], device)
-                else:  # all remaining cells wait for networks
+                else:  # all remaining cells wait for networks or programs
                     continue
                 free.remove(device)
                 running[future] = device, task
@@ -148,24 +122,12 @@ def run_here(store: Store) -> Iterator[Step]:
                 if isinstance(task, Job):
                     networks[task] = future.result()
                 else:
-                    store.write_cell(task.number, *future.result())
+                    compiled[programs_of(study, task.scenario)[-1], device] = True
+                    write_file(store.cell_file(task.number), future.result())
                     done += 1
     finally:
         # An interrupt does not wait for running tasks, which may last minutes; their results are lost.
         pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _next_cell(study: Study, programs: list[_Program], networks: Container[Job | None], device: Any) -> Cell | None:
-    """A cell of the program that the device runs already, else of one that no device runs, else of the longest."""
-    ready = [p for p in programs if p.waiting and study.job(p.waiting[0].scenario) in networks]
-    own = [p for p in ready if device in p.devices]
-    new = [p for p in ready if not p.devices]
-    long = [p for p in ready if len(p.waiting) >= _WORTH_COMPILING]
-    program = next(iter(own or new), None) or max(long, key=lambda p: len(p.waiting), default=None)
-    if program is None:
-        return None
-    program.devices.add(device)
-    return program.waiting.popleft()
 
 
 def _give_memory_back() -> None:
@@ -176,13 +138,13 @@ def _give_memory_back() -> None:
 
 def _train(store: Store, job: Job, device: Any) -> bytes | str:
     """`train` on a device, or the file of an earlier run."""
-    begin, number = time.perf_counter(), store.study.jobs()[job]
+    number = store.study.jobs()[job]
     if store.read_network(number) is None:
         with jax.default_device(device):
             data = train(store.study, job)
         if isinstance(data, str):
             return data
-        store.write_network(number, data, seconds=round(time.perf_counter() - begin, 3))
+        write_file(store.network_file(number), data)
     return store.network_file(number).read_bytes()
 
 
@@ -193,7 +155,7 @@ def train(study: Study, job: Job) -> bytes | str:
     """
     scales = [scale or 1.0 for scale in study.scales]
     try:
-        with jax.enable_x64(study.double):
+        with jax.enable_x64(True):
             fleet, key = fleet_of(study, job), key_of(study.network.seed, study.jobs()[job])
             settings = study.network.estimator(job.channels, (min(scales), max(scales)))
             return encode_network(settings.fit(blank_problem(study, fleet, 1.0, job.channels), fleet.bracket, key=key))
@@ -201,14 +163,13 @@ def train(study: Study, job: Job) -> bytes | str:
         return str(error)
 
 
-def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> tuple[bytes, float]:
-    """The bytes of a cell's file, and the seconds of its computation. Equal results give equal bytes."""
-    begin = time.perf_counter()
+def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> bytes:
+    """The bytes of a cell's file. Equal results give equal bytes."""
     try:
         if isinstance(network, str):
             raise TrainingError(network)
         with jax.default_device(device):
-            results = run_cell(study, cell, None if network is None else _loaded(network, study.double))
+            results = run_cell(study, cell, None if network is None else _loaded(network))
     except FAILURES as error:
         if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
             remedy = "free some and run the study again, or start another study with a smaller `batch`"
@@ -216,7 +177,7 @@ def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> t
         results = {"failed": np.asarray(" ".join(str(error).split())[:500])}
     file = io.BytesIO()
     np.savez(file, **results)  # pyright: ignore[reportArgumentType]
-    return file.getvalue(), round(time.perf_counter() - begin, 3)
+    return file.getvalue()
 
 
 def label_of(study: Study, task: Job | Cell) -> str:
@@ -235,13 +196,8 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
     """
     from distributed import as_completed
 
-    study, waiting, numbers = store.study, deque(map(store.study.cell, store.missing())), store.study.jobs()
-    done = study.count - len(waiting)
-    networks: dict[Job | None, Any] = {None: None}
-    running: dict[Future, tuple[Cell, Job | None]] = {}
-    finished = as_completed(loop=client.loop, raise_errors=False)
-    threads: Any = client.nthreads
-    if waiting and not threads():
+    study, cells, numbers = store.study, [store.study.cell(index) for index in store.missing()], store.study.jobs()
+    if cells and not client.nthreads():
         raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
 
     def network_of(job: Job) -> Any:
@@ -250,40 +206,33 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         # Read here, and not on a worker, because it may be damaged. As a task: data of a lost worker are lost with it.
         return client.submit(bytes, store.network_file(numbers[job]).read_bytes(), pure=False)
 
-    def submit() -> None:
-        room = _AHEAD * max(sum(threads().values()), 1) - len(running)
-        for _ in range(min(room, len(waiting))):
-            cell = waiting.popleft()
-            job = study.job(cell.scenario)
-            if job is not None and job not in networks:
-                networks[job] = network_of(job)
-            future = client.submit(compute, study, cell, networks[job], retries=_RETRIES, pure=False)
-            running[future] = cell, job
-            finished.add(future)
-
-    submit()
-    while running:
-        future = next(finished)
+    jobs = [study.job(cell.scenario) for cell in cells]
+    networks: dict[Job | None, Any] = {job: network_of(job) for job in dict.fromkeys(jobs) if job is not None} | {
+        None: None
+    }
+    running = {
+        client.submit(compute, study, cell, networks[job], retries=_RETRIES, pure=False): (cell, job)
+        for cell, job in zip(cells, jobs, strict=True)
+    }
+    finished = as_completed(list(running), loop=client.loop, raise_errors=False)
+    for done, future in enumerate(finished, start=study.count - len(cells) + 1):
         cell, job = running.pop(future)
         try:
-            data, seconds = future.result()
+            data = future.result()
             trained = None if job is None or store.network_file(numbers[job]).exists() else networks[job].result()
         except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
             what = " ".join(str(error).split())[:300] or type(error).__name__
             lost = f"cell {cell.number}: lost by the cluster ({what})"
             raise InputError(f"{lost}; run the study again to resume.") from None
         if job is not None and isinstance(trained, bytes):
-            store.write_network(numbers[job], trained)
-        store.write_cell(cell.number, data, seconds)
-        done += 1
+            write_file(store.network_file(numbers[job]), trained)
+        write_file(store.cell_file(cell.number), data)
         yield Step(done, label_of(study, cell))
-        submit()
-    yield Step(done, "")
 
 
 @functools.lru_cache(maxsize=8)
-def _loaded(network: bytes, double: bool) -> TrainedNetwork:
-    with jax.enable_x64(double):
+def _loaded(network: bytes) -> TrainedNetwork:
+    with jax.enable_x64(True):
         return load_network(io.BytesIO(network))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from .._custom_types import RotorSpeeds, as_float
 from .._files import read_toml
-from ..airframe import PRESETS, Airframe, airframe_from_table
+from ..airframe import PRESETS
 from ..errors import InputError
 from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
@@ -33,15 +33,15 @@ Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 _CHOICES: dict[str, Collection[str]] = {
     "models": MODELS,
+    "airframes": PRESETS,
     "excitations": EXCITATIONS,
     "methods": METHODS,
     "noises": NOISES,
     "channels": CHANNELS,
     "estimators": ESTIMATORS,
 }
-# A larger study is a mistake in its specification: each cell is a file, and all estimates must fit in memory.
+# A larger study is a mistake in its specification: each cell is a file.
 _MOST_CELLS = 1_000_000
-_MOST_ESTIMATES = 100_000_000
 _MOST_SAMPLES = 1_000_000
 
 
@@ -52,17 +52,14 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
       alone looks at the rates.
     """
 
-    features: Literal["score", "raw"] = "score"
-    approximator: Literal["mlp", "cmac"] = "mlp"
-    steps: Count = NetworkEstimator.steps
+    steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = NetworkEstimator.steps
     held_out: Annotated[int, msgspec.Meta(ge=1000)] = NetworkEstimator.held_out
     hybrid_channels: Literal["rates", "attitude", "all"] = "all"
     seed: Seed = 0
 
     def estimator(self, channels: str, noise: tuple[float, float]) -> NetworkEstimator:
-        """The network to be trained. Raises `ValueError` as `NetworkEstimator` does."""
-        sizes = {"steps": self.steps, "held_out": self.held_out}
-        return NetworkEstimator(self.features, self.approximator, channels, noise, **sizes)
+        """The network to be trained."""
+        return NetworkEstimator(channels=channels, noise=noise, steps=self.steps, held_out=self.held_out)
 
 
 class Scenario(NamedTuple):
@@ -113,8 +110,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     The axes of the grid are lists; every combination is flown `flights` times.
 
-    - `models`, `excitations`, `channels`, `estimators`: names as on the command line.
-    - `airframes`: names of presets, or of tables `[airframe.NAME]` with the keys of an airframe file.
+    - `models`, `airframes`, `excitations`, `channels`, `estimators`: names as on the command line.
     - `input`: more excitations: rotor speeds of each sample, by name. In the file: a table of paths of CSV files with
       `t` and `omega1..4`, as `jaxos4 design` writes them, relative to the folder of the specification.
     - `durations` [s], at a sample time of `dt` [s].
@@ -128,7 +124,6 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     - `initial_state`: `"known"`, or `"free"`: estimated too.
     - `flights`, `seed`: number of flights of a scenario, and the random seed.
     - `batch`: flights of a cell, identified at once by one device. The last digits of results depend on it.
-    - `precision`: `"float64"` or `"float32"`.
     - `network`: how networks are trained; a table.
     """
 
@@ -150,9 +145,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     flights: Count = 1000
     seed: Seed = 0
     batch: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 128
-    precision: Literal["float64", "float32"] = "float64"
     network: Training = Training()
-    airframe: dict[str, dict[str, Any]] = {}
     input: dict[str, tuple[Speeds, ...]] = {}
 
     def __post_init__(self):
@@ -171,55 +164,28 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(choices)}.")
         if not math.isfinite(self.dt):
             raise InputError(f"`dt` must be finite, got {self.dt}; give the sample time in seconds.")
-        for key, text in (("title", self.title), *(("airframe", name) for name in self.airframe)):
-            if not text.isprintable():
-                raise InputError(f"`{key}` has a line break or another control character; remove it.")
-        for name, table in self.airframe.items():
-            if name not in self.airframes:
-                raise InputError(f"[airframe.{name}] is not flown; name it in `airframes`, or remove it.")
-            if not all(math.isfinite(value) for value in table.values() if isinstance(value, float)):
-                raise InputError(f"[airframe.{name}]: not finite; leave out `max_rotor_speed` if it is unknown.")
-        for name in self.airframes:
-            self.vehicle(name)
+        if not self.title.isprintable():
+            raise InputError("`title` has a line break or another control character; remove it.")
         for duration in self.durations:
             if not 2 <= duration / self.dt <= _MOST_SAMPLES:
                 got = f"{duration:g} s at `dt` {self.dt:g} s"
                 raise InputError(f"`durations`: {got} is not 2 to {_MOST_SAMPLES} samples; change one.")
         if self.count > _MOST_CELLS:
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
-        if (estimates := math.prod(self.shape) * self.flights) > _MOST_ESTIMATES:
-            most = f"more than {_MOST_ESTIMATES}"
-            raise InputError(f"{estimates} estimates, {most}; reduce `flights`, or shorten an axis.")
 
     def check_computable(self) -> None:
-        """Raises `InputError` for an excitation that an airframe cannot fly, or a network that cannot be trained."""
+        """Raises `InputError` for an excitation that an airframe cannot fly."""
         for name, excitation, duration in itertools.product(self.airframes, self.excitations, self.durations):
             try:
                 self.omega(excitation, name, duration)
             except ValueError as error:
                 raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
-        try:
-            self.network.estimator("rates", NetworkEstimator.noise)
-        except ValueError as error:
-            raise InputError(f"`network`: {error}") from None
-
-    def vehicle(self, name: str) -> Airframe:
-        """The airframe of that name. Raises `InputError` if there is none, or if its table is not usable."""
-        if name in self.airframe:
-            try:
-                return airframe_from_table(self.airframe[name])
-            except InputError as error:
-                raise InputError(f"[airframe.{name}]: {error}") from None
-        if name not in PRESETS:
-            presets = ", ".join(PRESETS)
-            raise InputError(f"`airframes`: unknown {name!r}; choose from {presets}, or add [airframe.{name}].")
-        return PRESETS[name]
 
     def omega(self, excitation: str, airframe: str, duration: float) -> RotorSpeeds:
         """The rotor speeds of an excitation [rad/s]. Raises `ValueError` if it cannot be flown."""
         if excitation not in self.input:
-            return EXCITATIONS[excitation](self.vehicle(airframe), duration=duration, dt=self.dt)
-        speeds, fastest = np.asarray(self.input[excitation]), float(self.vehicle(airframe).max_rotor_speed)
+            return EXCITATIONS[excitation](PRESETS[airframe], duration=duration, dt=self.dt)
+        speeds, fastest = np.asarray(self.input[excitation]), float(PRESETS[airframe].max_rotor_speed)
         if len(speeds) != round(duration / self.dt) + 1:
             raise ValueError(f"its file lasts {(len(speeds) - 1) * self.dt:g} s; correct `durations`.")
         if speeds.max() > fastest:
@@ -241,11 +207,6 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         """The networks that the study needs, with their numbers."""
         needed = (self.job(self.cell(index).scenario) for index in range(0, self.count, self.blocks))
         return {job: number for number, job in enumerate(dict.fromkeys(job for job in needed if job))}
-
-    @property
-    def double(self) -> bool:
-        """True if the study is computed in double precision."""
-        return self.precision == "float64"
 
     @property
     def shape(self) -> tuple[int, ...]:

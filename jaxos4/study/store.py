@@ -1,4 +1,4 @@
-"""The folder of a study: its specification, networks, finished cells, and a log of the computation.
+"""The folder of a study: its specification, networks and finished cells.
 
 Every file is complete or absent: it is written under another name and then renamed. A lock keeps a second run out; it
 ends with its process, even if the process is killed.
@@ -8,7 +8,6 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import io
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from ..networks import TrainedNetwork, load_network
 from .specification import Study
 
 RESULTS_FILE = "results.nc"
-_SPECIFICATION, _LOCK, _LOG = "study.json", "lock", "log.jsonl"
+_SPECIFICATION, _LOCK = "study.json", "lock"
 # Names of files that were being written when a run was killed.
 _UNFINISHED = ".*.part*"
 
@@ -62,36 +61,13 @@ class Store:
             what = " ".join(str(error).split())[:120]
             raise InputError(f"{path}: not a whole cell ({what}); delete it, and run the study again.") from None
 
-    def write_cell(self, index: int, data: bytes, seconds: float) -> None:
-        """Writes the file of a cell, and an entry of the log with the seconds that it took."""
-        write_file(self.cell_file(index), data)
-        self._log(cell=index, seconds=seconds)
-
-    def write_network(self, number: int, data: bytes, **entry: Any) -> None:
-        """Writes the file of a network, and an entry of the log."""
-        write_file(self.network_file(number), data)
-        self._log(network=number, **entry)
-
-    def _log(self, **entry: Any) -> None:
-        with open(self.directory / _LOG, "a", encoding="utf-8") as file:
-            file.write("\n" + json.dumps(entry))  # after the end of a line that a kill or a full disk cut
-
-    def read_log(self) -> list[dict[str, Any]]:
-        """The entries of the log in their order, without lines that a kill cut."""
-        entries = []
-        with contextlib.suppress(FileNotFoundError):
-            for line in (self.directory / _LOG).read_text(encoding="utf-8", errors="replace").splitlines():
-                with contextlib.suppress(ValueError):
-                    entries.append(json.loads(line))
-        return entries
-
     def read_network(self, number: int) -> TrainedNetwork | None:
         """A network, or `None` if it is not trained. Raises `InputError` if its file is damaged."""
         path = self.network_file(number)
         if not path.exists():
             return None
         try:
-            with jax.enable_x64(self.study.double):
+            with jax.enable_x64(True):
                 return load_network(path)
         except InputError:
             raise InputError(f"{path}: not a whole network; delete it, and run the study again.") from None

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from benchmarks.case import Case
-from benchmarks.opponents.jaxos4_fit import for_all_flights, problem_of
+from benchmarks.opponents.jaxos4_fit import problem_of
 
-from jaxos4.study import use_all_cores
+from jaxos4.shooting import cores
 
 BLOCK = 32  # shots at a time
 
@@ -22,7 +22,7 @@ def shots(
     compared with the first flight, as those of a search are.
     """
     if all_cores:
-        use_all_cores()
+        jax.config.update("jax_num_cpu_devices", cores())
     problem = problem_of(case, channels)
     rows = jax.tree.map(lambda leaf: leaf[0], problem.rows())  # of its only window
     first = problem.first_state()[0]
@@ -51,3 +51,20 @@ def shots(
         return {"costs": found[0].ravel()[: case.flights]}
 
     return run
+
+
+def for_all_flights(function: Callable, all_cores: bool, batch: Callable) -> Callable:
+    """`batch(function)`; with `all_cores`, each core computes the batch of its own flights."""
+    if not all_cores:
+        return batch(function)
+    cores, share = jax.device_count(), jax.sharding.PartitionSpec("flights")
+    mesh = jax.make_mesh((cores,), ("flights",), axis_types=(jax.sharding.AxisType.Auto,))
+    divided = jax.shard_map(batch(function), mesh=mesh, in_specs=share, out_specs=share, check_vma=False)
+
+    def whole(*data):
+        count = jax.tree.leaves(data)[0].shape[0]
+        # The last flight is repeated, so that all cores have the same number.
+        even = jax.tree.map(lambda x: jnp.concatenate([x, jnp.repeat(x[-1:], -count % cores, axis=0)]), data)
+        return jax.tree.map(lambda x: x[:count], divided(*even))
+
+    return whole
