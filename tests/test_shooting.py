@@ -62,22 +62,6 @@ def test_cost_and_residuals_are_the_weighted_mismatch(model_class, channels, fre
     assert cost > 1
 
 
-@every_channels
-def test_an_exact_flight_costs_nothing_at_the_truth(channels):
-    problem = problem_of(channels, states=standard_flight(duration=DURATION).states)
-    assert float(problem.cost(problem.model.alpha)) < 1e-20
-    assert float(problem.cost(off())) > 1
-
-
-def test_the_first_sample_counts_only_if_the_initial_state_is_free():
-    for free in (False, True):
-        states = measured()
-        problem, moved = (problem_of("rates", free=free, states=s) for s in (states, states.at[0].add(0.01)))
-        start = jnp.asarray(first_of(problem))
-        same = float(moved.cost(off(), start)) == float(problem.cost(off(), start))
-        assert same is not free
-
-
 def test_a_free_initial_state_starts_at_the_first_measurements():
     states = measured()
     order = np.asarray(CASCADE_ORDER)
@@ -117,13 +101,6 @@ def test_missing_measurements_contribute_nothing(free):
     assert np.isfinite(gradient).all()
     np.testing.assert_allclose(curvature.gradient[:8], gradient, rtol=1e-9)
     assert np.isfinite(curvature.information).all()
-
-
-def test_a_flight_without_measurements_costs_nothing():
-    problem = problem_of("attitude", states=jnp.full((101, 12), jnp.nan))
-    assert float(problem.cost(off())) == 0
-    assert not problem.residuals(off()).any()
-    assert not curvature_of(problem, off(), problem.first_state()[0]).information.any()
 
 
 def test_restricting_is_the_same_problem_on_fewer_channels():
@@ -234,13 +211,6 @@ def test_loop_and_vmap_agree(channels):
     batch = [jnp.asarray(x) for x in (alphas, noisy_states(3, duration=DURATION), sigmas)]
     together, alone = jax.jit(jax.vmap(cost))(*batch), [cost(*lane) for lane in zip(*batch, strict=True)]
     np.testing.assert_allclose(together, alone, rtol=1e-12)
-
-
-def test_jitted_and_not_agree():
-    problem = standard_problem(duration=0.03)
-    compiled = problem.cost(off())
-    with jax.disable_jit():
-        np.testing.assert_allclose(problem.cost(off()), compiled, rtol=1e-12)
 
 
 @every_channels

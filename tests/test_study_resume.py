@@ -5,7 +5,6 @@ import errno
 import os
 import pathlib
 import random
-import resource
 import shutil
 import signal
 import time
@@ -114,18 +113,6 @@ def test_a_full_disk_is_one_line_and_the_study_resumes_later(whole, run, tmp_pat
     assert run("study", "spec.toml", "--out", "out")[0] == 0
     assert cells(tmp_path / "out") == cells(whole)
     xr.testing.assert_identical(results(tmp_path / "out"), results(whole))
-
-
-def test_a_full_disk_keeps_the_older_dataset(copy, run):
-    older, (soft, hard) = (copy / "results.nc").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(older) // 2, hard))
-    try:
-        result = run("study", "spec.toml", "--out", "out")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    refused(result, "results.nc", "File too large")
-    assert (copy / "results.nc").read_bytes() == older
-    assert not list(copy.glob(".*"))
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused(run, tmp_path, monkeypatch):
