@@ -230,15 +230,6 @@ def test_a_measured_input_acts_in_its_own_step(measured, channels):
     np.testing.assert_allclose(moved[8], expected, rtol=1e-9, atol=1e-15)
 
 
-def test_gaps_of_a_measured_force_are_filled_with_the_value_before_or_after():
-    gaps = np.random.default_rng(0).normal(size=(51, 3))
-    filled = gaps.copy()
-    gaps[10:14, 0], gaps[:3, 1] = np.nan, np.nan
-    filled[10:14, 0], filled[:3, 1] = gaps[9, 0], gaps[3, 1]
-    found = [rates_with("flapping", "specific_force", force, "rates") for force in (gaps, filled)]
-    np.testing.assert_array_equal(*found)
-
-
 SUBSETS = [
     (),
     *((term,) for term in ALL),

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, same, standard_flight
+from helpers import DT, compiled_programs, same, standard_flight
 from lanes import LANES, lost
 from small_network import (
     BRACKET,
@@ -128,22 +128,15 @@ def test_the_same_key_gives_the_same_network_and_another_another():
 
 def test_a_second_training_of_the_same_shapes_compiles_nothing():
     """Other numbers are no reason to compile: bracket, noise, rate, number of steps, key."""
-    compiled = []
-
-    def count(event: str, _: float, **__) -> None:
-        compiled.append(event == "/jax/core/compile/backend_compile_duration")
 
     def fit(changes, bracket, key):
         jaxos4.NetworkEstimator(**(SHORT | changes)).fit(problem_of(), bracket, key=jax.random.key(key))
 
     other = jaxos4.Bracket.around(BRACKET.center + 0.1 * BRACKET.half_width, 0.5 * BRACKET.half_width)
     fit({}, BRACKET, 0)
-    jax.monitoring.register_event_duration_secs_listener(count)
-    try:
+    with compiled_programs() as programs:
         fit({"noise": (0.5, 2.0), "steps": 300, "learning_rate": 0.01}, other, 1)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(count)
-    assert not any(compiled)
+    assert programs == []
 
 
 def test_training_stops_early_without_progress():
