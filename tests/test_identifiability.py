@@ -182,14 +182,6 @@ def test_robust_is_the_bound_under_white_noise():
     np.testing.assert_allclose(again, robust, rtol=1e-6)
 
 
-def test_robust_is_honest_where_most_samples_are_missing():
-    """Dropouts reduce the number of pairs of residuals by another factor than the number of samples."""
-    kept = np.random.default_rng(0).random(501) < 0.3
-    states = jnp.where(kept[:, None], noisy_states(1, seed=9)[0], jnp.nan)
-    _, _, ratio = robust_ratio(standard_problem(channels="rates", states=states))
-    assert np.all((ratio > 0.6) & (ratio < 1.4))
-
-
 def test_robust_is_infinite_without_measurements_or_a_trajectory():
     problem = standard_problem(channels="rates")
     blank = eqx.tree_at(lambda p: p.flight.states, problem, jnp.full((501, 12), jnp.nan))

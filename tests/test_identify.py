@@ -105,18 +105,12 @@ def test_two_logs_share_the_vehicle(run, vehicle, tmp_path, monkeypatch):
 VEHICLE = "flight1.csv --airframe airframe.toml"
 BIASED = [name for name, kind in ESTIMATORS.items() if not kind.in_closed_loop]
 REFUSED = {
-    f"{VEHICLE} --model flight --terms wings": "--terms: knows no `wings`",
     f"{VEHICLE} --terms wings": "--terms: knows no `wings`",
     f"{VEHICLE} --model flight --terms velocity": "did not measure",
-    f"{VEHICLE} --model flight --holdout 0.9": "--holdout",
-    f"{VEHICLE} --model flight --window 0.25": "--window: a vehicle is identified from its rates",
-    f"{VEHICLE} --model flight --sample-time nan": "--sample-time",
     f"{VEHICLE} --model flight --sample-time 0.001": "--sample-time",
     f"{VEHICLE} --model flight --from 5 --to 4": "--from",
     f"{VEHICLE} --model flight --from 50": "fewer than two samples",
     **{f"{VEHICLE} --estimator {name}": f"--estimator {name}: is biased by a controller" for name in BIASED},
-    f"{VEHICLE} --model flight --channels rates": "--channels",
-    f"{VEHICLE} --model flight --initial-state known": "--initial-state",
     f"{VEHICLE} --model published --terms offset": "--terms",
     f"{VEHICLE} --model published --from 1": "--from",
     f"{VEHICLE} --model published --report r.html": "--report",

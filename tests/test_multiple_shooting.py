@@ -138,16 +138,6 @@ def test_the_hybrid_runs_on_windows():
         network(windowed(1, "rates", CORRECTED), bracket)
 
 
-def test_robust_covariance_of_windows_is_the_bound_under_white_noise():
-    found, states, ratios = noisy("ibss", CORRECTED, "rates"), noisy_states(LANES, CORRECTED), []
-    for lane in range(8):
-        problem = windowed(WINDOWS, "rates", CORRECTED, states=states[lane])
-        robust = jaxos4.robust_covariance(problem, found.parameters[lane], found.initial_state[lane])
-        ratios.append(np.sqrt(np.diagonal(robust)) / found.std[lane])
-    ratio = np.mean(ratios, axis=0)
-    assert np.all((ratio > 0.7) & (ratio < 1.3)), ratio
-
-
 @pytest.mark.parametrize("windows", [0, -1, 251])
 def test_impossible_windows_are_named(windows):
     with pytest.raises(ValueError, match="`windows` must be an integer from 1 to 250"):
