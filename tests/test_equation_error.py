@@ -205,15 +205,3 @@ def test_a_gap_that_is_not_bridged_costs_more():
     problem, bracket = standard_problem(channels="rates", free=True, states=states), bracket_of(PUBLISHED)
     bridged, split = (EquationError(bridge=bridge)(problem, bracket) for bridge in (4, 0))
     assert (split.std > 5 * bridged.std).all()
-
-
-# When things go wrong.
-
-
-@pytest.mark.parametrize("estimator", [EquationError(), RecursiveLeastSquares()])
-def test_models_that_are_not_linear_are_refused(estimator):
-    flight = standard_flight(duration=0.1)
-    lagging = jaxos4.FlightModel(terms=("lag",))
-    problem = jaxos4.ShootingProblem(lagging, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0])
-    with pytest.raises(ValueError, match="linear in its parameters|no rotor lag"):
-        estimator(problem)

@@ -147,35 +147,9 @@ def test_unflyable_amplitudes_name_the_scale_that_flies(airframe, amplitude, exc
         excite(airframe, amplitude=np.multiply(amplitude, 1.02 * scale))
 
 
-@pytest.mark.parametrize(
-    ("excitations", "name", "values"),
-    [
-        (EXCITATIONS.values(), "duration", (0.0, -1.0, np.nan, np.inf, 0.001)),
-        (EXCITATIONS.values(), "dt", (0.0, np.nan)),
-        (EXCITATIONS.values(), "amplitude", (np.nan, (1.0, 1.0))),
-        ([multisine], "tones", [((1.0,), (1.0,)), ((50.0,), (1.0,), (1.0,)), ((0.0,), (1.0,), (1.0,))]),
-        ([doublet, step3211], "duration", [4.0]),
-        ([doublet], "width", [0.001, np.nan]),
-        ([doublet, step3211, chirp], "axes", [(), "roll", ("roll", "heave")]),
-        ([chirp], "duration", [1.0]),
-        ([chirp], "frequencies", [(1.0, 60.0), (0.0, 3.0)]),
-    ],
-)
-def test_arguments_out_of_range_are_named(excitations, name, values):
-    for excite in excitations:
-        for value in values:
-            with pytest.raises(ValueError, match=f"`{name}`"):
-                excite(OS4, **{name: value})
-
-
 def test_standard_references_have_the_largest_values_that_are_asked_for():
     largest = np.array([0.1, 0.2, 0.3, 2.0])
     for name, references in standard_references(5001, 0.004, largest).items():
         np.testing.assert_allclose(np.abs(references).max(axis=0), largest, rtol=1e-9)
         assert (np.count_nonzero(references, axis=1).max() == 1) == (name != "multisine")  # one after another
     assert np.all(standard_references(500, 0.004, largest)["3211"] == 0)  # no room for one axis
-
-
-def test_an_airframe_that_cannot_hover_is_named():
-    with pytest.raises(ValueError, match="`airframe` cannot hover"):
-        multisine(with_largest_speed(200.0), amplitude=0.0)

@@ -1,5 +1,6 @@
 """Each experiment runs in a small configuration, writes its results, and draws them."""
 
+import functools
 import importlib.util
 import json
 import pathlib
@@ -8,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+import jaxos4
 from jaxos4.report import read_results
 from jaxos4.study import load_study, metrics
 
@@ -25,8 +27,11 @@ def load(name, script="run"):
 
 
 @pytest.fixture
-def report_of(tmp_path):
-    """Runs an experiment with these options, and returns the JSON that it writes."""
+def report_of(tmp_path, monkeypatch):
+    """Runs an experiment with these options and small networks, and returns the JSON that it writes."""
+    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, batch=64, held_out=4000)
+    small.steps = jaxos4.NetworkEstimator.steps
+    monkeypatch.setattr(jaxos4, "NetworkEstimator", small)
 
     def report(name, script="run", **options):
         load(name, script).main(**options, out=tmp_path / "out.json")

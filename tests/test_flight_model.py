@@ -263,32 +263,6 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     assert two == tuple(f"{name}_{i}" for i in (1, 2) for name in NAMES["offset"])
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"terms": ("motor",)}, "max_rotor_speed"),
-        ({"terms": ("motor", "lag")}, "leave out lag"),
-        ({"terms": ("voltage",)}, "`battery_voltage` must be given for the term voltage"),
-        ({"terms": ("wind",)}, "`terms` must be some of offset, center_of_mass, damping"),
-        ({"terms": ("lag", "lag")}, "`terms` must be some of"),
-        ({"terms": ("lag", "Lag")}, "`terms` must be some of"),
-        *(({"recordings": some}, "`recordings` must count from 0") for some in ((), (1,), (0, 2), (-1, 0))),
-        ({"terms": ("velocity",)}, "velocity, drag need `Flight.body_vel"),
-        ({"terms": ("flapping",)}, "need `Flight.specific_force"),
-        ({"terms": ("voltage",), "battery_voltage": VOLTS}, "voltage need `Flight.voltage`"),
-    ],
-)
-def test_impossible_models_and_missing_measurements_are_named(settings, said):
-    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan))
-
-    def cost():
-        model = jaxos4.FlightModel(**settings)
-        return jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates").cost(truth(model))
-
-    with pytest.raises(ValueError, match=said):
-        cost()
-
-
 def brake(total, values, rates, forcing):
     """Damping that grows with the square of the rate."""
     coefficients = (values[f"{axis}_brake"] for axis in ("roll", "pitch", "yaw"))

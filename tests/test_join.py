@@ -117,13 +117,6 @@ def test_the_cost_of_joined_flights_is_the_sum_of_theirs():
     assert float(together.cost(parameters)) == pytest.approx(sum(float(p.cost(parameters)) for p in each), rel=1e-12)
 
 
-def test_flights_of_other_sample_times_are_refused():
-    with pytest.raises(ValueError, match=r"`flights` must have one sample time, got 0.01, 0.02 s"):
-        jaxos4.join([stretch(30, 0), stretch(30, 1, dt=0.02)], length=10)
-    with pytest.raises(ValueError, match="`flights` must hold at least `length` = 40 samples"):
-        jaxos4.join([], length=40)
-
-
 def rows(samples, ratio, seed, *, lost=0.0):
     rng = np.random.default_rng(seed)
     t = 3.0 + 0.001 * np.arange(samples)

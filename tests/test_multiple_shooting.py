@@ -138,24 +138,6 @@ def test_the_hybrid_runs_on_windows():
         network(windowed(1, "rates", CORRECTED), bracket)
 
 
-@pytest.mark.parametrize("windows", [0, -1, 251])
-def test_impossible_windows_are_named(windows):
-    with pytest.raises(ValueError, match="`windows` must be an integer from 1 to 250"):
-        windowed(windows)
-
-
-def test_windows_are_refused_with_a_known_start_and_by_estimators_that_do_not_shoot():
-    flight = standard_flight()
-    with pytest.raises(ValueError, match="`initial_state` must be `None` if there are several windows"):
-        jaxos4.ShootingProblem(
-            jaxos4.PublishedOS4(), flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0], windows=2
-        )
-    problem = windowed(2, "rates")
-    for estimator in (jaxos4.RecursiveLeastSquares(), jaxos4.SVSF(), jaxos4.JointEKF()):
-        with pytest.raises(ValueError, match="`problem.windows` must be 1"):
-            estimator(problem, jaxos4.Bracket.default(problem.model))
-
-
 def test_equation_error_is_the_same_whatever_the_windows():
     one, several = windowed(1, "rates"), windowed(4, "rates")
     bracket = jaxos4.Bracket.default(one.model)

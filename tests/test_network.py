@@ -158,25 +158,6 @@ def test_a_training_that_cannot_succeed_says_why(changes, off, message):
         jaxos4.NetworkEstimator(**(SMALL | changes)).fit(problem_of(model=CORRECTED()), bracket, key=jax.random.key(0))
 
 
-@pytest.mark.parametrize(
-    ("changes", "bracket", "message"),
-    [
-        ({"features": "fourier"}, BRACKET, r"`features` must be one of score, raw, got 'fourier'"),
-        ({"features": "raw", "approximator": "cmac"}, BRACKET, r"needs `features` \"score\""),
-        ({"steps": 0}, BRACKET, r"`steps` must be an integer of at least 1"),
-        ({"held_out": 10}, BRACKET, r"`held_out` must be an integer of at least 1000"),
-        ({"learning_rate": np.nan}, BRACKET, r"`learning_rate` must be positive"),
-        ({"noise": (1.0, 0.1)}, BRACKET, r"`noise` must be \(lowest, highest\)"),
-        ({"channels": "attitude"}, BRACKET, "`channels` 'attitude' are more than the problem's"),
-        ({}, jaxos4.Bracket(BRACKET.lower, BRACKET.upper.at[2].set(BRACKET.lower[2])), "`bracket` of alpha3 must have"),
-        ({}, jaxos4.Bracket(jnp.zeros(7), jnp.ones(7)), "`bracket` must hold 8 parameters, got 7"),
-    ],
-)
-def test_what_cannot_be_trained_for_is_named(changes, bracket, message):
-    with pytest.raises(ValueError, match=message):
-        jaxos4.NetworkEstimator(**changes).fit(problem_of(), bracket, key=jax.random.key(0))
-
-
 # Flights that it was not trained for.
 
 OTHER = {

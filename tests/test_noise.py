@@ -204,23 +204,3 @@ def test_chain_is_one_after_the_other():
     assert same(chained, by_hand)
     assert not np.array_equal(chained.states, Chain((second, first, first))(flight, key=key).states)
     assert same(Chain(())(flight, key=key), flight)
-
-
-# Misuse.
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (lambda: WhiteNoise(np.ones(3)), "sigma"),
-        (lambda: WhiteNoise(-0.1), "sigma"),
-        (lambda: WhiteNoise(np.nan), "sigma"),
-        (lambda: ConstantBias(1.0, mean=np.ones((2, 12))), "mean"),
-        (lambda: GaussMarkov(1.0, correlation_time=0.0), "correlation_time"),
-        (lambda: Quantisation(-1.0), "step"),
-        (lambda: Dropouts(1.5), "probability"),
-    ],
-)
-def test_numbers_out_of_range_are_named(make, name):
-    with pytest.raises(ValueError, match=f"`{name}`"):
-        make()

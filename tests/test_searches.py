@@ -125,12 +125,6 @@ def test_rollouts_are_counted_right():
         assert 2 * sweeps <= shots <= 3 + sweeps * (1 + most)
 
 
-def test_starts_of_another_length_are_named():
-    problem = standard_problem(channels="rates", duration=0.1)
-    with pytest.raises(ValueError, match=r"`start` must hold 8 unknowns, got shape \(7,\)"):
-        jaxos4.IBSS()(problem, jaxos4.Bracket.default(PUBLISHED()), start=jnp.zeros(7))
-
-
 def test_the_colony_reaches_the_optimum_of_ibss_with_many_more_rollouts():
     arguments = lanes(noisy_states(LANES, seed=50))
     colony, ibss = (identify(estimator, *arguments) for estimator in (jaxos4.AntColony(), jaxos4.IBSS()))

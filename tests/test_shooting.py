@@ -245,7 +245,7 @@ def test_a_failed_shot_is_compared_up_to_the_failure():
     assert float(problem.cost(jnp.asarray(steep), jnp.asarray(start))) == np.inf
 
 
-# Noise levels, and misuse.
+# Noise levels.
 
 
 def test_reweighting_finds_the_noise_level_of_each_channel():
@@ -272,15 +272,3 @@ def test_reweighting_an_exact_fit_gives_finite_weights():
     assert float(again.cost(problem.model.alpha)) < 12 * 501
     hover = standard_problem(states=jnp.zeros((501, 12)))  # all measurements are zero
     np.testing.assert_array_equal(hover.reweighted(jnp.zeros(501 * 12)).sigma, SIGMA)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"channels": "some"}, r"`channels` must be one of rates, attitude, all, got 'some'"),
-        ({"method": "diffrax"}, r"`method` must be one of euler, rk4, got 'diffrax'"),
-    ],
-)
-def test_misuse_is_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        jaxos4.ShootingProblem(jaxos4.PublishedOS4(), standard_flight(), **{"sigma": SIGMA, **arguments})

@@ -43,7 +43,7 @@ def test_a_study_is_the_same_after_any_number_of_kills_and_on_any_number_of_devi
     out, moments, kills = tmp_path / "out", random.Random(1), 0
     command = ("study", specification(tmp_path), "--out", out)
     count, before = load_study(tmp_path / "spec.toml").count, 0
-    while kills < 4:
+    while kills < 3:
         process = start(*command)
         # The first kill comes during the start, the others after some more cells.
         deadline = time.monotonic() + (moments.uniform(0, 2) if kills == 0 else 120)

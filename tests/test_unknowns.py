@@ -98,16 +98,6 @@ def test_a_bracket_moves_free_unknowns_only():
     assert eqx.tree_equal(twice, problem.unknowns)
 
 
-def test_misuse_is_named():
-    problem = noisy_problem()
-    with pytest.raises(ValueError, match="`values`: wind is no unknown; the unknowns are alpha1, "):
-        problem.hold({"alpha1": 0.0, "wind": 1.0})
-    with pytest.raises(ValueError, match="`values` holds every unknown"):
-        problem.hold(dict.fromkeys(problem.unknowns.names, 0.0))
-    with pytest.raises(ValueError, match="`bracket` must hold 8 parameters, got 3"):
-        problem.within(jaxos4.Bracket(np.zeros(3), np.ones(3)))
-
-
 ALPHA = jaxos4.PublishedOS4().alpha
 HALF = jaxos4.DEFAULT_HALF_WIDTH
 
@@ -145,14 +135,6 @@ def test_says_when_it_is_none(lower, upper):
     unknowns = jaxos4.Unknowns.of(jaxos4.PublishedOS4())
     assert bool(unknowns.valid)
     assert not bool(unknowns.within(jaxos4.Bracket(np.resize(lower, 8), np.resize(upper, 8))).valid)
-
-
-@pytest.mark.parametrize(
-    ("lower", "upper"), [(np.zeros(8), np.ones(7)), (np.zeros((2, 8)), np.ones((2, 8))), (0.0, 1.0)]
-)
-def test_ends_that_do_not_fit_are_named(lower, upper):
-    with pytest.raises(ValueError, match=r"`lower` and `upper` must be one-dimensional and of one shape"):
-        jaxos4.Bracket(lower, upper)
 
 
 # Results.
