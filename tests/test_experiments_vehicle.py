@@ -33,7 +33,6 @@ def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.usefixtures("optimised")
 def test_closed_loop(report_of, plot, monkeypatch):  # noqa: F811
     def load_with_small_chunks(name, script="run"):
         module = load(name, script)

@@ -128,7 +128,8 @@ def test_a_window_without_measurements_changes_no_estimate(name):
 def test_the_hybrid_runs_on_windows():
     problem = windowed(WINDOWS, "rates", CORRECTED)
     bracket = jaxos4.Bracket.default(problem.model)
-    network = jaxos4.NetworkEstimator(steps=100, held_out=1000).fit(problem, bracket, key=jax.random.key(0))
+    network = jaxos4.NetworkEstimator(width=32, depth=2, batch=64, steps=100, held_out=1000)
+    network = network.fit(problem, bracket, key=jax.random.key(0))
     found = jaxos4.Hybrid(network)(problem, bracket)
     brackets = (jnp.tile(end, (LANES, 1)) for end in (bracket.lower, bracket.upper))
     alone = flown("ibss", CORRECTED, "rates", noisy_states(LANES, CORRECTED), tuple(brackets))

@@ -17,11 +17,12 @@ from jaxos4.estimators.svsf import SVSF
 PUBLISHED: Any = jaxos4.PublishedOS4
 CORRECTED: Any = jaxos4.CorrectedOS4
 ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])  # p, q, r, phi, theta, psi, x, vx, ...
+FEW = 16  # lanes of a batch
 
 
 @functools.cache
 def noisy(model_class, channels, free, passes=10):
-    arguments = lanes(noisy_states(LANES, model_class), model_class, channels, free=free, seed=100)
+    arguments = lanes(noisy_states(FEW, model_class), model_class, channels, free=free, seed=100)
     return identify(JointEKF(passes=passes), *arguments)
 
 
@@ -45,7 +46,7 @@ def test_history_ends_at_the_answer(model_class, channels, free):
     estimates = noisy(model_class, channels, free)
     np.testing.assert_array_equal(estimates.rollouts, (8 + 3 * free + 1) * estimates.sweeps + 1)
     history = np.asarray(estimates.history)
-    assert history.shape == (LANES, 501, 8)
+    assert history.shape == (FEW, 501, 8)
     np.testing.assert_array_equal(history[:, -1], estimates.parameters)
     # The error shrinks on the way.
     off = np.sqrt(np.mean(((history - np.asarray(model_class().alpha)) / HALF) ** 2, axis=(0, 2)))
@@ -54,7 +55,7 @@ def test_history_ends_at_the_answer(model_class, channels, free):
 
 def test_a_free_initial_state_is_estimated():
     estimates = noisy(PUBLISHED, "rates", True)
-    assert estimates.initial_state.shape == (LANES, 3)
+    assert estimates.initial_state.shape == (FEW, 3)
     # Better than its one measurement, with all the flight behind it.
     rms = np.sqrt(np.mean(np.square(estimates.initial_state), axis=0))
     assert (rms < 0.5 * jaxos4.SENSOR_SIGMA[ORDER[:3]]).all(), rms
@@ -152,7 +153,7 @@ def test_a_linear_model_with_a_wide_prior_is_least_squares():
 
 def test_agrees_with_shooting():
     """The prior aside, which a wide bracket makes weak, both have the same optimum."""
-    problem, states, omega, lower, upper = lanes(noisy_states(16), seed=100)
+    problem, states, omega, lower, upper = lanes(noisy_states(FEW), seed=100)
     middle = (lower + upper) / 2
     wide = identify(JointEKF(), problem, states, omega, middle - 5 * HALF, middle + 5 * HALF)
     shot = identify(jaxos4.IBSS(tolerance=1e-4), problem, states, omega, lower, upper)

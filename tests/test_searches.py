@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import noisy_states, same, standard_flight, standard_problem
-from lanes import HALF, LANES, bound, errors, identify, lanes, names
+from lanes import HALF, bound, errors, identify, lanes, names
 
 import jaxos4
 from jaxos4.estimators.ant_colony import _directions
@@ -126,7 +126,7 @@ def test_rollouts_are_counted_right():
 
 
 def test_the_colony_reaches_the_optimum_of_ibss_with_many_more_rollouts():
-    arguments = lanes(noisy_states(LANES, seed=50))
+    arguments = lanes(noisy_states(FEW, seed=50))
     colony, ibss = (identify(estimator, *arguments) for estimator in (jaxos4.AntColony(), jaxos4.IBSS()))
     assert set(names(colony)) == {"successful"}
     # A cost of 0.005 is an error of 0.1 standard deviations.
