@@ -47,11 +47,10 @@ hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("experiments", "network", "estimators", "experiment_studies", "study_resume", "filter_error", "ibss", "cli"),
+    *("experiments", "experiments_vehicle", "network", "errors", "estimators", "study_resume", "filter_error", "cli"),
     *("study_cluster", "vehicle", "multiple_shooting", "flight_model", "shooting", "design", "study"),
-    *("report_browser", "judge", "equation_error", "startup", "report", "unknowns", "programs", "compare", "simulate"),
-    *("new_estimator", "diagnostics", "identifiability", "models", "kalman", "output_error", "identify", "svsf"),
-    *("closed_loop", "logs_readers", "flight_model_fits", "cli_vehicle", "ant_colony", "noise", "stretches", "inertia"),
+    *("report_browser", "judge", "startup", "report", "unknowns", "programs", "compare", "simulate", "ibss"),
+    *("new_estimator", "diagnostics", "identifiability", "models", "kalman", "identify", "svsf", "closed_loop"),
 )
 
 
@@ -116,7 +115,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 # Modules that compute for longer than they compile. XLA hardly optimises the programs of the others, which then compile
 # in a third of the time, and compute three to five times as long. A program keeps the level of its first use: the
 # fixtures below act on what a test is the first to compile, and not on fixtures of the module.
-COMPUTING = {"ant_colony", "design", "design_references", "estimators", "experiments"}
+COMPUTING = {"ant_colony", "design"}
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,10 +3,6 @@
 import contextlib
 import functools
 import itertools
-import json
-import os
-import subprocess
-import sys
 
 import equinox as eqx
 import jax
@@ -265,11 +261,3 @@ def how_we_compile():
     settings = ("jax_compilation_cache_dir", "jax_disable_most_optimizations")
     ours = {name.upper(): str(jax.config.values[name]) for name in settings}
     return ours | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
-
-
-def single_precision(script):
-    """What a script writes as JSON in a process of its own, with JAX as it comes."""
-    environment = os.environ | how_we_compile() | {"JAX_ENABLE_X64": "0", "JAX_PLATFORMS": jax.default_backend()}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)

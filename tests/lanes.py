@@ -36,22 +36,10 @@ def lanes(states, model_class=jaxos4.PublishedOS4, channels="rates", *, free=Fal
 
 @functools.cache
 def bound(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
-    """Standard deviations at the Cramer-Rao bound."""
-    return np.sqrt(np.diagonal(_covariance(model_class, channels, free)))
-
-
-@functools.cache
-def information(model_class=jaxos4.PublishedOS4, channels="rates", free=False):
-    """The information about the parameters at the truth."""
-    return inverse_square(np.linalg.cholesky(_covariance(model_class, channels, free)).T)
-
-
-@functools.cache
-def _covariance(model_class, channels, free):
-    """Of the NumPy equations. That of the library: `test_information.py`."""
+    """Standard deviations at the Cramer-Rao bound by the NumPy equations. The library's: `test_information.py`."""
     problem = standard_problem(model_class, channels, free=free)
     slopes = numpy_jacobian(problem, model_class().alpha, np.zeros(problem.size))
-    return inverse_square(slopes if free else slopes[:, :8])[:8, :8]
+    return np.sqrt(np.diagonal(inverse_square(slopes if free else slopes[:, :8])))[:8]
 
 
 def errors(estimates, model_class=jaxos4.PublishedOS4):

@@ -11,12 +11,10 @@ import pytest
 
 import jaxos4
 from jaxos4.airframe import (
-    ALTERNATING_SPINS,
     OS4,
     OS4_SIMULATOR,
     PRESETS,
     VOOS,
-    Airframe,
     alpha_from_inertia,
     load_airframe,
 )
@@ -199,15 +197,3 @@ def test_neither_file_nor_preset(tmp_path):
     with pytest.raises(InputError, match="os4-simulator, voos, crazyflie") as caught:
         load_airframe(tmp_path / "none.toml")
     assert "none.toml" in str(caught.value)
-
-
-def test_any_layout_fits():
-    """A plus layout turned by 45 degrees: the same authority about an axis between the arms."""
-    turn = np.array([[1, -1], [1, 1]]) / np.sqrt(2)
-    x_layout = eqx.tree_at(lambda a: a.rotor_positions, OS4, OS4.rotor_positions @ turn.T)
-    assert isinstance(x_layout, Airframe)
-    np.testing.assert_array_equal(x_layout.rotor_spins, ALTERNATING_SPINS)
-    omega_squared = np.array([2e4, 5e4, 3e4, 6e4])
-    torque, turned = OS4.mixer @ omega_squared, x_layout.mixer @ omega_squared
-    np.testing.assert_allclose(turned[:2], turn @ torque[:2], rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(turned[2:], torque[2:], rtol=1e-12)

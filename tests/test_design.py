@@ -16,14 +16,10 @@ from helpers import (
     CRAZYFLIE_TOML,
     DT,
     euler_trajectory,
-    measured,
     published_derivative,
-    random_starts,
     refused,
     standard_flight,
-    standard_problem,
 )
-from lanes import HALF, LANES, identify
 
 import jaxos4
 from jaxos4 import design
@@ -143,20 +139,6 @@ def test_the_shortest_flight_is_the_first_sample_at_which_the_bounds_are_small_e
     designed = speeds.found.designed
     np.testing.assert_allclose(designed.shortest(designed.history[120, :3]), 1.2, rtol=1e-9)
     np.testing.assert_allclose(designed.shortest(designed.bounds / 3), 9 * SECONDS, rtol=1e-9)
-
-
-@pytest.mark.usefixtures("quickly_compiled")
-def test_many_flights_reach_the_bounds(speeds):
-    """RMSE / bound of each parameter by IBSS, within four standard errors of 1."""
-    omega = jnp.asarray(speeds.found.designed.inputs)
-    exact = jaxos4.simulate(MODEL, MODEL.alpha, omega, dt=DT)
-    states = measured(jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA), exact, jax.random.split(jax.random.key(5), LANES))
-    problem, center = standard_problem(duration=SECONDS), random_starts(MODEL, LANES, seed=150)
-    inputs = jnp.asarray(np.tile(omega, (LANES, 1, 1)))
-    estimates = identify(jaxos4.IBSS(), problem, states, inputs, center - HALF, center + HALF)
-    assert (np.asarray(jaxos4.result_names(estimates.result)) == "successful").all()
-    error = np.asarray(estimates.parameters - MODEL.alpha) / speeds.found.designed.bounds
-    assert np.abs(np.square(error).mean(axis=0) - 1).max() < 4 * np.sqrt(2 / LANES)
 
 
 def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, run):

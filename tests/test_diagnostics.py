@@ -74,7 +74,7 @@ def test_true_models_pass_as_often_as_the_level_says():
 
 
 FIFTH = np.arange(501)[:, None] % 5 == 0
-GAPS = {share: np.random.default_rng(0).random((200, 501, 12)) > share for share in (0.2, 0.7)} | {"4 of 5": FIFTH}
+GAPS = {"7 of 10": np.random.default_rng(0).random((200, 501, 12)) > 0.7, "4 of 5": FIFTH}
 
 
 @pytest.mark.parametrize("kept", GAPS.values(), ids=GAPS)
@@ -123,13 +123,6 @@ def test_no_alarm_without_measurements_or_with_rounding_errors_or_after_divergen
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(diverged))
 
 
-@pytest.mark.parametrize("lags", [0, 501])
-def test_lags_that_cannot_be_are_named(lags):
-    problem = standard_problem(channels="rates")
-    with pytest.raises(ValueError, match="`lags` must lie in 1 to 500"):
-        jaxos4.residual_diagnostics(problem, problem.model.alpha, lags=lags)
-
-
 def test_sparse_measurements_show_slow_noise():
     slow = jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, 0.1)
     coloured = judged(jnp.where(FIFTH, coloured_states(slow), jnp.nan))
@@ -160,7 +153,3 @@ def test_windows_have_no_verdict_on_whiteness():
     judgement = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
     assert (judgement.white_p == 1).all()
     np.testing.assert_allclose(judgement.level, 1, atol=5 * np.sqrt(2 / 430))
-    with pytest.raises(ValueError, match=r"`initial_state` must be of shape \(60,\)"):
-        jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state[:30])
-    with pytest.raises(ValueError, match=r"`parameters` must be of shape \(8,\)"):
-        jaxos4.residual_diagnostics(problem, found.parameters[:7], found.initial_state)

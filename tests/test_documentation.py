@@ -1,8 +1,14 @@
-"""The documentation agrees with the code: the API reference and the picture of the floors."""
+"""The documentation agrees with the code, and the type checker of the tests sees every call."""
 
 import importlib.util
 import pathlib
 import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float, TypeCheckError, jaxtyped
+from typechecker import check
 
 import jaxos4
 
@@ -24,3 +30,26 @@ def test_the_picture_of_the_floors_is_up_to_date():
     drawn = (ROOT / "docs" / "pictures" / "floors.svg").read_text(encoding="utf-8")
     # If this fails: python experiments/pictures/run.py docs/pictures --only floors
     assert drawn == module.floors_picture(ROOT / "pyproject.toml")
+
+
+def differences(values, annotation):
+    """An inner function with this annotation of its argument, defined anew at each call."""
+
+    @jaxtyped(typechecker=check)
+    def inner(x: annotation, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        return x - y
+
+    return inner(values, jnp.zeros(3))
+
+
+def test_inner_functions_are_checked_at_each_call():
+    vector, anything = Float[Array, " n"], Float[Array, "..."]
+    for _ in range(2):
+        assert differences(jnp.ones(3), vector).shape == (3,)
+        assert differences(jnp.ones((2, 1, 3))[0, 0], anything).shape == (3,)
+        with pytest.raises(TypeCheckError, match="parameters"):
+            differences(jnp.ones(4), vector)
+        with pytest.raises(TypeCheckError, match="parameters"):
+            differences(np.ones(3), vector)
+        with pytest.raises(TypeCheckError, match="return value"):
+            differences(jnp.ones((2, 3)), anything)

@@ -1,28 +1,18 @@
 """Equation error, in batch and recursive: against plain NumPy, with noise, with gaps, and when things go wrong."""
 
-import functools
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import DT, OS4, doublet_problem, noisy_states, standard_flight, standard_problem
-from lanes import HALF, LANES, assert_chi_square, assert_covered, assert_nothing_invented, bound, errors, lost, names
+from helpers import DT, OS4, noisy_states, standard_flight, standard_problem
+from lanes import HALF, bound, errors, lost, names
 
 import jaxos4
 from jaxos4.estimators.equation_error import EquationError, RecursiveLeastSquares
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 RATES = np.array([jaxos4.STATE_NAMES.index(name) for name in "pqr"])
-BOTH = pytest.mark.parametrize("estimator", [EquationError(), RecursiveLeastSquares()], ids=["batch", "recursive"])
 STARTS = pytest.mark.parametrize("free", [False, True], ids=["known", "free"])
-
-
-def identify(estimator, problem, states, bracket):
-    """One estimate for each flight of `states`, by the program of one. That a batch has the same: `test_estimators`."""
-    each = [estimator(with_states(problem, s), bracket) for s in states]
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each)
 
 
 def with_states(problem, states):
@@ -78,29 +68,19 @@ def reference(states, omega, form, *, forgetting=1.0, corrected=False):
 
 
 @pytest.mark.parametrize(
-    ("model_class", "form"),
+    ("estimator", "model_class", "form", "forgetting"),
     [
-        (PUBLISHED, "known"),
-        (PUBLISHED, "free"),
-        (PUBLISHED, "differences"),
-        (CORRECTED, "free"),
-        (CORRECTED, "differences"),
+        *((EquationError(), *case, 1.0) for case in ((PUBLISHED, "known"), (PUBLISHED, "free"), (CORRECTED, "free"))),
+        *((EquationError(memory=0.0), model_class, "differences", 1.0) for model_class in (PUBLISHED, CORRECTED)),
+        *((RecursiveLeastSquares(forgetting=share), PUBLISHED, "free", share) for share in (0.99, 0.9)),
     ],
 )
-def test_equals_least_squares_in_numpy(model_class, form):
+def test_equals_least_squares_in_numpy(estimator, model_class, form, forgetting):
     states = noisy_states(1, model_class)[0]
     problem = standard_problem(model_class, "rates", free=form != "known", states=states)
-    estimate = EquationError(memory=0.0 if form == "differences" else 1.0)(problem, bracket_of(model_class))
-    expected = reference(states, problem.flight.omega, form, corrected=model_class is CORRECTED)
-    assert np.abs((estimate.parameters - expected) / estimate.std).max() < 1e-9
-
-
-@pytest.mark.parametrize("forgetting", [0.99, 0.9])
-def test_forgetting_equals_weighted_least_squares_in_numpy(forgetting):
-    states = noisy_states(1)[0]
-    problem = standard_problem(channels="rates", free=True, states=states)
-    estimate = RecursiveLeastSquares(forgetting=forgetting)(problem, bracket_of(PUBLISHED))
-    expected = reference(states, problem.flight.omega, "free", forgetting=forgetting)
+    estimate = estimator(problem, bracket_of(model_class))
+    corrected = model_class is CORRECTED
+    expected = reference(states, problem.flight.omega, form, forgetting=forgetting, corrected=corrected)
     assert np.abs((estimate.parameters - expected) / estimate.std).max() < 1e-9
 
 
@@ -151,44 +131,6 @@ def test_the_trapezoidal_rule_is_for_flights_that_were_not_flown_by_eulers():
     assert off["rk4"] < 0.2 < 0.4 < off["euler"]
 
 
-# With noise.
-
-
-@functools.cache
-def noisy(model_class, free, memory, scale=1.0):
-    problem = standard_problem(model_class, "rates", free=free)
-    problem = eqx.tree_at(lambda p: p.sigma, problem, scale * problem.sigma)
-    states = noisy_states(LANES, model_class, scale=scale)
-    return identify(EquationError(memory=memory), problem, states, bracket_of(model_class))
-
-
-@pytest.mark.parametrize(
-    ("model_class", "free", "memory", "scale"),
-    [
-        (PUBLISHED, False, 1.0, 1.0),
-        (PUBLISHED, False, 1.0, 10.0),
-        (PUBLISHED, True, 1.0, 1.0),
-        (PUBLISHED, True, 0.0, 1.0),
-        (CORRECTED, True, 1.0, 1.0),
-    ],
-)
-def test_estimates_know_their_errors(model_class, free, memory, scale):
-    """Normalised squared error and coverage within four standard errors of what the covariance claims."""
-    estimates = noisy(model_class, free, memory, scale)
-    assert set(names(estimates)) == {"successful"}
-    assert_chi_square(errors(estimates, model_class), np.linalg.inv(estimates.covariance))
-    assert_covered(errors(estimates, model_class), estimates.std)
-
-
-def test_the_integrated_form_is_nearly_efficient_and_plain_differences_are_not():
-    error = errors(noisy(PUBLISHED, True, 1.0)) / bound(PUBLISHED, free=True)
-    efficiency = np.sqrt(np.mean(error**2, axis=0))
-    assert efficiency.max() < 1.11 * (1 + 3.5 / np.sqrt(2 * LANES)), efficiency
-    assert np.abs(error.mean(axis=0) * np.sqrt(LANES)).max() < 4 * 1.11
-    differences = errors(noisy(PUBLISHED, True, 0.0)) / bound(PUBLISHED, free=True)
-    assert np.sqrt(np.mean(differences**2, axis=0)).min() > 1.4
-
-
 # Recursion.
 
 
@@ -230,14 +172,6 @@ def test_forgetting_follows_parameters_that_jump():
     assert np.abs((stays.parameters - after) / HALF).max() > 0.1
 
 
-def test_forgetting_knows_its_errors():
-    problem = standard_problem(channels="rates", free=True)
-    estimator = RecursiveLeastSquares(forgetting=0.98)
-    estimates = identify(estimator, problem, noisy_states(LANES, seed=5), bracket_of(PUBLISHED))
-    assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))
-    assert (np.median(estimates.std, axis=0) > 2 * bound(PUBLISHED, free=True)).all()
-
-
 # Gaps.
 
 
@@ -271,27 +205,3 @@ def test_a_gap_that_is_not_bridged_costs_more():
     problem, bracket = standard_problem(channels="rates", free=True, states=states), bracket_of(PUBLISHED)
     bridged, split = (EquationError(bridge=bridge)(problem, bracket) for bridge in (4, 0))
     assert (split.std > 5 * bridged.std).all()
-
-
-# When things go wrong.
-
-
-@BOTH
-@pytest.mark.parametrize("axes", [["roll"], ["roll", "pitch", "yaw"]])
-def test_no_numbers_are_invented_for_doublets_with_a_free_start(estimator, axes):
-    assert_nothing_invented(estimator, *doublet_problem(axes, free=True))
-
-
-@BOTH
-def test_a_truth_far_from_the_bracket_is_reported(estimator):
-    estimate = estimator(standard_problem(channels="rates", free=True), bracket_of(PUBLISHED, 5.0))
-    assert names(estimate) == "at_bound"
-
-
-@BOTH
-def test_models_that_are_not_linear_are_refused(estimator):
-    flight = standard_flight(duration=0.1)
-    lagging = jaxos4.FlightModel(terms=("lag",))
-    problem = jaxos4.ShootingProblem(lagging, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=flight.states[0])
-    with pytest.raises(ValueError, match="linear in its parameters|no rotor lag"):
-        estimator(problem)

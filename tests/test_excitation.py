@@ -147,44 +147,6 @@ def test_unflyable_amplitudes_name_the_scale_that_flies(airframe, amplitude, exc
         excite(airframe, amplitude=np.multiply(amplitude, 1.02 * scale))
 
 
-def test_exceeding_the_rotor_speed_says_by_how_much():
-    fastest = float(multisine(OS4, amplitude=0.5).max())
-    with pytest.raises(ValueError, match="squared speed of") as caught:
-        multisine(with_largest_speed(fastest - 2), amplitude=0.5)
-    assert named(r"squared speed of (\S+) rad", caught) == pytest.approx(fastest**2, rel=1e-4)
-    assert named(r"0 to (\S+) \(`max", caught) == pytest.approx((fastest - 2) ** 2, rel=1e-4)
-    assert multisine(with_largest_speed(fastest + 1e-6), amplitude=0.5).size
-    with pytest.raises(ValueError, match="`airframe` cannot hover"):
-        multisine(with_largest_speed(200.0), amplitude=0.0)
-
-
-@pytest.mark.parametrize(
-    ("excitations", "name", "values"),
-    [
-        (EXCITATIONS.values(), "duration", (0.0, -1.0, np.nan, np.inf, 0.001)),
-        (EXCITATIONS.values(), "dt", (0.0, np.nan)),
-        (EXCITATIONS.values(), "amplitude", (np.nan, (1.0, 1.0))),
-        ([multisine], "tones", [((1.0,), (1.0,)), ((50.0,), (1.0,), (1.0,)), ((0.0,), (1.0,), (1.0,))]),
-        ([doublet, step3211], "duration", [4.0]),
-        ([doublet, step3211, chirp], "dt", [1.0]),
-        ([doublet, step3211, chirp], "axes", [(), "roll", ("roll", "heave")]),
-        ([chirp], "duration", [1.0]),
-    ],
-)
-def test_arguments_out_of_range_are_named(excitations, name, values):
-    for excite in excitations:
-        for value in values:
-            with pytest.raises(ValueError, match=f"`{name}`"):
-                excite(OS4, **{name: value})
-
-
-@every_in_turn
-def test_the_shortest_duration_it_names_is_enough(excite):
-    with pytest.raises(ValueError, match="`duration` must be at least") as caught:
-        excite(OS4, duration=1.0)
-    assert np.isfinite(excite(OS4, duration=named(r"at least (\S+) s", caught), amplitude=0.2)).all()
-
-
 def test_standard_references_have_the_largest_values_that_are_asked_for():
     largest = np.array([0.1, 0.2, 0.3, 2.0])
     for name, references in standard_references(5001, 0.004, largest).items():

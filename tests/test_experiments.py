@@ -1,17 +1,200 @@
-"""Each experiment that is a script runs in a small configuration, writes its results, and draws them."""
+"""Each experiment runs in a small configuration, writes its results, and draws them."""
 
+import functools
+import importlib.util
 import json
+import pathlib
+import sys
 
 import numpy as np
 import pytest
-from helpers import how_we_compile
-from small_experiments import load, plot, report_of
+
+import jaxos4
+from jaxos4.report import read_results
+from jaxos4.study import load_study, metrics
+
+EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
+sys.path.append(str(EXPERIMENTS))
+
+import shared  # noqa: E402
 
 
-@pytest.mark.usefixtures("quickly_compiled")
-def test_efficiency(tmp_path):
+def load(name, script="run"):
+    spec = importlib.util.spec_from_file_location(f"experiment_{name}_{script}", EXPERIMENTS / name / f"{script}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def report_of(tmp_path, monkeypatch):
+    """Runs an experiment with these options and small networks, and returns the JSON that it writes."""
+    small = functools.partial(jaxos4.NetworkEstimator, width=32, depth=2, batch=64, held_out=4000)
+    small.steps = jaxos4.NetworkEstimator.steps
+    monkeypatch.setattr(jaxos4, "NetworkEstimator", small)
+
+    def report(name, script="run", **options):
+        load(name, script).main(**options, out=tmp_path / "out.json")
+        return json.loads((tmp_path / "out.json").read_text())
+
+    return report
+
+
+@pytest.fixture
+def plot(tmp_path, monkeypatch):
+    """Draws the results in `tmp_path / "out"`, or in its JSON. Only the comparison is drawn as PDF too."""
+
+    def drawn(name, script="plot", results="out.json", *, suffixes=(".svg",)):
+        with monkeypatch.context() as patch:
+            if ".pdf" not in suffixes:
+                patch.setattr(shared, "pdf", lambda figure: b"")
+            load(name, script).main(tmp_path / results, tmp_path / "figures")
+        for suffix in suffixes:
+            figures = list((tmp_path / "figures").glob(f"*{suffix}"))
+            assert figures
+            assert all(path.name.startswith(name) and path.stat().st_size > 5000 for path in figures)
+
+    return drawn
+
+
+# Studies: experiments with a specification.
+
+STUDIES = ("comparison", "noise_study", "noise_kinds", "scale")  # those without a script of their own
+OTHERS = ("frontier", "rollout_budget", "published_corrected", "inverse_crime", "bracket_and_seeds")
+
+
+def small(name):
+    return EXPERIMENTS / name / "small.toml"
+
+
+@pytest.fixture
+def study(tmp_path, plot):
+    """Runs and plots the small configuration of an experiment that is a study."""
+
+    def results(name, **options):
+        shared.run_studies({name: load_study(small(name))}, tmp_path)
+        plot(name, results=name, **options)
+        return read_results(tmp_path / name).squeeze()
+
+    return results
+
+
+@pytest.fixture
+def run(tmp_path, plot):
+    """Runs and plots the small configuration of an experiment with a script."""
+
+    def results(name, **options):
+        load(name).main(small(name), tmp_path / "out", **options)
+        plot(name, results="out")
+        return tmp_path / "out"
+
+    return results
+
+
+@pytest.mark.parametrize("name", [*STUDIES, *OTHERS])
+def test_configurations(name):
+    """The full configuration is valid, and no smaller than the small one."""
+    real, short = load_study(EXPERIMENTS / name / "study.toml"), load_study(small(name))
+    assert real.count * real.batch >= short.count * short.batch
+    assert (EXPERIMENTS / name / "run.py").exists() == (name not in STUDIES)
+
+
+def test_comparison(study):
+    accuracy = metrics.accuracy(study("comparison", suffixes=(".svg", ".pdf")))
+    # On the rates of one second both are at the bound, within chance: 8 parameters of 32 flights.
+    assert (abs(accuracy.sel(scale=1.0) - 1) < 3 / np.sqrt(2 * 8 * 32)).all()
+    # At ten times the noise IBSS ends at its limits around the bracket.
+    assert (accuracy.sel(scale=10.0, estimator="ibss") < accuracy.sel(scale=10.0, estimator="equation-error")).all()
+
+
+def test_noise_study(study):
+    error = metrics.estimator_error(study("noise_study"))["absolute"].sel(estimator="ibss")
+    # Ten times the noise, ten times the error: the flights draw the same numbers.
+    np.testing.assert_allclose(error.sel(scale=1.0) / error.sel(scale=0.1), 10, rtol=0.1)
+
+
+def test_noise_kinds(study):
+    covered = metrics.mean_coverage(study("noise_kinds")).sel(level=0.95)
+    assert float(covered["low"].sel(noise="white")) < 0.95 < float(covered["high"].sel(noise="white"))
+    assert (covered["coverage"].sel(noise=["coloured", "biased"]) < covered["low"].sel(noise="white")).all()
+    # Without 10 % of the samples the errors are about 5 % larger, and the intervals too.
+    assert float(covered["high"].sel(noise="lossy")) > 0.95
+
+
+def test_scale(study):
+    data = study("scale")
+    efficiency, covered = metrics.efficiency(data), metrics.mean_coverage(data).sel(level=0.95)["coverage"]
+    # Each of eight parameters is within five Monte-Carlo errors of the bound.
+    assert (abs(efficiency["efficiency"] - 1) < 5 / np.sqrt(2 * 128)).all()
+    assert (abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 128)).all()
+
+
+def test_frontier(run):
+    frontier = shared.load_results(run("frontier"))["frontier"].squeeze()
+    # The published gyroscopic terms are far below any sensor's noise, the corrected ones are not.
+    gyroscopic = frontier.sel(parameter="alpha2", excitation="multisine")
+    assert float(gyroscopic.sel(model="published")) < 1e-4 < 1 < float(gyroscopic.sel(model="corrected"))
+    # A doublet moves one axis at a time, so products of rates are not excited. alpha7 is 0.
+    assert frontier.sel(excitation="doublet", parameter="alpha1").isnull().all()
+    assert (frontier.sel(parameter="alpha7") == 0).all()
+
+
+def test_rollout_budget(run):
+    data = shared.load_results(
+        run("rollout_budget", limits=[1, 10], names=["IBSS, whitened", "output error"])
+    ).squeeze()
+    reached, (few, enough) = load("rollout_budget", "plot").accuracy(data), data["rollouts"].mean("flight").T
+    assert (enough >= few).all()
+    # One sweep, or one step, of each stage is nearly as good as the complete search: the rates are nearly linear.
+    assert (reached.isel(limit=0) < 1.2).all()
+    assert (few < 0.7 * enough).all()
+    # Both minimise the same cost.
+    np.testing.assert_allclose(reached.isel(limit=1), 1, atol=0.2)
+
+
+def test_published_corrected(run):
+    data = shared.load_results(run("published_corrected")).squeeze()
+    rms, rejected = (data["error"] ** 2).mean("flight") ** 0.5, (data["white_p"] < 0.01).mean("flight")
+    # Each model is at the bound on its own flights, and the residuals are noise.
+    for which in ({"flown": model, "fitted": model} for model in ("published", "corrected")):
+        assert data["answered"].sel(which).all()
+        np.testing.assert_allclose(rms.sel(which), 1, atol=0.6)
+        assert float(rejected.sel(which)) < 0.2
+    # The published model lacks a term of the corrected one, and its residuals show it.
+    alien = {"flown": "corrected", "fitted": "published"}
+    assert float(rms.sel(alien).min()) > 2
+    assert float(rejected.sel(alien)) == 1
+    # With alpha2 = alpha5 = 0 the corrected model equals the published one: only these two estimates are wrong.
+    alien = {"flown": "published", "fitted": "corrected"}
+    assert float(rejected.sel(alien)) < 0.2
+    assert (rms.sel(alien).sel(parameter=["alpha2", "alpha5"]) > 10).all()
+    assert (rms.sel(alien).drop_sel(parameter=["alpha2", "alpha5"]) < 2).all()
+
+
+def test_inverse_crime(run):
+    out, bias = run("inverse_crime", fit_methods=["euler", "rk4"], dts=[0.01]), load("inverse_crime", "plot").bias
+    euler, rk4 = (bias(read_results(out / f"{fit} 0.01 s")).squeeze() for fit in ("euler", "rk4"))
+    assert float(euler.sel({"method": "rk4"})) > 8 * float(euler.sel({"method": "euler"}))
+    assert float(rk4.sel({"method": "rk4"})) < float(euler.sel({"method": "rk4"})) / 8
+
+
+def test_bracket_and_seeds(run):
+    data = read_results(run("bracket_and_seeds", seeds=[0]) / "seed 0").squeeze()
+    rollouts, accuracy = metrics.mean_rollouts(data), metrics.accuracy(data)
+    assert float(rollouts.sel(estimator="ibss", width=2.0)) > float(rollouts.sel(estimator="ibss", width=0.5))
+    assert (rollouts.sel(estimator="hybrid") < rollouts.sel(estimator="ibss")).all()
+    np.testing.assert_allclose(accuracy.sel(estimator="hybrid"), accuracy.sel(estimator="ibss"), rtol=0.05)
+    # The rates are nearly linear in the parameters: the network loses little, and less in a narrower bracket.
+    network = accuracy.sel(estimator="network")
+    assert float(network.sel(width=0.5)) < min(1.5, float(network.sel(width=2.0)))
+
+
+# Experiments that are scripts.
+
+
+def test_efficiency(report_of):
     case = "published, rates"
-    row = report_of("efficiency", tmp_path, flights=48, seed=0, scale=1.0, cases=[case])["cases"][case]
+    row = report_of("efficiency", flights=48, seed=0, scale=1.0, cases=[case])["cases"][case]
     assert row["results"] == {"successful": 48}
     # Within four Monte-Carlo standard errors of the bound, on each of the eight parameters.
     assert np.all(np.abs(np.array(row["efficiency"]) - 1) < 4 * row["monte_carlo_error"])
@@ -19,17 +202,16 @@ def test_efficiency(tmp_path):
     assert abs(row["covered"] - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 48)
 
 
-@pytest.mark.usefixtures("quickly_compiled")
-def test_speed(tmp_path):
+def test_speed(report_of):
     sizes = {"batch": 64, "steps": 40, "flights": [2], "repeats": 2}
-    report = report_of("speed", tmp_path, **sizes, channels=["rates"], methods=["euler", "rk4"])
+    report = report_of("speed", **sizes, channels=["rates"], methods=["euler"])
     assert report["provenance"]["precision"] == "float64"
     assert all(row["rate"] > 0 and row["min_seconds"] <= row["median_seconds"] for row in report["rows"])
 
 
-def test_networks(tmp_path):
+def test_networks(report_of):
     cases = {"cases": ["standard"], "networks": ["score, mlp"], "noises": [1.0], "channels": "rates", "separate": False}
-    report = report_of("networks", tmp_path, flights=100, seed=7, steps=100, many=100, **cases)
+    report = report_of("networks", flights=100, seed=7, steps=100, many=100, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
     assert report["one_call"]["flights"] == 100
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
@@ -40,9 +222,9 @@ def test_networks(tmp_path):
     assert rows["hybrid"]["hit_rate"] > 0.9
 
 
-def test_baselines(tmp_path):
+def test_baselines(report_of):
     cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
-    rows = report_of("baselines", tmp_path, flights=100, seed=5, channels="rates", **cases)["rows"]
+    rows = report_of("baselines", flights=100, seed=5, channels="rates", **cases)["rows"]
     exact, noisy = rows[:2], rows[2:]
     assert all(row["answers"] == 100 for row in rows)
     assert all(max(row["efficiency"]) < 1e-6 for row in exact)
@@ -51,9 +233,9 @@ def test_baselines(tmp_path):
     assert max(noisy[0]["efficiency"]) < 1.6 + 8 * noisy[0]["monte_carlo_error"]
 
 
-def test_coverage(tmp_path):
+def test_coverage(report_of):
     cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
-    rows = report_of("coverage", tmp_path, flights=100, seed=11, scales=[1.0], steps=100, **cases)["rows"]
+    rows = report_of("coverage", flights=100, seed=11, scales=[1.0], steps=100, **cases)["rows"]
     assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
         assert row["results"] == {"successful": 100}
@@ -62,9 +244,9 @@ def test_coverage(tmp_path):
         assert np.all(np.abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 100))
 
 
-def test_dirty_flights(tmp_path):
-    report = report_of("dirty_flights", tmp_path, flights=2, duration=6.0, seed=17, airframes=["os4"])
-    plot("dirty_flights", tmp_path / "out.json", tmp_path / "figures")
+def test_dirty_flights(report_of, plot):
+    report = report_of("dirty_flights", flights=2, duration=6.0, seed=17, airframes=["os4"])
+    plot("dirty_flights")
     found = report["airframes"]["os4"]
     assert {flight["result"] for flight in found["flights"]} == {"successful"}
     assert max(flight["fastest"] for flight in found["flights"]) < 5
@@ -76,112 +258,12 @@ def test_dirty_flights(tmp_path):
     assert abs(found["summary"]["rotor_delay"]["mean_error"]) < 2e-3
 
 
-@pytest.mark.usefixtures("quickly_compiled")
-def test_long_flight(tmp_path):
+def test_long_flight(report_of):
     """Windows follow a drift that one shot cannot."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
-    one, many = report_of("long_flight", tmp_path, flights=2, seed=3, steps=100, **cases)["rows"]
+    one, many = report_of("long_flight", flights=2, seed=3, steps=100, **cases)["rows"]
     assert many["results"] == {"successful": 2}
     assert max(many["percent"]) < 5
     assert max(many["percent"][place] for place in (1, 3, 4)) < 2  # the gains of the torques
     # One shot ends at the bounds, and its result says so.
     assert one["results"] == {"at_bound": 2}
-
-
-@pytest.mark.usefixtures("quickly_compiled")
-def test_real_flight(shared_flights, tmp_path):
-    out = tmp_path / "out.json"
-    cases = {"names": ["rollpitch"], "estimators": ["filter-error"], "end": 12.0}
-    load("real_flight").main(flights=shared_flights, out=out, **cases)
-    plot("real_flight", out, tmp_path / "figures")
-    (row,) = json.loads(out.read_text())["estimators"]["filter-error"]["flights"].values()
-    assert all(0.8e-5 < row["constants"][name]["estimate"] < 2.2e-5 for name in ("Ix", "Iy"))
-    assert all(value > 0 for value, _ in row["ahead"].values())
-
-
-def test_flights_that_disagree_are_found():
-    rows = {name: {"constants": {"Ix": {"estimate": x, "std": 3.0}}} for name, x in (("one", 1.0), ("two", 11.0))}
-    rows |= {"three": {"constants": {}}}
-    found = load("real_flight").disagreements(rows)
-    assert found == {"Ix": {"one, two": pytest.approx(10 / np.sqrt(18))}}
-
-
-def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
-    monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
-    with pytest.raises(SystemExit, match="--flights: no flights in None: give"):
-        load("real_flight").main(out=tmp_path / "out")
-    with pytest.raises(SystemExit, match="--flights: no arpl_crazyflie_rollpitch.csv in"):
-        load("real_flight").main(flights=tmp_path, out=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.usefixtures("quickly_compiled")
-def test_closed_loop(tmp_path, monkeypatch):
-    def load_with_small_chunks(name, script="run"):
-        module = load(name, script)
-        module.CHUNK = 3  # two calls of each estimator, the second of them padded
-        return module
-
-    monkeypatch.setattr("small_experiments.load", load_with_small_chunks)
-    cases = {
-        "flights": 4,
-        "gusts": [10.0],
-        "duration": 6.0,
-        "seed": 16,
-        "estimators": ["equation-error", "output-error"],
-    }
-    report = report_of("closed_loop", tmp_path, **cases)
-    plot("closed_loop", tmp_path / "out.json", tmp_path / "figures")
-    assert [len(case["flights"]) for case in report["cases"]] == [4, 4]
-    # A controller that answers gusts makes both biased by tens of percent, and their intervals do not know it.
-    for row in (row for case in report["cases"] for row in case["summary"].values()):
-        assert row["bias"] > 0.2
-        assert row["covered"] == 0
-    # An interrupted study is continued: the flights that are there are not identified again.
-    assert report_of("closed_loop", tmp_path, **cases) == report
-    with pytest.raises(SystemExit, match="other settings"):
-        report_of("closed_loop", tmp_path, **{**cases, "seed": 17})
-
-
-@pytest.mark.usefixtures("quickly_compiled")
-def test_benchmarks(tmp_path, monkeypatch):
-    for name, value in how_we_compile().items():
-        monkeypatch.setenv(name, value)
-    fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
-    sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
-    growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}
-    report = report_of(
-        "benchmarks", tmp_path, **sizes, contenders=fits, shooters=shots, **growth, network_steps=0, simulations=0
-    )
-    rows = report["fits"]["known"]
-    # Both reach the same optimum, and are timed in turns.
-    assert {name: row["reached"] for name, row in rows.items()} == dict.fromkeys(fits, 1.0)
-    assert all(len(row["laps"]) == 2 and row["min_seconds"] <= row["median_seconds"] for row in rows.values())
-    assert all(row["peak_mib"] > 10 for row in rows.values())
-    assert report["shots"]["jaxos4"]["steps_per_second"] > 0
-    assert 0 < report["roofline"]["share"] < 1
-    plot("benchmarks", tmp_path / "out.json", tmp_path / "figures")
-
-
-def test_a_benchmark_skips_who_is_missing_or_fails():
-    run = load("benchmarks")
-    case = run.make_case(1, 50)
-    failing = run.Contender("scipy_fit:levenberg_marquardt", alone=True, options={"unknown": 1})
-    absent = run.Contender("scipy_fit:levenberg_marquardt", "no_such_package")
-    skipped = []
-    assert run.line_up({"failing": failing, "absent": absent}, case, 1, skipped) == {}
-    assert "failing: failed: TypeError" in skipped[0]
-    assert skipped[1] == "absent: no_such_package is not installed: pip install no_such_package"
-
-
-def test_a_benchmark_times_only_who_reaches_the_least_cost():
-    run = load("benchmarks")
-    case = run.make_case(2, 50)
-    truth, first = np.tile(case.truth, (2, 1)), np.zeros((2, 12))
-    answers = {
-        "both": {"parameters": truth, "first": first},
-        "one of both": {"parameters": np.stack([truth[0], case.starts[1]]), "first": first},
-        "only the first": {"parameters": truth[:1], "first": first[:1]},
-        "diverged": {"parameters": 1e3 * truth, "first": first},
-    }
-    assert list(run.reached(case, answers).values()) == [1.0, 0.5, 1.0, 0.0]

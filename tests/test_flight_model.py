@@ -230,15 +230,6 @@ def test_a_measured_input_acts_in_its_own_step(measured, channels):
     np.testing.assert_allclose(moved[8], expected, rtol=1e-9, atol=1e-15)
 
 
-def test_gaps_of_a_measured_force_are_filled_with_the_value_before_or_after():
-    gaps = np.random.default_rng(0).normal(size=(51, 3))
-    filled = gaps.copy()
-    gaps[10:14, 0], gaps[:3, 1] = np.nan, np.nan
-    filled[10:14, 0], filled[:3, 1] = gaps[9, 0], gaps[3, 1]
-    found = [rates_with("flapping", "specific_force", force, "rates") for force in (gaps, filled)]
-    np.testing.assert_array_equal(*found)
-
-
 SUBSETS = [
     (),
     *((term,) for term in ALL),
@@ -270,32 +261,6 @@ def test_every_parameter_has_a_name_a_unit_and_a_bracket(recordings):
     assert jaxos4.FlightModel(terms=("lag", "offset")).parameter_names[8:] == (*NAMES["offset"], "rotor_lag")
     two = jaxos4.FlightModel(terms=("offset",), recordings=(0, 1)).parameter_names[8:]
     assert two == tuple(f"{name}_{i}" for i in (1, 2) for name in NAMES["offset"])
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"terms": ("motor",)}, "max_rotor_speed"),
-        ({"terms": ("motor", "lag")}, "leave out lag"),
-        ({"terms": ("voltage",)}, "`battery_voltage` must be given for the term voltage"),
-        ({"terms": ("wind",)}, "`terms` must be some of offset, center_of_mass, damping"),
-        ({"terms": ("lag", "lag")}, "`terms` must be some of"),
-        ({"terms": ("lag", "Lag")}, "`terms` must be some of"),
-        *(({"recordings": some}, "`recordings` must count from 0") for some in ((), (1,), (0, 2), (-1, 0))),
-        ({"terms": ("velocity",)}, "velocity, drag need `Flight.body_vel"),
-        ({"terms": ("flapping",)}, "need `Flight.specific_force"),
-        ({"terms": ("voltage",), "battery_voltage": VOLTS}, "voltage need `Flight.voltage`"),
-    ],
-)
-def test_impossible_models_and_missing_measurements_are_named(settings, said):
-    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan))
-
-    def cost():
-        model = jaxos4.FlightModel(**settings)
-        return jaxos4.ShootingProblem(model, flight, sigma=np.ones(12), channels="rates").cost(truth(model))
-
-    with pytest.raises(ValueError, match=said):
-        cost()
 
 
 def brake(total, values, rates, forcing):

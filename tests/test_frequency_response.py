@@ -141,20 +141,6 @@ def test_a_response_that_comes_late_has_a_negative_phase(flown):
     assert axis.phase[at] == pytest.approx(expected, abs=0.1)
 
 
-def test_in_closed_loop_low_frequencies_are_biased():
-    """y' = u + d and u = -K y: below K, the response is the controller's, -s/K, and not the vehicle's, 1."""
-    rng, gain, samples = np.random.default_rng(3), 2 * math.pi * 8, 200 * LENGTH
-    disturbance, rate, u = rng.normal(size=samples), np.zeros(samples + 1), np.zeros(samples)
-    for k in range(samples):
-        u[k] = -gain * rate[k] + rng.normal(0, 0.1)
-        rate[k + 1] = rate[k] + DT * (u[k] + disturbance[k])
-    found = response(u, np.diff(rate) / DT, begins(samples), LENGTH, DT)
-    at = np.argmin(np.abs(found.frequency - 3))
-    assert found.clear[at]
-    assert found.gain[at] == pytest.approx(3 / 8, rel=0.05)
-    assert found.phase[at] == pytest.approx(-math.pi / 2, abs=0.1)
-
-
 def test_gaps_and_stretches_are_not_crossed(flown):
     """Gaps and ends of stretches take segments away; rubbish beside them changes nothing else."""
     problem, values = flown

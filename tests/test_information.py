@@ -1,9 +1,13 @@
+"""Information and its inverse, and the constants of a rigid body: fitted to alphas, and estimated instead of them."""
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import noisy_states, numpy_jacobian, standard_problem
+import scipy.optimize
+import scipy.stats
+from helpers import numpy_jacobian, standard_problem
 
 import jaxos4
 from jaxos4 import linalg
@@ -11,10 +15,7 @@ from jaxos4.models.state import CHANNELS
 
 # Each as one program.
 invert = jax.jit(linalg.invert)
-joint_factor, covariance_of_shared = (
-    jax.jit(function, static_argnums=1) for function in (linalg.joint_factor, linalg.covariance_of_shared)
-)
-every_channels = pytest.mark.parametrize("channels", CHANNELS)
+joint_factor = jax.jit(linalg.joint_factor, static_argnums=1)
 
 # Standard flight, known initial state: standard deviations in % of alpha (alpha2, 5 and 7: absolute x 100).
 PRINTED = {
@@ -29,7 +30,7 @@ def percent(bound):
     return 100 * np.sqrt(np.diagonal(bound)) / np.where(np.abs(alpha) > 1e-6, np.abs(alpha), 1)
 
 
-@every_channels
+@pytest.mark.parametrize("channels", CHANNELS)
 def test_the_standard_flights_bounds_are_the_known_figures(channels):
     bound = jaxos4.cramer_rao_bound(standard_problem(channels=channels), jaxos4.PublishedOS4().alpha)
     figures = percent(bound)
@@ -37,8 +38,10 @@ def test_the_standard_flights_bounds_are_the_known_figures(channels):
     assert rounded == list(PRINTED[channels])
 
 
-@pytest.mark.parametrize("model_class", [jaxos4.PublishedOS4, jaxos4.CorrectedOS4])
-@every_channels
+@pytest.mark.parametrize(
+    ("model_class", "channels"),
+    [(jaxos4.PublishedOS4, "attitude"), (jaxos4.CorrectedOS4, "rates"), (jaxos4.CorrectedOS4, "all")],
+)
 def test_information_is_the_jacobians_square(model_class, channels):
     """A free initial state is eliminated: the bound is a corner of the inverse of the joint information."""
     alpha = model_class().alpha
@@ -65,13 +68,6 @@ def test_twice_the_noise_is_twice_the_bound_and_lost_samples_cost():
     np.testing.assert_allclose(ratio, 2, rtol=0.05)
 
 
-def test_the_information_does_not_depend_on_what_was_measured():
-    alpha = jaxos4.PublishedOS4().alpha
-    exact = jaxos4.fisher_information(standard_problem(channels="rates"), alpha)
-    noisy = jaxos4.fisher_information(standard_problem(channels="rates", states=noisy_states(1)[0]), alpha)
-    np.testing.assert_allclose(exact, noisy, rtol=1e-12)
-
-
 # The inverse.
 
 
@@ -92,17 +88,6 @@ def test_inverts_whatever_the_units(condition):
     np.testing.assert_allclose(unit, np.eye(8), atol=1e-14 * 8 * condition)
 
 
-@pytest.mark.parametrize("lost", [[3], [0, 7], list(range(8))])
-def test_an_unknown_without_information_gets_a_huge_and_finite_variance(lost):
-    information = np.asarray(random_information(8, 10.0)).copy()
-    expected = np.linalg.inv(np.delete(np.delete(information, lost, 0), lost, 1))
-    information[lost, :] = information[:, lost] = 0
-    inverse = np.asarray(invert(jnp.asarray(information)))
-    assert np.isfinite(inverse).all()
-    assert (np.diagonal(inverse)[lost] > 1e12).all()
-    np.testing.assert_allclose(np.delete(np.delete(inverse, lost, 0), lost, 1), expected, rtol=1e-9)
-
-
 def test_a_combination_without_information_gets_a_huge_and_finite_variance():
     slopes = np.random.default_rng(0).normal(size=(100, 4))
     slopes[:, 3] = slopes[:, 0] - slopes[:, 1]
@@ -111,19 +96,6 @@ def test_a_combination_without_information_gets_a_huge_and_finite_variance():
     assert np.isfinite(inverse).all()
     assert (variance[[0, 1, 3]] > 1e10).all()
     assert variance[2] == pytest.approx(1 / 100, rel=0.5)
-
-
-def test_a_marginal_is_the_inverses_corner():
-    joint = random_information(11, 1e3)
-    expected = np.linalg.inv(joint)[:8, :8]
-    scale = np.sqrt(np.diagonal(expected))
-    covariance = covariance_of_shared(joint[None], 8)
-    np.testing.assert_allclose(covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-10)
-    factor = np.asarray(joint_factor(joint[None], 8).factor)[0, :8, -8:]
-    np.testing.assert_array_equal(factor, np.tril(factor))
-    np.testing.assert_allclose(
-        (factor @ factor.T) * np.outer(scale, scale) @ (expected / np.outer(scale, scale)), np.eye(8), atol=1e-9
-    )
 
 
 def arrow(blocks, count):
@@ -154,3 +126,89 @@ def test_block_elimination_is_the_inverse_of_the_whole(windows):
         np.testing.assert_allclose(found[w] / own, inverse[np.ix_(places, places)] / own, atol=1e-9)
     identity = np.broadcast_to(np.eye(11), basis.shape)
     np.testing.assert_allclose(np.swapaxes(basis, 1, 2) @ factor, identity, atol=1e-9)
+
+
+MODELS = (jaxos4.PublishedOS4, jaxos4.CorrectedOS4)
+
+
+def constants(airframe=jaxos4.OS4):
+    """Ix, Iy, Iz, J_R."""
+    return np.append(np.asarray(airframe.inertia), airframe.rotor_inertia)
+
+
+def bound_of(model_class, channels="all"):
+    """The covariance of an efficient estimate of the standard flight."""
+    return jaxos4.cramer_rao_bound(standard_problem(model_class, channels), model_class(jaxos4.OS4).alpha)
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+@pytest.mark.parametrize("airframe", [jaxos4.OS4, jaxos4.OS4_SIMULATOR, jaxos4.VOOS])
+def test_exact_alphas_give_exact_constants(model_class, airframe):
+    model = model_class(airframe)
+    fit = jaxos4.fit_inertia(model, model.alpha, bound_of(model_class))
+    np.testing.assert_allclose(fit.constants[:3], constants(airframe)[:3], rtol=1e-9)
+    assert np.all(np.abs(fit.constants - constants(airframe)) < 1e-6 * fit.std)
+    assert fit.mismatch < 1e-9
+    assert fit.is_rigid_body
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+def test_it_is_the_weighted_least_squares_that_another_minimiser_finds(model_class):
+    model, covariance = model_class(jaxos4.OS4), np.asarray(bound_of(model_class))
+    alpha = np.random.default_rng(0).multivariate_normal(model.alpha, covariance)
+    fit = jaxos4.fit_inertia(model, jnp.asarray(alpha), jnp.asarray(covariance))
+    whiten, factor = np.linalg.inv(np.linalg.cholesky(covariance)), float(model.gyroscopic_factor)
+
+    def residuals(u):
+        ix, iy, iz, rotor = u * constants()
+        g = rotor * factor
+        own = [(iy - iz) / ix, g / ix, 1 / ix, (iz - ix) / iy, g / iy, 1 / iy, (ix - iy) / iz, 1 / iz]
+        return whiten @ (alpha - own)
+
+    best = scipy.optimize.least_squares(residuals, np.ones(4), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert np.abs((fit.constants - best.x * constants()) / fit.std).max() < 1e-4
+    spread = np.linalg.inv(best.jac.T @ best.jac) * np.outer(constants(), constants())
+    np.testing.assert_allclose(fit.std, np.sqrt(np.diagonal(spread)), rtol=1e-3)
+    # The weights matter: an unweighted fit gives another answer.
+    plain = jaxos4.fit_inertia(model, jnp.asarray(alpha), jnp.diag(jnp.square(model.half_width)))
+    assert np.abs((fit.constants - plain.constants) / fit.std).max() > 0.3
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_intervals_hold_the_truth_and_the_mismatch_is_chi_squared(scale):
+    model, draws = jaxos4.CorrectedOS4(), 4000
+    covariance = scale**2 * np.asarray(bound_of(jaxos4.CorrectedOS4))
+    alphas = np.random.default_rng(1).multivariate_normal(model.alpha, covariance, size=draws)
+    fit = jaxos4.fit_inertia(model, alphas, covariance)
+    held = (np.abs(fit.constants - constants()) < 1.96 * fit.std).mean(axis=0)
+    assert np.all(np.abs(held - 0.95) < 4 * np.sqrt(0.95 * 0.05 / draws))
+    assert scipy.stats.kstest(fit.p_value, "uniform").pvalue > 1e-3
+    np.testing.assert_allclose(fit.p_value, scipy.stats.chi2.sf(fit.mismatch, 4), rtol=1e-6, atol=1e-12)
+
+
+def test_alphas_of_no_rigid_body_are_seen():
+    model, covariance = jaxos4.CorrectedOS4(), bound_of(jaxos4.CorrectedOS4)
+    std = np.sqrt(np.diagonal(covariance))
+    odd = jaxos4.fit_inertia(model, model.alpha.at[0].add(10 * std[0]), covariance)
+    assert odd.p_value < 1e-3
+    flat = jaxos4.alpha_from_inertia(np.array([0.005, 0.005, 0.013]), 6e-5)
+    fit = jaxos4.fit_inertia(model, flat, covariance)
+    assert fit.p_value > 0.99
+    assert not fit.is_rigid_body
+    assert fit.triangle[2] == pytest.approx(-0.003)
+
+
+@pytest.mark.parametrize("model_class", MODELS)
+def test_alphas_far_from_the_airframe_or_without_an_error_give_a_fit_or_say_that_there_is_none(model_class):
+    model, covariance = model_class(jaxos4.OS4), bound_of(model_class)
+    for alpha in (model.alpha.at[2].set(0.0), jnp.full(8, jnp.nan), -model.alpha):
+        fit = jaxos4.fit_inertia(model, alpha, covariance)
+        assert np.isfinite(fit.constants).all()
+        assert fit.p_value < 1e-6
+    for spread in (jnp.full((8, 8), jnp.inf), jnp.full((8, 8), jnp.nan)):
+        fit = jaxos4.fit_inertia(model, model.alpha, spread)
+        np.testing.assert_allclose(fit.constants, constants())
+        assert np.isposinf(fit.std).all()
+        assert fit.p_value == 0
+    with pytest.raises(ValueError, match=r"shapes \(8,\), \(8, 8\), got \(4,\)"):
+        jaxos4.fit_inertia(model, model.alpha[:4], covariance[:4, :4])

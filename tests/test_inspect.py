@@ -5,12 +5,10 @@ import json
 import numpy as np
 import pytest
 from helpers import refused
-from recorded_logs import VEHICLE, blackbox_csv, crazyflie
+from recorded_logs import VEHICLE, blackbox_csv
 from test_logs_blackbox import T as BLACKBOX_TIME, recorded
 from test_logs_crazyflie import one_event
 from test_logs_ulog import everything
-
-import jaxos4
 
 LOGS = {
     "ULog": everything(),
@@ -57,29 +55,8 @@ def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
     assert "usable" in out
 
 
-# The mistakes of each format: `test_logs_readers.py`.
-BAD = {
-    "missing": (None, "there is no such file"),
-    "empty": (b"", "is empty"),
-    "ulog": (LOGS["ULog"][:14], "Header too short"),
-    "nothing flown": (crazyflie([("e", ["a.b(f)"], [0.0, 1.0], np.zeros((2, 1)))]), "no body rates"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_what_cannot_be_used_exits_with_2_and_one_line(name, run, tmp_path):
-    content, words = BAD[name]
-    if content is not None:
-        (tmp_path / "log").write_bytes(content)
-    refused(run("inspect", "log"), "jaxos4: log: ", words)
-
-
 def test_an_output_that_would_overwrite_the_log_is_refused(run, tmp_path):
     (tmp_path / "log").write_bytes(LOGS["Crazyflie"])
     refused(run("inspect", "log", "--out", "log"), "would overwrite an input")
     assert (tmp_path / "log").read_bytes() == LOGS["Crazyflie"]
     refused(run("inspect", "log", "--airframe", "nothing.toml"), "nothing.toml")
-
-
-def test_the_version_is_shown(run):
-    assert run("--version") == (0, f"jaxos4 {jaxos4.__version__}\n", "")

@@ -18,7 +18,6 @@ from jaxos4.recording import Recording
 from jaxos4.recording.pieces import averaged, cut
 from jaxos4.recording.reading import as_recording
 from jaxos4.recording.usable import Stretch
-from jaxos4.shooting.padding import padded
 
 
 def stretch(samples, seed, *, force=False, velocity=False, voltage=False, dt=0.01, start=0.0):
@@ -93,16 +92,6 @@ def test_voltage_is_averaged_and_cut_with_the_samples():
     np.testing.assert_array_equal(part.voltage, flight.voltage[100:201])
 
 
-def test_padding_repeats_the_last_voltage():
-    flight = stretch(50, 0, voltage=True)
-    problem = jaxos4.ShootingProblem(jaxos4.CorrectedOS4(), flight, sigma=jaxos4.SENSOR_SIGMA, channels="rates")
-    longer = padded(problem).flight
-    assert longer.voltage is not None
-    assert longer.voltage.shape == longer.time.shape
-    np.testing.assert_array_equal(longer.voltage[:50], flight.voltage)
-    np.testing.assert_array_equal(longer.voltage[50:], flight.voltage[-1])
-
-
 def test_the_cost_of_joined_flights_is_the_sum_of_theirs():
     model = jaxos4.FlightModel(terms=("lag", "delay", "offset"))
     omega = jaxos4.multisine(jaxos4.OS4, duration=0.6)
@@ -126,13 +115,6 @@ def test_the_cost_of_joined_flights_is_the_sum_of_theirs():
     ]
     parameters = model.alpha.at[8:].add(jnp.array([0.1, 0.0, -0.1, 0.01, 0.013]))
     assert float(together.cost(parameters)) == pytest.approx(sum(float(p.cost(parameters)) for p in each), rel=1e-12)
-
-
-def test_flights_of_other_sample_times_are_refused():
-    with pytest.raises(ValueError, match=r"`flights` must have one sample time, got 0.01, 0.02 s"):
-        jaxos4.join([stretch(30, 0), stretch(30, 1, dt=0.02)], length=10)
-    with pytest.raises(ValueError, match="`flights` must hold at least `length` = 40 samples"):
-        jaxos4.join([], length=40)
 
 
 def rows(samples, ratio, seed, *, lost=0.0):
@@ -169,15 +151,6 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     expected = averaged_slowly(t, channels, grid, dt)
     np.testing.assert_array_equal(np.isfinite(found), np.isfinite(expected))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def test_vibration_above_the_new_rate_does_not_fold_down():
-    t = 0.001 * np.arange(4001)
-    y = np.sin(2 * np.pi * 250.0 * t + 0.3)[:, None]
-    found = average(t, np.full((t.size, 4), 200.0), y, 0.004)[2]
-    assert np.abs(found[1:-1]).max() < 1e-9
-    taken = y[::4]
-    assert np.abs(taken).max() > 0.25
 
 
 def test_gaps_are_filled_from_their_own_stretch():

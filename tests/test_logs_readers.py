@@ -116,13 +116,6 @@ def write(path, lines, end="\n"):
     path.write_bytes(end.join(map(",".join, lines)).encode("utf-8", "surrogatepass"))
 
 
-@given(lines=flights())
-@settings(max_examples=100)
-def test_dropped_rows_never_refuse_a_flight(lines, path):
-    write(path, lines)
-    assert isinstance(outcome(read, path), Flight)
-
-
 @given(lines=flights(), data=st.data(), end=st.sampled_from(["\n", "\r\n", "\r"]))
 @settings(max_examples=400)
 def test_good_flights_after_accidents(lines, data, end, path):

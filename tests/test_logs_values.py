@@ -143,6 +143,17 @@ def test_motors_that_are_held_one_after_the_other_or_with_empty_cells(tmp_path, 
     assert repeating(tmp_path, 25, **kind).facts.motors.rate == pytest.approx(10.0, rel=0.05)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_commands_that_change_now_and_then_are_no_rate(save, seed):
+    """A 3-2-1-1, say."""
+    rng = np.random.default_rng(seed)
+    commands = 0.4 + 0.2 * rng.uniform(size=(200, 4))[np.cumsum(rng.uniform(size=ROWS) < 0.05)]
+    content = table_csv(["t", *COMMANDS, "p", "q", "r"], 0.004 * np.arange(ROWS), commands, rng.normal(size=(ROWS, 3)))
+    facts = read_recording(save(content), full_scale=1.0).facts
+    assert facts.motors.rate == pytest.approx(250.0, rel=0.01)
+    assert facts.too_slow == ""
+
+
 def slow_ulog(step):
     t = ulog.grid(step, 3.4, offset=-0.2)
     topics = (

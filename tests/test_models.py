@@ -235,19 +235,6 @@ def test_a_shallower_state_gives_the_same_derivative(model):
         np.testing.assert_array_equal(sensors[:size], seen[:size])
 
 
-@every_model
-def test_batches_are_loops_and_trace_once(model):
-    omega = standard_flight().omega[:40]
-    batch = np.linspace(0.9, 1.1, 5)[:, None] * np.asarray(model.alpha)
-
-    @jax.jit
-    @eqx.debug.assert_max_traces(max_traces=1)
-    def fly(parameters):
-        return jaxos4.simulate(model, parameters, omega, dt=0.01).states
-
-    np.testing.assert_allclose(jax.vmap(fly)(batch), [fly(parameters) for parameters in batch], rtol=1e-12, atol=1e-12)
-
-
 @every_os4
 def test_parameters_have_names_units_and_the_thesis_values(model_class):
     model = model_class()

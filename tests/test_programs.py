@@ -88,10 +88,6 @@ def test_windows_and_very_long_flights_are_not_padded():
     problem = standard_problem(channels="rates", free=True)
     windows = jaxos4.ShootingProblem(problem.model, problem.flight, sigma=problem.sigma, channels="rates", windows=5)
     assert padded(windows) is windows
-    with pytest.raises(ValueError, match="`length` must be `None`"):
-        jaxos4.ShootingProblem(
-            problem.model, problem.flight, sigma=problem.sigma, channels="rates", windows=5, length=jax.device_put(7)
-        )
 
 
 @pytest.mark.parametrize("windows", [1, 5])

@@ -1,4 +1,4 @@
-"""`simulate`: orders of convergence, zero-order hold, batches, failures."""
+"""`simulate`: orders of convergence, zero-order hold, batches, failures; and its sine and cosine."""
 
 import equinox as eqx
 import jax
@@ -6,10 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import DT, REFERENCES, standard_flight
+from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 import jaxos4
 from jaxos4.simulation import METHODS
+from jaxos4.trigonometry import sincos
 
 every_method = pytest.mark.parametrize("method", METHODS)
 THETA, Q = jaxos4.STATE_NAMES.index("theta"), jaxos4.STATE_NAMES.index("q")
@@ -126,13 +128,12 @@ def test_loop_and_vmap_agree(method):
     assert name(batched) == [SUCCESS] * LANES
 
 
-@pytest.mark.parametrize("method", ["euler", "rk4"])
-def test_vmaps_over_flights_models_and_sample_times_and_runs_without_jit(method):
+def test_vmaps_over_flights_models_and_sample_times_and_runs_without_jit():
     omega = standard_flight().omega[:4]
 
     def fly(mass, dt, scale):
         model = eqx.tree_at(lambda m: m.airframe.mass, jaxos4.CorrectedOS4(), mass)
-        return jaxos4.simulate(model, model.alpha, scale * omega, dt=dt, method=method).states
+        return jaxos4.simulate(model, model.alpha, scale * omega, dt=dt).states
 
     settings = jnp.array([0.5, 0.7]), jnp.array([0.01, 0.02]), jnp.array([1.0, 0.9])
     batched = eqx.filter_vmap(fly)(*settings)
@@ -168,29 +169,40 @@ def test_a_failing_lane_ends_where_it_fails_and_leaves_its_neighbours_alone(meth
     assert ended[5, 3:].all()
 
 
-@pytest.mark.parametrize(
-    ("said", "change"),
-    [
-        ("parameters", {"parameters": np.zeros(3)}),
-        ("omega", {"omega": np.ones((5, 3))}),
-        ("omega", {"omega": np.ones((1, 5, 4))}),
-        ("initial_state", {"initial_state": np.zeros(6)}),
-        ("dt", {"dt": 0.0}),
-        ("dt", {"dt": float("nan")}),
-        ("dt", {"dt": np.ones(2)}),
-        ("`method` must be one of euler, rk4, diffrax, got 'heun'", {"method": "heun"}),
-    ],
-)
-def test_misuse_names_the_argument(said, change):
-    model = jaxos4.PublishedOS4()
-    good = {"parameters": model.alpha, "omega": np.ones((5, 4)), "dt": 0.01, "initial_state": None}
-    arguments = {key: jnp.asarray(value) if np.ndim(value) else value for key, value in (good | change).items()}
-    with pytest.raises((ValueError, TypeError), match=said):
-        jaxos4.simulate(model, arguments.pop("parameters"), arguments.pop("omega"), **arguments)
+SINGLE, DOUBLE = np.float32, np.float64
 
 
-def test_a_flight_names_the_shapes_that_do_not_fit():
-    with pytest.raises(ValueError, match=r"`time`, `omega` and `states`"):
-        jaxos4.Flight(time=jnp.arange(3.0), omega=jnp.ones((3, 4)), states=jnp.ones((4, 12)))
-    with pytest.raises(ValueError, match="at least two samples"):
-        jaxos4.Flight(time=jnp.arange(1.0), omega=jnp.ones((1, 4)), states=jnp.ones((1, 12)))
+@pytest.mark.parametrize(("dtype", "turns"), [(DOUBLE, 1), (DOUBLE, 1e3), (DOUBLE, 1e5), (SINGLE, 1), (SINGLE, 1e3)])
+def test_agrees_with_the_library_to_about_one_ulp(dtype, turns):
+    rng = np.random.default_rng(0)
+    anywhere = rng.uniform(-turns, turns, 20_000)
+    quarters = np.round(rng.uniform(-4 * turns, 4 * turns, 2_000)) / 4
+    angle = (2 * np.pi * np.concatenate([anywhere, quarters])).astype(dtype)
+    sin, cos = sincos(jnp.asarray(angle))
+    assert sin.dtype == cos.dtype == dtype
+    exact = angle.astype(DOUBLE)
+    eps = np.finfo(dtype).eps
+    np.testing.assert_allclose(sin, np.sin(exact), rtol=0, atol=1.5 * eps)
+    np.testing.assert_allclose(cos, np.cos(exact), rtol=0, atol=1.5 * eps)
+    if dtype == DOUBLE and turns <= 1e3:  # and near the zeros, in their own units
+        np.testing.assert_allclose(sin, np.sin(exact), rtol=3 * eps)
+        np.testing.assert_allclose(cos, np.cos(exact), rtol=3 * eps)
+
+
+def test_nan_and_infinity_give_nan():
+    for value in sincos(jnp.array([jnp.nan, jnp.inf, -jnp.inf])):
+        assert np.isnan(value).all()
+    for value in jax.jvp(lambda x: sincos(x)[0], (jnp.array([jnp.nan, jnp.inf]),), (jnp.ones(2),)):
+        assert np.isnan(value).all()
+
+
+def test_derivatives_of_any_order_and_mode():
+    angle = jnp.array([-4.0, -0.3, 0.0, 0.78, np.pi / 2, 2.5, 100.0])
+    check_grads(lambda x: sincos(jnp.asarray(x)), (angle,), order=3, modes=("fwd", "rev"))
+    np.testing.assert_allclose(jax.vmap(jax.grad(lambda x: sincos(x)[0]))(angle), jnp.cos(angle), atol=1e-15)
+    np.testing.assert_allclose(jax.vmap(jax.grad(lambda x: sincos(x)[1]))(angle), -jnp.sin(angle), atol=1e-15)
+
+
+def test_the_reference_would_catch_a_coarser_one():
+    angle = jnp.linspace(-1, 1, 101)
+    assert np.abs(sincos(angle)[0] - jnp.sin(angle * (1 + 1e-14))).max() > 1.5 * np.finfo(DOUBLE).eps

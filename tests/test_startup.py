@@ -8,13 +8,14 @@ import pathlib
 import shutil
 import subprocess
 import sys
-import warnings
 
 import jax
+import numpy as np
 import pytest
+from jax._src import compiler
 
 import jaxos4
-from jaxos4._xla import NATIVE_LOOPS, NO_OPTIONS, make_loops_native
+from jaxos4._xla import NATIVE_LOOPS, NO_OPTIONS, make_loops_native, quick_jit
 from jaxos4.cli import _jax, _options, train
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
@@ -227,70 +228,48 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
         ({NO_OPTIONS: "1"}, None),
     ],
 )
-def test_the_import_makes_loops_native_and_replaces_no_flag(variables, flags, monkeypatch):
+def test_the_import_makes_loops_native_and_replaces_no_flag(variables, flags, monkeypatch, recwarn):
     for name in ("XLA_FLAGS", NO_OPTIONS):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # JAX has computed in this process
-        make_loops_native()
+    jax.devices()
+    make_loops_native()
     assert os.environ.get("XLA_FLAGS") == flags
+    # JAX has computed in this process, so that a new flag comes too late.
+    assert len(recwarn) == (flags != variables.get("XLA_FLAGS"))
+    assert all("JAX has computed before `import jaxos4`" in str(each.message) for each in recwarn)
 
 
-@pytest.mark.parametrize(
-    ("before", "variables", "warned"),
-    [
-        ("import jax", {}, 0),
-        ("import jax; jax.devices()", {}, 1),
-        ("import jax; jax.devices()", {NO_OPTIONS: "1"}, 0),
-        ("import jax; jax.devices()", {"XLA_FLAGS": NATIVE_LOOPS}, 0),
-    ],
-)
-def test_one_warning_says_that_the_import_comes_too_late(before, variables, warned):
-    code = f"{before}; import jaxos4; from jaxos4 import IBSS, _xla; _xla.make_loops_native()"
-    process = start(code=code, **{"XLA_FLAGS": ""} | variables)
+def test_one_warning_says_that_the_import_comes_too_late():
+    code = "import jax; jax.devices(); import jaxos4; from jaxos4 import IBSS, _xla; _xla.make_loops_native()"
+    process = start(code=code, XLA_FLAGS="")
     assert process.returncode == 0
-    assert process.stderr.count("RuntimeWarning: JAX has computed before `import jaxos4`") == warned
-
-
-# Prints the options of each program that is compiled: the whole key of the cache would be private to JAX.
-QUICKLY = """
-import json, os, sys
-import jax, jax.numpy as jnp, numpy as np
-from jax._src import compiler
-from jaxos4._xla import NATIVE_LOOPS, quick_jit
-
-seen, original = [], compiler.get_compile_options
-def spy(*args, **kwargs):
-    seen.append(bool(kwargs.get("env_options_overrides")))
-    return original(*args, **kwargs)
-compiler.get_compile_options = spy
-
-twice = quick_jit(lambda x, *, scale: 2 * x * scale)
-x, xs = np.ones(3), np.ones((2, 3))
-uses = {
-    "alone": lambda: twice(x, scale=1.0),
-    "jit": lambda: jax.jit(lambda x: twice(x, scale=1.0))(x),
-    "constant": lambda: jax.jit(lambda: twice(x, scale=1.0))(),
-    "vmap": lambda: jax.vmap(lambda x: twice(x, scale=1.0))(xs),
-    "grad": lambda: jax.grad(lambda x: twice(x, scale=1.0).sum())(x),
-    "loop": lambda: jax.lax.scan(lambda c, _: (twice(c, scale=1.0), None), x, None, 1)[0],
-}
-for name, use in uses.items():
-    seen.clear()
-    value = np.asarray(use())
-    assert np.all(value == 2), name
-    print(name, any(seen))
-print(os.environ.get("XLA_FLAGS") in (NATIVE_LOOPS, ""))
-"""
+    assert process.stderr.count("RuntimeWarning: JAX has computed before `import jaxos4`") == 1
 
 
 @pytest.mark.parametrize("off", [False, True])
-def test_only_a_program_that_is_called_alone_is_compiled_quickly_and_no_flag_of_the_process_says_so(off):
-    process = start(code=QUICKLY, XLA_FLAGS="", **{NO_OPTIONS: "1"} if off else {})
-    *programs, untouched = process.stdout.splitlines()
-    assert process.returncode == 0, process.stderr
-    alone = [f"alone {not off}", "jit False", "constant False", "vmap False", "grad False", "loop False"]
-    assert programs == alone
-    assert untouched == "True"
+def test_only_a_program_that_is_called_alone_is_compiled_quickly(off, monkeypatch):
+    """By the options of each program that is compiled: the whole key of the cache would be private to JAX."""
+    quickly, original = [], compiler.get_compile_options
+
+    def spy(*args, **options):
+        quickly.append(bool(options.get("env_options_overrides")))
+        return original(*args, **options)
+
+    monkeypatch.setattr(compiler, "get_compile_options", spy)
+    monkeypatch.setenv(NO_OPTIONS, "1" if off else "")
+    twice, x, before = quick_jit(lambda x, *, scale: 2 * x * scale), np.ones(3), os.environ.get("XLA_FLAGS")
+    uses = {
+        "alone": lambda: twice(x, scale=1.0),
+        "jit": lambda: jax.jit(lambda x: twice(x, scale=1.0))(x),
+        "constant": lambda: jax.jit(lambda: twice(x, scale=1.0))(),
+        "vmap": lambda: jax.vmap(lambda x: twice(x, scale=1.0))(np.ones((2, 3))),
+        "grad": lambda: jax.grad(lambda x: twice(x, scale=1.0).sum())(x),
+        "loop": lambda: jax.lax.scan(lambda c, _: (twice(c, scale=1.0), None), x, None, 1)[0],
+    }
+    for name, use in uses.items():
+        quickly.clear()
+        np.testing.assert_array_equal(use(), np.full_like(use(), 2))
+        assert any(quickly) == (name == "alone" and not off), name
+    assert os.environ.get("XLA_FLAGS") == before

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from jaxos4.errors import InputError
 from jaxos4.flight import Flight
 from jaxos4.recording import Recording, read_recording, stretches
-from jaxos4.recording.motion import excitation, gyro_noise
+from jaxos4.recording.motion import excitation
 from jaxos4.recording.pieces import cut
 from jaxos4.recording.usable import Stretch, nothing_usable, usable_stretches
 
@@ -264,13 +264,6 @@ def test_angles_stand_in_for_rates():
     roll, pitch, _ = excitation(flight, CRAZYFLIE).values()
     assert roll.rate == pytest.approx(1 / np.sqrt(2), rel=0.02)
     assert pitch.verdict == "not measured"
-
-
-def test_noise_is_separated_from_motion():
-    t = 0.002 * np.arange(5000)
-    rate = 3 * np.sin(2 * np.pi * 3 * t) + np.random.default_rng(0).normal(0, 0.05, t.size)
-    assert gyro_noise(rate) == pytest.approx(0.05, rel=0.05)
-    assert np.isnan(gyro_noise(np.full(3, np.nan)))
 
 
 # Real flights

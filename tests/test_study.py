@@ -259,32 +259,6 @@ def test_the_attributes_are_those_of_the_study_and_not_of_the_run(whole, dataset
 # Flights and cells that fail.
 
 
-@pytest.mark.parametrize("poison", [np.nan, np.inf])
-@pytest.mark.parametrize("estimator", ["ibss", "equation-error"])
-def test_a_poisoned_flight_leaves_its_neighbours_alone(tmp_path, monkeypatch, estimator, poison):
-    study = load_study(specification(tmp_path, SPECIFICATION))
-    cell = next(cell for cell in study.cells() if cell.scenario.estimator == estimator)
-    clean = run_cell(study, cell, None)
-
-    fly = cell_module.fly
-
-    def poisoned(*arguments):
-        flights = fly(*arguments)
-        return flights._replace(measured=flights.measured.at[2, 50:].set(poison).at[2, 0].set(poison))
-
-    monkeypatch.setattr(cell_module, "fly", poisoned)
-    found = run_cell(study, cell, None)
-    assert clean.keys() == found.keys()
-    others = [0, 1, 3]
-    for name, value in clean.items():
-        if len(value) == 4:
-            np.testing.assert_array_equal(found[name][others], value[others])
-    if np.isinf(poison):  # NaN are missing samples, which are allowed
-        assert OUTCOMES[found["result"][2]] == "nonfinite_trajectory"
-        assert np.isnan([found["estimate"][2], found["std"][2]]).all()
-    assert not np.array_equal(found["cost"][2], clean["cost"][2])
-
-
 def test_a_diverging_cell_is_counted_and_the_study_ends(run, tmp_path, dataset):
     specification(tmp_path, SPECIFICATION.replace("[1.0, 0.1]", "[1.0, 1e300]"))
     code, out, err = run("study", "spec.toml", "--out", "out")

@@ -1,4 +1,4 @@
-"""`Unknowns`: held parameters keep their values, and the others are estimated as if the values were known."""
+"""`Unknowns`, brackets and results: held parameters keep their values; the others are estimated as if known."""
 
 import equinox as eqx
 import jax
@@ -9,6 +9,7 @@ from helpers import noisy_states, standard_flight, standard_problem
 
 import jaxos4
 from jaxos4 import estimators
+from jaxos4.results import NAMES
 from jaxos4.shooting import InnovationsProblem
 
 HELD = {"alpha2": 0.0079, "alpha7": 0.01}
@@ -59,16 +60,16 @@ def test_information_about_held_unknowns_is_left_out(kind):
     held = free.hold(
         {name: float(value) for name, value in zip(HELD, free.unknowns.center[np.array(PLACES)], strict=True)}
     )
-    stages = [problem.stages(cascade=False) for problem in (free, held)]
-    at = free.join(free.starts[0], free.first_state()[0])
-    whole, part = (each.evaluate(jnp.asarray(0), at) for each in stages)
+    evaluate = eqx.filter_jit(lambda problem, at: problem.stages(cascade=False).evaluate(jnp.asarray(0), at))
+    at = eqx.filter_jit(lambda problem: problem.join(problem.starts[0], problem.first_state()[0]))(free)
+    whole, part = (jax.tree.map(np.asarray, evaluate(problem, at)) for problem in (free, held))
     others = np.delete(np.arange(free.unknowns.count), PLACES)
     np.testing.assert_allclose(part.shot.cost, whole.shot.cost, rtol=1e-12)
     np.testing.assert_allclose(part.gradient[:, others], whole.gradient[:, others], rtol=1e-9)
-    np.testing.assert_array_equal(np.asarray(part.gradient)[:, PLACES], 0)
+    np.testing.assert_array_equal(part.gradient[:, PLACES], 0)
     cross = np.ix_([0], others, others)
-    np.testing.assert_allclose(np.asarray(part.information)[cross], np.asarray(whole.information)[cross], rtol=1e-9)
-    np.testing.assert_array_equal(np.asarray(part.information)[np.ix_([0], PLACES, others)], 0)
+    np.testing.assert_allclose(part.information[cross], whole.information[cross], rtol=1e-9)
+    np.testing.assert_array_equal(part.information[np.ix_([0], PLACES, others)], 0)
 
 
 def test_held_values_are_data():
@@ -97,11 +98,65 @@ def test_a_bracket_moves_free_unknowns_only():
     assert eqx.tree_equal(twice, problem.unknowns)
 
 
-def test_misuse_is_named():
-    problem = noisy_problem()
-    with pytest.raises(ValueError, match="`values`: wind is no unknown; the unknowns are alpha1, "):
-        problem.hold({"alpha1": 0.0, "wind": 1.0})
-    with pytest.raises(ValueError, match="`values` holds every unknown"):
-        problem.hold(dict.fromkeys(problem.unknowns.names, 0.0))
-    with pytest.raises(ValueError, match="`bracket` must hold 8 parameters, got 3"):
-        problem.within(jaxos4.Bracket(np.zeros(3), np.ones(3)))
+ALPHA = jaxos4.PublishedOS4().alpha
+HALF = jaxos4.DEFAULT_HALF_WIDTH
+
+
+def test_a_bracket_reaches_one_half_width_to_each_side():
+    bracket = jaxos4.Bracket.around(ALPHA, HALF)
+    np.testing.assert_array_equal(bracket.lower, ALPHA - HALF)
+    np.testing.assert_array_equal(bracket.upper, ALPHA + HALF)
+    np.testing.assert_allclose(bracket.center, ALPHA, rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(bracket.half_width, HALF, rtol=1e-13)
+
+
+def test_the_default_bracket_is_the_models_own():
+    for airframe in (jaxos4.OS4, jaxos4.VOOS):
+        model = jaxos4.CorrectedOS4(airframe)
+        bracket = jaxos4.Bracket.default(model)
+        np.testing.assert_allclose(bracket.center, model.alpha)
+        np.testing.assert_allclose(bracket.half_width, model.half_width)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [
+        ([0.0, 1.0], [1.0, 1.0]),
+        ([0.0, 2.0], [1.0, 1.0]),
+        ([0.0, jnp.nan], [1.0, 1.0]),
+        ([0.0, 0.0], [1.0, jnp.nan]),
+        ([0.0, 0.0], [1.0, jnp.inf]),
+        ([-jnp.inf, 0.0], [1.0, 1.0]),
+        ([-jnp.inf, -jnp.inf], [jnp.inf, jnp.inf]),
+        ([0.0, jnp.inf], [1.0, jnp.inf]),
+    ],
+)
+def test_says_when_it_is_none(lower, upper):
+    unknowns = jaxos4.Unknowns.of(jaxos4.PublishedOS4())
+    assert bool(unknowns.valid)
+    assert not bool(unknowns.within(jaxos4.Bracket(np.resize(lower, 8), np.resize(upper, 8))).valid)
+
+
+# Results.
+
+
+def test_every_result_has_a_name_and_a_message():
+    assert len(jaxos4.RESULTS) == len(NAMES)
+    for name in NAMES:
+        result = getattr(jaxos4.RESULTS, name)
+        assert jaxos4.result_names(result).tolist() == name
+        assert (jaxos4.RESULTS[result] == "") is (name == "successful")
+
+
+def test_names_a_whole_batch():
+    codes = jnp.array([[0, 1, 2], [2, 1, 0]])
+
+    def result(code):
+        chosen = jaxos4.RESULTS.where(code == 1, jaxos4.RESULTS.at_bound, jaxos4.RESULTS.successful)
+        return jaxos4.RESULTS.where(code == 2, jaxos4.RESULTS.max_sweeps, chosen)
+
+    batch = eqx.filter_vmap(eqx.filter_vmap(result))(codes)
+    assert jaxos4.result_names(batch).tolist() == [
+        ["successful", "at_bound", "max_sweeps"],
+        ["max_sweeps", "at_bound", "successful"],
+    ]

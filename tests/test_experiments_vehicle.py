@@ -1,0 +1,140 @@
+"""The experiments with vehicles and the benchmarks, in small configurations."""
+
+import numpy as np
+import pytest
+from helpers import how_we_compile
+from test_experiments import load, plot, report_of  # noqa: F401
+
+import jaxos4
+
+
+def test_real_flight(shared_flights, report_of, plot):  # noqa: F811
+    cases = {"names": ["rollpitch"], "estimators": ["filter-error"], "end": 12.0}
+    report = report_of("real_flight", flights=shared_flights, **cases)
+    plot("real_flight")
+    (row,) = report["estimators"]["filter-error"]["flights"].values()
+    assert all(0.8e-5 < row["constants"][name]["estimate"] < 2.2e-5 for name in ("Ix", "Iy"))
+    assert all(value > 0 for value, _ in row["ahead"].values())
+
+
+def test_flights_that_disagree_are_found():
+    rows = {name: {"constants": {"Ix": {"estimate": x, "std": 3.0}}} for name, x in (("one", 1.0), ("two", 11.0))}
+    rows |= {"three": {"constants": {}}}
+    found = load("real_flight").disagreements(rows)
+    assert found == {"Ix": {"one, two": pytest.approx(10 / np.sqrt(18))}}
+
+
+def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
+    monkeypatch.delenv("JAXOS4_FLIGHTS", raising=False)
+    with pytest.raises(SystemExit, match="--flights: no flights in None: give"):
+        load("real_flight").main(out=tmp_path / "out")
+    with pytest.raises(SystemExit, match="--flights: no arpl_crazyflie_rollpitch.csv in"):
+        load("real_flight").main(flights=tmp_path, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_closed_loop(report_of, plot, monkeypatch):  # noqa: F811
+    def load_with_small_chunks(name, script="run"):
+        module = load(name, script)
+        module.CHUNK = 2  # two calls of each estimator, the second of them padded
+        return module
+
+    monkeypatch.setattr("test_experiments.load", load_with_small_chunks)
+    cases = {"flights": 3, "gusts": [10.0], "duration": 6.0, "seed": 16}
+    cases |= {"estimators": ["equation-error", "output-error"]}
+    report = report_of("closed_loop", **cases)
+    plot("closed_loop")
+    assert [len(case["flights"]) for case in report["cases"]] == [3, 3]
+    # A controller that answers gusts makes both biased by tens of percent, and their intervals do not know it.
+    for row in (row for case in report["cases"] for row in case["summary"].values()):
+        assert row["bias"] > 0.2
+        assert row["covered"] == 0
+    # An interrupted study is continued: the flights that are there are not identified again.
+    assert report_of("closed_loop", **cases) == report
+    with pytest.raises(SystemExit, match="other settings"):
+        report_of("closed_loop", **{**cases, "seed": 17})
+
+
+def test_effects(report_of, plot):  # noqa: F811
+    """The effects of real flights are flown, identified and drawn."""
+    report = report_of("closed_loop", "effects", flights=1, duration=10.0, effects=["gusts", "clock"])
+    plot("closed_loop", "plot_effects")
+    for case in report["cases"]:
+        assert [row["result"] for row in case["flights"]] == ["successful"]
+        assert abs(case["summary"]["thrust"]["mean"]) < 0.05
+
+
+def test_all_effects_are_drawn_at_random():
+    effects = load("closed_loop", "effects")
+    first, same, other = (effects.effect_of(effects.ALL, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert first == same != other
+    every = [effect._asdict() for effect in effects.EFFECTS.values()]
+    for part in ("air", "sensors", "loop"):
+        sizes = {name: size for effect in every for name, size in effect[part].items()}
+        drawn = getattr(first, part)
+        assert drawn.keys() == sizes.keys()
+        assert all(value is None or abs(value) <= max(sizes[name], 0.02) for name, value in drawn.items())
+
+
+def test_rotorpy(report_of, tmp_path):  # noqa: F811
+    pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
+    cases = {"flights": 1, "kinds": ["calm"], "duration": 8.0, "estimators": ["filter-error"]}
+    report = report_of("rotorpy", recordings=tmp_path / "flights", **cases)
+    (path,) = (tmp_path / "flights").iterdir()
+    flight = jaxos4.read_flight(path)
+    assert np.isfinite(flight.omega).all()
+    # Frames, positions and spins are those of jaxos4: torques of the airframe make the body accelerate.
+    vehicle = load("rotorpy", "flights").VEHICLE
+    rates = np.asarray(flight.states)[:, [7, 9, 11]]
+    change = np.diff(rates[::5], axis=0) / (5 * float(flight.dt))
+    speeds = np.asarray(flight.omega)[: 5 * len(change)].reshape(-1, 5, 4)
+    expected = np.square(speeds).mean(axis=1) @ vehicle.mixer[:3].T / vehicle.inertia
+    for axis in range(3):
+        assert np.corrcoef(change[:, axis], expected[:, axis])[0, 1] > 0.9
+    (case,) = report["cases"]
+    assert [row["result"] for row in case["flights"]] == ["successful"]
+    assert all(abs(case["summary"][name]["mean"]) < 0.05 for name in ("Ix", "Iy", "Iz", "thrust"))
+    # The flights that are there are not flown again, and those that were identified are not identified again.
+    recorded = path.stat().st_mtime_ns
+    assert report_of("rotorpy", recordings=tmp_path / "flights", **cases) == report
+    assert path.stat().st_mtime_ns == recorded
+
+
+# Benchmarks.
+
+
+def test_benchmarks(report_of, plot, monkeypatch):  # noqa: F811
+    for name, value in how_we_compile().items():
+        monkeypatch.setenv(name, value)
+    fits, shots = ["SciPy least_squares", "jaxos4 kalman"], ["jaxos4", "C -O3, one core"]
+    sizes = {"flights": 2, "alone": 1, "repeats": 2, "steps": 500, "starts": ["known"], "seed": 0}
+    growth = {"growing": "kalman", "grow_flights": [], "grow_steps": [], "grow_parameters": []}
+    others = {"contenders": fits, "shooters": shots, "network_steps": 0, "simulations": 0}
+    report = report_of("benchmarks", **sizes, **growth, **others)
+    rows = report["fits"]["known"]
+    # Both reach the same optimum, and are timed in turns.
+    assert {name: row["reached"] for name, row in rows.items()} == dict.fromkeys(fits, 1.0)
+    assert all(len(row["laps"]) == 2 and row["min_seconds"] <= row["median_seconds"] for row in rows.values())
+    assert all(row["peak_mib"] > 10 for row in rows.values())
+    assert report["shots"]["jaxos4"]["steps_per_second"] > 0
+    assert 0 < report["roofline"]["share"] < 1
+    plot("benchmarks")
+
+
+def test_a_benchmark_skips_who_is_missing_or_fails_and_times_only_who_reaches_the_least_cost():
+    run = load("benchmarks")
+    case = run.make_case(2, 50)
+    failing = run.Contender("scipy_fit:levenberg_marquardt", alone=True, options={"unknown": 1})
+    absent = run.Contender("scipy_fit:levenberg_marquardt", "no_such_package")
+    skipped = []
+    assert run.line_up({"failing": failing, "absent": absent}, case, 1, skipped) == {}
+    assert "failing: failed: TypeError" in skipped[0]
+    assert skipped[1] == "absent: no_such_package is not installed: pip install no_such_package"
+    truth, first = np.tile(case.truth, (2, 1)), np.zeros((2, 12))
+    answers = {
+        "both": {"parameters": truth, "first": first},
+        "one of both": {"parameters": np.stack([truth[0], case.starts[1]]), "first": first},
+        "only the first": {"parameters": truth[:1], "first": first[:1]},
+        "diverged": {"parameters": 1e3 * truth, "first": first},
+    }
+    assert list(run.reached(case, answers).values()) == [1.0, 0.5, 1.0, 0.0]

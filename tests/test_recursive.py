@@ -1,0 +1,262 @@
+"""The joint extended Kalman filter and the smooth variable structure filter. Their errors: `test_errors.py`."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import DT, REFERENCES, noisy_states, published_derivative, random_starts, standard_problem
+from lanes import HALF, LANES, bound, errors, identify, lanes, lost, names
+
+import jaxos4
+from jaxos4.estimators.kalman import JointEKF
+from jaxos4.estimators.svsf import SVSF
+
+PUBLISHED: Any = jaxos4.PublishedOS4
+CORRECTED: Any = jaxos4.CorrectedOS4
+ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])  # p, q, r, phi, theta, psi, x, vx, ...
+FEW = 16  # lanes of a batch
+
+
+@functools.cache
+def noisy(model_class, channels, free, passes=10):
+    arguments = lanes(noisy_states(FEW, model_class), model_class, channels, free=free, seed=100)
+    return identify(JointEKF(passes=passes), *arguments)
+
+
+def test_one_pass_is_not_enough_beyond_the_rates():
+    """Why there are passes: the plain filter keeps the errors of its first linearisations, and does not know it."""
+    case = CORRECTED, "all", False
+    plain, few, enough = (noisy(*case, passes) for passes in (1, 2, 10))
+    assert set(names(plain)) == {"successful"}
+    off = np.sqrt(np.mean((errors(plain, CORRECTED) / bound(*case)) ** 2, axis=0))
+    assert (off > 1.5).all(), off
+    assert (np.asarray(plain.sweeps) == 1).all()
+    assert (np.asarray(enough.sweeps) > 2).all()
+    # Too few passes are reported.
+    assert "max_sweeps" in names(few)
+    close = np.abs(errors(few, CORRECTED) / bound(*case)).max(axis=1) < 6
+    assert close[names(few) == "successful"].all()
+
+
+@pytest.mark.parametrize(("model_class", "channels", "free"), [(PUBLISHED, "rates", True), (CORRECTED, "all", False)])
+def test_history_ends_at_the_answer(model_class, channels, free):
+    estimates = noisy(model_class, channels, free)
+    np.testing.assert_array_equal(estimates.rollouts, (8 + 3 * free + 1) * estimates.sweeps + 1)
+    history = np.asarray(estimates.history)
+    assert history.shape == (FEW, 501, 8)
+    np.testing.assert_array_equal(history[:, -1], estimates.parameters)
+    # The error shrinks on the way.
+    off = np.sqrt(np.mean(((history - np.asarray(model_class().alpha)) / HALF) ** 2, axis=(0, 2)))
+    assert off[-1] < off[250] < off[60] < off[0]
+
+
+def test_a_free_initial_state_is_estimated():
+    estimates = noisy(PUBLISHED, "rates", True)
+    assert estimates.initial_state.shape == (FEW, 3)
+    # Better than its one measurement, with all the flight behind it.
+    rms = np.sqrt(np.mean(np.square(estimates.initial_state), axis=0))
+    assert (rms < 0.5 * jaxos4.SENSOR_SIGMA[ORDER[:3]]).all(), rms
+
+
+# Against other ways to the same numbers.
+
+
+def textbook(states, omega, center, half, sigma, *, start, free, derivative):
+    """The filter as a textbook has it: matrix gains, Jacobians by central differences, all channels at once.
+
+    The initial state's prior is three sigma around its measurement where it is free.
+    """
+    size, count = len(sigma), 8
+
+    def step(z, row):
+        full = np.zeros(12)
+        full[ORDER[:size]] = z[:size]
+        return np.concatenate([(full + DT * derivative(full, row, z[size:]))[ORDER[:size]], z[size:]])
+
+    z = np.concatenate([states[0] if free else start, center])
+    p = np.diag(np.concatenate([(3 * sigma if free else 0 * sigma) ** 2, half**2]))
+    h = np.eye(size, size + count)
+    history = []
+    for k, y in enumerate(states):
+        if k > 0 or free:
+            seen = ~np.isnan(y)
+            hs = h[seen]
+            gain = p @ hs.T @ np.linalg.inv(hs @ p @ hs.T + np.diag(sigma[seen] ** 2))
+            z = z + gain @ (y[seen] - hs @ z)
+            p = (np.eye(size + count) - gain @ hs) @ p
+        history.append(z[size:])
+        scale = np.concatenate([np.ones(size), half]) * 1e-4
+        f = np.stack([(step(z + d, omega[k]) - step(z - d, omega[k])) / (2 * d.sum()) for d in np.diag(scale)], axis=1)
+        z, p = step(z, omega[k]), f @ p @ f.T
+    return np.stack(history), p[size:, size:]
+
+
+@pytest.mark.parametrize(
+    ("model_class", "channels", "free"),
+    [(PUBLISHED, "rates", False), (PUBLISHED, "rates", True), (CORRECTED, "all", False)],
+)
+def test_agrees_with_the_textbook_filter(model_class, channels, free):
+    states = np.array(noisy_states(1, model_class, seed=3, duration=1.0)[0])
+    problem = standard_problem(model_class, channels, free=free, duration=1.0)
+    order = ORDER[: problem.size]
+    states[30:40, order[1]] = np.nan
+    states[50, order] = np.nan
+    center = np.asarray(random_starts(model_class(), 1, seed=4)[0])
+    problem = eqx.tree_at(lambda p: p.flight.states, problem, jnp.asarray(states))
+    estimate = JointEKF(passes=1)(problem, jaxos4.Bracket.around(center, HALF))
+    arguments = (states[:, order], np.asarray(problem.flight.omega), center, HALF, jaxos4.SENSOR_SIGMA[order])
+    settings = {"start": np.zeros(problem.size), "free": free, "derivative": REFERENCES[model_class]}
+    history, covariance = textbook(*arguments, **settings)
+    std = np.sqrt(np.diagonal(covariance))
+    assert estimate.history is not None
+    np.testing.assert_allclose(estimate.history / HALF, history / HALF, atol=1e-6)
+    np.testing.assert_allclose(estimate.covariance / np.outer(std, std), covariance / np.outer(std, std), atol=1e-6)
+    # The comparison can fail: a model with one wrong term, a sigma that is a hundredth off.
+    other = REFERENCES[CORRECTED if model_class is PUBLISHED else PUBLISHED]
+    for wrong in (
+        textbook(*arguments, **{**settings, "derivative": other}),
+        textbook(*arguments[:-1], 1.01 * arguments[-1], **settings),
+    ):
+        assert np.abs(estimate.history / HALF - wrong[0] / HALF).max() > 1e-4
+
+
+class Slopes(jaxos4.PublishedOS4):
+    """Linear in its parameters and without a state of its own: each rate is driven by torques alone."""
+
+    def angular_acceleration(self, rates, forcing, parameters):
+        """Linear in the parameters, without the rates."""
+        a1, a2, a3, a4, a5, a6, a7, a8 = parameters
+        t = (forcing.roll, forcing.pitch, forcing.yaw)
+        p = a3 * t[0] + a1 * t[1] / 100 + a2 * t[2] / 10
+        q = a6 * t[1] + a4 * t[2] / 100 + a5 * t[0] / 10
+        return jaxos4.models.state.Rates(p, q, a8 * t[2] + a7 * t[0] / 100)
+
+
+def test_a_linear_model_with_a_wide_prior_is_least_squares():
+    problem = standard_problem(channels="rates", states=noisy_states(1, seed=5)[0])
+    problem = eqx.tree_at(lambda p: p.model, problem, Slopes(jaxos4.OS4))
+    at_zero, *at_one = (np.asarray(problem.residuals(jnp.asarray(x))) for x in np.vstack([np.zeros(8), np.eye(8)]))
+    slope = np.stack(at_one, axis=1) - at_zero[:, None]
+    best = np.linalg.lstsq(slope, -at_zero, rcond=None)[0]
+    covariance = np.linalg.inv(slope.T @ slope)
+    std = np.sqrt(np.diagonal(covariance))
+    bracket = jaxos4.Bracket.around(best + 100 * std, 1e4 * std)
+    for passes in (1, 10):
+        estimate = JointEKF(passes=passes)(problem, bracket)
+        assert np.abs((estimate.parameters - best) / std).max() < 1e-4
+        np.testing.assert_allclose(estimate.std, std, rtol=1e-4)
+    assert int(estimate.sweeps) == 2  # the second moves nothing
+
+
+def test_agrees_with_shooting():
+    """The prior aside, which a wide bracket makes weak, both have the same optimum."""
+    problem, states, omega, lower, upper = lanes(noisy_states(FEW), seed=100)
+    middle = (lower + upper) / 2
+    wide = identify(JointEKF(), problem, states, omega, middle - 5 * HALF, middle + 5 * HALF)
+    shot = identify(jaxos4.IBSS(tolerance=1e-4), problem, states, omega, lower, upper)
+    assert np.abs((wide.parameters - shot.parameters) / shot.std).max() < 0.02
+    np.testing.assert_allclose(wide.std, shot.std, rtol=0.02)
+    np.testing.assert_allclose(wide.cost, shot.cost, rtol=1e-5)
+
+
+RATES = [7, 9, 11]
+
+
+@functools.cache
+def noisy_svsf():
+    return identify(SVSF(), *lanes(noisy_states(LANES, seed=50)))
+
+
+def test_history_is_what_was_averaged():
+    estimates = noisy_svsf()
+    history = np.asarray(estimates.history)
+    assert history.shape == (LANES, 501, 8)
+    late = np.arange(501) >= 0.5 * 501
+    np.testing.assert_allclose(history[:, late].mean(axis=1), estimates.parameters, rtol=1e-9, atol=1e-12)
+    assert (np.asarray(estimates.rollouts) == 4 * 12 + 1).all()
+
+
+def test_a_free_initial_state_is_better_than_the_first_measurement():
+    states = noisy_states(LANES, seed=50)
+    estimates = identify(SVSF(), *lanes(states, free=True))
+    start, first = np.asarray(estimates.initial_state), np.asarray(states[:, 0, RATES])
+    # The flights begin at rest: what is not 0 is error.
+    assert np.sqrt(np.mean(start**2)) < 0.8 * np.sqrt(np.mean(first**2))
+    assert set(names(estimates)) == {"successful"}
+    error = errors(estimates)
+    assert np.sqrt(np.mean((error / bound(free=True)) ** 2, axis=0)).max() < 6
+    assert np.mean(np.abs(error) < 1.96 * np.asarray(estimates.std)) > 0.95 - 4 * np.sqrt(0.95 * 0.05 / LANES)
+
+
+# The corrections themselves.
+
+
+def plain(states, omega, center, *, gamma, rates_layer, parameter_layer, damping, equilibration):
+    """One pass in plain NumPy from the printed equations, with the one-step influence by finite differences."""
+    sigma = jaxos4.SENSOR_SIGMA[RATES]
+
+    def step(x, u, row):
+        full = np.zeros(12)
+        full[RATES] = x
+        return x + DT * published_derivative(full, row, center + u * HALF)[RATES]
+
+    x, u, remaining, phi, energy, history = np.zeros(3), np.zeros(8), np.zeros(3), np.zeros((3, 8)), np.zeros(8), []
+    for k, y in enumerate(states):
+        seen = ~np.isnan(y) & (k > 0)
+        e = np.where(seen, y - x, 0.0)
+        energy = energy + (np.where(seen[:, None], phi, 0) ** 2).sum(axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit = np.where(energy > 0, np.minimum(np.sqrt(energy.max() / energy), equilibration), equilibration)
+        scaled = np.where(seen[:, None], phi * unit, 0)
+        damped = damping**2 * (energy.max() / (k + 1) if energy.max() > 0 else 1.0)
+        inverse = scaled.T @ np.linalg.inv(scaled @ scaled.T + damped * np.eye(3))
+        w = inverse @ e
+        layer = parameter_layer * np.sqrt((inverse**2) @ sigma**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sat = np.where(layer > 0, np.clip(w / layer, -1, 1), 0)
+        x = x + (np.abs(e) + gamma * remaining) * np.clip(e / (rates_layer * sigma), -1, 1)
+        u = np.clip(u + unit * (np.abs(w) + gamma * np.abs(w)) * sat, -4, 4)
+        remaining = np.where(seen, np.abs(y - x), remaining)
+        history.append(center + u * HALF)
+        phi = np.stack([(step(x, u + d, omega[k]) - step(x, u - d, omega[k])) / 2 for d in np.eye(8)], axis=1)
+        x = step(x, u, omega[k])
+    return np.stack(history)
+
+
+def test_agrees_with_plain_numpy():
+    states = np.array(noisy_states(1, seed=3, duration=1.0)[0])
+    states[30:40, RATES[1]] = np.nan
+    states[50] = np.nan
+    center = np.asarray(random_starts(PUBLISHED(), 1, seed=4)[0])
+    problem = standard_problem(channels="rates", duration=1.0, states=jnp.asarray(states))
+    # Narrow layers, so that corrections leave them too.
+    settings = {"gamma": 0.3, "rates_layer": 2.0, "parameter_layer": 2.0, "damping": 8.0, "equilibration": 20.0}
+    history = SVSF(**settings, passes=1, memory=False)(problem, jaxos4.Bracket.around(center, HALF)).history
+    assert history is not None
+    expected = plain(states[:, RATES], np.asarray(problem.flight.omega), center, **settings)
+    np.testing.assert_allclose(history / HALF, expected / HALF, atol=1e-9)
+    assert np.abs((expected[-1] - center) / HALF).max() > 0.05
+    # The comparison can fail.
+    for name, value in settings.items():
+        other = plain(states[:, RATES], np.asarray(problem.flight.omega), center, **{**settings, name: 1.1 * value})
+        assert np.abs(other / HALF - history / HALF).max() > 1e-6, name
+
+
+def test_other_channels_do_not_matter():
+    states, (_, _, _, lower, upper) = noisy_states(LANES, seed=50), lanes(noisy_states(LANES, seed=50))
+    alone = SVSF()(standard_problem(channels="all", states=states[1]), jaxos4.Bracket(lower[1], upper[1]))
+    assert (np.abs(alone.parameters - noisy_svsf().parameters[1]) / bound()).max() < 1e-6
+    np.testing.assert_allclose(alone.covariance, noisy_svsf().covariance[1], rtol=1e-5, atol=1e-15)
+    assert alone.initial_state.shape == (12,)
+
+
+def test_missing_samples_only_cost_precision():
+    estimates = identify(SVSF(), *lanes(lost(noisy_states(LANES, seed=7))))
+    good = names(estimates) == "successful"
+    assert good.mean() > 0.9
+    error = errors(estimates)
+    assert np.sqrt(np.mean((error / bound()) ** 2, axis=0)).max() < 5
+    assert np.mean(np.abs(error) < 1.96 * np.asarray(estimates.std)) > 0.87
