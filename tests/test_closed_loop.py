@@ -295,7 +295,6 @@ def flown(samples=5, **settings):
         (flown, {"dt": 0.0}, "`dt`"),
         (flown, {"substeps": 0}, "`substeps`"),
         (jaxos4.random_references, {"duration": 0.0, "key": None}, "`duration`"),
-        (jaxos4.random_references, {"hold": -1.0, "key": None}, "`hold`"),
         (jaxos4.random_references, {"amplitude": (1.0,), "key": None}, "`amplitude`"),
     ],
 )

@@ -31,7 +31,7 @@ DIMS = ("model", "excitation", "duration", "channels", "parameter")
 
 def limits(study: Study, model_name: str, excitation: str, duration: float, channels: str) -> np.ndarray:
     """The largest noise for each parameter, in multiples of the standard noise. 0: the truth is 0. NaN: not excited."""
-    model = MODELS[model_name](study.vehicle(study.airframes[0]))
+    model = MODELS[model_name](jaxos4.load_airframe(study.airframes[0]))
     omega = EXCITATIONS[excitation](model.airframe, duration=duration, dt=study.dt)
     flight = jaxos4.simulate(model, model.alpha, omega, dt=study.dt)
     problem = jaxos4.ShootingProblem(
@@ -46,7 +46,7 @@ def main(specification: Path, out: Annotated[Path, typer.Option(help="Folder for
     study = load_study(specification)
     axes = (study.models, study.excitations, study.durations, study.channels)
     values = np.stack([limits(study, *which) for which in itertools.product(*axes)])
-    names = MODELS[study.models[0]](study.vehicle(study.airframes[0])).parameter_names
+    names = MODELS[study.models[0]](jaxos4.load_airframe(study.airframes[0])).parameter_names
     coordinates = dict(zip(DIMS, (*map(list, axes), list(names)), strict=True))
     shape = [len(axis) for axis in coordinates.values()]
     frontier = xr.DataArray(values.reshape(shape), coordinates, DIMS, attrs={"units": "1"})

@@ -46,7 +46,7 @@ class Fits(NamedTuple):
 
 def model_of(study: Study, name: str) -> jaxos4.AbstractModel:
     """The model of this name, with the airframe of the study."""
-    return MODELS[name](study.vehicle(study.airframes[0]))
+    return MODELS[name](jaxos4.load_airframe(study.airframes[0]))
 
 
 @eqx.filter_jit

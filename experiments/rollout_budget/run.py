@@ -39,7 +39,7 @@ HYBRID = "hybrid"
 
 def identify(study: Study, channels: str, names: list[str], limits: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Errors in bounds [searches, limits, flights, parameters], and rollouts [searches, limits, flights]."""
-    model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
+    model = MODELS[study.models[0]](jaxos4.load_airframe(study.airframes[0]))
     omega = EXCITATIONS[study.excitations[0]](model.airframe, duration=study.durations[0], dt=study.dt)
     exact = jaxos4.simulate(model, model.alpha, omega, dt=study.dt)
     sigma = study.scales[0] * jaxos4.SENSOR_SIGMA

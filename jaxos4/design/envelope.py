@@ -56,7 +56,7 @@ class Envelope(eqx.Module):
         """The limits that flights just keep. `dt`: of the rotor speeds; the states may be sampled more often."""
         return cls(**_needs(omega, states, dt))
 
-    def limited(self, limits: Mapping[str, float]) -> "Envelope":
+    def limited(self, limits: Mapping[str, Any]) -> "Envelope":
         """This envelope with some limits replaced. Raises `InputError` if one of them is impossible."""
         try:
             return Envelope(**vars(self) | dict(limits))

@@ -12,6 +12,7 @@ from .table import (
     COMMAND_NAMES as COMMAND_NAMES,
     LIMITS,
     MAX_ROWS,
+    PITCH,
     SPEED_NAMES as SPEED_NAMES,
     Recording,
     Sampling,
@@ -44,7 +45,7 @@ def recording_of(
     rarest = {"motors": _slowest(table, motors), "gyro": _slowest(table, ("p", "q", "r"))}
     facts = table.facts._replace(**{name: getattr(table.facts, name) or found for name, found in rarest.items()})
     dt = _check_time(table)
-    table = table.without_impossible()
+    table = table.without_impossible(LIMITS | PITCH)
     _check_heading(table)
     if table.impossible:
         found.append(table.impossible_note)

@@ -99,12 +99,13 @@ LIMITS = {
     **dict.fromkeys("xyz", Limit(-1e6, 1e6, "m", _POSITION)),
     **dict.fromkeys(("vx", "vy", "vz"), Limit(-1e3, 1e3, "m/s", _VELOCITY)),
     **dict.fromkeys("pqr", Limit(-60.0, 60.0, "rad/s", "it looks like deg/s: divide by 57.3")),
-    **dict.fromkeys(("phi", "psi"), Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")),
-    "theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH),
+    **dict.fromkeys(("phi", "theta", "psi"), Limit(-1e4, 1e4, "rad", "it looks like degrees: divide by 57.3")),
     **dict.fromkeys(FORCE_NAMES, Limit(-1e3, 1e3, "m/s^2", _FORCE)),
     "voltage": Limit(-200.0, 200.0, "V", _VOLTAGE),
 }
 """A value outside of these is impossible: beyond the reach of any quadrotor, but not beyond that of a wrong unit."""
+PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
+"""The pitch of a log: one that was not read from a file may be any number."""
 
 
 class Table(NamedTuple):
@@ -147,13 +148,13 @@ class Table(NamedTuple):
         what = [f"{self.names.get(name, name)}: {k} (first {first})" for name, (k, first) in self.impossible.items()]
         return f"impossible values count as not measured, in {', '.join(what)}"
 
-    def without_impossible(self) -> "Table":
-        """The table without the values outside of `LIMITS`: they count as not measured.
+    def without_impossible(self, limits: Mapping[str, Limit] = LIMITS) -> "Table":
+        """The table without the values outside of `limits`: they count as not measured.
 
         **Raises:** `InputError` if they are more than 1 % of the values of a column.
         """
         columns, impossible = dict(self.columns), dict(self.impossible)
-        for name, limit in LIMITS.items():
+        for name, limit in limits.items():
             values = columns.get(name, np.empty(0))
             wrong = (values < limit.least) | (values > limit.largest)
             if name == "t" or not wrong.any():
