@@ -267,3 +267,14 @@ def test_long_flight(report_of):
     assert max(many["percent"][place] for place in (1, 3, 4)) < 2  # the gains of the torques
     # One shot ends at the bounds, and its result says so.
     assert one["results"] == {"at_bound": 2}
+
+
+@pytest.mark.usefixtures("quickly_compiled")
+def test_public_flights(report_of, shared_flights):
+    """One flight is identified, and another one predicted better than by constant velocity."""
+    names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
+    report = report_of("public_flights", flights=shared_flights, end=15.0, **names)
+    found = report["flights"]["B8_star_fast_rep2"]["quantities"]
+    assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
+    for rate in "pq":
+        assert found[rate]["error"][9] < found[rate]["constant"][9]

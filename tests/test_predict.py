@@ -11,7 +11,6 @@ import xarray as xr
 from helpers import CRAZYFLIE, compiled_programs, refused
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from small_experiments import report_of
 from synthetic_results import vehicle_result
 
 import jaxos4
@@ -304,14 +303,3 @@ def test_flights_without_attitude_or_with_measured_speeds_are_refused(write):
     )
     with pytest.raises(jaxos4.InputError, match="has no battery voltage, which the term voltage needs"):
         jaxos4.predict(powered, flown(2))
-
-
-@pytest.mark.usefixtures("quickly_compiled")
-def test_public_flights(shared_flights, tmp_path):
-    """One flight is identified, and another one predicted better than by constant velocity."""
-    names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    report = report_of("public_flights", tmp_path, flights=shared_flights, end=15.0, **names)
-    found = report["flights"]["B8_star_fast_rep2"]["quantities"]
-    assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
-    for rate in "pq":
-        assert found[rate]["error"][9] < found[rate]["constant"][9]

@@ -292,7 +292,7 @@ def _filter_rows(
             wide = jax.tree.map(lambda t: jnp.zeros((count, segments), dtype=float).at[positions].set(t), tangents)
             at, directions = (*at, forcing), (*directions, wide)
         (known, errors), push = jax.linearize(filtered, *at)
-        slopes, by_errors = jax.vmap(pushed)(*directions)
+        slopes, by_errors = jax.vmap(pushed)(*directions)  # pyright: ignore[reportArgumentType]
         found = tuple(map(jnp.stack, (errors, by_errors, by_noise_errors))), gains.variance, gain_slopes.variance
         return ((covariance, by_noise), (known, slopes, noise_slopes), sound), found
 
