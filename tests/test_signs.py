@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from jaxos4.errors import InputError
 from jaxos4.logs import read_recording, write_flight
 from jaxos4.recording import Recording, cut, usable_stretches
-from jaxos4.recording.motion import opposite_axes as opposites, refused_note, yaw_doubt
+from jaxos4.recording.motion import motor_clock_note, opposite_axes as opposites, refused_note, yaw_doubt
 from jaxos4.recording.preparation import at_limit, prepare
 
 DT = 0.004
@@ -110,6 +110,27 @@ def test_inspect_questions_the_spins(run, tmp_path):
     assert (code, err) == (0, "")
     assert "note: yaw answers the rotors with the opposite sign" in " ".join(out.split())
     assert "cannot identify" not in out
+
+
+@pytest.mark.parametrize(("shift", "words"), [(-9, "ms early"), (0, ""), (6, "ms late")])
+def test_clocks_of_motors_and_gyro_are_compared(shift, words):
+    """Measured rotor speeds, later than they were by `shift` samples of 4 ms."""
+    flight = flown(CRAZYFLIE, 0, gust=5.0, lag=0.004)._replace(commanded=False)
+    moved = flight._replace(omega=np.roll(flight.omega, shift, axis=0))
+    note = motor_clock_note([moved], CRAZYFLIE)
+    assert words in note
+    assert bool(note) == bool(words)
+    if note:
+        assert float(note.split("about ")[1].split()[0]) == pytest.approx(
+            abs(4 - 4 * shift), abs=2
+        )  # the rotors lag by 4 ms
+
+
+def test_the_lag_of_commands_is_no_error_of_clocks(shared_flights):
+    for path in sorted(shared_flights.glob("*/*.csv")):
+        flight = read_recording(path, CRAZYFLIE)
+        parts = [cut(flight, stretch) for stretch in usable_stretches(flight, CRAZYFLIE)]
+        assert motor_clock_note(parts, CRAZYFLIE) == ""
 
 
 def test_rotors_at_their_limit_are_named(shared_flights):

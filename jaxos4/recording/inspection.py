@@ -8,7 +8,7 @@ import numpy as np
 from ..airframe import Airframe
 from ..flight import CHANNEL_NAMES
 from ..logs import log_format
-from .motion import Excitation, excitation, opposite_axes, refused_note, yaw_doubt
+from .motion import Excitation, excitation, motor_clock_note, opposite_axes, refused_note, yaw_doubt
 from .pieces import cut
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
@@ -77,6 +77,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     nothing = "" if usable else f"{nothing_usable(found)}; give the log of a flight"
     opposite = {} if airframe is None else opposite_axes(usable, airframe)
     doubt = yaw_doubt(opposite)
+    clock = "" if airframe is None else motor_clock_note(usable, airframe)
     findings = tuple(filter(None, (nothing, facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
@@ -87,7 +88,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
         sample_time=recording.dt,
         measured=_measured(recording),
         findings=findings,
-        notes=(*recording.notes, *(["; ".join(doubt)] if doubt else [])),
+        notes=(*recording.notes, *filter(None, ("; ".join(doubt or ()), clock))),
         parts=tuple(parts),
     )
 

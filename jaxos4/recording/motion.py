@@ -25,7 +25,9 @@ _ANGLE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("phi", "theta", "psi
 _STEP = 0.008  # [s]
 _SMOOTH, _SLOW = 3, 63  # samples: differences of these means are the motion between about 2 and 20 Hz
 # Motors against gyro [s]: lag and delay of rotors; and the same with clocks that may be shifted either way.
-_CAUSAL, _SHIFTED = (0.0, 0.048), (-0.04, 0.06)
+_CAUSAL, _SHIFTED, _WIDE = (0.0, 0.048), (-0.04, 0.06), (-0.08, 0.08)
+# Motors are late or early beyond these delays [s]; rotors that were measured act at once.
+_LATE, _EARLY, _SEEN = -0.005, 0.02, 0.6
 _LEAST_SECONDS = 3.0
 _OPPOSITE, _CLEAR = 0.4, 1.5  # correlation, and by how much it exceeds that of another sign or pair of rotors
 # The same before a sign of the airframe is called wrong, by axis. A controller turns the sign at negative shifts.
@@ -106,11 +108,7 @@ def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> dict[str, 
 
     **Arguments:** usable stretches of flights, each of one vehicle.
     """
-    mixer = np.asarray(airframe.mixer, dtype=float)[:3]
-    found = np.diagonal(_correlations(pieces, mixer, _SHIFTED), axis1=1, axis2=2)
-    torques = [(piece.omega[:-1] ** 2 @ mixer.T).std(axis=0) for piece in pieces]
-    least = _LEAST_TORQUE * float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
-    found = np.where(np.max(torques, axis=0, initial=0.0) < least, np.nan, found)
+    _, found = _torque_correlations(pieces, airframe, _SHIFTED)
     ends = zip(_WRONG.items(), -found.min(axis=0), found.max(axis=0), strict=True)
     return {axis: float(wrong) for (axis, (least, times)), wrong, right in ends if wrong > max(least, times * right)}
 
@@ -147,7 +145,7 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
 
     **Arguments:** usable stretches of flights, each of one vehicle, with motors and gyro logged fast.
     """
-    found = _correlations(pieces, _PAIRS, _CAUSAL)
+    _, found = _correlations(pieces, _PAIRS, _CAUSAL)
     roll, pitch = (_pair(found[:, :, axis]) for axis in (0, 1))
     if roll is None or pitch is None or roll == pitch:
         return None
@@ -159,13 +157,50 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
     return RotorSigns(tuple(forward.tolist()), tuple(left.tolist()), spins)
 
 
+def motor_clock_note(pieces: Sequence[Recording], airframe: Airframe) -> str:
+    """By how much motors are recorded late or early against the gyro, if roll and pitch show it clearly; else empty.
+
+    Commands precede the motion by an unknown lag of the rotors: they are never called early, and late by at least the
+    answer.
+    """
+    delays, found = _torque_correlations(pieces, airframe, _WIDE)
+    peaks = []
+    for row in found[:, :2].T:
+        best = int(np.argmax(row)) if np.isfinite(row).all() else 0
+        if 0 < best < row.size - 1 and row[best] > _SEEN and row[best] > -row.min():
+            before, at, after = row[best - 1 : best + 2]
+            between = 0.5 * (before - after) / (before - 2 * at + after)
+            # Accelerations are those of the end of a sample, torques those of its middle.
+            peaks.append(delays[best] + (between + 0.5) * (delays[1] - delays[0]))
+    if not peaks:
+        return ""
+    if max(peaks) < _LATE:
+        least = "at least " if pieces[0].commanded else "about "
+        return f"motors are recorded {least}{-1e3 * np.mean(peaks):.0f} ms late, or the gyro early (term `delay`)"
+    if min(peaks) > _EARLY and not pieces[0].commanded:
+        return f"motors are recorded about {1e3 * np.mean(peaks):.0f} ms early, or the gyro late (term `delay`)"
+    return ""
+
+
+def _torque_correlations(
+    pieces: Sequence[Recording], airframe: Airframe, between: tuple[float, float]
+) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, "delays 3"]]:
+    """How the torque about each axis correlates with its angular acceleration, by delay [s]. NaN: too little torque."""
+    mixer = np.asarray(airframe.mixer, dtype=float)[:3]
+    delays, found = _correlations(pieces, mixer, between)
+    hover = float(airframe.hover_speed) ** 2 * np.abs(mixer).sum(axis=1)
+    torques = [(piece.omega[:-1] ** 2 @ mixer.T).std(axis=0) for piece in pieces]
+    weak = np.max(torques, axis=0, initial=0.0) < _LEAST_TORQUE * hover
+    return delays, np.where(weak, np.nan, np.diagonal(found, axis1=1, axis2=2))
+
+
 def _correlations(
     pieces: Sequence[Recording], mixer: Float[np.ndarray, "rows 4"], between: tuple[float, float]
-) -> Float[np.ndarray, "delays rows 3"]:
+) -> tuple[Float[np.ndarray, " delays"], Float[np.ndarray, "delays rows 3"]]:
     """How sums of squared rotor speeds correlate with the angular accelerations that follow them, at 2 to 20 Hz.
 
     A controller that answers gusts does not change the sign. One number for each delay, each row of `mixer` (the weight
-    of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion.
+    of each rotor), and roll, pitch and yaw. NaN: the axis has no clear motion. Also the delays [s].
 
     **Arguments:** `between`: the first and the last delay of the gyro after the motors [s].
     """
@@ -185,7 +220,7 @@ def _correlations(
             x, y = torque[measured] - torque[measured].mean(axis=0), along[measured] - along[measured].mean()
             spreads = x.std(axis=0) * y.std()
             found[place, :, i] = np.where(spreads > 0, y @ x / y.size, np.nan) / np.where(spreads > 0, spreads, 1.0)
-    return found
+    return step * np.array(shifts), found
 
 
 def _clear_sign(found: Float[np.ndarray, " delays"]) -> float:
