@@ -35,6 +35,15 @@ batch = 4
 steps = 2
 held_out = 1000
 """
+AIRFRAME = """
+[airframe.mine]
+mass = 0.6
+inertia = [7e-3, 7e-3, 1.2e-2]
+arm = 0.2
+thrust_coefficient = 3e-5
+drag_coefficient = 7e-7
+rotor_inertia = 6e-5
+"""
 COMMAND = "from jaxos4.cli import main; main()"
 
 

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 from helpers import refused
 from hypothesis import given, settings, strategies as st
-from small_study import COMMAND, environment, run_study, specification
+from small_study import AIRFRAME, COMMAND, environment, run_study, specification
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
@@ -66,8 +66,8 @@ def test_another_specification_is_refused_with_what_changed(run, tmp_path):
 
 
 def test_a_dry_run_writes_nothing_and_counts(tmp_path):
-    text = "airframes = ['voos']\ntruth = 'drawn'\nflights = 1000\nbatch = 100\nestimators = ['ibss', 'kalman']\n"
-    specification(tmp_path, text)
+    text = "airframes = ['mine']\ntruth = 'drawn'\nflights = 1000\nbatch = 100\nestimators = ['ibss', 'kalman']\n"
+    specification(tmp_path, text + AIRFRAME)
     command = [sys.executable, "-c", COMMAND, "study", "spec.toml", "--out", "out", "--dry-run"]
     env = {name: value for name, value in environment().items() if name != "JAX_NUM_CPU_DEVICES"} | {"COLUMNS": "100"}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=120, check=False)

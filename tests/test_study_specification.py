@@ -7,18 +7,19 @@ from pathlib import Path
 import pytest
 from helpers import refused
 from hypothesis import given, settings, strategies as st
-from small_study import specification
+from small_study import AIRFRAME, specification
 
 import jaxos4
 from jaxos4.study import Study, load_study
 
+MINE = 'airframes = ["mine"]\n' + AIRFRAME
 # Refused with a message that names the key.
 WRONG_VALUES = (
     "flights = 1.5", "flights = 0", 'models = "published"', 'excitations = ["wobble"]', 'methods = ["rk5"]',
     'fit_method = "diffrax"', 'noises = ["pink"]', 'channels = ["smell"]', 'estimators = ["oracle"]',
     'initial_state = "hidden"', "scales = [-1.0]", "scales = [nan]", "scales = [inf]",
     "widths = [0.0]", "durations = [-1.0]", "durations = [inf]", "durations = [0.01]", "durations = [1e300]",
-    "dt = nan", "dt = inf", "dt = 0", "seed = -1", "seed = 9223372036854775808", "batch = 0",
+    "dt = nan", "dt = inf", "dt = 0", "seed = -1", "seed = 9223372036854775808", "batch = 0", "airframe = 3",
     'title = "two\\nlines"', 'title = "\\u0000"',
 )  # fmt: skip
 WRONG_SPECIFICATIONS = [
@@ -35,9 +36,14 @@ WRONG_SPECIFICATIONS = [
     ("flights = 1_000_000_000", "cells"),
     ('durations = [0.5]\nexcitations = ["chirp"]', "`excitations`: chirp of 0.5 s by os4: `duration`"),
     ("dt = 0.5", "`excitations`: multisine of 5 s by os4: `tones`"),
+    (MINE + "max_rotor_speed = 230", "`excitations`: multisine of 5 s by mine: `amplitude`"),
     ("[network]\nsteps = 0", "network.steps"),
     ("[network]\nsteps = 100_000_000", "network.steps"),
     ("[network]\nheld_out = 10", "network.held_out"),
+    (MINE + "wheels = 4", "[airframe.mine]: `wheels` is not a known key"),
+    (MINE.replace("mass = 0.6", "mass = -0.6"), "[airframe.mine]: `mass`"),
+    (MINE + "max_rotor_speed = inf", "[airframe.mine]: not finite"),
+    (AIRFRAME, "[airframe.mine] is not flown"),
     ("flights = ", "not a TOML file"),
     ("a = " + "[" * 5000, "spec.toml"),
     *((text, f"`{text.split()[0]}") for text in WRONG_VALUES),

@@ -19,7 +19,6 @@ from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from .._xla import quick_jit
-from ..airframe import PRESETS
 from ..analysis.covariance import cramer_rao_bound
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
@@ -77,7 +76,7 @@ class Flights(NamedTuple):
 def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
     """Model, bracket and rotor speeds of a scenario or of a network's job."""
     with jax.enable_x64(True):
-        model = MODELS[scenario.model](PRESETS[scenario.airframe])
+        model = MODELS[scenario.model](study.vehicle(scenario.airframe))
         offset = study.truth == "airframe"
         bracket = _bracket(model, np.asarray(scenario.width), key_of(study.seed, 0), offset=offset)
         omega = study.omega(scenario.excitation, scenario.airframe, scenario.duration)

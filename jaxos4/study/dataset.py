@@ -13,7 +13,6 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
-from ..airframe import PRESETS
 from ..errors import InputError
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
@@ -112,7 +111,7 @@ def save_dataset(dataset: xr.Dataset, directory: Path) -> None:
 
 
 def _coordinates(study: Study) -> dict[str, tuple]:
-    model = MODELS[study.models[0]](PRESETS[study.airframes[0]])
+    model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
     values = {dim: list(getattr(study, axis)) for dim, axis in zip(SCENARIO, AXES, strict=True)}
     values |= {"flight": np.arange(study.flights), "parameter": list(model.parameter_names), "level": list(LEVELS)}
     units = {"duration": "s"}

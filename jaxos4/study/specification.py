@@ -15,7 +15,7 @@ import numpy as np
 
 from .._custom_types import RotorSpeeds, as_float
 from .._files import read_toml
-from ..airframe import PRESETS
+from ..airframe import PRESETS, Airframe, airframe_from_table
 from ..errors import InputError
 from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
@@ -33,7 +33,6 @@ Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 _CHOICES: dict[str, Collection[str]] = {
     "models": MODELS,
-    "airframes": PRESETS,
     "excitations": EXCITATIONS,
     "methods": METHODS,
     "noises": NOISES,
@@ -110,7 +109,8 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     The axes of the grid are lists; every combination is flown `flights` times.
 
-    - `models`, `airframes`, `excitations`, `channels`, `estimators`: names as on the command line.
+    - `models`, `excitations`, `channels`, `estimators`: names as on the command line.
+    - `airframes`: names of presets, or of tables `[airframe.NAME]` with the keys of an airframe file.
     - `input`: more excitations: rotor speeds of each sample, by name. In the file: a table of paths of CSV files with
       `t` and `omega1..4`, as `jaxos4 design` writes them, relative to the folder of the specification.
     - `durations` [s], at a sample time of `dt` [s].
@@ -147,6 +147,7 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     batch: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 128
     network: Training = Training()
     input: dict[str, tuple[Speeds, ...]] = {}
+    airframe: dict[str, dict[str, Any]] = {}
 
     def __post_init__(self):
         for axis in AXES:
@@ -164,8 +165,16 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(choices)}.")
         if not math.isfinite(self.dt):
             raise InputError(f"`dt` must be finite, got {self.dt}; give the sample time in seconds.")
-        if not self.title.isprintable():
-            raise InputError("`title` has a line break or another control character; remove it.")
+        for key, text in (("title", self.title), *(("airframe", name) for name in self.airframe)):
+            if not text.isprintable():
+                raise InputError(f"`{key}` has a line break or another control character; remove it.")
+        for name, table in self.airframe.items():
+            if name not in self.airframes:
+                raise InputError(f"[airframe.{name}] is not flown; name it in `airframes`, or remove it.")
+            if not all(math.isfinite(value) for value in table.values() if isinstance(value, float)):
+                raise InputError(f"[airframe.{name}]: not finite; leave out `max_rotor_speed` if it is unknown.")
+        for name in self.airframes:
+            self.vehicle(name)
         for duration in self.durations:
             if not 2 <= duration / self.dt <= _MOST_SAMPLES:
                 got = f"{duration:g} s at `dt` {self.dt:g} s"
@@ -181,11 +190,23 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             except ValueError as error:
                 raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
 
+    def vehicle(self, name: str) -> Airframe:
+        """The airframe of that name. Raises `InputError` if there is none, or if its table is not usable."""
+        if name in self.airframe:
+            try:
+                return airframe_from_table(self.airframe[name])
+            except InputError as error:
+                raise InputError(f"[airframe.{name}]: {error}") from None
+        if name not in PRESETS:
+            presets = ", ".join(PRESETS)
+            raise InputError(f"`airframes`: unknown {name!r}; choose from {presets}, or add [airframe.{name}].")
+        return PRESETS[name]
+
     def omega(self, excitation: str, airframe: str, duration: float) -> RotorSpeeds:
         """The rotor speeds of an excitation [rad/s]. Raises `ValueError` if it cannot be flown."""
         if excitation not in self.input:
-            return EXCITATIONS[excitation](PRESETS[airframe], duration=duration, dt=self.dt)
-        speeds, fastest = np.asarray(self.input[excitation]), float(PRESETS[airframe].max_rotor_speed)
+            return EXCITATIONS[excitation](self.vehicle(airframe), duration=duration, dt=self.dt)
+        speeds, fastest = np.asarray(self.input[excitation]), float(self.vehicle(airframe).max_rotor_speed)
         if len(speeds) != round(duration / self.dt) + 1:
             raise ValueError(f"its file lasts {(len(speeds) - 1) * self.dt:g} s; correct `durations`.")
         if speeds.max() > fastest:
