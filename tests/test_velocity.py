@@ -5,11 +5,10 @@ import functools
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
 from jaxos4.recording import Recording
-from jaxos4.recording.velocity import motion_of, with_smooth_drag
+from jaxos4.recording.velocity import motion_of
 
 G, FORGETS, SECONDS = 9.81, 2.0, 20.0
 ANGLES, VELOCITY, RATES = [6, 8, 10], [1, 3, 5], [7, 9, 11]
@@ -137,25 +136,3 @@ def test_drag_carries_a_part_of_the_weight():
     silent = motion_of(recording._replace(specific_force=None, states=np.where(np.isnan(states), 0.0, states)))
     assert silent is not None
     assert np.isnan(silent.drag_lift).all()
-
-
-def test_drag_is_smoothed_as_well_as_by_the_posterior_mean():
-    """Against the mean of a random walk behind white noise, whose variances are known: one banded system."""
-    random, samples, walk, noise = np.random.default_rng(5), 5000, 0.02, 0.3
-    states = np.zeros((samples, 12))
-    true = np.cumsum(walk * random.normal(size=(samples, 2)), axis=0)
-    measured = true + noise * random.normal(size=true.shape)
-    force = np.column_stack([measured, np.full(samples, G)])
-    recording = Recording(0.004 * np.arange(samples), np.full((samples, 4), 300.0), states, force)
-    assert with_smooth_drag(recording) is recording  # its velocity was measured
-    smooth = with_smooth_drag(without(recording, VELOCITY)).specific_force
-    precision = np.full((2, samples), 1 / noise**2 + 2 / walk**2)
-    precision[0], precision[1, [0, -1]] = -1 / walk**2, 1 / noise**2 + 1 / walk**2
-    best = solveh_banded(precision, measured / noise**2)
-    np.testing.assert_array_equal(smooth[:, 2], force[:, 2])
-    error, least, raw = (np.square(each - true).mean() for each in (smooth[:, :2], best, measured))
-    assert error < 1.05 * least < 0.1 * raw
-    gaps = force.copy()
-    gaps[100:110, 0] = np.nan
-    lost = with_smooth_drag(without(recording._replace(specific_force=gaps), VELOCITY)).specific_force
-    assert np.abs(lost[:, 0] - smooth[:, 0]).max() < noise

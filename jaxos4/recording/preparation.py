@@ -25,7 +25,7 @@ from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
-from .velocity import Motion, motion_of, with_smooth_drag
+from .velocity import Motion, motion_of
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -120,7 +120,7 @@ def prepare(
         if doubt := yaw_doubt(opposite):
             doubts.append((f"{recording.name}: {doubt[0]}", doubt[1]))
         notes += [*recording.named_notes, *([] if note is None else [f"{recording.name}: {note}"])]
-        parts += [(number, with_smooth_drag(piece)) for piece in pieces]
+        parts += [(number, piece) for piece in pieces]
     if len({piece.commanded for _, piece in parts}) > 1:
         raise InputError(
             f"{recordings[0].name}: some of these logs hold commands, others rotor speeds; fit them separately."

@@ -1,6 +1,5 @@
 """The velocity along the body's axes and the upright direction, measured or by dead reckoning."""
 
-import itertools
 import math
 from typing import NamedTuple
 
@@ -14,10 +13,6 @@ from .reading import Recording
 # specific force with the second [s].
 _FORGETS, _LEVELS = 2.0, 2.0
 _GRAVITY = 9.81
-_MEASURED = ("phi", "theta", "psi"), ("vx", "vy", "vz")
-# Noise of neighbouring samples may correlate, and a drag may change slowly: differences over these times [s] tell noise
-# from a walk. A smoother averages over this time at most [s].
-_NEAR, _FAR, _LONGEST = 0.02, 0.2, 0.5
 
 
 class Motion(NamedTuple):
@@ -42,7 +37,7 @@ def motion_of(recording: Recording) -> Motion | None:
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
     this sum are forgotten. The thrust's answer to axial velocity is faster.
     """
-    angles, velocity = (_filled(recording, names) for names in _MEASURED)
+    angles, velocity = (_filled(recording, names) for names in (("phi", "theta", "psi"), ("vx", "vy", "vz")))
     if angles is not None and velocity is not None:
         to_body = _to_body(*angles.T)
         up = to_body[:, :, 2]
@@ -55,49 +50,9 @@ def motion_of(recording: Recording) -> Motion | None:
     return Motion(_dead_reckoned(rates, force, up, recording.dt), up, _drag_lift(recording, up), measured=False)
 
 
-def with_smooth_drag(recording: Recording) -> Recording:
-    """The recording with smoothed specific force along x and y, if that has to show the airspeed.
-
-    The drag of the rotors is proportional to the airspeed. A flight whose velocity was measured is unchanged.
-    """
-    force = recording.specific_force
-    known = all(_filled(recording, names) is not None for names in _MEASURED)
-    if known or force is None or np.isnan(force[:, :2]).all(axis=0).any():
-        return recording
-    smooth = force.copy()
-    smooth[:, :2] = _without_noise(_without_gaps(force[:, :2]), recording.dt)
-    return recording._replace(specific_force=smooth)
-
-
 def _drag_lift(recording: Recording, up: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, " samples"]:
     force = recording.specific_force
     return np.full(len(up), np.nan) if force is None else (force * up)[:, :2].sum(axis=1)
-
-
-def _without_noise(values: Float[np.ndarray, "samples columns"], dt: float) -> Float[np.ndarray, "samples columns"]:
-    """Estimate random walks behind white noise, by steady Kalman smoothers: exponential averages forth and back.
-
-    A regression on noisy values finds too small coefficients; a regression on smoothed values does not. The variances
-    of noise and walk follow from mean squared differences between values `apart`: twice the noise's, and the walk's for
-    each sample between.
-    """
-    apart = max(round(_NEAR / dt), 2), max(round(_FAR / dt), 8)
-    if len(values) <= apart[1]:
-        return values
-    near, far = (np.square(values[k:] - values[:-k]).mean(axis=0) for k in apart)
-    walk = np.maximum((far - near) / (apart[1] - apart[0]), 0.0)
-    noise = np.maximum(near - apart[0] * walk, 0.0) / 2
-    spread = (walk + np.sqrt(walk * (walk + 4 * noise))) / 2
-    share = np.divide(noise, spread + noise, out=np.zeros_like(noise), where=noise > 0)
-    kept = np.minimum(share, max(1 - dt / _LONGEST, 0.0)).tolist()
-    forth = [_averaged(column, keep) for column, keep in zip(values.T.tolist(), kept, strict=True)]
-    back = [_averaged(column[::-1], keep)[::-1] for column, keep in zip(forth, kept, strict=True)]
-    return np.array(back).T
-
-
-def _averaged(values: list[float], kept: float) -> list[float]:
-    """The exponential average until each value."""
-    return list(itertools.accumulate(values, lambda mean, value: value + kept * (mean - value)))
 
 
 def _filled(recording: Recording, names: tuple[str, ...]) -> Float[np.ndarray, "samples 3"] | None:
