@@ -88,7 +88,7 @@ class Step(NamedTuple):
     sensor: Channels
 
 
-def transition(time_constant: Float[Array, "*channels"], dt: Scalar) -> tuple[Array, Array]:
+def transition(time_constant: Float[Array, "*channels"], dt: Float[Array, "..."]) -> tuple[Array, Array]:
     """The share of a disturbance that remains after one sample, and what a unit of it adds to the rate [s]."""
     share = dt / time_constant
     return jnp.exp(-share), -time_constant * jnp.expm1(-share)
@@ -99,7 +99,7 @@ def _is_rate(channels: int) -> Bool[np.ndarray, "channels 1"]:
     return np.arange(channels)[:, None] < RATES
 
 
-def step_of(noise: LogNoise, dt: Scalar) -> Step:
+def step_of(noise: LogNoise, dt: Float[Array, "..."]) -> Step:
     """What one sample of this length adds, exact for an Ornstein-Uhlenbeck process."""
     strength, time_constant, sensor = (leaf.reshape(leaf.shape[0], -1) for leaf in noise)
     variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
