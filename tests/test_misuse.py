@@ -138,7 +138,6 @@ MISUSE = [
     ),
     # Networks.
     ("`features` must be one of score, raw, got 'fourier'", lambda: fit(features="fourier")),
-    ('needs `features` "score"', lambda: fit(features="raw", approximator="cmac")),
     ("`steps` must be an integer of at least 1", lambda: fit(steps=0)),
     ("`held_out` must be an integer of at least 1000", lambda: fit(held_out=10)),
     ("`learning_rate` must be positive", lambda: fit(learning_rate=np.nan)),
@@ -165,10 +164,8 @@ ARGUMENTS = [
     (EXCITATIONS.values(), "amplitude", (np.nan, (1.0, 1.0))),
     ([multisine], "tones", [((1.0,), (1.0,)), ((50.0,), (1.0,), (1.0,)), ((0.0,), (1.0,), (1.0,))]),
     ([doublet, step3211], "duration", [4.0]),
-    ([doublet], "width", [0.001, np.nan]),
     ([doublet, step3211, chirp], "axes", [(), "roll", ("roll", "heave")]),
     ([chirp], "duration", [1.0]),
-    ([chirp], "frequencies", [(1.0, 60.0), (0.0, 3.0)]),
 ]
 
 
