@@ -333,3 +333,26 @@ def test_padding_changes_nothing():
     )
     for name, alone, beside in zip(one._fields, one, two, strict=True):
         np.testing.assert_allclose(alone, beside, rtol=1e-10, atol=1e-10 * np.abs(alone).max(), err_msg=name)
+
+
+def test_lanes_may_differ_in_everything():
+    """Lanes become segments of one filter: each with its own model, sample time, number of samples and noise."""
+    problem = disturbed()
+    flight = pad_flight(problem.flight, 700)
+
+    def at(i):
+        """A problem in segments, whose number `i` changes all data."""
+        other = eqx.tree_at(lambda f: f.time, flight, flight.time * (1 + 0.1 * i))
+        each = eqx.tree_at(lambda p: p.model.airframe.inertia, problem, problem.model.airframe.inertia * (1 + 0.2 * i))
+        length = jnp.asarray(501 - 40 * i, dtype=int)
+        each = eqx.tree_at(lambda p: (p.flight, p.length), each, (other, length), is_leaf=lambda leaf: leaf is None)
+        noise = LogNoise(*(leaf + 0.1 * i for leaf in NOISE))
+        return InnovationsProblem(each, segments=3, settling=50).innovations(MODEL.alpha * (1 + 0.01 * i), noise)
+
+    together = eqx.filter_jit(eqx.filter_vmap(at))(jnp.arange(3.0))
+    one = eqx.filter_jit(at)
+    for i in range(3):
+        alone = one(jnp.asarray(float(i)))
+        for name, expected, found in zip(alone._fields, alone, together, strict=True):
+            atol = 1e-9 * np.abs(expected).max()
+            np.testing.assert_allclose(found[i], expected, rtol=1e-9, atol=atol, err_msg=name)

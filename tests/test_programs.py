@@ -69,6 +69,26 @@ def test_other_limits_and_tolerances_of_a_search_need_no_other_program():
         assert not programs
 
 
+def test_a_batch_is_the_same_on_any_number_of_cores_by_one_program(monkeypatch):
+    """150 flights: the last of three chunks begins with flights of the second. `shared` has a leaf that is no array."""
+    problem, states = standard_problem(channels="rates"), jnp.asarray(noisy_states(150))
+
+    def identify(states, problem, negative):
+        problem = eqx.tree_at(lambda p: p.flight.states, problem, states)
+        return negative(jaxos4.OutputError()(problem, jaxos4.Bracket.default(problem.model)).parameters)
+
+    fit, found, counts = jaxos4.on_all_cores(identify), [], []
+    for cores in ("1", "2"):
+        monkeypatch.setenv("JAX_NUM_CPU_DEVICES", cores)
+        with compiled_programs() as programs:
+            found.append(fit(states, problem, jnp.negative))
+        counts.append(programs.count("jit(chunk)"))
+    assert counts == [1, 0]
+    np.testing.assert_array_equal(*found)
+    alone = [identify(states[i], problem, jnp.negative) for i in (0, 100, 149)]
+    np.testing.assert_allclose(found[0][np.array([0, 100, 149])], alone, rtol=1e-9)
+
+
 @pytest.mark.parametrize("channels", ["rates", "all"])
 def test_padding_changes_no_result(channels):
     problem = standard_problem(states=noisy_states(1)[0], channels=channels, free=True)

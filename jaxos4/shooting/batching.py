@@ -115,13 +115,15 @@ def on_all_cores(function: Callable) -> Callable:
 
     @eqx.filter_jit
     def chunk(many: Any, first: Array, size: int, shared: Any) -> Any:
-        part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), many)
+        arrays, others = eqx.partition(many, eqx.is_array)
+        arrays = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, size), arrays)
+        part = eqx.combine(arrays, others)
         return eqx.filter_vmap(lambda one: function(one, *shared))(part)
 
     compiled = set()
 
     def batch(many: Any, *shared: Any) -> Any:
-        leaves, structure = jax.tree.flatten((many, shared))
+        leaves, structure = jax.tree.flatten(eqx.filter((many, shared), eqx.is_array))
         lanes, double = leaves[0].shape[0], bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
         size = min(lanes, _CHUNK) if jax.default_backend() == "cpu" else lanes
 
