@@ -116,6 +116,14 @@ def unit_directions(information: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return joint_factor(information[None], information.shape[0]).basis[0]
 
 
+def covariance_root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """A matrix B with B B^T = covariance, which may be singular, whatever the units of its rows."""
+    std = np.sqrt(np.diagonal(covariance))
+    scale = np.where(std > 0, std, 1.0)
+    spread, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return scale[:, None] * axes * np.sqrt(np.maximum(spread, 0.0))
+
+
 def gram(matrix: Float[Array, "*batch n m"]) -> Float[Array, "*batch n n"]:
     """M M^T of each matrix M, in plain operations."""
     return (matrix[..., :, None, :] * matrix[..., None, :, :]).sum(axis=-1)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ..airframe import Airframe, airframe_from_table
 from ..errors import InputError
+from ..linalg import covariance_root
 from ..results import NAMES, meaning
 from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
 
@@ -131,12 +132,9 @@ class Identified(NamedTuple):
         **Raises:** `InputError` if hardly any draw is possible.
         """
         generator = np.random.default_rng([seed, number])
-        std = np.sqrt(np.diagonal(self.covariance))
-        scale = np.where(std > 0, std, 1.0)
-        spread, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        root = scale[:, None] * axes * np.sqrt(np.maximum(spread, 0.0))
+        root = covariance_root(self.covariance)
         for impossible in range(_MOST_DRAWS):
-            errors = root @ generator.standard_normal(std.size)
+            errors = root @ generator.standard_normal(len(root))
             changed = {name: self.values[name] + float(error) for name, error in zip(self.drawn, errors, strict=True)}
             vehicle = rigid_vehicle(self.airframe, _clipped(self.values | changed))
             if not vehicle.impossible:

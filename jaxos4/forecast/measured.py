@@ -1,4 +1,4 @@
-"""What a flight measured, with the attitude as a quaternion; and the simple predictions for comparison."""
+"""The measurements of a flight, with the attitude as a quaternion; and the simple predictions for comparison."""
 
 from typing import NamedTuple
 
@@ -6,18 +6,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..flight import STATE_NAMES, Flight
+from ..recording.motion import white_noise
 from .motion import PARTS, inverse, product, turned
-
-# Median of |x| over the standard deviation of a Gaussian x, and the root sum of squares of a fourth difference.
-_MEDIAN, _FOURTH = 0.6745, np.sqrt(70.0)
 
 
 class Measured(NamedTuple):
-    """What a flight measured. NaN: not measured.
+    """The measurements of a flight. NaN: not measured.
 
     - `states`: see `jaxos4.forecast.motion.PARTS`.
     - `omega`: rotor speeds or commands [rad/s]. `stretch`: the number of each sample's stretch. `dt`: sample time [s].
-    - `noise`: standard deviation of the white noise of position, velocity, attitude and rates.
+    - `noise`: standard deviation of the white noise of position, velocity, attitude and rates; 0 if not measured.
     """
 
     states: Float[np.ndarray, "samples 13"]
@@ -39,7 +37,8 @@ class Measured(NamedTuple):
         roll, pitch, yaw = ((half[0, :, i], *np.insert([zero, zero], i, half[1, :, i], axis=0)) for i in range(3))
         attitude = np.stack(product(yaw, product(pitch, roll)), axis=1)
         stretch = np.zeros(len(angles), int) if flight.stretch is None else np.asarray(flight.stretch)
-        noise = np.concatenate([_white_noise(each) for each in (position, velocity, angles, rates)])
+        columns = np.concatenate([position, velocity, angles, rates], axis=1).T
+        noise = np.nan_to_num([white_noise(column, 4) for column in columns])
         states = np.concatenate([position, velocity, attitude, rates], axis=1)
         return cls(states, np.asarray(flight.omega), stretch, float(flight.dt), noise)
 
@@ -59,17 +58,6 @@ class Measured(NamedTuple):
         """The first half of the samples."""
         half = slice(len(self.stretch) // 2)
         return self._replace(states=self.states[half], omega=self.omega[half], stretch=self.stretch[half])
-
-
-def _white_noise(values: Float[np.ndarray, "samples columns"]) -> Float[np.ndarray, " columns"]:
-    """The standard deviation of white noise on slow columns, from their fourth differences; 0 if nothing is measured.
-
-    Their median: jumps between stretches, and of angles by a turn, do not count.
-    """
-    differences = np.abs(np.diff(values, n=4, axis=0))
-    known = np.isfinite(differences).sum(axis=0) > 0
-    differences = np.where(known, differences, 0.0)
-    return np.nanmedian(differences, axis=0) / (_MEDIAN * _FOURTH) if len(differences) else np.zeros(values.shape[1])
 
 
 def constant_rates(

@@ -39,7 +39,7 @@ class Motion(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What is known at a start; with a leading axis, at many.
+    """The knowledge at a start; with a leading axis, at many.
 
     - `first`: the sample.
     - `state`: as measured, as in `PARTS`.
@@ -80,7 +80,7 @@ class Lanes(NamedTuple):
 
 
 class _Acting(NamedTuple):
-    """What acts for a step: the forcing, and disturbances of p', q', r' [rad/s^2] and along the body's axes [m/s^2]."""
+    """Inputs of a step: the forcing, and disturbances of p', q', r' [rad/s^2] and along the body's axes [m/s^2]."""
 
     forcing: Forcing
     turning: Vector
@@ -247,7 +247,7 @@ def forcing_and_offsets(
 
 @quick_jit
 def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[Array, " channels"]]:
-    """Of each channel's filter, when its gains no longer change.
+    """The state of each channel's filter when its gains no longer change.
 
     **Returns:** the covariance of rate and disturbance after a measurement; what a step adds to it; and the share of a
     constant acceleration that the disturbance absorbs.

@@ -73,11 +73,7 @@ def predict(
     **Raises:** `InputError`, one line, for a result without a vehicle, a flight that cannot be predicted, or unusable
     arguments; `OSError` if `found` cannot be read.
     """
-    for name, value, least in (("horizon", horizon, "positive"), ("spacing", spacing, "at least 0")):
-        if not math.isfinite(value) or value < 0 or (value == 0 and name == "horizon"):
-            raise InputError(f"`{name}`: must be a number of seconds, {least}, got {value:g}.")
-    if not isinstance(seed, int) or seed < 0:
-        raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
+    _check_options(horizon, spacing, seed)
     vehicle, recording = found if isinstance(found, Vehicle) else vehicle_of(found), as_recording(flight)
     prepared = _prepare(vehicle, recording, sample_time)
     measured, problem = Measured.of(prepared.fitted), padded(_problem(vehicle, prepared))
@@ -107,6 +103,14 @@ def predict(
         seed=seed,
         notes=(*vehicle.notes, *prepared.notes),
     )
+
+
+def _check_options(horizon: float, spacing: float, seed: int) -> None:
+    for name, value, least in (("horizon", horizon, "positive"), ("spacing", spacing, "at least 0")):
+        if not math.isfinite(value) or value < 0 or (value == 0 and name == "horizon"):
+            raise InputError(f"`{name}`: must be a number of seconds, {least}, got {value:g}.")
+    if not isinstance(seed, int) or seed < 0:
+        raise InputError(f"`seed`: must be an integer of at least 0, got {seed!r}.")
 
 
 def _prepare(vehicle: Vehicle, recording: Recording, sample_time: float | None) -> Prepared:
@@ -228,7 +232,7 @@ def _known(
     offset: Float[np.ndarray, "padded 6"],
     missing: tuple[str, ...],
 ) -> Known:
-    """What is known at each sample, in NumPy; `unsure` is missing. A position that was not measured is 0."""
+    """The knowledge at each sample, in NumPy; `unsure` is missing. A position that was not measured is 0."""
     samples = slice(len(measured.stretch))
     filtered = disturbances(problem, as_float(vehicle.parameters), noise, offset=offset[:, :3], memory=_MEMORY)
     state, flight = measured.states.copy(), problem.flight

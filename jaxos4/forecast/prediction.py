@@ -11,6 +11,7 @@ from jaxtyping import Float
 from .._files import write_atomically
 from .._version import __version__
 from ..errors import InputError
+from ..identification.results import finite_or_none
 from .motion import PARTS, departures
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ QUANTITIES: dict[str, tuple[str, list[int]]] = {
     "q": ("rad/s", [10]),
     "r": ("rad/s", [11]),
 }
-"""What is compared: the unit, and the components of an error."""
+"""The compared quantities: the unit, and the components of an error."""
 
 _AXES = {"attitude": ("component", ["w", "x", "y", "z"]), "rates": ("rate", ["p", "q", "r"])}
 
@@ -107,8 +108,8 @@ class FlightPrediction(NamedTuple):
         """Dictionaries, lists, numbers and strings: what `jaxos4 predict --json` writes."""
         quantities = {
             name: {"unit": QUANTITIES[name][0]}
-            | {field: [_finite(x) for x in values] for field, values in quality._asdict().items()}
-            | {"sum": {field: _finite(x) for field, x in quality.sums.items()}}
+            | {field: [finite_or_none(x) for x in values] for field, values in quality._asdict().items()}
+            | {"sum": {field: finite_or_none(x) for field, x in quality.sums.items()}}
             for name, quality in self.quality.items()
         }
         return {
@@ -183,10 +184,6 @@ def check_suffix(path: str | os.PathLike[str], *suffixes: str) -> None:
     """Refuse a file whose name does not end with one of the suffixes."""
     if Path(path).suffix not in suffixes:
         raise InputError(f"{path}: the name says the format; give one that ends with {' or '.join(suffixes)}.")
-
-
-def _finite(x: float) -> float | None:
-    return float(x) if np.isfinite(x) else None
 
 
 def _mean(values: Float[np.ndarray, "starts *rest"]) -> Float[np.ndarray, "*rest"]:

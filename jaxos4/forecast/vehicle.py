@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..export.result import ResultFile, checked, read_file
 from ..flight import FORCE_NAMES
 from ..identification import Identification
+from ..linalg import covariance_root
 from ..models.vehicle import FlightModel
 from ..shooting.gains import LogNoise
 
@@ -24,7 +25,7 @@ _LEAST = 1e-9  # of a noise level, whose logarithm must be finite
 
 
 class Vehicle(NamedTuple):
-    """What predicts.
+    """The vehicle that predicts.
 
     - `name`: of the result's file; `estimator` and model if there is none.
     - `model`: of one recording.
@@ -49,11 +50,8 @@ class Vehicle(NamedTuple):
 
     def draw(self, count: int, generator: np.random.Generator) -> Float[np.ndarray, "count parameters"]:
         """Parameters drawn from the estimate's uncertainty."""
-        std = np.sqrt(np.diagonal(self.covariance))
-        scale = np.where(std > 0, std, 1.0)
-        spread, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
-        root = scale[:, None] * axes * np.sqrt(np.maximum(spread, 0.0))
-        return self.parameters + generator.standard_normal((count, std.size)) @ root.T
+        root = covariance_root(self.covariance)
+        return self.parameters + generator.standard_normal((count, len(root))) @ root.T
 
 
 def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:

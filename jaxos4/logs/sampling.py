@@ -226,10 +226,16 @@ def unwrapped(t: Times, angles: Float[np.ndarray, "samples 3"]) -> Series:
 def attitude_of(t: Times, quaternion: Float[np.ndarray, "samples 4"]) -> Series:
     """Roll, pitch, yaw [rad] of quaternions (w, x, y, z), which need not be normalised. NaN if one is zero."""
     with np.errstate(all="ignore"):
-        w, x, y, z = (quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))).T
+        unit = quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
+    return unwrapped(t, euler_angles(unit))
+
+
+def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarray, "*samples 3"]:
+    """Roll, pitch, yaw [rad] of unit quaternions (w, x, y, z), without unwrapping."""
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
     phi = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     theta = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return unwrapped(t, np.column_stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))]))
+    return np.stack([phi, theta, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))], axis=-1)
 
 
 def in_order(t: Times) -> Bool[np.ndarray, " samples"] | None:

@@ -95,9 +95,17 @@ def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
 
     It follows from the median size of second differences: motion is smooth from sample to sample, noise is not.
     """
-    second = np.diff(rate, 2)
-    second = np.abs(second[np.isfinite(second)])
-    return float(np.median(second)) / 0.6745 / math.sqrt(6) if second.size else math.nan
+    return white_noise(rate, 2)
+
+
+def white_noise(values: Float[np.ndarray, " samples"], order: int) -> float:
+    """The standard deviation of white noise, from the median size of differences of this order; NaN without any.
+
+    A higher order tolerates faster motion. Jumps between stretches, and of angles by a turn, do not count.
+    """
+    size = np.diff(values, order)
+    size = np.abs(size[np.isfinite(size)])
+    return float(np.median(size)) / 0.6745 / math.sqrt(math.comb(2 * order, order)) if size.size else math.nan
 
 
 def opposite_axes(pieces: Sequence[Recording], airframe: Airframe) -> dict[str, float]:

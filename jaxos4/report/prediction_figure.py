@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from .._files import write_atomically
 from ..forecast import FlightPrediction
+from ..logs.sampling import euler_angles
 from .style import BOUND_DASHES, INK, drawing, grid, pdf, style, svg
 
 # The figure shows at most this much time [s], with as many predictions as fit into it without overlap.
@@ -64,9 +65,5 @@ def prediction_figure(found: FlightPrediction) -> Figure:
 
 def _angles(states: np.ndarray) -> np.ndarray:
     """The states with roll, pitch and yaw [rad] in the place of the quaternion."""
-    w, x, y, z = np.moveaxis(states[..., 6:10], -1, 0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    angles = np.unwrap(np.stack([roll, pitch, yaw], axis=-1), axis=-2)
+    angles = np.unwrap(euler_angles(states[..., 6:10]), axis=-2)
     return np.concatenate([states[..., :6], angles, states[..., 10:]], axis=-1)

@@ -185,12 +185,11 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
 
 
-def programs_of(study: Study, scenario: Scenario) -> list[tuple]:
-    """The keys of the programs that identify the flights of a scenario, in the order of use."""
-    kind, shapes = ESTIMATORS[scenario.estimator], (scenario.model, scenario.duration)
-    if issubclass(kind, Hybrid):  # it shares its search with IBSS
-        return [(TrainedNetwork, *shapes, study.seed_channels(scenario)), (IBSS, *shapes, scenario.seen)]
-    return [(kind, *shapes, scenario.seen)]
+def program_of(scenario: Scenario) -> tuple:
+    """The key of the program that searches for the parameters of a scenario's flights."""
+    kind = ESTIMATORS[scenario.estimator]
+    kind = IBSS if issubclass(kind, Hybrid) else kind  # the hybrid shares its search with IBSS
+    return kind, scenario.model, scenario.duration, scenario.seen
 
 
 def _answers(

@@ -22,7 +22,7 @@ import xarray as xr
 from ..errors import InputError, TrainingError
 from ..networks import TrainedNetwork, encode_network, load_network
 from ..shooting import cores
-from .cell import blank_problem, fleet_of, key_of, programs_of, run_cell
+from .cell import blank_problem, fleet_of, key_of, program_of, run_cell
 from .dataset import assemble, save_dataset
 from .specification import Cell, Job, Study
 from .store import Store, check_store, open_store, write_file
@@ -56,7 +56,7 @@ def workers() -> list[Any]:
 
 
 def device_name() -> str:
-    """What computes in this process, in words."""
+    """The workers of this process, in words."""
     return f"{len(workers())} x {jax.local_devices()[0].device_kind}"
 
 
@@ -78,7 +78,7 @@ def run_here(store: Store) -> Iterator[Step]:
     done, waiting = study.count - len(cells), defaultdict[tuple, deque[Cell]](deque)
     # Cells of IBSS first: those of the hybrid, which end with the same program, wait for a network.
     for cell in sorted(cells, key=lambda cell: study.job(cell.scenario) is not None):
-        waiting[programs_of(study, cell.scenario)[-1]].append(cell)
+        waiting[program_of(cell.scenario)].append(cell)
     untrained = deque(dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None))
     # A cell without a network never waits for one.
     networks: dict[Job | None, Trained] = {None: None}
@@ -122,7 +122,7 @@ def run_here(store: Store) -> Iterator[Step]:
                 if isinstance(task, Job):
                     networks[task] = future.result()
                 else:
-                    compiled[programs_of(study, task.scenario)[-1], device] = True
+                    compiled[program_of(task.scenario), device] = True
                     write_file(store.cell_file(task.number), future.result())
                     done += 1
     finally:
