@@ -86,6 +86,8 @@ def _case(
 ) -> Case:
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
+    if (level := _level(prepared, airframe)) is not None and "az_bias" in model.parameter_names and not isinstance(bracket, Bracket):
+        bracket = {"az_bias": level, **(bracket or {})}
     shooting = _vehicle_shooting(model, prepared, bracket_of(bracket, model), recordings[0].name)
     held_out, notes = _held_out(recordings, validate, prepared, shooting, model)
     stretch = prepared.fitted.stretch
@@ -176,12 +178,25 @@ def _innovations(
     return InnovationsProblem(padded, segments=segments, balance=_balance(prepared, airframe, capacity))
 
 
+def _level(prepared: Prepared, airframe: Airframe):
+    import os
+    if os.environ.get('OLD') or prepared.upright is None: return None
+    f=np.asarray(prepared.fitted.specific_force)[:,2]; up=prepared.upright
+    k=~np.isnan(f)
+    gravity = float(airframe.gravity)
+    drag_lift = prepared.drag_lift if np.isfinite(prepared.drag_lift) else 0.0
+    gained = _GAINED * np.sqrt(len(prepared.recordings)) / (k.sum() * float(prepared.fitted.dt))
+    c=(((f*up)[k]).mean()+drag_lift-gravity)/up[k].mean(); h=np.hypot(gained, _CARRIED * gravity)
+    return [float(c-h),float(c+h)]
+
+
 def _balance(prepared: Prepared, airframe: Airframe, capacity: int) -> Balance | None:
     """The balance of weight, if the tilt is known: over each stretch the vehicle gains a velocity of about 1 m/s.
 
     Drag carries a part of the weight of a vehicle that leans into its airspeed.
     """
-    if prepared.upright is None:
+    import os
+    if not os.environ.get('OLD') or prepared.upright is None:
         return None
     samples, gravity = prepared.upright.size, float(airframe.gravity)
     gained = _GAINED * np.sqrt(len(prepared.recordings)) / (samples * float(prepared.fitted.dt))
