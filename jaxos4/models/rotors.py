@@ -62,10 +62,13 @@ class Speeds(NamedTuple):
 
 
 class SquaredSpeeds(NamedTuple):
-    """The thrust of each rotor divided by b [rad^2/s^2]: its mean over the sample, and its value at the begin."""
+    """The thrust of each rotor divided by b [rad^2/s^2].
+
+    `mean`: over the sample. `around`: over the same time around the begin of the sample, if a speed jumps there.
+    """
 
     mean: RotorSpeeds
-    begin: RotorSpeeds
+    around: RotorSpeeds
 
 
 def measured_speeds(omega: RotorSpeeds, grid: Grid) -> Speeds:
@@ -75,10 +78,12 @@ def measured_speeds(omega: RotorSpeeds, grid: Grid) -> Speeds:
     return Speeds(omega, omega, following - omega)
 
 
-def squared(speeds: Speeds) -> SquaredSpeeds:
+def squared(speeds: Speeds, grid: Grid) -> SquaredSpeeds:
     """Squares of speeds that change linearly over a sample: the mean square makes the mean torque."""
     begin, end, _ = speeds
-    return SquaredSpeeds((begin * begin + begin * end + end * end) / 3, begin * begin)
+    is_first = (jnp.arange(begin.shape[0]) == grid.first)[:, None]
+    before = jnp.where(is_first, begin, jnp.roll(end, 1, axis=0))
+    return SquaredSpeeds((begin * begin + begin * end + end * end) / 3, (before * before + begin * begin) / 2)
 
 
 def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:

@@ -142,7 +142,7 @@ class FlightModel(AbstractModel):
         speeds = measured_speeds(omega, grid)
         for change, values in self._contributions("speed", parameters):
             speeds = change(speeds, values, grid, airframe)
-        squares = squared(speeds)
+        squares = squared(speeds, grid)
         roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
         recording = jnp.asarray(self.recordings)[grid.stretch]
@@ -154,7 +154,7 @@ class FlightModel(AbstractModel):
             thrust=thrust / mass,
             residual_speed=(speeds.begin + speeds.end) @ spins / 2,
             spin_up=speeds.change @ spins / inputs.dt,
-            specific_thrust=squares.begin.sum(axis=1) * airframe.thrust_coefficient / mass,
+            specific_thrust=squares.around.sum(axis=1) * airframe.thrust_coefficient / mass,
             recording=tuple((recording == i).astype(omega.dtype) for i in range(max(self.recordings) + 1)),
             velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
             lateral=None if force is None else tuple(force.T[:2]),
