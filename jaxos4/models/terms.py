@@ -46,6 +46,8 @@ _AXES = ("roll", "pitch", "yaw")
 # The half-width of the damping [1/s]: rotors resist roll and pitch by their thrust, and yaw by their drag only.
 _DAMPING = (5.0, 5.0, 2.0)
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
+VERTICAL_BIAS = _FORCE_BIASES[2]
+"""The parameter that is the constant error of the accelerometer along z."""
 
 T = TypeVar("T")
 Values = Mapping[str, Float[Array, "..."]]

@@ -2,10 +2,9 @@
 
 A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a
 force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
-The filter of a body rate knows the rate and its disturbance. A specific force is measured as its mean over a sample, so
-its filter knows the mean of the disturbance over the sample, and its value at the end of the sample. The mean stands in
-the place of the rate: it is as exact an integral of the disturbance, which begins anew in each sample. Channels share no
-covariance.
+The filter of a body rate knows the rate and its disturbance. A specific force is measured as its mean over a sample.
+Its filter knows the disturbance at the end of the sample and, in the place of the rate, the mean over the sample. Both
+rate and mean are integrals of the disturbance, but each sample has its own mean. Channels share no covariance.
 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
