@@ -22,6 +22,7 @@ def table(*rows):
             0.004 * 2**i,
             {name: Constant(value, 1.0, "kg m^2") for name, value in zip(("Ix", "Iy"), values, strict=False)},
             correlation,
+            samples=5000 // 2**i,
         )
         for i, (values, correlation) in enumerate(rows)
     ]
