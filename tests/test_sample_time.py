@@ -46,8 +46,8 @@ A, B, C = (10.0, 20.0), (13.0, 20.0), (10.0, 25.0)
         (table((A, 0.1), (B, 0.1), (A, 0.1)), 0),
         (table(((), 0.1), (A, 0.1), (A, 0.1)), 1),
     ],
-    ids=["one", "plateau", "later plateau", "plateau of Iy", "beyond chance", "white later", "negative", "none white", "last alone",
-         "no plateau", "no answer"],
+    ids=["one", "plateau", "later plateau", "plateau of Iy", "beyond chance", "white later", "negative", "none white",
+         "last alone", "no plateau", "no answer"],
 )  # fmt: skip
 def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(answers, place):
     assert shortest(answers) == place

@@ -8,6 +8,7 @@ the moments of inertia are those of samples twice as long, within two standard d
 shortest without vibration and noise. If all have it: the longest with an answer.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -65,7 +66,7 @@ def shortest(answers: Sequence[SampleTime]) -> int:
 
 
 def _is_clean(answer: SampleTime) -> bool:
-    chance = _CHANCE / np.sqrt(answer.samples)
+    chance = _CHANCE / math.sqrt(answer.samples)
     return abs(answer.correlation) <= WHITE + chance and answer.speed_noise <= NOISY
 
 
