@@ -9,10 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ._custom_types import LARGEST, Parameters, Scalar
+from ._custom_types import Parameters, Scalar
 from .bracket import Bracket
 from .linalg import covariance_of_shared, invert
 from .results import RESULTS
@@ -260,26 +259,6 @@ def check_recursive(problem: ShootingProblem) -> None:
             "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
             "use an estimator that shoots."
         )
-
-
-def check_count(name: str, value: Any, least: int) -> None:
-    """Raises `ValueError` for a setting that is not an integer of at least `least`, or a traced array of integers."""
-    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
-        if isinstance(value, Tracer):
-            return
-        value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
-    if value > LARGEST:
-        raise ValueError(f"`{name}` must be at most {LARGEST}, got {value}.")
-
-
-def check_positive(name: str, value: Scalar | float, *, finite: bool = False) -> None:
-    """Raises `ValueError` for a setting that is not one positive number; a traced one is not checked."""
-    if isinstance(value, Tracer):
-        return
-    if np.shape(value) != () or not np.asarray(value) > 0 or (finite and not np.isfinite(value)):
-        raise ValueError(f"`{name}` must be positive{' and finite' if finite else ''}, got {value}.")
 
 
 class AbstractEstimator(eqx.Module):

@@ -11,10 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ._custom_types import Key, States, as_float
+from ._custom_types import Key, States, as_float, setting
 from .flight import STATE_NAMES, STATE_UNITS, Flight
 
 PerChannel = Float[Array, "12"]
@@ -25,25 +24,6 @@ SENSOR_SIGMA = np.array([_SIGMA_OF_UNIT[unit] for unit in STATE_UNITS])
 SENSOR_SIGMA.flags.writeable = False
 # Standard deviation of an accelerometer in flight [m/s^2]: mostly vibration.
 FORCE_SIGMA = 0.3
-
-
-def _per_channel(
-    name: str, low: float, high: float = np.inf, *, open_below: bool = False
-) -> Callable[[ArrayLike], Array]:
-    """A field's converter: accepts one number or 12, and checks the range unless the values are traced."""
-
-    def convert(value: ArrayLike) -> Array:
-        array = as_float(value)
-        if array.shape not in ((), (12,)):
-            raise ValueError(f"`{name}` must be one number or 12, one for each state, got shape {array.shape}.")
-        if not isinstance(array, Tracer):
-            numbers = np.asarray(array)
-            if not np.all((numbers > low if open_below else numbers >= low) & (numbers <= high)):
-                ends = f"{'(' if open_below else '['}{low:g}, {high:g}]"
-                raise ValueError(f"`{name}` must lie in {ends}, got {numbers.tolist()}.")
-        return jnp.broadcast_to(array, (len(STATE_NAMES),))
-
-    return convert
 
 
 def _with_states(flight: Flight, states: States) -> Flight:
@@ -61,7 +41,7 @@ class AbstractNoise(eqx.Module):
 class WhiteNoise(AbstractNoise):
     """Independent Gaussian errors of every sample, with `sigma` for each state in `STATE_UNITS`. 0: exact."""
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
+    sigma: PerChannel = eqx.field(converter=setting("sigma", STATE_NAMES))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -74,8 +54,8 @@ class ConstantBias(AbstractNoise):
     - `sigma`, `mean`: of the offset, for each state in `STATE_UNITS`. `ConstantBias(0, mean=offset)` is a known offset.
     """
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
-    mean: PerChannel = eqx.field(converter=_per_channel("mean", -np.inf), default=0.0)
+    sigma: PerChannel = eqx.field(converter=setting("sigma", STATE_NAMES))
+    mean: PerChannel = eqx.field(converter=setting("mean", STATE_NAMES, low=-np.inf), default=0.0)
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -91,8 +71,10 @@ class GaussMarkov(AbstractNoise):
     - `correlation_time`: T [s] for each state, positive. Infinite: a constant bias.
     """
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
-    correlation_time: PerChannel = eqx.field(converter=_per_channel("correlation_time", 0.0, open_below=True))
+    sigma: PerChannel = eqx.field(converter=setting("sigma", STATE_NAMES))
+    correlation_time: PerChannel = eqx.field(
+        converter=setting("correlation_time", STATE_NAMES, positive=True, finite=False)
+    )
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -111,7 +93,7 @@ class GaussMarkov(AbstractNoise):
 class Quantisation(AbstractNoise):
     """Rounding to the nearest multiple of `step`, for each state in `STATE_UNITS`. 0: not rounded."""
 
-    step: PerChannel = eqx.field(converter=_per_channel("step", 0.0))
+    step: PerChannel = eqx.field(converter=setting("step", STATE_NAMES))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -122,7 +104,7 @@ class Quantisation(AbstractNoise):
 class Dropouts(AbstractNoise):
     """Lost samples: each sample of each state becomes NaN with `probability`, independently of the others."""
 
-    probability: PerChannel = eqx.field(converter=_per_channel("probability", 0.0, 1.0))
+    probability: PerChannel = eqx.field(converter=setting("probability", STATE_NAMES, high=1.0))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""

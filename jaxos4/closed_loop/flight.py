@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .._custom_types import Key, Numeric, Scalar, as_float
+from .._custom_types import Key, Numeric, Scalar, as_float, setting
 from .._xla import quick_jit
 from ..airframe import alpha_scalars
 from ..flight import Flight
@@ -18,7 +18,7 @@ from ..models.state import Attitude, Rates, Vector
 from ..simulation import rk4_step
 from ..trigonometry import sincos
 from .sensors import Motion, Sense, Signals, log
-from .settings import ClosedLoop, PerAxis, setting
+from .settings import ClosedLoop, PerAxis
 
 References = Float[Array, "samples 4"]
 

@@ -4,15 +4,13 @@ Flights share one program if they have the same `log_every` and `logged`, and al
 `sensors`: all other settings are data.
 """
 
-from collections.abc import Callable, Sequence
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .._custom_types import Scalar, as_float
+from .._custom_types import Scalar, setting
 from ..airframe import Airframe
 from ..models.rotors import Motor
 from ..models.terms import STEEPEST, has_full_scale
@@ -23,39 +21,6 @@ Pair = Float[Array, "2"]
 
 LOGGED = ("commands", "speeds")
 _BODY, _XYZ, _XY, _TILT = ("roll", "pitch", "yaw"), ("x", "y", "z"), ("x", "y"), ("roll", "pitch")
-
-
-def setting(
-    name: str,
-    axes: tuple[str, ...] = (),
-    *,
-    low: float = 0.0,
-    high: float = np.inf,
-    positive: bool = False,
-    optional: bool = False,
-) -> Callable[[ArrayLike | Sequence[float] | None], Array]:
-    """A field's converter: accepts one number, or one for each of `axes`, in a range unless traced.
-
-    An optional setting can be `None`, which is stored as NaN, so that all flights share one program.
-    """
-
-    def convert(value: ArrayLike | Sequence[float] | None) -> Array:
-        value = np.nan if value is None else value
-        array = as_float(np.asarray(value, dtype=float) if isinstance(value, Sequence) else value)
-        if array.shape not in ((), (len(axes),) if axes else ()):
-            several = f" or {len(axes)} ({', '.join(axes)})" if axes else "; use `vmap` for a batch"
-            raise ValueError(f"`{name}` must be one number{several}, got shape {array.shape}.")
-        if not isinstance(array, Tracer):
-            numbers = np.asarray(array)
-            allowed = (numbers >= low) & (numbers <= high) & np.isfinite(numbers) & ((numbers > 0) | (not positive))
-            if not np.all(allowed | (np.isnan(numbers) & optional)):
-                least = "" if low == -np.inf or positive else f" and at least {low:g}"
-                most = "" if high == np.inf else f" and at most {high:g}"
-                kind = "positive and finite" if positive else "finite"
-                raise ValueError(f"`{name}` must be {kind}{least}{most}, got {numbers.tolist()}.")
-        return jnp.broadcast_to(array, (len(axes),)) if axes else array
-
-    return convert
 
 
 class Air(eqx.Module):

@@ -10,12 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._custom_types import Count, Parameters, Scalar, as_float, as_int
+from .._custom_types import Count, Parameters, Scalar, as_float, integer, setting
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate, check_recursive
 from ..shooting import ShootingProblem, in_blocks
-from .regression import Regression, check_linear, check_settings, normal_equations, solve
+from .regression import Regression, check_linear, normal_equations, solve
 
 
 class EquationError(AbstractEstimator):
@@ -48,11 +48,8 @@ class EquationError(AbstractEstimator):
     shoots: ClassVar[bool] = False
     prior: ClassVar[float] = NO_PRIOR
 
-    memory: Scalar = eqx.field(converter=as_float, default=1.0)
-    bridge: Count = eqx.field(converter=as_int, default=4)
-
-    def __check_init__(self):
-        check_settings(self.memory, self.bridge)
+    memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)
+    bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
@@ -108,12 +105,9 @@ class RecursiveLeastSquares(AbstractEstimator):
     shoots: ClassVar[bool] = False
     prior: ClassVar[float] = NO_PRIOR
 
-    forgetting: Scalar = eqx.field(converter=as_float, default=1.0)
-    memory: Scalar = eqx.field(converter=as_float, default=1.0)
-    bridge: Count = eqx.field(converter=as_int, default=4)
-
-    def __check_init__(self):
-        check_settings(self.memory, self.bridge, self.forgetting)
+    forgetting: Scalar = eqx.field(converter=setting("forgetting", high=1.0, positive=True), default=1.0)
+    memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)
+    bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Count, Parameters, Scalar, as_int
+from .._custom_types import Count, Parameters, Scalar, integer
 from .._xla import quick_jit
 from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, as_estimate, check_count, check_recursive
+from ..estimate import AbstractEstimator, Estimate, as_estimate, check_recursive
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
 from ..shooting import Rows, ShootingProblem, Unknowns, in_blocks
@@ -60,10 +60,7 @@ class JointEKF(AbstractEstimator):
     shoots: ClassVar[bool] = False
     prior: ClassVar[float] = GAUSSIAN_PRIOR
 
-    passes: Count = eqx.field(converter=as_int, default=10)
-
-    def __check_init__(self):
-        check_count("passes", self.passes, 1)
+    passes: Count = eqx.field(converter=integer("passes", 1), default=10)
 
     @quick_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:

@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar
-from ..estimate import Estimate, as_estimate, best_start, check_count
+from ..estimate import Estimate, as_estimate, best_start
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
@@ -233,13 +233,3 @@ def solve(information: Matrix, moment: Float[Array, " parameters"]) -> tuple[Flo
 
 def _prior(count: int) -> Matrix:
     return jnp.eye(count, dtype=float) / DIFFUSE**2
-
-
-def check_settings(memory: Scalar, bridge: Count, forgetting: Scalar | float = 1.0) -> None:
-    """Raises `ValueError` for a setting of a regression that is out of range."""
-    for name, value, positive in (("forgetting", forgetting, True), ("memory", memory, False)):
-        if not isinstance(value, Tracer):
-            number = np.asarray(value)
-            if number.shape != () or not ((number > 0 if positive else number >= 0) and number <= 1):
-                raise ValueError(f"`{name}` must lie in {'(' if positive else '['}0, 1], got {number}.")
-    check_count("bridge", bridge, 0)
