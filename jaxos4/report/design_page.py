@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from .._files import write_atomically
+from .._files import write_file
 from ..design import Design
 from .text import Listing, plain
 
@@ -118,5 +118,4 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
         handles = panels[_COLUMNS].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=len(every))
         content = svg(figure)
-    with write_atomically(out) as beside:
-        beside.write_bytes(content)
+    write_file(out, content)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from .._files import write_atomically
+from .._files import write_file
 from ..forecast import FlightPrediction
 from ..logs.sampling import euler_angles
 from .style import BOUND_DASHES, INK, drawing, grid, pdf, style, svg
@@ -19,8 +19,7 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
     """Writes the figure as SVG or PDF, by the suffix. Raises `OSError` if it cannot be written."""
     with drawing():
         drawn = (pdf if Path(path).suffix == ".pdf" else svg)(prediction_figure(found))
-    with write_atomically(path) as beside:
-        beside.write_bytes(drawn)
+    write_file(path, drawn)
 
 
 def prediction_figure(found: FlightPrediction) -> Figure:
