@@ -78,16 +78,8 @@ class GaussMarkov(AbstractNoise):
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
-        steps = flight.dt / self.correlation_time
-        decay, fresh = jnp.exp(-steps), jnp.sqrt(-jnp.expm1(-2 * steps))
-        normal = _normal(key, flight.states)
-
-        def step(error: PerChannel, draw: PerChannel) -> tuple[PerChannel, PerChannel]:
-            error = decay * error + fresh * draw
-            return error, error
-
-        later = jax.lax.scan(step, normal[0], normal[1:])[1]
-        return _with_states(flight, flight.states + self.sigma * jnp.concatenate([normal[:1], later]))
+        errors = coloured(_normal(key, flight.states), flight.dt / self.correlation_time)
+        return _with_states(flight, flight.states + self.sigma * errors)
 
 
 class Quantisation(AbstractNoise):
@@ -122,6 +114,17 @@ class Chain(AbstractNoise):
         for i, noise in enumerate(self.noises):
             flight = noise(flight, key=jax.random.fold_in(key, i))
         return flight
+
+
+def coloured(draws: Float[Array, "count columns"], step: Float[Array, "*columns"]) -> Float[Array, "count columns"]:
+    """Ornstein-Uhlenbeck processes of unit variance, from white noise; `step`: time step / correlation time."""
+    decay, fresh = jnp.exp(-step), jnp.sqrt(-jnp.expm1(-2 * step))
+
+    def advance(value: Array, draw: Array) -> tuple[Array, Array]:
+        value = decay * value + fresh * draw
+        return value, value
+
+    return jnp.concatenate([draws[:1], jax.lax.scan(advance, draws[0], draws[1:])[1]])
 
 
 def _normal(key: Key, like: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

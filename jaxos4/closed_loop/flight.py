@@ -15,6 +15,7 @@ from ..airframe import alpha_scalars
 from ..flight import Flight
 from ..models.rotation import attitude_rates
 from ..models.state import Attitude, Rates, Vector
+from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
 from .sensors import Motion, Sense, Signals, log
@@ -310,11 +311,4 @@ def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> 
 
 def ornstein_uhlenbeck(key: Key, count: int, step: Scalar) -> Float[Array, "count 4"]:
     """Four independent Ornstein-Uhlenbeck processes of unit variance; `step`: time step / correlation time."""
-    decay, fresh = jnp.exp(-step), jnp.sqrt(-jnp.expm1(-2 * step))
-    draws = jax.random.normal(key, (count, 4))
-
-    def advance(value, draw):
-        value = decay * value + fresh * draw
-        return value, value
-
-    return jnp.concatenate([draws[:1], jax.lax.scan(advance, draws[0], draws[1:])[1]])
+    return coloured(jax.random.normal(key, (count, 4)), step)

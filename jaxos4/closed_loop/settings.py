@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from .._custom_types import Scalar, setting
 from ..airframe import Airframe
 from ..models.rotors import Motor
-from ..models.terms import STEEPEST, has_full_scale
+from ..models.terms import STEEPEST
 from ..noise import FORCE_SIGMA
 
 PerAxis = Float[Array, "3"]
@@ -151,7 +151,7 @@ class ClosedLoop(eqx.Module):
         if self.log_every < 1:
             raise ValueError(f"`log_every` must be at least 1, got {self.log_every}.")
         loaded = [x for x in (self.thrust_curve, self.motor_braking) if not isinstance(x, Tracer) and float(x) != 1]
-        if loaded and not has_full_scale(self.airframe):
+        if loaded and not self.airframe.has_full_scale:
             raise ValueError("`airframe.max_rotor_speed` must be known for `thrust_curve` and `motor_braking`: set it.")
 
     @property

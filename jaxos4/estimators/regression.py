@@ -13,7 +13,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar
@@ -200,20 +199,6 @@ class Regression(NamedTuple):
             sound=shot.sound,
             done=jnp.ones((), dtype=bool),
             history=history,
-        )
-
-
-def check_linear(problem: ShootingProblem) -> None:
-    """Raises `ValueError` unless the rate equations are linear in all parameters that are not held.
-
-    Inside `jit`, where it is not known which parameters are held, all of them must be linear.
-    """
-    mask, parameters = problem.unknowns.free, problem.model.parameters
-    free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
-    if any(each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):
-        raise ValueError(
-            "`problem.model` must have rate equations that are linear in its parameters for a regression: hold the "
-            "others, or use an estimator that shoots."
         )
 
 

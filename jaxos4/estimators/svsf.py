@@ -20,12 +20,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Parameters, Scalar, integer, setting
-from .._xla import quick_jit
-from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, as_estimate, check_recursive, fit_start
+from ..bracket import GAUSSIAN_PRIOR
+from ..estimate import REACH, AbstractRecursion, Estimate, as_estimate, fit_start
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, stack, unstack
-from ..shooting import Rows, ShootingProblem, Unknowns, in_blocks
+from ..shooting import Rows, ShootingProblem, Unknowns
 
 _AVERAGED = 0.5  # the share of the last pass over which the parameters are averaged
 
@@ -48,7 +47,7 @@ class _Filter(NamedTuple):
     covariance: Float[Array, "joint joint"]
 
 
-class SVSF(AbstractEstimator):
+class SVSF(AbstractRecursion):
     """Smooth Variable Structure Filter of the body rates and the parameters.
 
     **Arguments:**
@@ -76,7 +75,6 @@ class SVSF(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "rates"
-    shoots: ClassVar[bool] = False
     prior: ClassVar[float] = GAUSSIAN_PRIOR
 
     gamma: Scalar = eqx.field(converter=setting("gamma", high=0.999), default=0.0)
@@ -87,18 +85,8 @@ class SVSF(AbstractEstimator):
     passes: int = eqx.field(static=True, converter=integer("passes", 1, static=True), default=4)
     memory: bool = eqx.field(static=True, default=True)
 
-    @quick_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. The filter begins at the bracket's center.
-
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
-        windows, or a model with rotor lag, delay, thrust curve or sensor terms.
-        """
-        check_recursive(problem)
-        return in_blocks(self._identify, problem.within(bracket))
-
-    def _identify(self, problem: ShootingProblem) -> Estimate:
-        """One flight, or a block of flights."""
+    def identify(self, problem: ShootingProblem) -> Estimate:
+        """See `AbstractRecursion`."""
         box, rates = problem.unknowns.usable, problem.restrict("rates")
         rows, start = jax.tree.map(lambda leaf: leaf[0], rates.rows()), rates.first_state()
         count, samples = box.center.shape[0], rows.measured[0].shape[0]

@@ -19,7 +19,6 @@ from ..models.terms import (
     LATERAL_FORCE,
     VERTICAL_FORCE,
     VOLTAGE,
-    has_full_scale,
 )
 from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
@@ -198,7 +197,7 @@ def _available_inputs(
         BODY_VELOCITY: bool(motions) and all(motion.measured for motion in motions),
         LATERAL_FORCE: force[0] and force[1],
         VERTICAL_FORCE: force[2],
-        FULL_SCALE: has_full_scale(airframe),
+        FULL_SCALE: airframe.has_full_scale,
         VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
