@@ -112,7 +112,7 @@ def fly_standard(
 
 
 class _Acting(NamedTuple):
-    """What acts on the vehicle for a step.
+    """Torque, forces and wind that act on the vehicle for a step.
 
     Torque [N m], thrust over the mass [m/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind
     along the body's axes [m/s].

@@ -46,7 +46,7 @@ class Air(eqx.Module):
 
 
 class Sensors(eqx.Module):
-    """What gyro, accelerometer and recorder do to a flight besides white noise. With these defaults nothing.
+    """Effects of gyro, accelerometer and recorder besides white noise. With these defaults there are none.
 
     - `gyro_vibration` [rad/s], `force_vibration` [m/s^2]: amplitude of the sine that each rotor in hover adds to each
       axis, once for each revolution. The amplitude is proportional to the squared speed. Sampling causes aliasing.

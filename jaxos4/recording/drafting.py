@@ -74,7 +74,8 @@ def airframe_draft(recording: Recording) -> AirframeDraft:
         missing.append("hover_speed")
         say("hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
     else:
-        add("hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
+        how = f"{'by the accelerometer' if hover.felt else 'the median'} in {hover.seconds:.1f} s of flight"
+        add("hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {how}")
         if not hover.felt:
             say("Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
     if recording.commanded:
@@ -115,10 +116,6 @@ def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:
         f"rotor_positions = [{', '.join(f'[{x}, {y}]' for x, y in signed)}]  # m: numbers for x (forward) and y (left)",
         f"(as the vehicle turns in this flight: {names})",
     )
-
-
-def _how(hover: _Hover) -> str:
-    return f"{'by the accelerometer' if hover.felt else 'the median'} in {hover.seconds:.1f} s of flight"
 
 
 def _short(value: Any) -> Any:

@@ -170,6 +170,7 @@ def _sampled(
     moved = len(motions) == len(pieces)
     if moved:
         pieces = [piece._replace(body_velocity=motion.velocity) for piece, motion in zip(pieces, motions, strict=True)]
+    lifts = np.concatenate([motion.drag_lift for motion in motions]) if moved else np.full(1, math.nan)
     whole, whole_time = joined(pieces), np.concatenate([piece.time for piece in pieces])
     fitted, tested = hold_out(whole, length, holdout)
     return Prepared(
@@ -180,7 +181,7 @@ def _sampled(
         length,
         _available_inputs(whole, pieces, airframe, motions if moved else []),
         np.concatenate([motion.up[:, 2] for motion in motions]) if moved else None,
-        _mean([motion.drag_lift for motion in motions]) if moved else math.nan,
+        float(np.nanmean(lifts)) if np.isfinite(lifts).any() else math.nan,
         (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
         *about,
     )
@@ -201,12 +202,6 @@ def _available_inputs(
         VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
-
-
-def _mean(series: Sequence[np.ndarray]) -> float:
-    """The mean of what was measured; NaN if nothing was."""
-    values = np.concatenate(series)
-    return float(np.nanmean(values)) if np.isfinite(values).any() else math.nan
 
 
 def _seconds(recording: Recording) -> float:
