@@ -30,11 +30,7 @@ _HOLD = 0.5
 
 
 def random_references(
-    *,
-    duration: float = 20.0,
-    dt: float = 0.004,
-    amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5),
-    key: Key,
+    *, duration: float = 20.0, dt: float = 0.004, amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5), key: Key
 ) -> References:
     """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
 
@@ -65,12 +61,7 @@ def _levels(key: Key, steps: Int[Array, "samples 4"], count: int, amplitude: Ref
 
 
 def fly_closed_loop(
-    loop: ClosedLoop,
-    references: References,
-    *,
-    dt: Float[ArrayLike, ""] = 0.004,
-    key: Key,
-    substeps: int = 4,
+    loop: ClosedLoop, references: References, *, dt: Float[ArrayLike, ""] = 0.004, key: Key, substeps: int = 4
 ) -> Flight:
     """Fly a vehicle in closed loop from hovering, and return what its autopilot logs. `vmap` it for a batch.
 

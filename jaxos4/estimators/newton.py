@@ -20,15 +20,7 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Count, Scalar, integer, setting
 from .._xla import quick_jit
 from ..bracket import GAUSSIAN_PRIOR, NO_PRIOR, Bracket
-from ..estimate import (
-    REACH,
-    AbstractEstimator,
-    Estimate,
-    as_estimate,
-    estimate_at,
-    fit_start,
-    from_starts,
-)
+from ..estimate import REACH, AbstractEstimator, Estimate, as_estimate, estimate_at, fit_start, from_starts
 from ..linalg import joint_factor, movable, slopes_along
 from ..results import RESULTS
 from ..shooting import AbstractProblem, Curvature, InnovationsProblem, ShootingProblem, in_blocks

@@ -61,13 +61,6 @@ class Speeds(NamedTuple):
     change: RotorSpeeds
 
 
-class SquaredSpeeds(NamedTuple):
-    """The thrust of each rotor divided by b [rad^2/s^2]: its mean over the sample, and its value at the begin."""
-
-    mean: RotorSpeeds
-    begin: RotorSpeeds
-
-
 def measured_speeds(omega: RotorSpeeds, grid: Grid) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing."""
     is_last = (jnp.arange(omega.shape[0]) == grid.last)[:, None]
@@ -75,10 +68,9 @@ def measured_speeds(omega: RotorSpeeds, grid: Grid) -> Speeds:
     return Speeds(omega, omega, following - omega)
 
 
-def squared(speeds: Speeds) -> SquaredSpeeds:
-    """Squares of speeds that change linearly over a sample: the mean square makes the mean torque."""
-    begin, end, _ = speeds
-    return SquaredSpeeds((begin * begin + begin * end + end * end) / 3, begin * begin)
+def mean_square(begin: RotorSpeeds, end: RotorSpeeds) -> RotorSpeeds:
+    """The mean square of speeds that change linearly over a sample, which makes the mean torque."""
+    return (begin * begin + begin * end + end * end) / 3
 
 
 def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:

@@ -11,15 +11,7 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
-from ..models.terms import (
-    AXIAL_VELOCITY,
-    BODY_VELOCITY,
-    COMMANDS,
-    FULL_SCALE,
-    LATERAL_FORCE,
-    VERTICAL_FORCE,
-    VOLTAGE,
-)
+from ..models.terms import AXIAL_VELOCITY, BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE
 from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
@@ -221,7 +213,7 @@ def _usable_parts(
             return [cut(recording, Stretch(first if begin is None else begin, last if end is None else end))], None
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
-    every = stretches(recording, airframe, landed=recording.facts.landed)
+    every = stretches(recording, airframe)
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:
