@@ -314,10 +314,12 @@ class AbstractRecursion(AbstractEstimator):
                 "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
                 "use an estimator that shoots."
             )
-        return in_one_program(self.identify, problem.within(bracket))
+        return in_one_program(self.identify, problem, bracket)
 
 
 @quick_jit
-def in_one_program(identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem) -> Estimate:
-    """The estimate of one flight, or of a batch in blocks."""
-    return in_blocks(identify, problem)
+def in_one_program(
+    identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem, bracket: Bracket | None
+) -> Estimate:
+    """The estimate of one flight in a bracket, or of a batch in blocks."""
+    return in_blocks(identify, problem.within(bracket))

@@ -65,7 +65,7 @@ class EquationError(AbstractEstimator):
                 "`problem.model` must have rate equations that are linear in its parameters for a regression: hold the "
                 "others, or use an estimator that shoots."
             )
-        return in_one_program(self._identify, problem.within(bracket))
+        return in_one_program(self._identify, problem, bracket)
 
     def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
