@@ -35,7 +35,7 @@ COMMON |= {"problem": SimpleNamespace(model=SimpleNamespace(airframe=CRAZYFLIE))
 VERSIONS = {"airframe": "os4", "version": "0", "jax": "0", "device": "cpu", "precision": "float64"}
 
 SAMPLE_TIMES = tuple(
-    SampleTime(step, {"Ix": Constant(ix, 2e-7, "kg m^2"), "Iy": Constant(1.8e-5, 3e-7, "kg m^2")}, 0.1)
+    SampleTime(step, {"Ix": Constant(ix, 2e-7, "kg m^2"), "Iy": Constant(1.8e-5, 3e-7, "kg m^2")}, 0.1, samples=1000)
     for step, ix in ((0.004, 1.64e-5), (0.008, 1.78e-5), (0.016, 1.8e-5))
 )
 

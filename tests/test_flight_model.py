@@ -141,7 +141,9 @@ def reference(terms, omega, dt, *, fine, values=VALUES, airframe=FULL):
     for k in range(omega.shape[0]):
         u = omega[max(k - late, 0)]
         states.append(z[:12])
-        forces.append(whole(z, u)[1])
+        # The accelerometer measures the mean over a sample around this time.
+        before = omega[max(k - 1 - late, 0)]
+        forces.append((whole(z, u)[1] + whole(z, before)[1]) / 2)
         for _ in range(fine):
             k1 = whole(z, u)[0]
             k2 = whole(z + h / 2 * k1, u)[0]

@@ -22,6 +22,7 @@ def table(*rows):
             0.004 * 2**i,
             {name: Constant(value, 1.0, "kg m^2") for name, value in zip(("Ix", "Iy"), values, strict=False)},
             correlation,
+            samples=5000 // 2**i,
         )
         for i, (values, correlation) in enumerate(rows)
     ]
@@ -36,7 +37,8 @@ A, B, C = (10.0, 20.0), (13.0, 20.0), (10.0, 25.0)
         (table((A, 0.0)), 0),
         (table((A, 0.1), (A, 0.0), (A, 0.0)), 0),
         (table((A, 0.1), (B, 0.0), (B, 0.0)), 1),
-        (table((A, 0.1), (C, 0.0), (C, -0.2)), 1),
+        (table((A, 0.1), (C, 0.0), (C, -0.1)), 1),
+        (table((A, 0.12), (A, 0.1), (A, 0.1)), 1),
         (table((A, 0.5), (A, 0.1), (A, 0.1)), 1),
         (table((A, -0.5), (A, 0.1), (A, 0.1)), 1),
         (table((A, 0.9), (A, 0.8), (A, 0.7)), 2),
@@ -44,8 +46,8 @@ A, B, C = (10.0, 20.0), (13.0, 20.0), (10.0, 25.0)
         (table((A, 0.1), (B, 0.1), (A, 0.1)), 0),
         (table(((), 0.1), (A, 0.1), (A, 0.1)), 1),
     ],
-    ids=["one", "plateau", "later plateau", "plateau of Iy", "white later", "negative", "none white", "last alone",
-         "no plateau", "no answer"],
+    ids=["one", "plateau", "later plateau", "plateau of Iy", "beyond chance", "white later", "negative", "none white",
+         "last alone", "no plateau", "no answer"],
 )  # fmt: skip
 def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(answers, place):
     assert shortest(answers) == place

@@ -114,25 +114,3 @@ def test_a_log_without_gyro_or_accelerometer_has_no_velocity():
         recording._replace(specific_force=force),
     ):
         assert motion_of(lacking) is None
-
-
-def test_drag_carries_a_part_of_the_weight():
-    """In steady flight, leaning into the airspeed, thrust and drag together carry the weight."""
-    samples = 400
-    states = np.full((samples, 12), np.nan)
-    states[:, [*ANGLES, *RATES]] = 0.0
-    states[:, ANGLES[:2]] = 0.1, -0.2
-    up = Rotation.from_euler("xyz", [0.1, -0.2, 0.0]).as_matrix()[2]
-    recording = Recording(
-        time=0.01 * np.arange(samples),
-        omega=np.full((samples, 4), 300.0),
-        states=states,
-        specific_force=np.tile(G * up, (samples, 1)),
-    )
-    motion = motion_of(recording)
-    assert motion is not None
-    np.testing.assert_allclose(motion.up[:, 2] * G * up[2] + motion.drag_lift, G, rtol=1e-9)
-    assert motion.drag_lift[0] > 0.04 * G
-    silent = motion_of(recording._replace(specific_force=None, states=np.where(np.isnan(states), 0.0, states)))
-    assert silent is not None
-    assert np.isnan(silent.drag_lift).all()

@@ -236,19 +236,18 @@ def _filtered(
     begins: Bool[Array, " samples"],
     dt: Scalar,
 ) -> tuple[Float[Array, "samples channels"], Float[Array, "samples channels"]]:
-    """Rates and disturbances. A specific force is measured less its model, and has no rate."""
+    """Rates and disturbances. A specific force is measured less its model; its rate is the disturbance's mean."""
     is_known, is_rate = ~jnp.isnan(measured), np.arange(measured.shape[1]) < len(RATES)
     observed = Observed(measured[:, :, None], begins[:, None], begins[:, None])
     gains = gains_of(observed, noise, dt)
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
-    reach = jnp.where(is_rate, reach, 0.0)
 
     def step(known: tuple[Array, Array], row) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         (rate, disturbance), (y, is_known, added, begins, by_rate, by_disturbance) = known, row
         rate, disturbance = (jnp.where(begins, 0.0, x) for x in (rate, disturbance))
-        error = jnp.where(is_known, y - jnp.where(is_rate, rate, disturbance), 0.0)
+        error = jnp.where(is_known, y - rate, 0.0)
         rate, disturbance = rate + by_rate * error, disturbance + by_disturbance * error
-        return (rate + added * dt + reach * disturbance, kept * disturbance), (rate, disturbance)
+        return (is_rate * rate + added * dt + reach * disturbance, kept * disturbance), (rate, disturbance)
 
     zero = jnp.zeros(measured.shape[1], dtype=float)
     rows = measured, is_known, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]

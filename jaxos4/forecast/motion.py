@@ -166,8 +166,9 @@ def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Sca
 
     def step(carry: tuple[Motion, Array, Array], row) -> tuple[tuple[Motion, Array, Array], Array]:
         (motion, disturbance, sound), (forcing, gust) = carry, row
-        turning = offset[:3] + (reach * disturbance + gust[:, 0])[:3] / dt
-        pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(disturbance[3:])
+        pushed = reach * disturbance + gust[:, 0]
+        turning = offset[:3] + pushed[:3] / dt
+        pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(pushed[3:])
         acting = _Acting(forcing._replace(lateral=lateral), tuple(turning), tuple(pushing))
         moved = rk4_step(_Free(model), motion, acting, scalars, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
@@ -257,8 +258,7 @@ def settled(noise: LogNoise, dt: Scalar) -> tuple[Covariance, Covariance, Float[
     p, gains = jax.lax.scan(
         lambda p, _: next_gains(p, step, measured, never), first_covariance(step, 1), length=_SETTLED
     )
-    is_rate, rate, disturbance = step.reach > 0, 1 - gains.rate[-1], gains.disturbance[-1]
-    of_rate = p.disturbance - p.cross * disturbance
-    after = Covariance(p.rate * rate, p.cross * rate, jnp.where(is_rate, of_rate, p.disturbance * (1 - disturbance)))
+    rate, disturbance = 1 - gains.rate[-1], gains.disturbance[-1]
+    after = Covariance(p.rate * rate, p.cross * rate, p.disturbance - p.cross * disturbance)
     absorbed = disturbance * dt / (disturbance * dt + (1 - step.kept) * gains.rate[-1])
     return jax.tree.map(lambda x: x[:, 0], (after, step.added, absorbed))

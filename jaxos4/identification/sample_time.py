@@ -8,6 +8,7 @@ the moments of inertia are those of samples twice as long, within two standard d
 shortest without vibration and noise. If all have it: the longest with an answer.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,15 +16,18 @@ import numpy as np
 from ..airframe import Airframe
 from ..estimate import REACH
 from ..flight import Flight
+from ..models.state import CASCADE_ORDER
 from ..shooting import InnovationsProblem
 from .answers import AXES, overwhelmed, vehicle_constants
 from .fit import Fit, fit_innovations
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
 
-# Innovations that correlate by less count as white. Two answers agree within so many standard deviations and this
-# share, which allows for errors of discretisation.
-WHITE, AGREE, _DISCRETE = 0.3, 2.0, 0.03
+# Innovations are white if they correlate by less than this beyond chance, which is so many standard errors: the largest
+# correlation is that of 24.
+WHITE, _CHANCE = 0.06, 3.0
+# Two answers agree within so many standard deviations and this share, which allows for errors of discretisation.
+AGREE, _DISCRETE = 2.0, 0.03
 # Noise may be this share of the changes of the rotors' torque from sample to sample. More makes inertias too large.
 NOISY = 0.1
 # The share of the way to its limit at which an unknown counts as being there.
@@ -62,7 +66,8 @@ def shortest(answers: Sequence[SampleTime]) -> int:
 
 
 def _is_clean(answer: SampleTime) -> bool:
-    return abs(answer.correlation) <= WHITE and answer.speed_noise <= NOISY
+    chance = _CHANCE / math.sqrt(answer.samples)
+    return abs(answer.correlation) <= WHITE + chance and answer.speed_noise <= NOISY
 
 
 def noise_of_speeds(flight: Flight, airframe: Airframe) -> float:
@@ -97,4 +102,6 @@ def answer_of(case: Case, fit: Fit) -> SampleTime:
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
     flight = case.shooting.flight
-    return SampleTime(float(flight.dt), constants, largest, noise_of_speeds(flight, fit.problem.model.airframe))
+    fitted = int(np.isfinite(np.asarray(flight.states)[:, CASCADE_ORDER[0]]).sum())
+    noise = noise_of_speeds(flight, fit.problem.model.airframe)
+    return SampleTime(float(flight.dt), constants, largest, fitted, noise)

@@ -14,13 +14,12 @@ from ..errors import InputError, TrainingError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
-from ..models.terms import FULL_SCALE, TERMS, VOLTAGE, default_terms
+from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, default_terms
 from ..models.vehicle import FlightModel
 from ..recording import preparation
 from ..recording.preparation import Prepared
 from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, pad_flight
-from ..shooting.innovations import Balance
 from .network import GivenNetwork, vehicle_network_for
 from .prepare import Case, HeldOut, Progress
 from .problem import Intervals, bracket_of
@@ -36,8 +35,6 @@ _FEW_RECORDINGS = 4  # from twice this number of recordings on, there are more s
 _SHORTEST_SEGMENT = 1.25  # no segment is shorter than this [s]
 # The cost has kinks where a delay passes a sample. Closer to the minimum than this, slopes jump [standard deviations].
 _KINKS = 0.05
-# The thrust carries the weight but for the velocity that a stretch gains [m/s], and for this share of the weight.
-_GAINED, _CARRIED = 1.0, 0.003
 # The estimator of a vehicle, which flies in closed loop.
 DEFAULT = "filter-error"
 
@@ -86,7 +83,9 @@ def _case(
 ) -> Case:
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
-    shooting = _vehicle_shooting(model, prepared, bracket_of(bracket, model), recordings[0].name)
+    shooting = _vehicle_shooting(
+        model, prepared, bracket_of(_levelled(bracket, prepared, model), model), recordings[0].name
+    )
     held_out, notes = _held_out(recordings, validate, prepared, shooting, model)
     stretch = prepared.fitted.stretch
     number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
@@ -104,7 +103,7 @@ def _case(
         **versions(shooting),
     )
     recording = np.asarray(prepared.recordings)[number]
-    problem = _innovations(shooting, prepared, room, airframe)
+    problem = _innovations(shooting, prepared, room)
     return Case(
         problem, shooting, FilterError(), name, "flight", FilterError.prior, held_out, recording, provenance,
         doubts=prepared.doubts, log_step=prepared.log_step,
@@ -128,12 +127,17 @@ def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int,
     return case._replace(problem=_unpadded(case), estimator=_coarser(make_estimator(estimator, trained)))
 
 
+def _levelled(bracket: Intervals, prepared: Prepared, model: FlightModel) -> Intervals:
+    """The bracket, in which the error of the accelerometer along z is known if the flight says it."""
+    if prepared.level is None or isinstance(bracket, Bracket) or VERTICAL_BIAS not in model.parameter_names:
+        return bracket
+    value, error = prepared.level
+    return {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
+
+
 def _unpadded(case: Case) -> InnovationsProblem:
     """The likelihood without padding: a network answers flights of the length that it was trained for."""
-    problem, samples = case.innovations, case.shooting.flight.time.shape[0]
-    balance = problem.balance
-    balance = None if balance is None else balance._replace(weight=balance.weight[:samples])
-    return dataclasses.replace(problem, problem=case.shooting, balance=balance)
+    return dataclasses.replace(case.innovations, problem=case.shooting)
 
 
 def _coarser(method: AbstractEstimator) -> AbstractEstimator:
@@ -159,9 +163,7 @@ def _vehicle_shooting(model: FlightModel, prepared: Prepared, bracket: Bracket, 
     return shooting
 
 
-def _innovations(
-    shooting: ShootingProblem, prepared: Prepared, room: Prepared, airframe: Airframe
-) -> InnovationsProblem:
+def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) -> InnovationsProblem:
     """The likelihood of a vehicle, in a program for all flights that are not longer than `room`."""
     samples, recordings = prepared.fitted.time.shape[0], max(prepared.recordings) + 1
     capacity = capacity_of(room.fitted.time.shape[0])
@@ -173,21 +175,7 @@ def _innovations(
     padded = dataclasses.replace(
         shooting, flight=pad_flight(prepared.fitted, capacity), windows=1, length=jax.device_put(np.asarray(samples))
     )
-    return InnovationsProblem(padded, segments=segments, balance=_balance(prepared, airframe, capacity))
-
-
-def _balance(prepared: Prepared, airframe: Airframe, capacity: int) -> Balance | None:
-    """The balance of weight, if the tilt is known: over each stretch the vehicle gains a velocity of about 1 m/s.
-
-    Drag carries a part of the weight of a vehicle that leans into its airspeed.
-    """
-    if prepared.upright is None:
-        return None
-    samples, gravity = prepared.upright.size, float(airframe.gravity)
-    gained = _GAINED * np.sqrt(len(prepared.recordings)) / (samples * float(prepared.fitted.dt))
-    weight = np.pad(prepared.upright / samples, (0, capacity - samples))
-    drag_lift = prepared.drag_lift if np.isfinite(prepared.drag_lift) else 0.0
-    return Balance(weight, gravity - drag_lift, np.hypot(gained, _CARRIED * gravity))
+    return InnovationsProblem(padded, segments=segments)
 
 
 def _held_out(

@@ -61,6 +61,16 @@ class Speeds(NamedTuple):
     change: RotorSpeeds
 
 
+class SquaredSpeeds(NamedTuple):
+    """The thrust of each rotor divided by b [rad^2/s^2].
+
+    `mean`: over the sample. `around`: over the same time around the begin of the sample, if a speed jumps there.
+    """
+
+    mean: RotorSpeeds
+    around: RotorSpeeds
+
+
 def measured_speeds(omega: RotorSpeeds, grid: Grid) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing."""
     is_last = (jnp.arange(omega.shape[0]) == grid.last)[:, None]
@@ -68,9 +78,12 @@ def measured_speeds(omega: RotorSpeeds, grid: Grid) -> Speeds:
     return Speeds(omega, omega, following - omega)
 
 
-def mean_square(begin: RotorSpeeds, end: RotorSpeeds) -> RotorSpeeds:
-    """The mean square of speeds that change linearly over a sample, which makes the mean torque."""
-    return (begin * begin + begin * end + end * end) / 3
+def squared(speeds: Speeds, grid: Grid) -> SquaredSpeeds:
+    """Squares of speeds that change linearly over a sample: the mean square makes the mean torque."""
+    begin, end, _ = speeds
+    is_first = (jnp.arange(begin.shape[0]) == grid.first)[:, None]
+    before = jnp.where(is_first, begin, jnp.roll(end, 1, axis=0))
+    return SquaredSpeeds((begin * begin + begin * end + end * end) / 3, (before * before + begin * begin) / 2)
 
 
 def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:

@@ -38,12 +38,13 @@ STEEPEST = 1.2
 """A thrust curve beyond this is no propeller's."""
 _BIAS = 0.3  # no levelled accelerometer has twice this bias [m/s^2]
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
-# The yaw torque of the rotors as a share of their roll torque.
-_YAW = 0.2
+_YAW = 0.2  # the yaw torque of the rotors as a share of their roll torque
 _AXES = ("roll", "pitch", "yaw")
 # The half-width of the damping [1/s]: rotors resist roll and pitch by their thrust, and yaw by their drag only.
 _DAMPING = (5.0, 5.0, 2.0)
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
+VERTICAL_BIAS = _FORCE_BIASES[2]
+"""The parameter that is the constant error of the accelerometer along z."""
 
 T = TypeVar("T")
 Values = Mapping[str, Float[Array, "..."]]
@@ -186,8 +187,7 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
 
 
 def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpeeds:
-    voltage = _measured(grid.voltage, VOLTAGE, "voltage")
-    return omega * (voltage ** values["voltage_exponent"])[:, None]
+    return omega * (_measured(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"])[:, None]
 
 
 def _drive(speeds: Speeds, values: Values, grid: Grid, airframe: Airframe) -> Speeds:

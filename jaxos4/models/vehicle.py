@@ -14,7 +14,7 @@ from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from .os4 import CorrectedOS4
 from .rotation import attitude_rates, to_body, to_earth
-from .rotors import Grid, mean_square, measured_speeds
+from .rotors import Grid, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector
 from .terms import (
     BODY_VELOCITY,
@@ -141,7 +141,8 @@ class FlightModel(AbstractModel):
         speeds = measured_speeds(omega, grid)
         for change, values in self._contributions("speed", parameters):
             speeds = change(speeds, values, grid, airframe)
-        roll, pitch, yaw, thrust = (mean_square(speeds.begin, speeds.end) @ airframe.mixer.T).T
+        squares = squared(speeds, grid)
+        roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
         recording = jnp.asarray(self.recordings)[grid.stretch]
         force = inputs.force if self._needs(LATERAL_FORCE) else None
@@ -152,7 +153,7 @@ class FlightModel(AbstractModel):
             thrust=thrust / mass,
             residual_speed=(speeds.begin + speeds.end) @ spins / 2,
             spin_up=speeds.change @ spins / inputs.dt,
-            specific_thrust=jnp.square(speeds.begin).sum(axis=1) * airframe.thrust_coefficient / mass,
+            specific_thrust=squares.around.sum(axis=1) * airframe.thrust_coefficient / mass,
             recording=tuple((recording == i).astype(omega.dtype) for i in range(max(self.recordings) + 1)),
             velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
             lateral=None if force is None else tuple(force.T[:2]),

@@ -16,7 +16,7 @@ from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
-from .velocity import Motion, motion_of
+from .velocity import GRAVITY, Motion, motion_of
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -28,6 +28,8 @@ _MOST_REASONS = 3
 _FEWEST_SAMPLES = 4
 # Sample times that differ by less than this factor count as equal.
 _NEARLY_EQUAL = 1.01
+# The velocity that a stretch gains [m/s], and the share of the weight that is not carried by other causes.
+_GAINED, _CARRIED = 1.0, 0.003
 # The share of time of a rotor at its limit, and how close to full speed that is.
 _OFTEN, _FULL = 0.01, 0.999
 
@@ -41,8 +43,8 @@ class Prepared(NamedTuple):
     - `time`: of each sample in its log [s].
     - `length`: of a window, in samples.
     - `available`: what every recording offers to the terms of a model, see `Term.needs`.
-    - `upright`: the cosine of the tilt at each sample. `None`: unknown.
-    - `drag_lift`: the mean of `Motion.drag_lift` [m/s^2]. NaN: not measured.
+    - `level`: the constant error of the accelerometer along z, and its standard deviation [m/s^2], see `_level`.
+      `None`: unknown.
     - `seconds`: how long the fitted and the tested measurements last [s].
     - `notes`: what the reader changed, and which stretches are not used.
     - `doubts`: cause and remedy of each doubt about the logs.
@@ -55,8 +57,7 @@ class Prepared(NamedTuple):
     time: Float[np.ndarray, " samples"]
     length: int
     available: frozenset[str]
-    upright: Float[np.ndarray, " samples"] | None
-    drag_lift: float
+    level: tuple[float, float] | None
     seconds: tuple[float, float]
     notes: tuple[str, ...]
     doubts: tuple[tuple[str, str], ...]
@@ -162,7 +163,6 @@ def _sampled(
     moved = len(motions) == len(pieces)
     if moved:
         pieces = [piece._replace(body_velocity=motion.velocity) for piece, motion in zip(pieces, motions, strict=True)]
-    lifts = np.concatenate([motion.drag_lift for motion in motions]) if moved else np.full(1, math.nan)
     whole, whole_time = joined(pieces), np.concatenate([piece.time for piece in pieces])
     fitted, tested = hold_out(whole, length, holdout)
     return Prepared(
@@ -172,8 +172,7 @@ def _sampled(
         whole_time,
         length,
         _available_inputs(whole, pieces, airframe, motions if moved else []),
-        np.concatenate([motion.up[:, 2] for motion in motions]) if moved else None,
-        float(np.nanmean(lifts)) if np.isfinite(lifts).any() else math.nan,
+        _level(whole, np.concatenate([motion.up for motion in motions]), len(pieces)) if moved else None,
         (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
         *about,
     )
@@ -194,6 +193,19 @@ def _available_inputs(
         VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
+
+
+def _level(whole: Recording, up: Float[np.ndarray, "samples 3"], stretches: int) -> tuple[float, float] | None:
+    """The constant error of the accelerometer along z: what its upright part exceeds gravity by, on average.
+
+    Over a stretch of flight a vehicle gains little velocity, so all forces together carry its weight.
+    """
+    force = whole.specific_force
+    if force is None or not (known := np.isfinite(force[:, 2])).any():
+        return None
+    upright, cosine = np.nansum(force * up, axis=1)[known].mean(), up[known, 2].mean()
+    gained = _GAINED * math.sqrt(stretches) / (np.count_nonzero(known) * whole.dt)
+    return (upright - GRAVITY) / cosine, math.hypot(gained, _CARRIED * GRAVITY) / cosine
 
 
 def _seconds(recording: Recording) -> float:

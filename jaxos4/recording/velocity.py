@@ -12,7 +12,7 @@ from .reading import Recording
 # Dead reckoning forgets its velocity with the first time constant, and turns its upright direction towards the mean
 # specific force with the second [s].
 _FORGETS, _LEVELS = 2.0, 2.0
-_GRAVITY = 9.81
+GRAVITY = 9.81
 
 
 class Motion(NamedTuple):
@@ -20,14 +20,11 @@ class Motion(NamedTuple):
 
     - `velocity`: along the body's axes [m/s].
     - `up`: the upright direction in the body's axes.
-    - `drag_lift`: the upright part of the measured specific force along x and y [m/s^2]: a vehicle that leans into its
-      airspeed is carried by its drag too. NaN: not measured.
     - `measured`: whether the velocity was measured. If not, only its part along z is of use.
     """
 
     velocity: Float[np.ndarray, "samples 3"]
     up: Float[np.ndarray, "samples 3"]
-    drag_lift: Float[np.ndarray, " samples"]
     measured: bool
 
 
@@ -41,18 +38,13 @@ def motion_of(recording: Recording) -> Motion | None:
     if angles is not None and velocity is not None:
         to_body = _to_body(*angles.T)
         up = to_body[:, :, 2]
-        return Motion(np.einsum("tij,tj->ti", to_body, velocity), up, _drag_lift(recording, up), measured=True)
+        return Motion(np.einsum("tij,tj->ti", to_body, velocity), up, measured=True)
     rates, force = _filled(recording, ("p", "q", "r")), recording.specific_force
     if rates is None or force is None or np.isnan(force).all(axis=0).any():
         return None
     force = _without_gaps(force)
     up = _upright(rates, force, recording.dt) if angles is None else _to_body(*angles.T)[:, :, 2]
-    return Motion(_dead_reckoned(rates, force, up, recording.dt), up, _drag_lift(recording, up), measured=False)
-
-
-def _drag_lift(recording: Recording, up: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, " samples"]:
-    force = recording.specific_force
-    return np.full(len(up), np.nan) if force is None else (force * up)[:, :2].sum(axis=1)
+    return Motion(_dead_reckoned(rates, force, up, recording.dt), up, measured=False)
 
 
 def _filled(recording: Recording, names: tuple[str, ...]) -> Float[np.ndarray, "samples 3"] | None:
@@ -88,7 +80,7 @@ def _dead_reckoned(
 
     Plain numbers: in a loop of few operations they are ten times faster than arrays.
     """
-    push = force - _GRAVITY * up
+    push = force - GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
     kept, (vx, vy, vz), velocities = math.exp(-dt / _FORGETS), (0.0, 0.0, 0.0), []
     for (p, q, r), (ax, ay, az) in zip(rates.tolist(), push.tolist(), strict=True):

@@ -82,7 +82,10 @@ class _Row(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What the filters know before a measurement."""
+    """What the filters know before a measurement: the rates, and the disturbances.
+
+    That of a specific force is its value at the end of the sample, whose mean is measured.
+    """
 
     rates: Rates
     disturbance: tuple[Segments, ...]
@@ -102,7 +105,8 @@ def _advance(
 ) -> tuple[_Known, tuple[Segments, ...]]:
     """What is known one sample later, and the innovations of this sample."""
     outputs = observe(State(known.rates), forcing, scalars)
-    force = (h + d for h, d in zip(outputs[RATES:], known.disturbance[RATES:], strict=True))
+    means = zip(feedback.reach, feedback.kept, known.disturbance, strict=True)  # of the disturbance over this sample
+    force = (h + a / kept * d for h, (a, kept, d) in zip(outputs[RATES:], tuple(means)[RATES:], strict=True))
     # What was not measured has no gain.
     errors = tuple(z - h for z, h in zip(row.measured, (*outputs[:RATES], *force), strict=True))
     disturbance = tuple(

@@ -2,8 +2,9 @@
 
 A disturbance d acts in each channel: on a body rate as an angular acceleration [rad/s^2], on a specific force as a
 force per mass [m/s^2]. It is an Ornstein-Uhlenbeck process, d' = -d / tau + white noise, with the standard deviation s.
-The filter of a body rate knows the rate and its disturbance; that of a specific force knows its disturbance. Channels
-share no covariance.
+The filter of a body rate knows the rate and its disturbance. A specific force is measured as its mean over a sample.
+Its filter knows the disturbance at the end of the sample and, in the place of the rate, the mean over the sample. Both
+rate and mean are integrals of the disturbance, but each sample has its own mean. Channels share no covariance.
 
 Arrays have the axes (time, channels, segments). A segment is one part of the flight.
 """
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Numeric, Scalar
+from .._custom_types import Numeric, Scalar, as_float
 from ..models.state import CHANNELS
 
 Channels = Float[Array, "channels segments"]
@@ -76,9 +77,10 @@ class Covariance(NamedTuple):
 class Step(NamedTuple):
     """The disturbance over one sample, of each channel.
 
-    - `kept`: the share of it that remains. `reach`: what a unit of it adds to the rate.
+    - `kept`: the share of it that remains. `reach`: what a unit of it adds to the rate, or its mean over the sample.
     - `added`: the covariance that its noise adds.
     - `variance`: of the disturbance. `sensor`: of the sensor's noise.
+    - `memory`: 1 for a rate; 0 for the mean over a sample, which the next mean does not know.
     """
 
     kept: Channels
@@ -86,17 +88,14 @@ class Step(NamedTuple):
     added: Covariance
     variance: Channels
     sensor: Channels
+    memory: Channels
 
 
-def transition(time_constant: Float[Array, "*channels"], dt: Float[Array, "..."]) -> tuple[Array, Array]:
-    """The share of a disturbance that remains after one sample, and what a unit of it adds to the rate [s]."""
+def transition(time_constant: Float[Array, "channels *segments"], dt: Float[Array, "..."]) -> tuple[Array, Array]:
+    """The share of a disturbance that remains after one sample, and what a unit of it adds: see `Step`."""
     share = dt / time_constant
-    return jnp.exp(-share), -time_constant * jnp.expm1(-share)
-
-
-def _is_rate(channels: int) -> Bool[np.ndarray, "channels 1"]:
-    """Which channels are body rates; the others are specific force."""
-    return np.arange(channels)[:, None] < RATES
+    is_rate = (np.arange(len(time_constant)) < RATES).reshape(-1, *(1,) * (time_constant.ndim - 1))
+    return jnp.exp(-share), -time_constant * jnp.expm1(-share) / jnp.where(is_rate, 1.0, dt)
 
 
 def step_of(noise: LogNoise, dt: Float[Array, "..."]) -> Step:
@@ -105,62 +104,54 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."]) -> Step:
     variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
     share, (kept, reach) = dt / tau, transition(tau, dt)
     lost, lost_twice = -jnp.expm1(-share), -jnp.expm1(-2 * share)
-    is_rate = _is_rate(strength.shape[0])
     # For long time constants a difference of nearly equal numbers, and so its Taylor series.
     series = share**3 / 3 * (1 - share * (3 / 4 - share * (7 / 20 - share * (1 / 8 - share * (31 / 840)))))
     spread = jnp.where(share < _SHORT, series, share - 2 * lost + lost_twice / 2)
-    rate = jnp.where(is_rate, 2 * variance * tau**2 * spread, 0.0)
-    cross = jnp.where(is_rate, variance * tau * lost**2, 0.0)
-    reach = jnp.where(is_rate, reach, 0.0)
-    return Step(kept, reach, Covariance(rate, cross, variance * lost_twice), variance, jnp.exp(2 * sensor))
-
-
-def _restart(p: Covariance, restart: Bool[Array, " segments"], step: Step) -> Covariance:
-    is_rate = _is_rate(p.rate.shape[0])
-    return Covariance(
-        jnp.where(restart, jnp.where(is_rate, _UNKNOWN_RATE**2, 0.0), p.rate),
-        jnp.where(restart, 0.0, p.cross),
-        jnp.where(restart, step.variance, p.disturbance),
+    is_rate = np.arange(strength.shape[0])[:, None] < RATES
+    unit = jnp.where(is_rate, 1.0, 1 / dt)
+    added = Covariance(
+        2 * variance * jnp.square(tau * unit) * spread, variance * tau * unit * lost**2, variance * lost_twice
     )
+    memory = jnp.broadcast_to(as_float(is_rate), variance.shape)
+    return Step(kept, reach, added, variance, jnp.exp(2 * sensor), memory)
 
 
 def _measure(p: Covariance, is_measured: Bool[Array, "channels segments"], step: Step) -> tuple[Covariance, "Gains"]:
     """The covariance after a measurement, and the gains that belong to it."""
-    is_rate = _is_rate(p.rate.shape[0])
-    variance = jnp.where(is_rate, p.rate, p.disturbance) + step.sensor
+    variance = p.rate + step.sensor
     weight = jnp.where(is_measured, 1 / variance, 0.0)
     # The share that remains, without a difference of large numbers.
     kept = jnp.where(is_measured, step.sensor / variance, 1.0)
-    disturbance = jnp.where(is_rate, p.cross, p.disturbance) * weight
-    after = Covariance(
-        p.rate * jnp.where(is_rate, kept, 1.0),
-        p.cross * kept,
-        jnp.where(is_rate, p.disturbance - p.cross * disturbance, p.disturbance * kept),
-    )
+    disturbance = p.cross * weight
+    after = Covariance(p.rate * kept, p.cross * kept, p.disturbance - p.cross * disturbance)
     return after, Gains(p.rate * weight, disturbance, jnp.where(is_measured, variance, 1.0))
 
 
 def _predict(p: Covariance, step: Step) -> Covariance:
     """The covariance one sample later."""
-    reach, kept, added = step.reach, step.kept, step.added
+    reach, kept, added, memory = step.reach, step.kept, step.added, step.memory
     return Covariance(
-        p.rate + 2 * reach * p.cross + reach**2 * p.disturbance + added.rate,
-        kept * (p.cross + reach * p.disturbance) + added.cross,
+        memory * (p.rate + 2 * reach * p.cross) + reach**2 * p.disturbance + added.rate,
+        kept * (memory * p.cross + reach * p.disturbance) + added.cross,
         kept**2 * p.disturbance + added.disturbance,
     )
 
 
 def first_covariance(step: Step, segments: int) -> Covariance:
-    """The covariance before the first measurement of a segment."""
+    """The covariance before the first measurement of a segment, whose rates are known."""
     zero = jnp.zeros((step.variance.shape[0], segments), dtype=float)
-    return Covariance(zero, zero, zero + step.variance)
+    settled = Covariance(zero, zero, zero + step.variance)
+    return jax.tree.map(lambda rate, mean: jnp.where(step.memory > 0, rate, mean), settled, _predict(settled, step))
 
 
 def next_gains(
     p: Covariance, step: Step, is_measured: Bool[Array, "channels segments"], restart: Bool[Array, " segments"]
 ) -> tuple[Covariance, Gains]:
     """The covariance one sample later, and the gains of this sample, from the covariance before it."""
-    p, gains = _measure(_restart(p, restart, step), is_measured, step)
+    first = first_covariance(step, p.rate.shape[-1])
+    first = first._replace(rate=first.rate + step.memory * _UNKNOWN_RATE**2)
+    p = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
+    p, gains = _measure(p, is_measured, step)
     return _predict(p, step), gains
 
 

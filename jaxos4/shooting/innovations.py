@@ -10,7 +10,7 @@ References: Jategaonkar, Flight Vehicle System Identification, ch. 5; Ljung, Sys
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -19,12 +19,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
+from .._custom_types import InitialStates, Parameters, Scalar, as_float
 from ..bracket import PROPER_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import CHANNELS, Forcing
-from ..models.vehicle import FlightModel
 from .abstract import AbstractProblem, Stages, WindowUnknowns
 from .filters import Innovations, innovate
 from .gains import LogNoise, Observed, first_noise
@@ -46,18 +45,6 @@ NOISE_PRECISION = 1e-2  # of a weak prior on each logarithm
 _STRIDE = 1.0  # the cost is roughly quadratic in a logarithm over such a step
 
 
-class Balance(NamedTuple):
-    """The balance of thrust and weight: over a flight the thrust carries the weight.
-
-    - `weight`: of the specific force along z at each sample: the cosine of the tilt over the number of samples.
-    - `gravity`, `sigma`: the weighted sum, without what drag carries of the weight, and its standard deviation [m/s^2].
-    """
-
-    weight: Float[Numeric, " samples"]
-    gravity: Float[ArrayLike, ""]
-    sigma: Float[ArrayLike, ""]
-
-
 class InnovationsProblem(AbstractProblem):
     """A shooting problem's rates and specific force, compared as innovations of Kalman filters.
 
@@ -77,7 +64,6 @@ class InnovationsProblem(AbstractProblem):
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
-    - `balance`: of thrust and weight, another measurement of a model that predicts the specific force along z.
     """
 
     prior: ClassVar[float] = PROPER_PRIOR
@@ -86,7 +72,6 @@ class InnovationsProblem(AbstractProblem):
     segment: int = eqx.field(static=True, default=SEGMENT)
     segments: int | None = eqx.field(static=True, default=None)
     settling: int = eqx.field(static=True, default=SETTLING)
-    balance: Balance | None = None
 
     def __init__(
         self,
@@ -96,13 +81,11 @@ class InnovationsProblem(AbstractProblem):
         segments: int | None = None,
         settling: int = SETTLING,
         start: Float[ArrayLike, " unknowns"] | None = None,
-        balance: Balance | None = None,
     ):
         number = 1 if segments is None else segments
         for name, value, least in (("segment", segment, 1), ("segments", number, 1), ("settling", settling, 0)):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
-        self.balance = None if balance is None else jax.tree.map(as_float, balance)
         self.problem, self.segment, self.settling = problem.restrict("rates"), segment, settling
         self.segments = segments
         # An array in any case, so that all starts share one program.
@@ -207,7 +190,6 @@ class InnovationsProblem(AbstractProblem):
     def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
         """See `AbstractProblem`. `parts` are the segments."""
         unknowns, innovations, forced = self.unknowns.usable, self._innovations(self.observed()), self._forced()
-        lift = self._lift()
         count, free = self.problem.unknowns.count, unknowns.free
         both = free & free[:, None]
 
@@ -220,11 +202,6 @@ class InnovationsProblem(AbstractProblem):
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
             slope = jnp.where(free, gradient.sum(axis=0) + unknowns.precision * off, 0.0)
             curvature = jnp.where(both, information.sum(axis=0), 0.0) + jnp.diag(unknowns.precision)
-            if lift is not None:
-                excess, slopes = lift(values[:count], forcing, tangents)
-                slopes = jnp.where(free, jnp.pad(slopes, (0, free.size - count)), 0.0)
-                cost, slope = cost + excess**2 / 2, slope + excess * slopes
-                curvature = curvature + slopes[:, None] * slopes
             parts = Parts(gradient, information, jnp.moveaxis(found.products, -1, 0))
             return Curvature(Shot(cost[None], found.sound.all()[None]), slope[None], curvature[None], parts)
 
@@ -296,32 +273,6 @@ class InnovationsProblem(AbstractProblem):
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (found.forcing, found.forcing_tangents))
 
         return forced
-
-    def _lift(self) -> Callable[[Parameters, Forcing, Forcing | None], tuple[Scalar, Parameters]] | None:
-        """By how many standard deviations the thrust exceeds the weight, and the slopes; `None` without a balance."""
-        balance, model = self.balance, self.model
-        if balance is None or not isinstance(model, FlightModel) or 2 not in model.force_axes:
-            return None
-        index, owned, _ = self.cut
-        place = jnp.minimum(jnp.asarray(index), self.flight.time.shape[0] - 1)
-        weight = jnp.where(owned, balance.weight[place], 0.0).T
-        positions = np.asarray(model.forcing_parameters, dtype=int)
-
-        def excess(parameters: Parameters, thrust: Array, forcing: Forcing) -> Scalar:
-            def along_z(thrust: Array, forcing: Forcing) -> Scalar:
-                return model.specific_force(thrust, forcing, tuple(parameters))[2]
-
-            force = jax.vmap(jax.vmap(along_z))(thrust, forcing)
-            return ((weight * force).sum() - balance.gravity) / balance.sigma
-
-        def lift(parameters: Parameters, forcing: Forcing, tangents: Forcing | None) -> tuple[Scalar, Parameters]:
-            at = parameters, forcing.specific_thrust, forcing
-            value, (slopes, by_thrust) = jax.value_and_grad(excess, argnums=(0, 1))(*at)
-            if tangents is not None:
-                slopes = slopes.at[positions].add(jnp.einsum("ts,tps->p", by_thrust, tangents.specific_thrust))
-            return value, slopes
-
-        return lift
 
 
 def joined(

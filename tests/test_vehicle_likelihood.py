@@ -1,0 +1,141 @@
+"""The likelihood of a vehicle in closed loop: means of specific force, the weight, padding, shifted clocks."""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from helpers import CRAZYFLIE
+from scipy.spatial.transform import Rotation
+
+import jaxos4
+from jaxos4.flight import STATE_NAMES
+from jaxos4.recording.preparation import prepare
+from jaxos4.recording.reading import as_recordings
+from jaxos4.shooting import InnovationsProblem
+from jaxos4.shooting.gains import LogNoise
+from jaxos4.shooting.innovations import SEGMENT, SETTLING
+from jaxos4.shooting.padding import pad_flight
+
+DT, SAMPLES = 0.004, SETTLING + 8 * SEGMENT
+ANGLES_AND_RATES = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "p", "q", "r")]
+TERMS = ("offset", "lag", "delay", "accelerometer")
+
+
+@functools.cache
+def flown():
+    keys = jax.random.split(jax.random.key(1))
+    references = jaxos4.random_references(duration=DT * (SAMPLES - 1), dt=DT, key=keys[0])
+    return jaxos4.fly_closed_loop(jaxos4.ClosedLoop(CRAZYFLIE, gust=2.0), references, dt=DT, key=keys[1])
+
+
+def problem_of(flight):
+    model = jaxos4.FlightModel(CRAZYFLIE, terms=TERMS)
+    shooting = jaxos4.ShootingProblem(model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4")
+    return InnovationsProblem(shooting)
+
+
+@eqx.filter_jit
+def curvature(problem, values):
+    return problem.evaluator()(values, jnp.zeros(0))
+
+
+@eqx.filter_jit
+def searched(problem):
+    return jaxos4.FilterError()(problem)
+
+
+def named(problem, found):
+    """Value and standard deviation of each parameter."""
+    rows = zip(found.parameters.tolist(), found.std.tolist(), strict=True)
+    return dict(zip(problem.problem.unknowns.names, rows, strict=False))
+
+
+def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples():
+    """The dense covariance of the means of an Ornstein-Uhlenbeck process, with a gap."""
+    samples, strength, tau, sensor = 80, 1.3, 0.3, 0.05
+    flight, rng = flown(), np.random.default_rng(2)
+    force = np.full((SAMPLES, 3), np.nan)
+    force[:samples, 2] = 9.81 + rng.normal(size=samples)
+    force[30:37] = np.nan
+    flight = dataclasses.replace(flight, specific_force=force)
+    problem, silent = (
+        dataclasses.replace(problem_of(dataclasses.replace(flight, specific_force=each)), segments=1)
+        for each in (force, np.full_like(force, np.nan))
+    )
+    values, noise = np.asarray(problem.starts[0]), np.log([[1.0, 1.0, 1.0]] * 3 + [[strength, tau, sensor]])
+    parameters = values[: problem.problem.unknowns.count]
+    noise = LogNoise(*map(jnp.asarray, noise.T))
+    of_all, of_rates = (each.innovations(jnp.asarray(parameters), noise).cost.sum() for each in (problem, silent))
+
+    named = dict(zip(problem.unknowns.names, parameters.tolist(), strict=False))
+    forcing = problem.model.forcing(flight.inputs, jnp.asarray(parameters))
+    expected = named["thrust_gain"] * np.asarray(forcing.specific_thrust)[:samples] + named["az_bias"]
+    share, apart = DT / tau, np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+    lost = 1 - np.exp(-share)
+    means = (strength / share) ** 2 * np.where(apart == 0, 2 * (share - lost), lost**2 * np.exp(-share * (apart - 1)))
+    known = np.isfinite(force[:samples, 2])
+    covariance = (means + sensor**2 * np.eye(samples))[np.ix_(known, known)]
+    off = (force[:samples, 2] - expected)[known]
+    dense = (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(covariance)[1]) / 2
+    np.testing.assert_allclose(of_all - of_rates, dense, rtol=1e-9)
+
+
+def test_the_weight_tells_the_error_of_the_accelerometer():
+    """Not of the thrust: the airframe says 20 % less than there is."""
+    flight = flown()
+    flight = dataclasses.replace(flight, specific_force=np.asarray(flight.specific_force) + [0.0, 0.0, 0.25])
+    (prepared,) = prepare(as_recordings(flight), CRAZYFLIE, sample_time=DT, holdout=0.0)
+    value, error = prepared.level
+    assert error < 0.1
+    assert abs(value - 0.25) < 3 * error
+    weak = eqx.tree_at(lambda a: a.thrust_coefficient, CRAZYFLIE, 0.8 * CRAZYFLIE.thrust_coefficient)
+    (other,) = prepare(as_recordings(flight), weak, sample_time=DT, holdout=0.0)
+    assert other.level == prepared.level
+
+
+def test_a_vehicle_that_leans_is_carried_by_its_drag_too():
+    """In steady flight all forces carry the weight, whatever the tilt; what is left is the accelerometer's error."""
+    samples, tilt = 400, (0.1, -0.2, 0.0)
+    states = np.full((samples, 12), np.nan)
+    states[:, ANGLES_AND_RATES] = 0.0
+    states[:, ANGLES_AND_RATES[:3]] = tilt
+    up = Rotation.from_euler("xyz", tilt).as_matrix()[2]
+    force = 9.81 * up + [0.0, 0.0, 0.1] + 1e-3 * np.random.default_rng(0).normal(size=(samples, 3))
+    flight = jaxos4.Flight(
+        time=DT * np.arange(samples), omega=np.full((samples, 4), 1500.0), states=states, specific_force=force
+    )
+    (prepared,) = prepare(as_recordings(flight), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
+    assert abs(prepared.level[0] - 0.1) < 1e-3
+
+
+def test_padding_changes_the_likelihood_by_rounding_only():
+    flight, values = flown(), None
+    found = []
+    for capacity in (SAMPLES, SAMPLES + 2 * SEGMENT):
+        problem = problem_of(pad_flight(flight, capacity))
+        values = np.asarray(problem.starts[0]) if values is None else values
+        found.append(curvature(problem, jnp.asarray(values)))
+    own, padded = found
+    np.testing.assert_allclose(padded.shot.cost, own.shot.cost, rtol=1e-10)
+    for name in ("gradient", "information"):
+        one, other = (np.asarray(getattr(each, name)) for each in (own, padded))
+        # The prior of the noise has its center where the differences of measurements are counted.
+        np.testing.assert_allclose(other / np.abs(one).max(), one / np.abs(one).max(), atol=1e-10)
+
+
+def test_shifted_clocks_give_the_same_inertias():
+    """The motors are recorded 20 ms early or late: only `rotor_delay` says so."""
+    flight, found = flown(), {}
+    for shift in (-5, 0, 5):
+        rows = np.clip(np.arange(SAMPLES) - shift, 0, SAMPLES - 1)
+        problem = problem_of(dataclasses.replace(flight, omega=np.asarray(flight.omega)[rows]))
+        found[shift] = named(problem, searched(problem))
+    for shift in (-5, 5):
+        for name in ("alpha3", "alpha6"):
+            (value, std), (own, _) = found[shift][name], found[0][name]
+            assert abs(value - own) < 0.3 * std, name
+        moved = found[shift]["rotor_delay"][0] - found[0]["rotor_delay"][0]
+        assert abs(moved + DT * shift) < 1e-3
