@@ -1,10 +1,12 @@
-"""Shapes that public signatures share, and the converters of fields."""
+"""Shapes that public signatures share, and the converters and checks of fields."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 Scalar = Float[Array, ""]
@@ -29,16 +31,6 @@ def as_float(x: ArrayLike) -> Array:
     return jnp.asarray(x, dtype=float)
 
 
-def as_int(x: Any) -> Any:
-    """Convert a setting that is an integer to an array, so that other values share the compiled program.
-
-    Anything else stays as it is, also an integer beyond `LARGEST`.
-    """
-    if isinstance(x, bool) or not isinstance(x, int | np.integer) or abs(int(x)) > LARGEST:
-        return x
-    return _constant(x, int)
-
-
 def _constant(x: ArrayLike, kind: type) -> Array:
     with jax.ensure_compile_time_eval():  # its value is known, also while a function is traced
         return jax.device_put(np.asarray(x, dtype=jax.dtypes.canonicalize_dtype(kind)))
@@ -50,3 +42,59 @@ def as_constant(x: Any) -> Array | np.ndarray:
     JAX would round a module's constants at import, before the user has chosen a precision.
     """
     return x if isinstance(x, jax.Array) else np.asarray(x, dtype=np.float64)
+
+
+def setting(
+    name: str,
+    axes: Sequence[str] = (),
+    *,
+    low: float = 0.0,
+    high: float = np.inf,
+    positive: bool = False,
+    finite: bool = True,
+    optional: bool = False,
+) -> Callable[[ArrayLike | Sequence[float] | None], Array]:
+    """A field's converter: accepts one number, or one for each of `axes`, in a range unless traced.
+
+    An optional setting can be `None`, which is stored as NaN, so that all values share one program.
+    """
+
+    def convert(value: ArrayLike | Sequence[float] | None) -> Array:
+        value = np.nan if value is None else value
+        array = as_float(np.asarray(value, dtype=float) if isinstance(value, Sequence) else value)
+        if array.shape not in ((), (len(axes),) if axes else ()):
+            several = f" or {len(axes)} ({', '.join(axes)})" if axes else "; use `vmap` for a batch"
+            raise ValueError(f"`{name}` must be one number{several}, got shape {array.shape}.")
+        if not isinstance(array, Tracer):
+            numbers = np.asarray(array)
+            allowed = (numbers >= low) & (numbers <= high) & ((numbers > 0) | (not positive))
+            allowed &= np.isfinite(numbers) | (not finite)
+            if not np.all(allowed | (np.isnan(numbers) & optional)):
+                limits = ["positive"] * positive + ["finite"] * finite
+                limits += [f"at least {low:g}"] * (low > -np.inf and not positive) + [f"at most {high:g}"] * (
+                    high < np.inf
+                )
+                raise ValueError(f"`{name}` must be {' and '.join(limits)}, got {numbers.tolist()}.")
+        return jnp.broadcast_to(array, (len(axes),)) if axes else array
+
+    return convert
+
+
+def integer(name: str, least: int, *, static: bool = False) -> Callable[[Any], Any]:
+    """A field's converter: accepts an integer of at least `least`, or a traced array of integers.
+
+    Unless the field is static, it becomes an array, so that other values share the compiled program.
+    """
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
+            if isinstance(value, Tracer):
+                return value
+            value = int(value)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
+        if value > LARGEST:
+            raise ValueError(f"`{name}` must be at most {LARGEST}, got {value}.")
+        return value if static else _constant(value, int)
+
+    return convert

@@ -62,6 +62,19 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_file(path: str | os.PathLike[str], content: str | bytes | memoryview) -> None:
+    """Write a file completely or not at all. Text is written as UTF-8."""
+    with write_atomically(path) as beside:
+        beside.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def write_netcdf(path: str | os.PathLike[str], dataset: Any, level: int) -> None:
+    """Write an xarray Dataset as netCDF, with its arrays of numbers compressed; completely or not at all."""
+    numbers = [name for name, data in dataset.data_vars.items() if data.dtype.kind in "fi" and data.ndim]
+    packed = dict.fromkeys(numbers, {"zlib": True, "complevel": level})
+    write_file(path, dataset.to_netcdf(engine="h5netcdf", encoding=packed))  # in memory: HDF5 can crash on a full disk
+
+
 def check_writable(path: str | os.PathLike[str]) -> Path:
     """`path` with links resolved, checked before a long computation.
 

@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Numeric, Scalar, as_constant
@@ -63,6 +64,11 @@ class Airframe(eqx.Module):
     def hover_speed(self) -> Scalar:
         """The rotor speed [rad/s] at which four equal rotors carry the weight."""
         return jnp.sqrt(jnp.asarray(self.mass * self.gravity / (4 * self.thrust_coefficient)))
+
+    @property
+    def has_full_scale(self) -> bool:
+        """Whether `max_rotor_speed` is known. A traced value counts as known."""
+        return isinstance(self.max_rotor_speed, Tracer) or bool(np.isfinite(self.max_rotor_speed))
 
     @property
     def hover_squares(self) -> Float[np.ndarray, "4"]:

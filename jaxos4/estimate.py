@@ -9,14 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ._custom_types import LARGEST, Parameters, Scalar
+from ._custom_types import Parameters, Scalar
+from ._xla import quick_jit
 from .bracket import Bracket
 from .linalg import covariance_of_shared, invert
 from .results import RESULTS
-from .shooting import AbstractProblem, Curvature, Parts, ShootingProblem
+from .shooting import AbstractProblem, Curvature, Parts, ShootingProblem, in_blocks
 from .shooting.abstract import WindowUnknowns
 
 if TYPE_CHECKING:
@@ -250,38 +250,6 @@ def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[
     return jax.lax.scan(improve, first, length=_START_STEPS)[0], _START_STEPS * (count + free)
 
 
-def check_recursive(problem: ShootingProblem) -> None:
-    """Raises `ValueError` for a problem that a filter cannot process sample by sample."""
-    if problem.windows > 1:
-        got = problem.windows
-        raise ValueError(f"`problem.windows` must be 1 for this estimator, got {got}: use an estimator that shoots.")
-    if problem.model.forcing_parameters or not problem.model.observes_states:
-        raise ValueError(
-            "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
-            "use an estimator that shoots."
-        )
-
-
-def check_count(name: str, value: Any, least: int) -> None:
-    """Raises `ValueError` for a setting that is not an integer of at least `least`, or a traced array of integers."""
-    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.integer) and value.shape == ():
-        if isinstance(value, Tracer):
-            return
-        value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
-    if value > LARGEST:
-        raise ValueError(f"`{name}` must be at most {LARGEST}, got {value}.")
-
-
-def check_positive(name: str, value: Scalar | float, *, finite: bool = False) -> None:
-    """Raises `ValueError` for a setting that is not one positive number; a traced one is not checked."""
-    if isinstance(value, Tracer):
-        return
-    if np.shape(value) != () or not np.asarray(value) > 0 or (finite and not np.isfinite(value)):
-        raise ValueError(f"`{name}` must be positive{' and finite' if finite else ''}, got {value}.")
-
-
 class AbstractEstimator(eqx.Module):
     """An algorithm that identifies parameters; its fields are its settings.
 
@@ -321,3 +289,37 @@ class AbstractEstimator(eqx.Module):
         `problem`: a `ShootingProblem`, or any other `AbstractProblem`. For a batch use `eqx.filter_vmap`: a lane that
         fails does not change the others.
         """
+
+
+class AbstractRecursion(AbstractEstimator):
+    """An estimator that goes through a flight sample by sample."""
+
+    shoots: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def identify(self, problem: ShootingProblem) -> Estimate:
+        """Identifies one flight, or a block of flights, in the problem's own bracket."""
+
+    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
+        """Identifies one flight.
+
+        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
+        windows, or a model with rotor lag, delay, thrust curve or sensor terms.
+        """
+        if problem.windows > 1:
+            remedy = f"got {problem.windows}: use an estimator that shoots"
+            raise ValueError(f"`problem.windows` must be 1 for this estimator, {remedy}.")
+        if problem.model.forcing_parameters or not problem.model.observes_states:
+            raise ValueError(
+                "`problem.model` must have no rotor lag, delay, thrust curve or sensor terms for this estimator: "
+                "use an estimator that shoots."
+            )
+        return in_one_program(self.identify, problem, bracket)
+
+
+@quick_jit
+def in_one_program(
+    identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem, bracket: Bracket | None
+) -> Estimate:
+    """The estimate of one flight in a bracket, or of a batch in blocks."""
+    return in_blocks(identify, problem.within(bracket))

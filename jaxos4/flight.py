@@ -1,6 +1,6 @@
 """A flight: the recorded rotor speeds, and the measured rates, attitude, velocity and position."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -115,16 +115,19 @@ class Flight(eqx.Module):
     @property
     def channels(self) -> Float[Array, "samples 15"]:
         """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
-        force = self.specific_force
-        nothing = jnp.full((*self.states.shape[:-1], len(FORCE_NAMES)), jnp.nan, self.states.dtype)
-        return jnp.concatenate([self.states, nothing if force is None else force], axis=-1)
+        return with_force(self.states, self.specific_force, jnp)
 
     @property
     def recorded(self) -> Float[np.ndarray, "samples 15"]:
         """`channels` of a recorded flight as NumPy, without a compiled program."""
-        states, force = np.asarray(self.states), self.specific_force
-        nothing = np.full((states.shape[0], len(FORCE_NAMES)), np.nan, states.dtype)
-        return np.concatenate([states, nothing if force is None else np.asarray(force)], axis=-1)
+        force = self.specific_force
+        return with_force(np.asarray(self.states), None if force is None else np.asarray(force), np)
+
+
+def with_force(states: Any, force: Any, numpy: Any) -> Any:
+    """The channels of a flight as one array of `numpy` or `jax.numpy`; NaN: not measured."""
+    nothing = numpy.full((*states.shape[:-1], len(FORCE_NAMES)), numpy.nan, states.dtype)
+    return numpy.concatenate([states, nothing if force is None else force], axis=-1)
 
 
 def fill_gaps(

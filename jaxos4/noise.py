@@ -11,10 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ._custom_types import Key, States, as_float
+from ._custom_types import Key, States, as_float, setting
 from .flight import STATE_NAMES, STATE_UNITS, Flight
 
 PerChannel = Float[Array, "12"]
@@ -25,25 +24,6 @@ SENSOR_SIGMA = np.array([_SIGMA_OF_UNIT[unit] for unit in STATE_UNITS])
 SENSOR_SIGMA.flags.writeable = False
 # Standard deviation of an accelerometer in flight [m/s^2]: mostly vibration.
 FORCE_SIGMA = 0.3
-
-
-def _per_channel(
-    name: str, low: float, high: float = np.inf, *, open_below: bool = False
-) -> Callable[[ArrayLike], Array]:
-    """A field's converter: accepts one number or 12, and checks the range unless the values are traced."""
-
-    def convert(value: ArrayLike) -> Array:
-        array = as_float(value)
-        if array.shape not in ((), (12,)):
-            raise ValueError(f"`{name}` must be one number or 12, one for each state, got shape {array.shape}.")
-        if not isinstance(array, Tracer):
-            numbers = np.asarray(array)
-            if not np.all((numbers > low if open_below else numbers >= low) & (numbers <= high)):
-                ends = f"{'(' if open_below else '['}{low:g}, {high:g}]"
-                raise ValueError(f"`{name}` must lie in {ends}, got {numbers.tolist()}.")
-        return jnp.broadcast_to(array, (len(STATE_NAMES),))
-
-    return convert
 
 
 def _with_states(flight: Flight, states: States) -> Flight:
@@ -61,7 +41,7 @@ class AbstractNoise(eqx.Module):
 class WhiteNoise(AbstractNoise):
     """Independent Gaussian errors of every sample, with `sigma` for each state in `STATE_UNITS`. 0: exact."""
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
+    sigma: PerChannel = eqx.field(converter=setting("sigma", STATE_NAMES))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -74,8 +54,8 @@ class ConstantBias(AbstractNoise):
     - `sigma`, `mean`: of the offset, for each state in `STATE_UNITS`. `ConstantBias(0, mean=offset)` is a known offset.
     """
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
-    mean: PerChannel = eqx.field(converter=_per_channel("mean", -np.inf), default=0.0)
+    sigma: PerChannel = eqx.field(converter=setting("sigma", STATE_NAMES))
+    mean: PerChannel = eqx.field(converter=setting("mean", STATE_NAMES, low=-np.inf), default=0.0)
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -91,27 +71,21 @@ class GaussMarkov(AbstractNoise):
     - `correlation_time`: T [s] for each state, positive. Infinite: a constant bias.
     """
 
-    sigma: PerChannel = eqx.field(converter=_per_channel("sigma", 0.0))
-    correlation_time: PerChannel = eqx.field(converter=_per_channel("correlation_time", 0.0, open_below=True))
+    sigma: PerChannel = eqx.field(converter=setting("sigma", STATE_NAMES))
+    correlation_time: PerChannel = eqx.field(
+        converter=setting("correlation_time", STATE_NAMES, positive=True, finite=False)
+    )
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
-        steps = flight.dt / self.correlation_time
-        decay, fresh = jnp.exp(-steps), jnp.sqrt(-jnp.expm1(-2 * steps))
-        normal = _normal(key, flight.states)
-
-        def step(error: PerChannel, draw: PerChannel) -> tuple[PerChannel, PerChannel]:
-            error = decay * error + fresh * draw
-            return error, error
-
-        later = jax.lax.scan(step, normal[0], normal[1:])[1]
-        return _with_states(flight, flight.states + self.sigma * jnp.concatenate([normal[:1], later]))
+        errors = coloured(_normal(key, flight.states), flight.dt / self.correlation_time)
+        return _with_states(flight, flight.states + self.sigma * errors)
 
 
 class Quantisation(AbstractNoise):
     """Rounding to the nearest multiple of `step`, for each state in `STATE_UNITS`. 0: not rounded."""
 
-    step: PerChannel = eqx.field(converter=_per_channel("step", 0.0))
+    step: PerChannel = eqx.field(converter=setting("step", STATE_NAMES))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -122,7 +96,7 @@ class Quantisation(AbstractNoise):
 class Dropouts(AbstractNoise):
     """Lost samples: each sample of each state becomes NaN with `probability`, independently of the others."""
 
-    probability: PerChannel = eqx.field(converter=_per_channel("probability", 0.0, 1.0))
+    probability: PerChannel = eqx.field(converter=setting("probability", STATE_NAMES, high=1.0))
 
     def __call__(self, flight: Flight, *, key: Key) -> Flight:
         """See `AbstractNoise`."""
@@ -140,6 +114,17 @@ class Chain(AbstractNoise):
         for i, noise in enumerate(self.noises):
             flight = noise(flight, key=jax.random.fold_in(key, i))
         return flight
+
+
+def coloured(draws: Float[Array, "count columns"], step: Float[Array, "*columns"]) -> Float[Array, "count columns"]:
+    """Ornstein-Uhlenbeck processes of unit variance, from white noise; `step`: time step / correlation time."""
+    decay, fresh = jnp.exp(-step), jnp.sqrt(-jnp.expm1(-2 * step))
+
+    def advance(value: Array, draw: Array) -> tuple[Array, Array]:
+        value = decay * value + fresh * draw
+        return value, value
+
+    return jnp.concatenate([draws[:1], jax.lax.scan(advance, draws[0], draws[1:])[1]])
 
 
 def _normal(key: Key, like: Float[Array, " *shape"]) -> Float[Array, " *shape"]:

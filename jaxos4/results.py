@@ -52,7 +52,7 @@ NAMES = (
 
 
 def meaning(name: str) -> str:
-    """What the result of this name says; empty if it is `"successful"`."""
+    """The message of a result, by its name; empty if it is `"successful"`."""
     return str(RESULTS[getattr(RESULTS, name)])
 
 

@@ -1,15 +1,15 @@
 """Simulation of a flight from rotor speeds: forward Euler, Runge-Kutta 4, or diffrax's adaptive Tsit5."""
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ._custom_types import Parameters, RotorSpeeds, Scalar, States, StateVector, as_float
+from ._custom_types import Parameters, RotorSpeeds, Scalar, StateVector, as_float
 from ._xla import quick_jit
 from .flight import STATE_NAMES, Flight, Inputs
 from .models.abstract import AbstractModel
@@ -17,15 +17,6 @@ from .models.state import CASCADE_ORDER, Forcing, State, stack, unstack
 from .results import RESULTS
 
 S = TypeVar("S")
-
-
-@runtime_checkable
-class Cascade(Protocol[S]):
-    """Whatever has a derivative: a model, or the true vehicle of a simulation."""
-
-    def cascade(self, state: S, forcing: Any, parameters: Any) -> S:
-        """The time derivative of a state, which is any tree of numbers."""
-        ...
 
 
 Stepper = Callable[[AbstractModel, State, Forcing, Parameters | tuple[Scalar, ...], Scalar], State]
@@ -36,8 +27,11 @@ def euler_step(model: AbstractModel, state: State, forcing: Forcing, parameters,
     return _advance(state, model.cascade(state, forcing, parameters), dt)
 
 
-def rk4_step(model: Cascade[S], state: S, forcing: Any, parameters: Any, dt: Scalar) -> S:
-    """The classical Runge-Kutta step, of order 4. The forcing is constant over the step."""
+def rk4_step(model: Any, state: S, forcing: Any, parameters: Any, dt: Scalar) -> S:
+    """The classical Runge-Kutta step, of order 4. The forcing is constant over the step.
+
+    `model`: whatever gives the derivative of a state, which is any tree of numbers, in its method `cascade`.
+    """
     k1 = model.cascade(state, forcing, parameters)
     k2 = model.cascade(_advance(state, k1, dt / 2), forcing, parameters)
     k3 = model.cascade(_advance(state, k2, dt / 2), forcing, parameters)
@@ -131,16 +125,17 @@ def _simulate(
     forcing = jax.tree.map(lambda leaf: leaf[:-1], model.forcing(Inputs(omega, dt), parameters))
     rest = jax.lax.scan(step, first, forcing)[1]
     trajectory = jnp.concatenate([stack(first)[None], stack(rest)])
-    states, result = _until_failure(trajectory[:, CASCADE_ORDER.argsort()])
+    states = trajectory[:, CASCADE_ORDER.argsort()]
+    valid, result = until_failure(states, states[:, STATE_NAMES.index("theta")])
+    states = jnp.where(valid[:, None], states, jnp.nan)
     return Flight(time=dt * jnp.arange(omega.shape[0]), omega=omega, states=states, result=result)
 
 
-def _until_failure(states: States) -> tuple[States, RESULTS]:
-    theta = states[:, STATE_NAMES.index("theta")]
-    finite = jnp.isfinite(states).all(axis=1)
-    failed = ~(finite & (jnp.abs(theta) < jnp.pi / 2))
-    valid: Array = jnp.cumsum(failed) == 0
-    first_failure = jnp.argmin(valid)
-    result = RESULTS.where(finite[first_failure], RESULTS.attitude_singularity, RESULTS.nonfinite_trajectory)
-    result = RESULTS.where(valid.all(), RESULTS.successful, result)
-    return jnp.where(valid[:, None], states, jnp.nan), result
+def until_failure(
+    numbers: Float[Array, "samples columns"], theta: Float[Array, " samples"]
+) -> tuple[Bool[Array, " samples"], RESULTS]:
+    """The samples before the first whose numbers are not finite, or whose pitch angle is 90 degrees; and the result."""
+    finite = jnp.isfinite(numbers).all(axis=1)
+    valid = jnp.cumsum(~(finite & (jnp.abs(theta) < jnp.pi / 2))) == 0
+    result = RESULTS.where(finite[jnp.argmin(valid)], RESULTS.attitude_singularity, RESULTS.nonfinite_trajectory)
+    return valid, RESULTS.where(valid.all(), RESULTS.successful, result)

@@ -11,6 +11,7 @@ import numpy as np
 
 import jaxos4
 from jaxos4.models.state import CASCADE_ORDER
+from jaxos4.recording import stretches
 
 # The constants of the OS4 thesis, typed again instead of imported.
 OS4 = {"m": 0.650, "L": 0.23, "b": 3.13e-5, "d": 7.5e-7, "g": 9.81}
@@ -261,3 +262,7 @@ def how_we_compile():
     settings = ("jax_compilation_cache_dir", "jax_disable_most_optimizations")
     ours = {name.upper(): str(jax.config.values[name]) for name in settings}
     return ours | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}
+
+
+def usable_stretches(flight, airframe=None):
+    return tuple(stretch for stretch in stretches(flight, airframe) if not stretch.reason)

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers import usable_stretches
 from recorded_logs import GRAVITY
 
 from jaxos4.logs import read_recording
-from jaxos4.recording import cut, usable_stretches
+from jaxos4.recording import cut
 from jaxos4.recording.motion import RotorSigns, rotor_signs
 
 # Rear right, front right, rear left, front left; props out.

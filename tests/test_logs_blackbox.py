@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, usable_stretches
 from recorded_logs import GRAVITY, RPM, blackbox_csv, check, force, rates, speeds
 
 from jaxos4.logs import log_format, read_log
 from jaxos4.logs.blackbox_frames import Numbers
-from jaxos4.recording import usable_stretches
 
 RATES = ("p", "q", "r")
 SETTINGS = {"Product": "Blackbox flight data recorder by Nicholas Sherlock", "acc_1G": "2048", "motor_poles": "12"}

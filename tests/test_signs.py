@@ -4,12 +4,12 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, usable_stretches
 from hypothesis import given, settings, strategies as st
 
 from jaxos4.errors import InputError
 from jaxos4.logs import read_recording, write_flight
-from jaxos4.recording import Recording, cut, usable_stretches
+from jaxos4.recording import Recording, cut
 from jaxos4.recording.motion import motor_clock_note, opposite_axes as opposites, refused_note, yaw_doubt
 from jaxos4.recording.preparation import at_limit, prepare
 

@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, usable_stretches
 from hypothesis import given, settings, strategies as st
 
 from jaxos4.errors import InputError
@@ -11,7 +11,7 @@ from jaxos4.flight import Flight
 from jaxos4.recording import Recording, read_recording, stretches
 from jaxos4.recording.motion import excitation
 from jaxos4.recording.pieces import cut
-from jaxos4.recording.usable import Stretch, nothing_usable, usable_stretches
+from jaxos4.recording.usable import Stretch, nothing_usable
 
 DT = 0.005
 HOVER = float(CRAZYFLIE.hover_speed)

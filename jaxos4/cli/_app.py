@@ -68,7 +68,10 @@ def main() -> None:
         sys.stderr.close()
         raise SystemExit(1) from None
     except (InputError, OSError, TrainingError) as error:
-        typer.echo(f"jaxos4: {_one_line(error)}", err=True)
+        what = " ".join(str(error).split())
+        if isinstance(error, OSError) and error.filename is not None:
+            what = f"{error.filename}: {error.strerror}; give a path that can be used."
+        typer.echo(f"jaxos4: {what}", err=True)
         raise SystemExit(1 if isinstance(error, TrainingError) else 2) from None
     except Exception as error:
         if not hasattr(error, "format_message"):  # what all errors of the parser have, in every version of typer
@@ -107,9 +110,3 @@ def _parser_message(error: Any) -> str:
     if "\n" in message:
         return message
     return f"jaxos4: {message}; see `{error.ctx.command_path if error.ctx else 'jaxos4'} --help`."
-
-
-def _one_line(error: InputError | OSError | TrainingError) -> str:
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}; give a path that can be used."
-    return " ".join(str(error).split())

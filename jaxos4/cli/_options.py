@@ -103,10 +103,9 @@ def make_loop(asked: Mapping[str, Any]) -> "ClosedLoop":
     """The vehicle in closed loop with these options."""
     from ..airframe import load_airframe
     from ..closed_loop import ClosedLoop
-    from ..models.terms import has_full_scale
 
     vehicle = load_airframe(asked["airframe"])
-    logged, scaled = chosen(asked["sensors"]), has_full_scale(vehicle)
+    logged, scaled = chosen(asked["sensors"]), vehicle.has_full_scale
     if logged == "commands" and not scaled:
         raise InputError(
             f"--sensors commands: {asked['airframe']} has no max_rotor_speed [rad/s]; set it, or log speeds."

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from .._files import check_writable, write_atomically
+from .._files import check_writable, write_file
 from ..errors import InputError
 
 _PHRASES = {
@@ -81,12 +81,6 @@ def check_outputs(*inputs: Path | str | None, **outputs: Path | None) -> None:
             raise InputError(f"{out}: {other} and {option} name one file; give them two.")
 
 
-def write_text(text: str, out: Path) -> None:
-    """Writes a text file."""
-    with write_atomically(out) as beside:
-        beside.write_text(text, encoding="utf-8")
-
-
 def write_folder(texts: dict[str, str], folder: Path) -> None:
     """Writes text files, by name, into a new folder. It appears when all files are in it."""
     beside = folder.with_name(f".{folder.name[:40]}.{secrets.token_hex(4)}.part")
@@ -103,4 +97,4 @@ def write_folder(texts: dict[str, str], folder: Path) -> None:
 
 def write_json(report: dict[str, Any], out: Path) -> None:
     """Writes a JSON file. A number that is not finite is an error of the program."""
-    write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", out)
+    write_file(out, json.dumps(report, indent=2, allow_nan=False) + "\n")

@@ -6,10 +6,10 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from .._files import check_writable
+from .._files import check_writable, write_file
 from ..errors import InputError
 from . import _options as options
-from ._output import check_outputs, option_names, stages, write_folder, write_text
+from ._output import check_outputs, option_names, stages, write_folder
 
 MOST_SAMPLES = 100_000
 
@@ -49,7 +49,7 @@ def export(
     if out is None:
         typer.echo(written.text, nl=False)
     else:
-        write_text(written.text, out)
+        write_file(out, written.text)
         typer.echo(f"{out}: {target.label}")
     for doubt in found.doubts:
         typer.echo(doubt, err=True)

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
+from .._files import write_file
 from ..errors import InputError
 from . import _options as options
-from ._output import check_outputs, option_names, stages, write_json, write_text
+from ._output import check_outputs, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -56,7 +57,7 @@ def inspect(
     if out is not None:
         write_json(found.to_dict(), out)
     if draft is not None and airframe_out is not None:
-        write_text(draft.text, airframe_out)
+        write_file(airframe_out, draft.text)
     _print_contents(console, found, log_format(log).label)
     _print_parts(console, found)
     if draft is not None:

@@ -41,8 +41,7 @@ def simulate(
     delay: options.DelayOption = None,
     sensors: options.SensorsOption = None,
     references: Annotated[
-        Path | None,
-        Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones."),
+        Path | None, Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones.")
     ] = None,
 ) -> None:
     """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""

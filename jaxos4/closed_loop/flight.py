@@ -9,16 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .._custom_types import Key, Numeric, Scalar, as_float
+from .._custom_types import Key, Numeric, Scalar, as_float, setting
 from .._xla import quick_jit
 from ..airframe import alpha_scalars
 from ..flight import Flight
 from ..models.rotation import attitude_rates
 from ..models.state import Attitude, Rates, Vector
+from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
 from .sensors import Motion, Sense, Signals, log
-from .settings import ClosedLoop, PerAxis, setting
+from .settings import ClosedLoop, PerAxis
 
 References = Float[Array, "samples 4"]
 
@@ -29,11 +30,7 @@ _HOLD = 0.5
 
 
 def random_references(
-    *,
-    duration: float = 20.0,
-    dt: float = 0.004,
-    amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5),
-    key: Key,
+    *, duration: float = 20.0, dt: float = 0.004, amplitude: Sequence[float] = (0.3, 0.3, 0.3, 1.5), key: Key
 ) -> References:
     """References of a standard flight: roll, pitch and yaw angle and vertical acceleration step to random levels.
 
@@ -64,12 +61,7 @@ def _levels(key: Key, steps: Int[Array, "samples 4"], count: int, amplitude: Ref
 
 
 def fly_closed_loop(
-    loop: ClosedLoop,
-    references: References,
-    *,
-    dt: Float[ArrayLike, ""] = 0.004,
-    key: Key,
-    substeps: int = 4,
+    loop: ClosedLoop, references: References, *, dt: Float[ArrayLike, ""] = 0.004, key: Key, substeps: int = 4
 ) -> Flight:
     """Fly a vehicle in closed loop from hovering, and return what its autopilot logs. `vmap` it for a batch.
 
@@ -111,7 +103,7 @@ def fly_standard(
 
 
 class _Acting(NamedTuple):
-    """What acts on the vehicle for a step.
+    """Torque, forces and wind that act on the vehicle for a step.
 
     Torque [N m], thrust over the mass [m/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind
     along the body's axes [m/s].
@@ -310,11 +302,4 @@ def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> 
 
 def ornstein_uhlenbeck(key: Key, count: int, step: Scalar) -> Float[Array, "count 4"]:
     """Four independent Ornstein-Uhlenbeck processes of unit variance; `step`: time step / correlation time."""
-    decay, fresh = jnp.exp(-step), jnp.sqrt(-jnp.expm1(-2 * step))
-    draws = jax.random.normal(key, (count, 4))
-
-    def advance(value, draw):
-        value = decay * value + fresh * draw
-        return value, value
-
-    return jnp.concatenate([draws[:1], jax.lax.scan(advance, draws[0], draws[1:])[1]])
+    return coloured(jax.random.normal(key, (count, 4)), step)

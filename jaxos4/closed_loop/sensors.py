@@ -11,7 +11,7 @@ from .._custom_types import Key, Scalar
 from ..flight import STATE_NAMES, Flight
 from ..models.rotation import to_earth
 from ..models.state import CASCADE_ORDER, Attitude, Rates, Vector
-from ..results import RESULTS
+from ..simulation import until_failure
 from ..trigonometry import sincos
 from .settings import ClosedLoop, PerAxis, Sensors
 
@@ -96,15 +96,13 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, Motion, Array, Array,
         states = states.at[:, _VELOCITY].set(velocity + noise)
     states = states.at[:, CASCADE_ORDER[:3]].set(rates)
 
-    finite = jnp.isfinite(jnp.stack(jax.tree.leaves(motion))).all(axis=0)
-    valid = jnp.cumsum(~(finite & (jnp.abs(motion.attitude.theta) < jnp.pi / 2))) == 0
-    result = RESULTS.where(finite[jnp.argmin(valid)], RESULTS.attitude_singularity, RESULTS.nonfinite_trajectory)
+    valid, result = until_failure(jnp.stack(jax.tree.leaves(motion), axis=1), motion.attitude.theta)
     return Flight(
         time=dt * jnp.arange(omega.shape[0]),
         omega=jnp.where(valid[:, None], omega, 0.0),
         states=jnp.where(valid[:, None], states, jnp.nan),
         specific_force=jnp.where(valid[:, None], specific, jnp.nan),
-        result=RESULTS.where(valid.all(), RESULTS.successful, result),
+        result=result,
         commanded=commands,
     )
 

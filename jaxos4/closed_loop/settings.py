@@ -4,18 +4,16 @@ Flights share one program if they have the same `log_every` and `logged`, and al
 `sensors`: all other settings are data.
 """
 
-from collections.abc import Callable, Sequence
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from .._custom_types import Scalar, as_float
+from .._custom_types import Scalar, setting
 from ..airframe import Airframe
 from ..models.rotors import Motor
-from ..models.terms import STEEPEST, has_full_scale
+from ..models.terms import STEEPEST
 from ..noise import FORCE_SIGMA
 
 PerAxis = Float[Array, "3"]
@@ -23,39 +21,6 @@ Pair = Float[Array, "2"]
 
 LOGGED = ("commands", "speeds")
 _BODY, _XYZ, _XY, _TILT = ("roll", "pitch", "yaw"), ("x", "y", "z"), ("x", "y"), ("roll", "pitch")
-
-
-def setting(
-    name: str,
-    axes: tuple[str, ...] = (),
-    *,
-    low: float = 0.0,
-    high: float = np.inf,
-    positive: bool = False,
-    optional: bool = False,
-) -> Callable[[ArrayLike | Sequence[float] | None], Array]:
-    """A field's converter: accepts one number, or one for each of `axes`, in a range unless traced.
-
-    An optional setting can be `None`, which is stored as NaN, so that all flights share one program.
-    """
-
-    def convert(value: ArrayLike | Sequence[float] | None) -> Array:
-        value = np.nan if value is None else value
-        array = as_float(np.asarray(value, dtype=float) if isinstance(value, Sequence) else value)
-        if array.shape not in ((), (len(axes),) if axes else ()):
-            several = f" or {len(axes)} ({', '.join(axes)})" if axes else "; use `vmap` for a batch"
-            raise ValueError(f"`{name}` must be one number{several}, got shape {array.shape}.")
-        if not isinstance(array, Tracer):
-            numbers = np.asarray(array)
-            allowed = (numbers >= low) & (numbers <= high) & np.isfinite(numbers) & ((numbers > 0) | (not positive))
-            if not np.all(allowed | (np.isnan(numbers) & optional)):
-                least = "" if low == -np.inf or positive else f" and at least {low:g}"
-                most = "" if high == np.inf else f" and at most {high:g}"
-                kind = "positive and finite" if positive else "finite"
-                raise ValueError(f"`{name}` must be {kind}{least}{most}, got {numbers.tolist()}.")
-        return jnp.broadcast_to(array, (len(axes),)) if axes else array
-
-    return convert
 
 
 class Air(eqx.Module):
@@ -81,7 +46,7 @@ class Air(eqx.Module):
 
 
 class Sensors(eqx.Module):
-    """What gyro, accelerometer and recorder do to a flight besides white noise. With these defaults nothing.
+    """Effects of gyro, accelerometer and recorder besides white noise. With these defaults there are none.
 
     - `gyro_vibration` [rad/s], `force_vibration` [m/s^2]: amplitude of the sine that each rotor in hover adds to each
       axis, once for each revolution. The amplitude is proportional to the squared speed. Sampling causes aliasing.
@@ -186,7 +151,7 @@ class ClosedLoop(eqx.Module):
         if self.log_every < 1:
             raise ValueError(f"`log_every` must be at least 1, got {self.log_every}.")
         loaded = [x for x in (self.thrust_curve, self.motor_braking) if not isinstance(x, Tracer) and float(x) != 1]
-        if loaded and not has_full_scale(self.airframe):
+        if loaded and not self.airframe.has_full_scale:
             raise ValueError("`airframe.max_rotor_speed` must be known for `thrust_curve` and `motor_braking`: set it.")
 
     @property

@@ -9,9 +9,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._custom_types import Numeric, RotorSpeeds, Scalar
+from .._custom_types import Numeric, RotorSpeeds, Scalar, setting
 from ..airframe import Airframe
-from ..closed_loop.settings import setting
 from ..errors import InputError
 from ..flight import STATE_NAMES
 

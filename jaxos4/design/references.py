@@ -65,12 +65,7 @@ def _parts(turns: np.ndarray) -> Float[np.ndarray, "*some coefficients"]:
 
 
 def _response(
-    fleet: Fleet,
-    envelope: Envelope,
-    largest: Float[np.ndarray, "4"],
-    tones: Tones,
-    samples: int,
-    key: Key,
+    fleet: Fleet, envelope: Envelope, largest: Float[np.ndarray, "4"], tones: Tones, samples: int, key: Key
 ) -> dict[str, Any]:
     """The fields `base`, `added` and `signals` of `References`: each tone is flown once in still air, by the simulator.
 

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Count, Key, Scalar, as_float, as_int
+from .._custom_types import Count, Key, Scalar, integer, setting
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_count, check_positive, estimate_at
+from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at
 from ..shooting import ROUNDING, AbstractProblem
 
 Points = Float[Array, "archive unknowns"]
@@ -62,19 +62,12 @@ class AntColony(AbstractEstimator):
     prior: ClassVar[float] = NO_PRIOR
     in_closed_loop: ClassVar[bool] = True
 
-    archive: int = eqx.field(static=True, default=50)
-    ants: int = eqx.field(static=True, default=10)
-    q: Scalar = eqx.field(converter=as_float, default=0.05)
-    xi: Scalar = eqx.field(converter=as_float, default=0.85)
-    tolerance: Scalar = eqx.field(converter=as_float, default=1e-3)
-    max_sweeps: Count = eqx.field(converter=as_int, default=5000)
-
-    def __check_init__(self):
-        check_count("archive", self.archive, 2)
-        check_count("ants", self.ants, 1)
-        check_count("max_sweeps", self.max_sweeps, 1)
-        for name in ("q", "xi", "tolerance"):
-            check_positive(name, getattr(self, name), finite=True)
+    archive: int = eqx.field(static=True, converter=integer("archive", 2, static=True), default=50)
+    ants: int = eqx.field(static=True, converter=integer("ants", 1, static=True), default=10)
+    q: Scalar = eqx.field(converter=setting("q", positive=True), default=0.05)
+    xi: Scalar = eqx.field(converter=setting("xi", positive=True), default=0.85)
+    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-3)
+    max_sweeps: Count = eqx.field(converter=integer("max_sweeps", 1), default=5000)
 
     @quick_jit
     def __call__(self, problem: AbstractProblem, bracket: Bracket | None = None) -> Estimate:

@@ -3,19 +3,20 @@
 `EquationError` uses all samples in one step, `RecursiveLeastSquares` one sample after the other, with forgetting.
 """
 
-from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
-from .._custom_types import Count, Parameters, Scalar, as_float, as_int
+from .._custom_types import Count, Parameters, Scalar, as_float, integer, setting
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, check_recursive
-from ..shooting import ShootingProblem, in_blocks
-from .regression import Regression, check_linear, check_settings, normal_equations, solve
+from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, in_one_program
+from ..shooting import ShootingProblem
+from .regression import Regression, normal_equations, solve
 
 
 class EquationError(AbstractEstimator):
@@ -48,20 +49,23 @@ class EquationError(AbstractEstimator):
     shoots: ClassVar[bool] = False
     prior: ClassVar[float] = NO_PRIOR
 
-    memory: Scalar = eqx.field(converter=as_float, default=1.0)
-    bridge: Count = eqx.field(converter=as_int, default=4)
-
-    def __check_init__(self):
-        check_settings(self.memory, self.bridge)
+    memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)
+    bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
         """Identifies one flight.
 
         **Raises:** `ValueError` for a bracket of another length than the model's parameters, or a model that is not
-        linear in those that are not held.
+        linear in those that are not held. Inside `jit`, where it is not known which are held, all must be linear.
         """
-        check_linear(problem)
-        return _in_blocks(self._identify, problem.within(bracket))
+        mask, parameters = problem.unknowns.free, problem.model.parameters
+        free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
+        if any(each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):
+            raise ValueError(
+                "`problem.model` must have rate equations that are linear in its parameters for a regression: hold the "
+                "others, or use an estimator that shoots."
+            )
+        return in_one_program(self._identify, problem, bracket)
 
     def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
@@ -83,7 +87,7 @@ class EquationError(AbstractEstimator):
         return Regression.of(problem, self.memory, self.bridge, as_float(1.0))
 
 
-class RecursiveLeastSquares(AbstractEstimator):
+class RecursiveLeastSquares(AbstractRecursion):
     """The regression of `EquationError`, updated at every sample with one row for each of p, q and r.
 
     The recursion carries the normal matrix and its right-hand side, which stay symmetric and positive in single
@@ -105,27 +109,14 @@ class RecursiveLeastSquares(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "rates"
-    shoots: ClassVar[bool] = False
     prior: ClassVar[float] = NO_PRIOR
 
-    forgetting: Scalar = eqx.field(converter=as_float, default=1.0)
-    memory: Scalar = eqx.field(converter=as_float, default=1.0)
-    bridge: Count = eqx.field(converter=as_int, default=4)
+    forgetting: Scalar = eqx.field(converter=setting("forgetting", high=1.0, positive=True), default=1.0)
+    memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)
+    bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
-    def __check_init__(self):
-        check_settings(self.memory, self.bridge, self.forgetting)
-
-    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
-
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a model with parameters of
-        the rotors or the sensors, or a flight that is cut into windows.
-        """
-        check_recursive(problem)
-        return _in_blocks(self._identify, problem.within(bracket))
-
-    def _identify(self, problem: ShootingProblem) -> Estimate:
-        """One flight, or a block of flights."""
+    def identify(self, problem: ShootingProblem) -> Estimate:
+        """See `AbstractRecursion`."""
         count, data = problem.unknowns.count, Regression.of(problem, self.memory, self.bridge, self.forgetting)
         rows, back = data.rows()
 
@@ -138,8 +129,3 @@ class RecursiveLeastSquares(AbstractEstimator):
         zero = jnp.zeros((count, count), dtype=float)
         (*_, inverse), steps = jax.lax.scan(update, (zero, jnp.zeros(count, dtype=float), zero), rows)
         return data.answer(steps[-1], data.covariance(rows, back, steps[-1], inverse), steps)
-
-
-@quick_jit
-def _in_blocks(identify: Callable[[ShootingProblem], Estimate], problem: ShootingProblem) -> Estimate:
-    return in_blocks(identify, problem)

@@ -60,7 +60,7 @@ class Hybrid(AbstractEstimator):
 
 
 class Seed(NamedTuple):
-    """Where a search begins: the answer of another estimator.
+    """The start of a search: the answer of another estimator.
 
     - `parameters`, `covariance`: the covariance is infinite if there is no answer.
     - `half_width`: of the 99.9 % intervals for all parameters at once.

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Count, InitialStates, Parameters, Scalar, as_float, as_int
+from .._custom_types import Count, InitialStates, Parameters, Scalar, integer, setting
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import REACH, AbstractEstimator, Estimate, check_count, check_positive, estimate_at, from_starts
+from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at, from_starts
 from ..linalg import coordinate_directions, gram, joint_factor, movable, room_to_limits, slopes_along
 from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
 from ..shooting.abstract import WindowUnknowns
@@ -92,19 +92,15 @@ class IBSS(AbstractEstimator):
     in_closed_loop: ClassVar[bool] = True
 
     directions: str = eqx.field(static=True, default="whitened")
-    halvings: int = eqx.field(static=True, default=2)
-    max_sweeps: Count = eqx.field(converter=as_int, default=60)
-    tolerance: Scalar = eqx.field(converter=as_float, default=0.005)
-    reach: Scalar = eqx.field(converter=as_float, default=REACH)
-    record: int = eqx.field(static=True, default=0)
+    halvings: int = eqx.field(static=True, converter=integer("halvings", 2, static=True), default=2)
+    max_sweeps: Count = eqx.field(converter=integer("max_sweeps", 1), default=60)
+    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=0.005)
+    reach: Scalar = eqx.field(converter=setting("reach", positive=True), default=REACH)
+    record: int = eqx.field(static=True, converter=integer("record", 0, static=True), default=0)
 
     def __check_init__(self):
         if self.directions not in DIRECTIONS:
             raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
-        for name, least in (("halvings", 2), ("record", 0), ("max_sweeps", 1)):
-            check_count(name, getattr(self, name), least)
-        for name in ("tolerance", "reach"):
-            check_positive(name, getattr(self, name))
 
     @quick_jit
     def __call__(

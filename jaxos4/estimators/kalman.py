@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Count, Parameters, Scalar, as_int
-from .._xla import quick_jit
-from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Estimate, as_estimate, check_count, check_recursive
+from .._custom_types import Count, Parameters, Scalar, integer
+from ..bracket import GAUSSIAN_PRIOR
+from ..estimate import AbstractRecursion, Estimate, as_estimate
 from ..linalg import gram
 from ..models.state import CASCADE_ORDER, stack, unstack
-from ..shooting import Rows, ShootingProblem, Unknowns, in_blocks
+from ..shooting import Rows, ShootingProblem, Unknowns
 
 _SETTLED = 0.1  # standard deviations: the passes end once one of them moves no parameter by more
 
@@ -35,7 +34,7 @@ class _Filter(NamedTuple):
     nominal: Float[Array, " size"]
 
 
-class JointEKF(AbstractEstimator):
+class JointEKF(AbstractRecursion):
     """Joint extended Kalman filter: states and constant parameters from one recursion over the flight.
 
     **Arguments:**
@@ -57,26 +56,12 @@ class JointEKF(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "all"
-    shoots: ClassVar[bool] = False
     prior: ClassVar[float] = GAUSSIAN_PRIOR
 
-    passes: Count = eqx.field(converter=as_int, default=10)
+    passes: Count = eqx.field(converter=integer("passes", 1), default=10)
 
-    def __check_init__(self):
-        check_count("passes", self.passes, 1)
-
-    @quick_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight.
-
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
-        windows, or a model with rotor lag, delay, thrust curve or sensor terms.
-        """
-        check_recursive(problem)
-        return in_blocks(self._identify, problem.within(bracket))
-
-    def _identify(self, problem: ShootingProblem) -> Estimate:
-        """One flight, or a block of flights."""
+    def identify(self, problem: ShootingProblem) -> Estimate:
+        """See `AbstractRecursion`."""
         rows, prior = jax.tree.map(lambda leaf: leaf[0], problem.rows()), problem.unknowns.usable
         count, size = prior.center.shape[0], problem.size
         start = problem.first_state()[0]

@@ -17,20 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Count, Scalar, as_float, as_int
+from .._custom_types import Count, Scalar, integer, setting
 from .._xla import quick_jit
 from ..bracket import GAUSSIAN_PRIOR, NO_PRIOR, Bracket
-from ..estimate import (
-    REACH,
-    AbstractEstimator,
-    Estimate,
-    as_estimate,
-    check_count,
-    check_positive,
-    estimate_at,
-    fit_start,
-    from_starts,
-)
+from ..estimate import REACH, AbstractEstimator, Estimate, as_estimate, estimate_at, fit_start, from_starts
 from ..linalg import joint_factor, movable, slopes_along
 from ..results import RESULTS
 from ..shooting import AbstractProblem, Curvature, InnovationsProblem, ShootingProblem, in_blocks
@@ -170,12 +160,8 @@ class OutputError(AbstractEstimator):
     shoots: ClassVar[bool] = True
     prior: ClassVar[float] = NO_PRIOR
 
-    tolerance: Scalar = eqx.field(converter=as_float, default=1e-5)
-    max_steps: Count = eqx.field(converter=as_int, default=100)
-
-    def __check_init__(self):
-        check_positive("tolerance", self.tolerance)
-        check_count("max_steps", self.max_steps, 1)
+    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=1e-5)
+    max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=100)
 
     @quick_jit
     def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
@@ -224,12 +210,8 @@ class FilterError(AbstractEstimator):
     prior: ClassVar[float] = GAUSSIAN_PRIOR
     in_closed_loop: ClassVar[bool] = True
 
-    tolerance: Scalar = eqx.field(converter=as_float, default=3e-3)
-    max_steps: Count = eqx.field(converter=as_int, default=200)
-
-    def __check_init__(self):
-        check_positive("tolerance", self.tolerance)
-        check_count("max_steps", self.max_steps, 1)
+    tolerance: Scalar = eqx.field(converter=setting("tolerance", positive=True), default=3e-3)
+    max_steps: Count = eqx.field(converter=integer("max_steps", 1), default=200)
 
     @quick_jit
     def __call__(self, problem: ShootingProblem | InnovationsProblem, bracket: Bracket | None = None) -> Estimate:

@@ -1,7 +1,7 @@
 """The estimators by name."""
 
+import pkgutil
 from collections import UserDict
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the command line offers the names before it imports JAX
@@ -9,33 +9,26 @@ if TYPE_CHECKING:  # the command line offers the names before it imports JAX
     from ..networks import TrainedNetwork
 
 
-class Estimators(UserDict[str, "type[AbstractEstimator]"]):
-    """Classes by name. A class given as `"module:Class"` is imported when it is first looked up."""
-
-    def __init__(self, classes: "dict[str, type[AbstractEstimator] | str]"):
-        super().__init__()
-        self.data = classes  # pyright: ignore[reportAttributeAccessIssue]
+class Estimators(UserDict[str, Any]):
+    """Classes by name. A class given as `"module:Class"` is imported when it is looked up."""
 
     def __getitem__(self, name: str) -> "type[AbstractEstimator]":
-        kind: Any = self.data[name]
-        if isinstance(kind, str):
-            module, _, attribute = kind.partition(":")
-            kind = self.data[name] = getattr(import_module(module, __package__), attribute)
-        return kind
+        kind = self.data[name]
+        return pkgutil.resolve_name(f"jaxos4.{kind}") if isinstance(kind, str) else kind
 
 
 ESTIMATORS = Estimators(
     {
-        "ibss": ".ibss:IBSS",
-        "network": "..networks:TrainedNetwork",
-        "hybrid": ".hybrid:Hybrid",
-        "output-error": ".newton:OutputError",
-        "filter-error": ".newton:FilterError",
-        "equation-error": ".equation_error:EquationError",
-        "rls": ".equation_error:RecursiveLeastSquares",
-        "svsf": ".svsf:SVSF",
-        "kalman": ".kalman:JointEKF",
-        "ant-colony": ".ant_colony:AntColony",
+        "ibss": "estimators.ibss:IBSS",
+        "network": "networks:TrainedNetwork",
+        "hybrid": "estimators.hybrid:Hybrid",
+        "output-error": "estimators.newton:OutputError",
+        "filter-error": "estimators.newton:FilterError",
+        "equation-error": "estimators.equation_error:EquationError",
+        "rls": "estimators.equation_error:RecursiveLeastSquares",
+        "svsf": "estimators.svsf:SVSF",
+        "kalman": "estimators.kalman:JointEKF",
+        "ant-colony": "estimators.ant_colony:AntColony",
     }
 )
 """The estimators by name: what the command line, studies and figures offer. A new estimator is one line here."""

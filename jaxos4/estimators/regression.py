@@ -13,11 +13,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar
-from ..estimate import Estimate, as_estimate, best_start, check_count
+from ..estimate import Estimate, as_estimate, best_start
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
@@ -203,20 +202,6 @@ class Regression(NamedTuple):
         )
 
 
-def check_linear(problem: ShootingProblem) -> None:
-    """Raises `ValueError` unless the rate equations are linear in all parameters that are not held.
-
-    Inside `jit`, where it is not known which parameters are held, all of them must be linear.
-    """
-    mask, parameters = problem.unknowns.free, problem.model.parameters
-    free = np.ones(len(parameters), dtype=bool) if isinstance(mask, Tracer) else np.asarray(mask)
-    if any(each.in_forcing for each, searched in zip(parameters, free, strict=True) if searched):
-        raise ValueError(
-            "`problem.model` must have rate equations that are linear in its parameters for a regression: hold the "
-            "others, or use an estimator that shoots."
-        )
-
-
 def normal_equations(rows: Float[Array, "*rows columns"]) -> tuple[Matrix, Float[Array, " parameters"]]:
     """X^T X and X^T y of rows [X, y]. Plain sums give the same digits alone and in a batch."""
     rows = rows.reshape(-1, rows.shape[-1])
@@ -233,13 +218,3 @@ def solve(information: Matrix, moment: Float[Array, " parameters"]) -> tuple[Flo
 
 def _prior(count: int) -> Matrix:
     return jnp.eye(count, dtype=float) / DIFFUSE**2
-
-
-def check_settings(memory: Scalar, bridge: Count, forgetting: Scalar | float = 1.0) -> None:
-    """Raises `ValueError` for a setting of a regression that is out of range."""
-    for name, value, positive in (("forgetting", forgetting, True), ("memory", memory, False)):
-        if not isinstance(value, Tracer):
-            number = np.asarray(value)
-            if number.shape != () or not ((number > 0 if positive else number >= 0) and number <= 1):
-                raise ValueError(f"`{name}` must lie in {'(' if positive else '['}0, 1], got {number}.")
-    check_count("bridge", bridge, 0)

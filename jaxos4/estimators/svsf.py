@@ -17,25 +17,14 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._custom_types import Parameters, as_float
-from .._xla import quick_jit
-from ..bracket import GAUSSIAN_PRIOR, Bracket
-from ..estimate import (
-    REACH,
-    AbstractEstimator,
-    Estimate,
-    as_estimate,
-    check_count,
-    check_positive,
-    check_recursive,
-    fit_start,
-)
+from .._custom_types import Parameters, Scalar, integer, setting
+from ..bracket import GAUSSIAN_PRIOR
+from ..estimate import REACH, AbstractRecursion, Estimate, as_estimate, fit_start
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, stack, unstack
-from ..shooting import Rows, ShootingProblem, Unknowns, in_blocks
+from ..shooting import Rows, ShootingProblem, Unknowns
 
 _AVERAGED = 0.5  # the share of the last pass over which the parameters are averaged
 
@@ -58,12 +47,12 @@ class _Filter(NamedTuple):
     covariance: Float[Array, "joint joint"]
 
 
-class SVSF(AbstractEstimator):
+class SVSF(AbstractRecursion):
     """Smooth Variable Structure Filter of the body rates and the parameters.
 
     **Arguments:**
 
-    - `gamma`: how much of its size an error outside the boundary layer keeps from sample to sample, 0 <= gamma < 1.
+    - `gamma`: how much of its size an error outside the boundary layer keeps from sample to sample, 0 to 0.999.
     - `rates_layer`: boundary layer of the rates, in multiples of the problem's sigma.
     - `parameter_layer`: boundary layer of the parameters, in multiples of the noise of w from one sample.
     - `damping`: of the pseudo-inverse, in multiples of a parameter's root mean square influence. Phi12 maps 3 errors
@@ -86,38 +75,18 @@ class SVSF(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "rates"
-    shoots: ClassVar[bool] = False
     prior: ClassVar[float] = GAUSSIAN_PRIOR
 
-    gamma: Float[Array, ""] = eqx.field(converter=as_float, default=0.0)
-    rates_layer: Float[Array, ""] = eqx.field(converter=as_float, default=110.0)
-    parameter_layer: Float[Array, ""] = eqx.field(converter=as_float, default=50.0)
-    damping: Float[Array, ""] = eqx.field(converter=as_float, default=3.0)
-    equilibration: Float[Array, ""] = eqx.field(converter=as_float, default=150.0)
-    passes: int = eqx.field(static=True, default=4)
+    gamma: Scalar = eqx.field(converter=setting("gamma", high=0.999), default=0.0)
+    rates_layer: Scalar = eqx.field(converter=setting("rates_layer", positive=True), default=110.0)
+    parameter_layer: Scalar = eqx.field(converter=setting("parameter_layer", positive=True), default=50.0)
+    damping: Scalar = eqx.field(converter=setting("damping", positive=True), default=3.0)
+    equilibration: Scalar = eqx.field(converter=setting("equilibration", low=1.0), default=150.0)
+    passes: int = eqx.field(static=True, converter=integer("passes", 1, static=True), default=4)
     memory: bool = eqx.field(static=True, default=True)
 
-    def __check_init__(self):
-        check_count("passes", self.passes, 1)
-        if not isinstance(self.gamma, Tracer) and not 0 <= self.gamma < 1:
-            raise ValueError(f"`gamma` must be at least 0 and below 1, got {self.gamma}.")
-        for name in ("rates_layer", "parameter_layer", "damping"):
-            check_positive(name, getattr(self, name), finite=True)
-        if not isinstance(self.equilibration, Tracer) and not 1 <= self.equilibration < float("inf"):
-            raise ValueError(f"`equilibration` must be finite and at least 1, got {self.equilibration}.")
-
-    @quick_jit
-    def __call__(self, problem: ShootingProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. The filter begins at the bracket's center.
-
-        **Raises:** `ValueError` for a bracket of another length than the model's parameters, a flight that is cut into
-        windows, or a model with rotor lag, delay, thrust curve or sensor terms.
-        """
-        check_recursive(problem)
-        return in_blocks(self._identify, problem.within(bracket))
-
-    def _identify(self, problem: ShootingProblem) -> Estimate:
-        """One flight, or a block of flights."""
+    def identify(self, problem: ShootingProblem) -> Estimate:
+        """See `AbstractRecursion`."""
         box, rates = problem.unknowns.usable, problem.restrict("rates")
         rows, start = jax.tree.map(lambda leaf: leaf[0], rates.rows()), rates.first_state()
         count, samples = box.center.shape[0], rows.measured[0].shape[0]

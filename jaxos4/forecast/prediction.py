@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .._files import write_atomically
+from .._files import write_atomically, write_netcdf
 from .._version import __version__
 from ..errors import InputError
 from ..identification.results import finite_or_none
@@ -154,11 +154,7 @@ class FlightPrediction(NamedTuple):
         """
         check_suffix(path, ".nc", ".csv")
         if Path(path).suffix == ".nc":
-            dataset = self.to_dataset()
-            packed = dict.fromkeys(dataset.data_vars, {"zlib": True, "complevel": 1})
-            data = dataset.to_netcdf(engine="h5netcdf", encoding=packed)  # in memory: HDF5 can crash on a full disk
-            with write_atomically(path) as beside:
-                beside.write_bytes(data)
+            write_netcdf(path, self.to_dataset(), 1)
             return
         names, columns = zip(*self._columns(), strict=True)
         with write_atomically(path) as beside, beside.open("w", encoding="utf-8") as file:

@@ -102,7 +102,9 @@ class _Log(NamedTuple):
 
 def read_blackbox(path: Path) -> tuple[Table, tuple[str, ...]]:
     """Read the columns of a blackbox log, and notes on what was assumed. Raises `InputError`."""
-    log = _decoded(path) if _is_raw(path) else _csv(path)
+    with opened(path, "rb") as file:
+        is_raw = file.seekable() and file.read(len(_MAGIC)) == _MAGIC
+    log = _decoded(path) if is_raw else _csv(path)
     raw, first_row = log.raw, None if log.header is None else log.header + 1
     time = next((name for name in _TIMES if name in raw), None)
     if time is None:
@@ -153,12 +155,6 @@ def _settings_above(path: Path) -> tuple[Settings, int]:
                 if values:
                     settings.setdefault(name.strip(), ",".join(values).strip())
     refuse(path, f"has no header of a blackbox log; decode it by blackbox_decode, or {_EXPORT}")
-
-
-def _is_raw(path: Path) -> bool:
-    """Whether a file is a blackbox log that was not decoded."""
-    with opened(path, "rb") as file:
-        return file.seekable() and file.read(len(_MAGIC)) == _MAGIC
 
 
 def _sessions(path: Path) -> list[tuple[Settings, bytes]]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import InputError
-from ..flight import FORCE_NAMES, Flight
+from ..flight import FORCE_NAMES, Flight, with_force
 
 Path = str | os.PathLike[str]
 Found = TypeVar("Found")
@@ -242,8 +242,7 @@ class Recording(NamedTuple):
     @property
     def channels(self) -> Float[np.ndarray, "samples 15"]:
         """Every channel in the order of `CHANNEL_NAMES`; NaN: not measured."""
-        nothing = np.full((self.time.size, len(FORCE_NAMES)), np.nan)
-        return np.column_stack([self.states, nothing if self.specific_force is None else self.specific_force])
+        return with_force(self.states, self.specific_force, np)
 
     def rows(self, part: slice) -> "Recording":
         """Some samples of the recording; their time stays as recorded."""

@@ -298,7 +298,7 @@ def _bank_of_motors(log: Topics) -> tuple[str, list[int]] | None:
 
 
 def _motor_order(functions: list[int]) -> list[int] | None:
-    """Where motors 1 to 4 are among the outputs with these functions; None if one of them is not."""
+    """The places of motors 1 to 4 among the outputs with these functions; None if one of them is missing."""
     motors = range(_FIRST_MOTOR, _FIRST_MOTOR + 4)
     return [functions.index(motor) for motor in motors] if set(motors) <= set(functions) else None
 

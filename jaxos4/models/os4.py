@@ -9,6 +9,7 @@ The paper's equations are here:
 """
 
 import abc
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +25,12 @@ from .state import Attitude, Forcing, Rates, State, Translation
 
 
 class AbstractOS4(AbstractModel):
-    """The common part of the two OS4 models: their parameters are alpha_1..8, and their sensors show the states."""
+    """The common part of the two OS4 models: their parameters are alpha_1..8, and their sensors show the states.
 
-    @property
-    @abc.abstractmethod
-    def gyroscopic_unit(self) -> str:
-        """The unit of alpha2 and alpha5."""
+    `gyroscopic_unit`: the unit of alpha2 and alpha5.
+    """
+
+    gyroscopic_unit: ClassVar[str]
 
     @abc.abstractmethod
     def acceleration(self, attitude: Attitude, forcing: Forcing) -> tuple[Scalar, Scalar, Scalar]:
@@ -98,17 +99,13 @@ class PublishedOS4(AbstractOS4):
     - Eqs. (7)-(9) mix two earth frames.
     """
 
+    gyroscopic_unit: ClassVar[str] = "1/s"
     airframe: Airframe = OS4
 
     @property
     def gyroscopic_factor(self) -> Scalar:
         """The drag coefficient d: the paper prints alpha2 = J_R d / Ix."""
         return as_float(self.airframe.drag_coefficient)
-
-    @property
-    def gyroscopic_unit(self) -> str:
-        """The unit that Eqs. (1)-(2) need."""
-        return "1/s"
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """p', q', r' [rad/s^2]: Eqs. (1)-(3)."""
@@ -137,17 +134,13 @@ class CorrectedOS4(AbstractOS4):
     them. The model does not include the reaction of accelerating rotors, -J_R Omega_r' / Iz in yaw.
     """
 
+    gyroscopic_unit: ClassVar[str] = "1"
     airframe: Airframe = OS4
 
     @property
     def gyroscopic_factor(self) -> Scalar:
         """1: alpha2 = J_R / Ix."""
         return jnp.asarray(1.0)
-
-    @property
-    def gyroscopic_unit(self) -> str:
-        """None: alpha2 and alpha5 are ratios of inertias."""
-        return "1"
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """Euler's equations with the gyroscopic torque -omega x (0, 0, J_R Omega_r)."""

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._custom_types import RotorSpeeds, Scalar
@@ -40,8 +38,7 @@ STEEPEST = 1.2
 """A thrust curve beyond this is no propeller's."""
 _BIAS = 0.3  # no levelled accelerometer has twice this bias [m/s^2]
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
-# The yaw torque of the rotors as a share of their roll torque.
-_YAW = 0.2
+_YAW = 0.2  # the yaw torque of the rotors as a share of their roll torque
 _AXES = ("roll", "pitch", "yaw")
 # The half-width of the damping [1/s]: rotors resist roll and pitch by their thrust, and yaw by their drag only.
 _DAMPING = (5.0, 5.0, 2.0)
@@ -102,7 +99,7 @@ class Term:
     description: str
     parameters: tuple[TermParameter, ...]
     needs: frozenset[str] = frozenset()
-    by_default: Callable[[frozenset[str]], bool] = lambda available: False
+    by_default: Callable[[frozenset[str]], bool] = lambda available: True
     force_axes: tuple[int, ...] = ()
     command: Callable[[RotorSpeeds, Values, Grid], RotorSpeeds] | None = None
     speed: Callable[[Speeds, Values, Grid, Airframe], Speeds] | None = None
@@ -190,8 +187,7 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
 
 
 def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpeeds:
-    voltage = _measured(grid.voltage, VOLTAGE, "voltage")
-    return omega * (voltage ** values["voltage_exponent"])[:, None]
+    return omega * (_measured(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"])[:, None]
 
 
 def _drive(speeds: Speeds, values: Values, grid: Grid, airframe: Airframe) -> Speeds:
@@ -223,27 +219,23 @@ TERMS: dict[str, Term] = {
     "offset": Term(
         "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
         tuple(TermParameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(_AXES)),
-        by_default=lambda available: True,
         angular_acceleration=_torque("offset", lambda rates, forcing: (1.0, 1.0, 1.0)),
     ),
     "center_of_mass": Term(
         "a torque proportional to thrust above hover, from an offset centre of mass: roll_thrust, pitch_thrust [rad/m]",
         # The bracket is an offset of 10 % of the arm.
         tuple(TermParameter(f"{x}_thrust", "rad/m", _authority(i, _HOVER)) for i, x in enumerate(_AXES[:2])),
-        by_default=lambda available: True,
         angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - _HOVER,) * 2),
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
         tuple(TermParameter(f"{x}_damping", "1/s", y, nonnegative=True) for x, y in zip(_AXES, _DAMPING, strict=True)),
-        by_default=lambda available: True,
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
     ),
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
         tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(_AXES[:2])),
         needs=frozenset({BODY_VELOCITY}),
-        by_default=lambda available: True,
         angular_acceleration=_torque(
             "velocity", lambda rates, forcing: _swapped(forcing.velocity, BODY_VELOCITY, "body_velocity")
         ),
@@ -262,7 +254,6 @@ TERMS: dict[str, Term] = {
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
         (TermParameter("voltage_exponent", "1", 0.5, center=0.5),),
         needs=frozenset({VOLTAGE, COMMANDS}),
-        by_default=lambda available: True,
         command=_scale_commands,
     ),
     "fade": Term(
@@ -284,7 +275,6 @@ TERMS: dict[str, Term] = {
         ),
         # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),
-        by_default=lambda available: True,
         speed=_drive,
     ),
     "lag": Term(
@@ -297,13 +287,11 @@ TERMS: dict[str, Term] = {
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
         # A delay of the motors, and an offset between the clocks of motors and gyro, of either sign.
         (TermParameter("rotor_delay", "s", 0.03),),
-        by_default=lambda available: True,
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
     ),
     "reaction": Term(
         "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
         (TermParameter("rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction),),
-        by_default=lambda available: True,
         angular_acceleration=_add_reaction,
     ),
     "accelerometer": Term(
@@ -317,7 +305,6 @@ TERMS: dict[str, Term] = {
             ),
         ),
         needs=frozenset({VERTICAL_FORCE}),
-        by_default=lambda available: True,
         force_axes=(2,),
         specific_force=lambda force, values, forcing: (force[0], force[1], values["thrust_gain"] * force[2]),
         accelerometer=_add_force_bias,
@@ -327,19 +314,20 @@ TERMS: dict[str, Term] = {
         # g over twice the induced velocity, which is 4 to 10 m/s in hover.
         (TermParameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
         needs=frozenset({AXIAL_VELOCITY, VERTICAL_FORCE}),
-        by_default=lambda available: True,
         specific_force=_add_inflow,
     ),
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
         (TermParameter("x_drag", "1/s", 1.0), TermParameter("y_drag", "1/s", 1.0)),
         needs=frozenset({BODY_VELOCITY, LATERAL_FORCE}),
+        by_default=lambda available: False,
         force_axes=(0, 1),
         specific_force=_add_drag,
     ),
     "gyro_bias": Term(
         "rates are measured with an offset, of each recording: p_bias, q_bias, r_bias [rad/s]",
         tuple(TermParameter(f"{rate}_bias", "rad/s", 0.1, each_recording=True) for rate in "pqr"),
+        by_default=lambda available: False,
         gyro=lambda rates, values: Rates(*(a + values[f"{rate}_bias"] for a, rate in zip(rates, "pqr", strict=True))),
     ),
 }
@@ -348,11 +336,6 @@ TERMS: dict[str, Term] = {
 def default_terms(available: frozenset[str]) -> tuple[str, ...]:
     """The terms that an estimate uses if the user names none, given what the logs and the airframe provide."""
     return tuple(name for name, term in TERMS.items() if term.needs <= available and term.by_default(available))
-
-
-def has_full_scale(airframe: Airframe) -> bool:
-    """Whether `max_rotor_speed` is known. A traced value counts as known."""
-    return isinstance(airframe.max_rotor_speed, Tracer) or bool(np.isfinite(airframe.max_rotor_speed))
 
 
 def required(value: T | None, message: str) -> T:

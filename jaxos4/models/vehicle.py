@@ -28,7 +28,6 @@ from .terms import (
     TermParameter,
     Values,
     default_terms,
-    has_full_scale,
     required,
 )
 
@@ -94,7 +93,7 @@ class FlightModel(AbstractModel):
         if not recordings or sorted(set(recordings)) != list(range(max(recordings) + 1)):
             raise ValueError(f"`recordings` must count from 0 and leave no number out, got {recordings}.")
         unscaled = [term for term in terms if FULL_SCALE in TERMS[term].needs]
-        if unscaled and not has_full_scale(airframe):
+        if unscaled and not airframe.has_full_scale:
             raise ValueError(f"`airframe.max_rotor_speed` must be known for the term {unscaled[0]}: set it.")
         powered = [term for term in terms if VOLTAGE in TERMS[term].needs]
         if powered and battery_voltage is None:

@@ -13,10 +13,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, UInt32
 
-from .._custom_types import Key, Parameters, Scalar, as_float
+from .._custom_types import Key, Parameters, Scalar, as_float, integer, setting
 from .._xla import quick_jit
 from ..bracket import UNIFORM_PRIOR, Bracket
-from ..estimate import AbstractEstimator, Calibration, Estimate, check_count, check_positive
+from ..estimate import AbstractEstimator, Calibration, Estimate
 from ..flight import STATE_NAMES
 from ..linalg import invert
 from ..models.state import CASCADE_ORDER, CHANNELS
@@ -72,24 +72,21 @@ class NetworkEstimator(eqx.Module):
     features: str = eqx.field(static=True, default="score")
     channels: str = eqx.field(static=True, default="rates")
     noise: tuple[float, float] = eqx.field(static=True, default=(0.1, 10.0))
-    width: int = eqx.field(static=True, default=128)
-    depth: int = eqx.field(static=True, default=3)
-    steps: int = eqx.field(static=True, default=4000)
-    batch: int = eqx.field(static=True, default=256)
+    width: int = eqx.field(static=True, converter=integer("width", 1, static=True), default=128)
+    depth: int = eqx.field(static=True, converter=integer("depth", 1, static=True), default=3)
+    steps: int = eqx.field(static=True, converter=integer("steps", 1, static=True), default=4000)
+    batch: int = eqx.field(static=True, converter=integer("batch", 1, static=True), default=256)
     learning_rate: float = eqx.field(static=True, default=0.01)
-    patience: int = eqx.field(static=True, default=10)
-    held_out: int = eqx.field(static=True, default=20_000)
+    patience: int = eqx.field(static=True, converter=integer("patience", 1, static=True), default=10)
+    held_out: int = eqx.field(static=True, converter=integer("held_out", 1000, static=True), default=20_000)
 
     def __check_init__(self):
         for name, choices in (("features", FEATURES), ("channels", CHANNELS)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"`{name}` must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
-        smallest = {"width": 1, "depth": 1, "steps": 1, "batch": 1, "patience": 1, "held_out": 1000}
-        for name, least in smallest.items():
-            check_count(name, getattr(self, name), least)
         if self.steps > _MOST_STEPS:
             raise ValueError(f"`steps` must be at most {_MOST_STEPS}, got {self.steps}.")
-        check_positive("learning_rate", self.learning_rate, finite=True)
+        setting("learning_rate", positive=True)(self.learning_rate)
         if not (len(self.noise) == 2 and 0 < self.noise[0] <= self.noise[1] < np.inf):
             raise ValueError(f"`noise` must be (lowest, highest), positive and finite, got {self.noise}.")
 

@@ -1,7 +1,6 @@
 """A trained network as one file: a zip of NumPy arrays and a header in JSON. Reading it runs no code from it."""
 
 import dataclasses
-import importlib.metadata
 import io
 import json
 import os
@@ -14,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._custom_types import as_float
-from .._files import BROKEN, write_atomically
+from .._files import BROKEN, write_file
+from .._version import __version__
 from ..airframe import Airframe
 from ..bracket import Bracket
 from ..errors import InputError
@@ -30,9 +30,7 @@ _FORMAT = 4
 
 def save_network(network: TrainedNetwork, path: str | os.PathLike[str]) -> None:
     """Writes the file of a network. Raises as `encode_network` does; `OSError` if the file cannot be written."""
-    data = encode_network(network)
-    with write_atomically(path) as beside:
-        beside.write_bytes(data)
+    write_file(path, encode_network(network))
 
 
 def encode_network(network: TrainedNetwork) -> bytes:
@@ -44,7 +42,7 @@ def encode_network(network: TrainedNetwork) -> bytes:
         raise ValueError(f"`network` is for the model {name}; only networks for {known} can be saved.")
     header = {
         "format": _FORMAT,
-        "version": importlib.metadata.version("jaxos4"),
+        "version": __version__,
         "settings": dataclasses.asdict(network.settings),
         "model": kinds[type(problem.model)],
         "method": problem.method,

@@ -27,14 +27,6 @@ class AirframeDraft(NamedTuple):
     missing: tuple[str, ...]
 
 
-class _Hover(NamedTuple):
-    """The rotor speed at which a vehicle hovers, in the unit of the flight; and how many seconds show it, and how."""
-
-    speed: float
-    seconds: float
-    felt: bool
-
-
 def airframe_draft(recording: Recording) -> AirframeDraft:
     """Begin the file of an airframe with what a log knows: spins, hover speed, sometimes the rotors' positions.
 
@@ -50,7 +42,7 @@ def airframe_draft(recording: Recording) -> AirframeDraft:
     def add(key: str, value: Any, comment: str) -> None:
         lines.append(f"{key} = {json.dumps(value)} # {comment}")
 
-    parts = [cut(recording, part) for part in stretches(recording, landed=facts.landed) if not part.reason]
+    parts = [cut(recording, part) for part in stretches(recording) if not part.reason]
     signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
     spins = facts.rotor_spins or (None if signs is None else signs.spins)
     say(f"The airframe of {Path(recording.name).name}. SI units.")
@@ -74,8 +66,11 @@ def airframe_draft(recording: Recording) -> AirframeDraft:
         missing.append("hover_speed")
         say("hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
     else:
-        add("hover_speed", _short(hover.speed * full), f"rad/s of each rotor; {_how(hover)}")
-        if not hover.felt:
+        speed, felt = hover
+        seconds = sum(float(np.ptp(part.time)) for part in parts)
+        how = f"{'by the accelerometer' if felt else 'the median'} in {seconds:.1f} s of flight"
+        add("hover_speed", _short(speed * full), f"rad/s of each rotor; {how}")
+        if not felt:
             say("Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
     if recording.commanded:
         add("max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
@@ -86,20 +81,19 @@ def airframe_draft(recording: Recording) -> AirframeDraft:
     return AirframeDraft("\n".join(lines) + "\n", tuple(missing))
 
 
-def _hover(parts: Sequence[Recording]) -> _Hover | None:
-    """The speed at which thrust is as large as the weight, by the accelerometer if it is plausible.
+def _hover(parts: Sequence[Recording]) -> tuple[float, bool] | None:
+    """The rotor speed at which thrust is as large as the weight, in the unit of the flight, and whether it was felt.
 
-    Without accelerometer, the median thrust in flight counts as the weight.
+    It is felt by a plausible accelerometer. If there is none, the median thrust in flight counts as the weight.
     """
     if not parts:
         return None
     squares = np.concatenate([(part.omega**2).mean(axis=1) for part in parts])
-    seconds = sum(float(np.ptp(part.time)) for part in parts)
     force = [part.specific_force[:, 2] for part in parts if part.specific_force is not None]
     vertical = np.concatenate(force) if len(force) == len(parts) else np.full(1, np.nan)
     share = float(np.median(vertical[np.isfinite(vertical)])) / _GRAVITY if np.isfinite(vertical).any() else np.nan
     felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
-    return _Hover(float(np.sqrt(np.median(squares) / (share if felt else 1.0))), seconds, felt)
+    return float(np.sqrt(np.median(squares) / (share if felt else 1.0))), felt
 
 
 def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:
@@ -115,10 +109,6 @@ def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:
         f"rotor_positions = [{', '.join(f'[{x}, {y}]' for x, y in signed)}]  # m: numbers for x (forward) and y (left)",
         f"(as the vehicle turns in this flight: {names})",
     )
-
-
-def _how(hover: _Hover) -> str:
-    return f"{'by the accelerometer' if hover.felt else 'the median'} in {hover.seconds:.1f} s of flight"
 
 
 def _short(value: Any) -> Any:

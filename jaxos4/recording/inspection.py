@@ -67,9 +67,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
 
     - `recording`: of a file, read with the same `airframe`, and with `full_scale=1.0`.
     """
-    facts = recording.facts
-    found = stretches(recording, airframe, landed=facts.landed)
-    usable, parts = [], []
+    found, usable, parts = stretches(recording, airframe), [], []
     for begin, end, reason in found:
         if not reason:
             usable.append(cut(recording, Stretch(begin, end)))
@@ -78,7 +76,7 @@ def inspect_log(recording: Recording, airframe: Airframe | None = None) -> Inspe
     opposite = {} if airframe is None else opposite_axes(usable, airframe)
     doubt = yaw_doubt(opposite)
     clock = "" if airframe is None else motor_clock_note(usable, airframe)
-    findings = tuple(filter(None, (nothing, facts.too_slow, refused_note(opposite))))
+    findings = tuple(filter(None, (nothing, recording.facts.too_slow, refused_note(opposite))))
     return Inspection(
         log=recording.name,
         format=log_format(recording.name).name,

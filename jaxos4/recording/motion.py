@@ -44,7 +44,7 @@ class Excitation(msgspec.Struct, frozen=True):
 
     - `torque`: standard deviation of the rotors' torque [N m]; it needs an airframe.
     - `rate`: standard deviation of the body rate [rad/s].
-    - `noise`: standard deviation of the gyro's white noise [rad/s], see `gyro_noise`.
+    - `noise`: standard deviation of the gyro's white noise [rad/s], see `white_noise`.
     - `verdict`: "good", "weak", "none" or "not measured".
     """
 
@@ -74,7 +74,7 @@ def excitation(flight: Flight | Recording, airframe: Airframe | None = None) -> 
         torque = (recording.omega[:-1] ** 2 @ mixer.T).std(axis=0)
     for i, axis in enumerate(AXES):
         rate, angle = recording.states[:, RATE_COLUMNS[i]], recording.states[:, _ANGLE_COLUMNS[i]]
-        noise = gyro_noise(rate)
+        noise = white_noise(rate, 2)
         if np.count_nonzero(np.isfinite(rate)) < 3:
             seen = np.isfinite(angle)
             measured = np.count_nonzero(seen) > 2
@@ -90,18 +90,11 @@ def excitation(flight: Flight | Recording, airframe: Airframe | None = None) -> 
     return found
 
 
-def gyro_noise(rate: Float[np.ndarray, " samples"]) -> float:
-    """The standard deviation of the white noise on a body rate [rad/s]; NaN if too little was measured.
-
-    It follows from the median size of second differences: motion is smooth from sample to sample, noise is not.
-    """
-    return white_noise(rate, 2)
-
-
 def white_noise(values: Float[np.ndarray, " samples"], order: int) -> float:
     """The standard deviation of white noise, from the median size of differences of this order; NaN without any.
 
-    A higher order tolerates faster motion. Jumps between stretches, and of angles by a turn, do not count.
+    Motion is smooth from sample to sample, noise is not. A higher order tolerates faster motion. Jumps between
+    stretches, and of angles by a turn, do not count.
     """
     size = np.diff(values, order)
     size = np.abs(size[np.isfinite(size)])

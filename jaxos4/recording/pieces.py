@@ -61,9 +61,8 @@ def join(flights: Sequence[Flight], *, length: int) -> Flight:
 
     **Raises:** `ValueError` if the sample times differ, or if no stretch is as long as one window.
     """
-    pieces = [as_recording(flight) for flight in flights]
-    _check_steps(pieces)
-    whole = [piece for piece in (whole_windows(piece, length) for piece in pieces) if piece.time.size]
+    whole = [whole_windows(as_recording(flight), length) for flight in flights]
+    whole = [piece for piece in whole if piece.time.size]
     if not whole:
         raise ValueError(f"`flights` must hold at least `length` = {length} samples without a break.")
     return joined(whole).flight
@@ -79,7 +78,9 @@ def joined(pieces: Sequence[Recording]) -> Recording:
 
     **Raises:** `ValueError` if the sample times differ.
     """
-    steps = _check_steps(pieces)
+    steps = [piece.dt for piece in pieces]
+    if np.ptp(steps) > _EQUAL_STEPS * steps[0]:
+        raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
     states, force = np.split(np.concatenate([piece.channels for piece in pieces]), [len(STATE_NAMES)], axis=1)
     sizes = [piece.time.size for piece in pieces]
     return Recording(
@@ -98,13 +99,6 @@ def _of_all(pieces: Sequence[Recording], name: str) -> np.ndarray | None:
     """A channel, if all pieces have it."""
     values = [getattr(piece, name) for piece in pieces]
     return None if any(each is None for each in values) else np.concatenate(values)
-
-
-def _check_steps(pieces: Sequence[Recording]) -> list[float]:
-    steps = [piece.dt for piece in pieces]
-    if steps and np.ptp(steps) > _EQUAL_STEPS * steps[0]:
-        raise ValueError(f"`flights` must have one sample time, got {', '.join(f'{dt:.6g}' for dt in steps)} s.")
-    return steps
 
 
 def hold_out(recording: Recording, length: int, share: float) -> tuple[Recording, Recording | None]:

@@ -11,16 +11,7 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
-from ..models.terms import (
-    AXIAL_VELOCITY,
-    BODY_VELOCITY,
-    COMMANDS,
-    FULL_SCALE,
-    LATERAL_FORCE,
-    VERTICAL_FORCE,
-    VOLTAGE,
-    has_full_scale,
-)
+from ..models.terms import AXIAL_VELOCITY, BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE
 from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
@@ -198,7 +189,7 @@ def _available_inputs(
         BODY_VELOCITY: bool(motions) and all(motion.measured for motion in motions),
         LATERAL_FORCE: force[0] and force[1],
         VERTICAL_FORCE: force[2],
-        FULL_SCALE: has_full_scale(airframe),
+        FULL_SCALE: airframe.has_full_scale,
         VOLTAGE: whole.voltage is not None,
     }
     return frozenset(name for name, offered in offers.items() if offered)
@@ -234,7 +225,7 @@ def _usable_parts(
             return [cut(recording, Stretch(first if begin is None else begin, last if end is None else end))], None
         except InputError as error:
             raise InputError(f"{name}: {error}") from None
-    every = stretches(recording, airframe, landed=recording.facts.landed)
+    every = stretches(recording, airframe)
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)
     if not usable:

@@ -65,9 +65,7 @@ class Stretch(NamedTuple):
         return self.end - self.begin
 
 
-def stretches(
-    flight: Flight | Recording, airframe: Airframe | None = None, *, landed: Sequence[tuple[float, float]] = ()
-) -> tuple[Stretch, ...]:
+def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
     """Divide a flight into stretches: usable ones, and others with the reason. Together they are the whole flight.
 
     **Arguments:**
@@ -75,14 +73,13 @@ def stretches(
     - `flight`: one flight, not a batch.
     - `airframe`: the weight, and the largest rotor speed. If there is none, or if it is evidently another vehicle's
       (thrust below a third or above three times the weight), the median thrust is taken as the weight.
-    - `landed`: from when to when the vehicle itself says that it is on the ground [s], see `jaxos4.logs.LogFacts`.
     """
     recording = as_recording(flight)
     time, omega, dt, force = recording.time, recording.omega, recording.dt, recording.specific_force
     rates = recording.states[:, RATE_COLUMNS]
     share = _thrust_share(omega, airframe, commanded=recording.commanded)
     ground = _ground(share, dt)
-    for begin, end in landed:
+    for begin, end in recording.facts.landed:  # as the vehicle itself says
         ground |= (time >= begin - dt / 2) & (time <= end + dt / 2)
     saturations = _saturations(omega, airframe, dt)
     labels = np.zeros(time.size, dtype=int)
@@ -103,11 +100,6 @@ def stretches(
         Stretch(float(time[begin]), float(time[end - 1]), _reason(int(labels[begin]), begin, end, saturations))
         for begin, end in itertools.pairwise(edges)
     )
-
-
-def usable_stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> tuple[Stretch, ...]:
-    """The usable stretches, in order; each lasts at least one second."""
-    return tuple(stretch for stretch in stretches(flight, airframe) if not stretch.reason)
 
 
 def nothing_usable(every: Sequence[Stretch]) -> str:

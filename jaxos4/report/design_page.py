@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from .._files import write_atomically
+from .._files import write_file
 from ..design import Design
 from .text import Listing, plain
 
@@ -48,19 +48,15 @@ def print_design(console: Console, found: Design, accuracy: float) -> None:
         rows.append((name, unit, *(plain(factor * x, 2) if x < task.unexcited[i] else "-" for x in bounds)))
     Listing(("parameter", "unit", *every), rows, right=tuple(every)).print_on(console)
     console.print(f"the smallest possible standard deviation; -: {unexcited}.")
-    gains = "; ".join(_gain(found, name) for name in found.standard)
-    console.print(f"geometric mean of the bounds {targets}: {gains}; {compared}.")
+    gains, count = [], task.scale.size
+    for name in found.standard:
+        ratio, excited = found.gain(name)
+        some = "" if excited == count else f" ({excited} of {count})"
+        gains.append(f"{plain(ratio, 2)} x {name}{some}" if excited else f"{name} excites nothing")
+    console.print(f"geometric mean of the bounds {targets}: {'; '.join(gains)}; {compared}.")
     uses = ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.designed.uses.items())
     console.print(f"largest share of each limit, of {task.vehicles} vehicles from the bracket: {uses}.")
     console.print(_lengths(found, accuracy))
-
-
-def _gain(found: Design, name: str) -> str:
-    ratio, excited = found.gain(name)
-    if not excited:
-        return f"{name} excites nothing"
-    count = found.task.scale.size
-    return f"{plain(ratio, 2)} x {name}{'' if excited == count else f' ({excited} of {count})'}"
 
 
 def _lengths(found: Design, accuracy: float) -> str:
@@ -118,5 +114,4 @@ def write_design(found: Design, accuracy: float, out: Path) -> None:
         handles = panels[_COLUMNS].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=len(every))
         content = svg(figure)
-    with write_atomically(out) as beside:
-        beside.write_bytes(content)
+    write_file(out, content)

@@ -36,20 +36,14 @@ def render(template: str, **values: Any) -> str:
     environment = jinja2.Environment(
         loader=loader, undefined=undefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"inline": inline, "plain": plain, "number": _number, "interval": _interval, "share": _share}
+    environment.filters |= {"inline": inline, "plain": plain, "number": _number}
+    environment.filters["interval"] = lambda ends: "" if ends is None else " to ".join(map(_number, ends))
+    environment.filters["share"] = lambda value: MISSING if value is None else f"{value:.2f}"
     return environment.get_template(template).render(**values)
 
 
 def _number(value: float | None, digits: int = 4) -> str:
     return MISSING if value is None else plain(value, digits)
-
-
-def _interval(ends: tuple[float, float] | None) -> str:
-    return "" if ends is None else f"{_number(ends[0])} to {_number(ends[1])}"
-
-
-def _share(value: float | None) -> str:
-    return MISSING if value is None else f"{value:.2f}"
 
 
 def inline(drawing: Drawing, stem: str, description: str, estimators: Sequence[str] = ()) -> Markup:

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MultipleLocator
 from scipy.spatial.distance import pdist
 
-from .._files import check_writable, write_atomically
+from .._files import check_writable, write_file
 from ..airframe import Airframe
 from ..analysis.frequency_response import AxisResponse, FrequencyResponse
 from ..analysis.inertia import CenterOfMass, center_of_mass
@@ -63,8 +63,7 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         notes=[*used.notes, *filter(None, [found.motor_clock])],
         provenance=[(name.replace("_", " "), _text(x)) for name, x in used.to_dict().items() if name not in _ELSEWHERE],
     )
-    with write_atomically(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    write_file(path, text)
 
 
 def verdict(found: Identification) -> str:

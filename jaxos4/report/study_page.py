@@ -7,7 +7,7 @@ from typing import NamedTuple
 import xarray as xr
 from matplotlib.figure import Figure
 
-from .._files import check_writable, write_atomically
+from .._files import check_writable, write_file
 from . import study_figures, study_tables
 from .html import Drawing, draw as draw_panels, render, swatch
 from .study_data import Scenario, best_estimators, bounds, names, scenarios
@@ -63,8 +63,7 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
         files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in contents.items() if content}
     folder.mkdir(exist_ok=True)
     for path, content in reversed(files.items()):  # the page last
-        with write_atomically(path) as beside:
-            beside.write_bytes(content)
+        write_file(path, content)
     return list(files)
 
 

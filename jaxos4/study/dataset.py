@@ -1,6 +1,5 @@
 """The results of a study as an xarray Dataset with units, names and provenance."""
 
-import importlib.metadata
 import itertools
 import json
 import math
@@ -13,14 +12,15 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
+from .._files import write_netcdf
+from .._version import __version__
 from ..errors import InputError
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
-from ..networks import CHECK
 from .cell import LEVELS, OUTCOMES, fleet_of, fly, fly_again
 from .metrics import SCENARIO
 from .specification import AXES, Study
-from .store import RESULTS_FILE, Store, write_file
+from .store import RESULTS_FILE, Store
 
 # For each variable of a flight: its further dimensions, type, unit and description.
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
@@ -54,8 +54,9 @@ _AXES = {
 def assemble(store: Store) -> xr.Dataset:
     """The Dataset of a study's finished cells; the result of all others is `not_run`.
 
-    Its dimensions are all axes of the grid, `flight`, `parameter`, `level`, and those of the example flight and of the
-    networks' training. Raises `InputError` if a cell's file is damaged.
+    Its dimensions are all axes of the grid, `flight`, `parameter`, `level`, and those of the example flight.
+
+    **Raises:** `InputError` if a cell's file is damaged.
     """
     study = store.study
     coordinates = _coordinates(study)
@@ -92,7 +93,7 @@ def assemble(store: Store) -> xr.Dataset:
     named["result"] |= {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
     variables = {name: (_dims(name), arrays[name], attributes) for name, attributes in named.items()}
     command = {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)}
-    variables |= _brackets(study) | _example(store) | _training(store)
+    variables |= _brackets(study) | _example(store)
     return xr.Dataset(variables, coords=coordinates, attrs=provenance(study, store.device) | command)
 
 
@@ -103,11 +104,7 @@ def _dims(name: str) -> tuple[str, ...]:
 
 def save_dataset(dataset: xr.Dataset, directory: Path) -> None:
     """Writes a study's Dataset into its folder, completely or not at all."""
-    packed = {"zlib": True, "complevel": 4}
-    numbers = [name for name, data in dataset.data_vars.items() if data.dtype.kind in "fi" and data.ndim]
-    # In memory first: HDF5 can crash on a full disk.
-    data = dataset.to_netcdf(engine="h5netcdf", encoding=dict.fromkeys(numbers, packed))
-    write_file(directory / RESULTS_FILE, data)
+    write_netcdf(directory / RESULTS_FILE, dataset, 4)
 
 
 def _coordinates(study: Study) -> dict[str, tuple]:
@@ -124,7 +121,7 @@ def provenance(study: Study, device: str) -> dict[str, str | int]:
     return {
         "title": study.title,
         "specification": tomlkit.dumps(msgspec.to_builtins(study)),
-        "version": importlib.metadata.version("jaxos4"),
+        "version": __version__,
         "jax": jax.__version__,
         "precision": "float64",
         "device": device,
@@ -186,26 +183,6 @@ def _example(store: Store) -> dict[str, tuple]:
             "search_estimate": (along, (upper + lower) / 2, _named("middle of the sweep's bracket", "unit")),
         }
     return variables
-
-
-def _training(store: Store) -> dict[str, tuple]:
-    """The losses of the networks during training."""
-    needed = store.study.jobs()
-    networks = [store.read_network(number) for number in range(len(needed))]
-    histories = [np.zeros((0, 2)) if network is None else np.asarray(network.history) for network in networks]
-    checks = max(map(len, histories), default=0)
-    if not checks:
-        return {}
-    losses = np.stack([np.pad(h, ((0, checks - len(h)), (0, 0)), constant_values=np.nan) for h in histories])
-    labels = [" ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in job) for job in needed]
-    steps = np.minimum(CHECK * np.arange(1, checks + 1), store.study.network.steps)
-    both = ("training", "check")
-    return {
-        "training": ("training", labels, _named("network", "1")),
-        "training_step": ("check", steps, _named("steps of training", "1")),
-        "training_loss": (both, losses[:, :, 0], _named("loss in training", "1")),
-        "validation_loss": (both, losses[:, :, 1], _named("loss on unseen flights", "1")),
-    }
 
 
 def _named(long_name: str, units: str) -> dict[str, Any]:

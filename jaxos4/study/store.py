@@ -6,7 +6,6 @@ ends with its process, even if the process is killed.
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import io
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,8 @@ import jax
 import msgspec
 import numpy as np
 
-from .._files import BROKEN, write_atomically
+from .._files import BROKEN, write_file
+from .._version import __version__
 from ..errors import InputError
 from ..networks import TrainedNetwork, load_network
 from .specification import Study
@@ -88,7 +88,7 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
         with filelock.FileLock(directory / _LOCK, timeout=0):
             store = check_store(directory, study, device)
             if not (directory / _SPECIFICATION).exists():
-                header = {"version": importlib.metadata.version("jaxos4"), "device": device, "study": study}
+                header = {"version": __version__, "device": device, "study": study}
                 data = msgspec.json.format(msgspec.json.encode(header), indent=2)
                 write_file(directory / _SPECIFICATION, data + b"\n")
             for folder in (directory, directory / "cells", directory / "networks"):
@@ -103,17 +103,17 @@ def open_store(directory: Path, study: Study, device: str) -> Iterator[Store]:
 
 def read_store(directory: Path) -> Store:
     """Opens the folder of a study to read. Raises `InputError` if it holds no study, or one of another version."""
-    path, ours = directory / _SPECIFICATION, importlib.metadata.version("jaxos4")
+    path = directory / _SPECIFICATION
     try:
         header = msgspec.json.decode(path.read_bytes())
-        if (version := header["version"]) == ours:
+        if (version := header["version"]) == __version__:
             return Store(directory, msgspec.convert(header["study"], Study), header["device"])
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{directory}: holds no study; `jaxos4 study` makes one.") from None
     except (*BROKEN, msgspec.MsgspecError) as error:
         what = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not the specification of a study ({what}); give another folder.") from None
-    raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {ours}; give another folder.")
+    raise InputError(f"{directory}: begun by jaxos4 {version}, and this is {__version__}; give another folder.")
 
 
 def check_store(directory: Path, study: Study, device: str = "") -> Store:
@@ -136,9 +136,3 @@ def check_store(directory: Path, study: Study, device: str = "") -> Store:
 def _short(value: Any) -> str:
     text = msgspec.json.encode(value).decode()
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def write_file(path: Path, data: bytes | memoryview) -> None:
-    """Writes a file of a study, completely or not at all."""
-    with write_atomically(path) as beside:
-        beside.write_bytes(data)
