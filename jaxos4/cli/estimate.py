@@ -1,7 +1,9 @@
 """`jaxos4 estimate`: the parameters of a quadrotor from recorded flights, with 95 % intervals."""
 
+import importlib
 import shlex
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from ..recording import Recording
 
 _OS4, _PUBLISHED = "os4", "published"
+# What draws a report: slow to import.
+_DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg", "matplotlib.figure", "jinja2")
 
 
 def estimate(
@@ -69,6 +73,8 @@ def estimate(
         if report is not None and not isinstance(subject, Airframe):
             sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
             raise InputError(f"--report: is for real vehicles, {sign}; leave it out.")
+        if report is not None:  # while the first program runs
+            threading.Thread(target=lambda: [*map(importlib.import_module, _DRAWING)], daemon=True).start()
         found = identify(
             recordings,
             subject,

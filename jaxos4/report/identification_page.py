@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MultipleLocator
-from scipy.spatial.distance import pdist
 
 from .._files import check_writable, write_file
 from ..airframe import Airframe
@@ -30,6 +29,7 @@ _INERTIAS = ("Ix", "Iy", "Iz")
 _ELSEWHERE = ("command", "notes")
 # The frequencies [Hz] and gains that the figure of the response shows, at most, and their ticks.
 _HIGHEST, _GAINS = 40.0, (0.2, 5.0)
+_MARGINS = {"left": 0.06, "right": 0.99, "top": 0.94, "bottom": 0.12, "wspace": 0.2, "hspace": 0.6}
 _FREQUENCY_TICKS, _GAIN_TICKS = (1, 2, 5, 10, 20, 40), (0.2, 0.5, 1, 2, 5)
 
 
@@ -41,13 +41,17 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     values = np.array([math.nan if row.estimate is None else row.estimate for row in found.parameters.values()])
     covariance = np.zeros((count, count)) if found.covariance is None else np.asarray(found.covariance)
     center = [x for x in center_of_mass(tuple(found.parameters), values, covariance, airframe) if math.isfinite(x.std)]
-    drawings = {}
     with drawing():
-        drawings["vehicle"] = draw(vehicle(airframe, found.rigid_body.constants, center, look))
+        figures = {"vehicle": vehicle(airframe, found.rigid_body.constants, center, look)}
         if found.sample_times:
-            drawings["sample times"] = draw(inertias_by_sample_time(found.sample_times, used.sample_time, look))
+            figures["sample times"] = inertias_by_sample_time(found.sample_times, used.sample_time, look)
         if found.response is not None:
-            drawings["response"] = draw(frequency_responses(found.response, look))
+            figures["response"] = frequency_responses(found.response, look)
+        for figure in figures.values():
+            # The page shows each panel by itself. To fit all labels exactly would take a third of the time.
+            figure.set_layout_engine(None)
+            figure.subplots_adjust(**_MARGINS)
+        drawings = {name: draw(figure) for name, figure in figures.items()}
     text = render(
         "identification.html.j2",
         title=title,
@@ -93,7 +97,8 @@ def vehicle(airframe: Airframe, constants: dict[str, Constant], center: Sequence
     """The vehicle as it was identified: left from above, front up, right its moments of inertia with 95 % intervals."""
     figure, (above, bars) = grid(2, columns=2, height=3.4)
     positions = 1e3 * np.asarray(airframe.rotor_positions, dtype=float)
-    (x, y), radius = positions.T, 0.42 * pdist(positions).min()
+    (x, y), distances = positions.T, np.linalg.norm(positions[:, None] - positions, axis=2)
+    radius = 0.42 * distances[distances > 0].min()
     for i, spin in enumerate(np.asarray(airframe.rotor_spins)):
         end = 1 - 0.25 * radius / math.hypot(x[i], y[i])  # leaves room for the number
         above.plot([0, -end * y[i]], [0, end * x[i]], color=FAINT, linewidth=3, zorder=1)
