@@ -47,10 +47,10 @@ hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("experiments", "experiments_vehicle", "network", "errors", "estimators", "study_resume", "filter_error", "cli"),
-    *("study_cluster", "vehicle", "multiple_shooting", "flight_model", "shooting", "design", "study"),
-    *("report_browser", "judge", "startup", "report", "unknowns", "programs", "compare", "simulate", "ibss"),
-    *("new_estimator", "diagnostics", "identifiability", "models", "kalman", "identify", "svsf", "closed_loop"),
+    *("experiments", "vehicle", "experiments_vehicle", "estimators", "design", "study_resume", "errors", "network"),
+    *("cli", "multiple_shooting", "study", "startup", "predict", "filter_error", "closed_loop", "shooting", "hybrid"),
+    *("compare", "closed_loop_effects", "vehicle_likelihood", "programs", "recursive", "searches"),
+    *("diagnostics", "identify", "flight_model", "report_browser", "report", "identifiability", "flight_model_fits"),
 )
 
 
@@ -115,7 +115,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 # Modules that compute for longer than they compile. XLA hardly optimises the programs of the others, which then compile
 # in a third of the time, and compute three to five times as long. A program keeps the level of its first use: the
 # fixtures below act on what a test is the first to compile, and not on fixtures of the module.
-COMPUTING = {"ant_colony", "design"}
+COMPUTING = {"design"}
 
 
 @pytest.fixture(scope="module", autouse=True)

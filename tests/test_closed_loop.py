@@ -276,35 +276,6 @@ def test_the_key_determines_the_flight():
     assert np.abs(one - other).max() > 0.1
 
 
-def flown(samples=5, **settings):
-    return jaxos4.fly_closed_loop(loop_of(), jnp.zeros((samples, 4)), key=jax.random.key(0), **settings)
-
-
-@pytest.mark.parametrize(
-    ("make", "settings", "fragment"),
-    [
-        (loop_of, {"gust": -1.0}, "`gust`"),
-        (loop_of, {"gust": (1.0, 2.0)}, r"`gust`.*\(2,\)"),
-        (loop_of, {"gust": np.nan}, "`gust`"),
-        (loop_of, {"rotor_lag": -0.1}, "`rotor_lag`"),
-        (loop_of, {"gust_time": np.array([0.1, 0.2])}, "`gust_time`"),
-        (loop_of, {"offset": np.inf}, "`offset`"),
-        (loop_of, {"controller_inertia": -1.0}, "`controller_inertia`"),
-        (loop_of, {"logged": "both"}, "`logged`.*'both'"),
-        (flown, {"samples": 1}, "`references`"),
-        (flown, {"dt": 0.0}, "`dt`"),
-        (flown, {"substeps": 0}, "`substeps`"),
-        (jaxos4.random_references, {"duration": 0.0, "key": None}, "`duration`"),
-        (jaxos4.random_references, {"amplitude": (1.0,), "key": None}, "`amplitude`"),
-    ],
-)
-def test_wrong_settings_are_named(make, settings, fragment):
-    if "key" in settings:
-        settings = settings | {"key": jax.random.key(0)}
-    with pytest.raises(ValueError, match=fragment):
-        make(**settings)
-
-
 # The command line.
 
 

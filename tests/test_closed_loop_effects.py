@@ -238,27 +238,3 @@ def test_flights_with_all_effects_and_with_none_are_one_batch():
         for field in ("states", "specific_force"):
             found, expected = np.asarray(getattr(together, field))[i], np.asarray(getattr(alone, field))
             np.testing.assert_allclose(found[:500], expected[:500], rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("make", "settings", "fragment"),
-    [
-        (jaxos4.Air, {"wind": -1.0}, "`wind`.*at least 0"),
-        (jaxos4.Air, {"drag": (1.0, 2.0, 3.0)}, r"`drag`.*2 \(x, y\).*\(3,\)"),
-        (jaxos4.Air, {"inflow": None}, "`inflow`"),
-        (jaxos4.Sensors, {"dropouts": 1.5}, "`dropouts`.*at most 1"),
-        (jaxos4.Sensors, {"clock_offset": np.inf}, "`clock_offset`"),
-        (jaxos4.Sensors, {"controller_gyro_noise": -1.0}, "`controller_gyro_noise`"),
-        (jaxos4.ClosedLoop, {"airframe": CRAZYFLIE, "sag": 2.0}, "`sag`"),
-        (jaxos4.ClosedLoop, {"airframe": CRAZYFLIE, "log_every": 0}, "`log_every`"),
-    ],
-)
-def test_wrong_settings_are_named(make, settings, fragment):
-    with pytest.raises(ValueError, match=fragment):
-        make(**settings)
-
-
-def test_each_run_of_the_controller_has_the_same_steps():
-    loop = jaxos4.ClosedLoop(CRAZYFLIE, log_every=3)
-    with pytest.raises(ValueError, match=r"`substeps`.*multiple of `log_every` = 3, got 4"):
-        jaxos4.fly_closed_loop(loop, jnp.zeros((5, 4)), key=jax.random.key(0))

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import standard_flight, standard_problem
+from helpers import CRAZYFLIE, standard_flight, standard_problem
 
 import jaxos4
 from jaxos4.airframe import OS4
@@ -66,6 +66,19 @@ def estimate(name, bracket=BRACKET, model=MODEL, **arguments):
 
 def flat_flight(samples, dt=0.01, rows=None):
     return jaxos4.Flight(dt * np.arange(samples), np.ones((samples, 4)), np.ones((rows or samples, 12)))
+
+
+def loop(**settings):
+    return jaxos4.ClosedLoop(CRAZYFLIE, **settings)
+
+
+def fly(samples=5, every=1, **settings):
+    loop = jaxos4.ClosedLoop(CRAZYFLIE, log_every=every)
+    return jaxos4.fly_closed_loop(loop, jnp.zeros((samples, 4)), key=jax.random.key(0), **settings)
+
+
+def references(**settings):
+    return jaxos4.random_references(**settings, key=jax.random.key(0))
 
 
 LAGGING = jaxos4.FlightModel(terms=("lag",))
@@ -145,6 +158,28 @@ MISUSE = [
     ("`channels` 'attitude' are more than the problem's", lambda: fit(channels="attitude")),
     ("`bracket` of alpha3 must have", lambda: fit(FLAT)),
     ("`bracket` must hold 8 parameters, got 7", lambda: fit(SEVEN)),
+    # A flight in closed loop.
+    *(("`gust`", lambda gust=gust: loop(gust=gust)) for gust in (-1.0, np.nan)),
+    (r"`gust`.*\(2,\)", lambda: loop(gust=(1.0, 2.0))),
+    ("`rotor_lag`", lambda: loop(rotor_lag=-0.1)),
+    ("`gust_time`", lambda: loop(gust_time=np.array([0.1, 0.2]))),
+    ("`offset`", lambda: loop(offset=np.inf)),
+    ("`controller_inertia`", lambda: loop(controller_inertia=-1.0)),
+    ("`logged`.*'both'", lambda: loop(logged="both")),
+    ("`sag`", lambda: loop(sag=2.0)),
+    ("`log_every`", lambda: loop(log_every=0)),
+    ("`references`", lambda: fly(samples=1)),
+    ("`dt`", lambda: fly(dt=0.0)),
+    ("`substeps`", lambda: fly(substeps=0)),
+    ("`substeps`.*multiple of `log_every` = 3, got 4", lambda: fly(every=3)),
+    ("`duration`", lambda: references(duration=0.0)),
+    ("`amplitude`", lambda: references(amplitude=(1.0,))),
+    ("`wind`.*at least 0", lambda: jaxos4.Air(wind=-1.0)),
+    (r"`drag`.*2 \(x, y\).*\(3,\)", lambda: jaxos4.Air(drag=(1.0, 2.0, 3.0))),
+    ("`inflow`", lambda: jaxos4.Air(inflow=None)),
+    ("`dropouts`.*at most 1", lambda: jaxos4.Sensors(dropouts=1.5)),
+    ("`clock_offset`", lambda: jaxos4.Sensors(clock_offset=np.inf)),
+    ("`controller_gyro_noise`", lambda: jaxos4.Sensors(controller_gyro_noise=-1.0)),
     # A rotor that cannot carry the weight.
     ("`airframe` cannot hover", lambda: multisine(eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(200.0)))),
 ]
