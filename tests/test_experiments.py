@@ -273,8 +273,10 @@ def test_long_flight(report_of):
 def test_public_flights(report_of, shared_flights):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    report = report_of("public_flights", flights=shared_flights, end=15.0, **names)
+    report = report_of("public_flights", flights=shared_flights, end=15.0, epochs=20, compared=[], **names)
+    assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
     for rate in "pq":
         assert found[rate]["error"][9] < found[rate]["constant"][9]
+        assert len(found[rate]["network"]) == 50

@@ -74,8 +74,8 @@ class Measured(NamedTuple):
     ) -> Float[np.ndarray, "steps 9"]:
         """How far position, velocity and attitude are from dead reckoning with gyro and accelerometer.
 
-        Dead reckoning begins as measured at each start. It knows no model: it is off because the sensors contradict each
-        other, by noise of any colour, or by shifted clocks. The mean error of the accelerometer is corrected.
+        Dead reckoning begins as measured at each start. It knows no model: it is off because the sensors contradict
+        each other, by noise of any colour, or by shifted clocks. The mean error of the accelerometer is corrected.
 
         **Returns:** the standard deviation after each step, without what the white noise of gyro and accelerometer
         causes, and at least what the white noise of the start and of the end causes.
