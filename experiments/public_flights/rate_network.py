@@ -45,7 +45,7 @@ def trained(recordings: list[Recording], *, epochs: int, seed: int) -> RateNetwo
     """A network of the recordings; samples with missing rates are left out. An epoch is one batch of starts."""
     data, places = [_data(recording) for recording in recordings], []
     for i, (rates, _) in enumerate(data):
-        known = np.isfinite(rates).all(axis=1)
+        known = np.asarray(np.isfinite(rates).all(axis=1))
         start = np.arange(PAST, len(rates) - STEPS)
         rows = start[:, None] + np.arange(-PAST, STEPS + 1)
         places += [(i, k) for k in start[known[rows].all(axis=1)]]
