@@ -269,12 +269,26 @@ def test_long_flight(report_of):
     assert one["results"] == {"at_bound": 2}
 
 
+def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interval():
+    def row(value):
+        return {"constants": {name: {"estimate": value, "std": 1.0} for name in ("Ix", "Iy")}}
+
+    rows = {"a": row(0.0), "b": row(2.7), "c": row(2.9), "refused": {"constants": {}}}
+    found = load("public_flights").agreement(rows)  # 1.96 sqrt(2) = 2.77
+    assert found["pairs"] == 6
+    assert found["share"] == pytest.approx(2 / 3)
+    assert found["ci95"][0] <= found["share"] <= found["ci95"][1]
+    assert load("public_flights").agreement({})["share"] is None
+
+
 @pytest.mark.usefixtures("quickly_compiled")
 def test_public_flights(report_of, shared_flights):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    report = report_of("public_flights", flights=shared_flights, end=15.0, **names)
+    report = report_of("public_flights", flights=shared_flights, end=15.0, epochs=20, compared=[], **names)
+    assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
     for rate in "pq":
         assert found[rate]["error"][9] < found[rate]["constant"][9]
+        assert len(found[rate]["network"]) == 50

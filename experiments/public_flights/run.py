@@ -1,24 +1,33 @@
-"""Public flights of a Crazyflie 2.1 (NanoBench): some are identified together, and all others are predicted whole.
+"""Public flights of a Crazyflie 2.1 (NanoBench): identified alone and together, and predicted whole.
 
-Position, velocity, attitude and body rates, 50 steps of 10 ms ahead, open loop, with the recorded commands. The errors
-stand beside those of constant velocity and rates, and of a regression that is fitted to the first half of the flight
-that it predicts. Each flight is predicted with the offsets that its own past shows.
+Each flight is identified alone, and all together; what is refused has its cause. The moments of inertia of one vehicle
+should differ by chance alone: `pairs` has the share of pairs of flights whose difference is inside its 95 %, with an
+interval from a bootstrap of the flights.
+
+Three flights are identified together, and all others are predicted: position, velocity, attitude and body rates, 50
+steps of 10 ms ahead, open loop, with the recorded commands. The errors stand beside those of constant velocity and
+rates, of a regression that is fitted to the first half of the flight that it predicts, and of a small network for the
+rates that is trained on the identified flights. Each flight is predicted with the offsets that its own past shows.
 """
 
+import itertools
 import json
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+import numpy as np
 import typer
 from rich.console import Console
 
 import jaxos4
-from jaxos4.recording import read_recording
+from jaxos4.recording import Recording, read_recording
+from jaxos4.results import NINETY_FIVE
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 
+from rate_network import errors_of, trained
 from shared import flight_files, table_of
 
 jax.config.update("jax_enable_x64", True)
@@ -29,16 +38,68 @@ PREDICTED = ("B2_circle_fast_rep2", "B3_figure8_fast_rep1", "B3_figure8_fast_rep
 TERMS = ("offset", "center_of_mass", "damping", "velocity", "voltage", "motor", "delay", "reaction", "accelerometer")
 TERMS += ("inflow", "drag")
 STEP = 0.01  # [s]
+INERTIAS = "Ix", "Iy"
+BOOTSTRAPS, SEEDS = 2000, 3
+
+
+def alone(recordings: list[Recording], end: float | None) -> dict[str, Any]:
+    """The result, the doubts and the moments of inertia of these recordings; or why they are refused."""
+    settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=STEP, end=end)
+    try:
+        found = jaxos4.identify(recordings, AIRFRAME, settings=settings).to_dict()
+    except jaxos4.InputError as error:
+        return {"result": "refused", "doubts": [{"cause": str(error)}], "constants": {}}
+    return {name: found[name] for name in ("result", "doubts", "constants")}
+
+
+def agreement(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The share of pairs whose difference is inside its 95 %, over all moments of inertia, with a bootstrap by flight.
+
+    Two draws of one flight are no pair. `None`: no pair.
+    """
+    names = [name for name, row in rows.items() if row["constants"]]
+    inside = np.full((len(names), len(names), len(INERTIAS)), np.nan)
+    for i, j in itertools.permutations(range(len(names)), 2):
+        for k, inertia in enumerate(INERTIAS):
+            a, b = (rows[names[place]]["constants"].get(inertia) for place in (i, j))
+            if a and b:
+                limit = NINETY_FIVE * np.hypot(a["std"], b["std"])
+                inside[i, j, k] = abs(a["estimate"] - b["estimate"]) <= limit
+    if not np.isfinite(inside).any():
+        return {"flights": names, "pairs": 0, "share": None, "ci95": None}
+    draws = np.random.default_rng(0).integers(len(names), size=(BOOTSTRAPS, len(names)))
+    drawn = [inside[np.ix_(draw, draw)] for draw in draws]
+    shares = [np.nanmean(each) for each in drawn if np.isfinite(each).any()]
+    pairs = int(np.isfinite(inside).sum()) // 2
+    ends = [float(x) for x in np.quantile(shares, [0.025, 0.975])]
+    return {"flights": names, "pairs": pairs, "share": float(np.nanmean(inside)), "ci95": ends}
+
+
+def print_flights(report: dict[str, Any]) -> None:
+    """One line for each flight that was identified alone, and the agreement of these flights."""
+    headings = "flight", "result", *(f"{name} [1e-5 kg m^2]" for name in INERTIAS), "results"
+    table = table_of("each flight alone, 95 % intervals", headings)
+    for flight, row in report["alone"].items():
+        values = [row["constants"].get(name) for name in INERTIAS]
+        numbers = (f"{1e5 * x['estimate']:.2f} +- {1e5 * NINETY_FIVE * x['std']:.2f}" if x else "" for x in values)
+        table.add_row(flight, row["result"], *numbers, "; ".join(each["cause"] for each in row["doubts"]))
+    console = Console(width=180)
+    console.print(table)
+    for which, found in report["pairs"].items():
+        console.print(
+            f"{which}: {found['pairs']} pairs, share inside 95 %: {found['share']}, by flight {found['ci95']}"
+        )
 
 
 def print_table(report: dict[str, Any]) -> None:
     """One line for each flight and quantity."""
-    headings = "flight", "quantity", "unit", "error", "constant", "regression", "0.1 s: error", "constant", "regression"
+    kinds = "error", "constant", "regression", "network"
+    headings = "flight", "quantity", "unit", *kinds, "0.1 s: error", *kinds[1:]
     table = table_of("mean absolute error: the sum over 50 steps of 10 ms, and 0.1 s ahead", headings)
     for flight, found in report["flights"].items():
         for quantity, row in found["quantities"].items():
-            kinds = ("error", "constant", "regression")
-            cells = [row["sum"][kind] for kind in kinds] + [row[kind][9] for kind in kinds]
+            cells = [row["sum"].get(kind) for kind in kinds]
+            cells += [row[kind][9] if kind in row else None for kind in kinds]
             table.add_row(flight, quantity, row["unit"], *("" if x is None else f"{x:.3g}" for x in cells))
     Console(width=150).print(table)
 
@@ -48,21 +109,36 @@ def main(
     flights: Annotated[Path | None, typer.Option(help="Folder of the flights; $JAXOS4_FLIGHTS by default.")] = None,
     fitted: Annotated[list[str], typer.Option(help="The flights to identify together.")] = FITTED,
     predicted: Annotated[list[str], typer.Option(help="The flights to predict.")] = PREDICTED,
+    compared: Annotated[list[str], typer.Option(help="The flights to identify alone.")] = (*FITTED, *PREDICTED),
     end: Annotated[float | None, typer.Option(help="Identify with the flights up to this time [s].")] = None,
+    epochs: Annotated[int, typer.Option(help="Epochs of the network's training.")] = 300,
 ) -> None:
-    """Identify some flights together, and predict the others."""
-    names = (*fitted, *predicted)
+    """Identify each flight and all together; identify some together, and predict the others."""
+    names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
     paths = flight_files(flights, [f"nanobench/{name}.csv" for name in names])
     recordings = {name: read_recording(path, AIRFRAME) for name, path in zip(names, paths, strict=True)}
     settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=STEP, end=end)
     found = jaxos4.identify([recordings[name] for name in fitted], AIRFRAME, settings=settings)
     print(f"{', '.join(fitted)}: {found.result}, {found.seconds:.0f} s", flush=True)
     vehicle = jaxos4.forecast.vehicle_of(found)
+    networks = [trained([recordings[name] for name in fitted], epochs=epochs, seed=seed) for seed in range(SEEDS)]
     report: dict[str, Any] = {"version": jaxos4.__version__, "identification": found.to_dict(), "flights": {}}
     for name in predicted:
-        report["flights"][name] = jaxos4.predict(vehicle, recordings[name], sample_time=STEP).to_dict()
+        prediction = jaxos4.predict(vehicle, recordings[name], sample_time=STEP)
+        row = prediction.to_dict()
+        for quantity, errors in errors_of(networks, recordings[name], prediction).items():
+            row["quantities"][quantity] |= {"network": errors}
+            row["quantities"][quantity]["sum"] |= {"network": sum(errors)}
+        report["flights"][name] = row
         out.write_text(json.dumps(report, indent=1) + "\n")
     print_table(report)
+    report["alone"] = {name: alone([recordings[name]], end) for name in compared}
+    trusted = {name: row for name, row in report["alone"].items() if row["result"] == "successful"}
+    report["pairs"] = {"not refused": agreement(trusted), "all that have a number": agreement(report["alone"])}
+    if len(compared) > 1:
+        report["alone"]["all together"] = alone([recordings[name] for name in compared], end)
+    out.write_text(json.dumps(report, indent=1) + "\n")
+    print_flights(report)
 
 
 if __name__ == "__main__":

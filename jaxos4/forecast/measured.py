@@ -7,18 +7,24 @@ from jaxtyping import Float, Int
 
 from ..flight import STATE_NAMES, Flight
 from ..recording.motion import white_noise
-from .motion import PARTS, inverse, product, turned
+from .motion import PARTS, departures, inverse, product, turned
+from .prediction import known_mean
+
+# The share of a Gaussian within one standard deviation, and the fewest starts for it.
+_ONE_SIGMA, _FEWEST = 0.6827, 10
 
 
 class Measured(NamedTuple):
     """The measurements of a flight. NaN: not measured.
 
     - `states`: see `jaxos4.forecast.motion.PARTS`.
+    - `force`: specific force [m/s^2].
     - `omega`: rotor speeds or commands [rad/s]. `stretch`: the number of each sample's stretch. `dt`: sample time [s].
     - `noise`: standard deviation of the white noise of position, velocity, attitude and rates; 0 if not measured.
     """
 
     states: Float[np.ndarray, "samples 13"]
+    force: Float[np.ndarray, "samples 3"]
     omega: Float[np.ndarray, "samples 4"]
     stretch: Int[np.ndarray, " samples"]
     dt: float
@@ -40,7 +46,10 @@ class Measured(NamedTuple):
         columns = np.concatenate([position, velocity, angles, rates], axis=1).T
         noise = np.nan_to_num([white_noise(column, 4) for column in columns])
         states = np.concatenate([position, velocity, attitude, rates], axis=1)
-        return cls(states, np.asarray(flight.omega), stretch, float(flight.dt), noise)
+        force = (
+            np.full((len(states), 3), np.nan) if flight.specific_force is None else np.asarray(flight.specific_force)
+        )
+        return cls(states, force, np.asarray(flight.omega), stretch, float(flight.dt), noise)
 
     def accelerations(self, gravity: float) -> Float[np.ndarray, "samples 6"]:
         """From each sample to the next: p', q', r' [rad/s^2], and the specific force that velocity implies [m/s^2]."""
@@ -57,7 +66,37 @@ class Measured(NamedTuple):
     def first_half(self) -> "Measured":
         """The first half of the samples."""
         half = slice(len(self.stretch) // 2)
-        return self._replace(states=self.states[half], omega=self.omega[half], stretch=self.stretch[half])
+        parts = {name: getattr(self, name)[half] for name in ("states", "force", "omega", "stretch")}
+        return self._replace(**parts)
+
+    def contradictions(
+        self, start: Int[np.ndarray, " starts"], steps: int, gravity: float
+    ) -> Float[np.ndarray, "steps 9"]:
+        """How far position, velocity and attitude are from dead reckoning with gyro and accelerometer.
+
+        Dead reckoning begins as measured at each start. It knows no model: it is off because the sensors contradict
+        each other, by noise of any colour, or by shifted clocks. The mean error of the accelerometer is corrected.
+
+        **Returns:** the standard deviation after each step, without what the white noise of gyro and accelerometer
+        causes, and at least what the white noise of the start and of the end causes.
+        """
+        rows, dt, down = start[:, None] + np.arange(steps + 1), self.dt, np.array([0.0, 0.0, gravity])
+        begin, rates = self.states[start], self.states[rows[:, 1:], 10:]
+        turning = _moved(begin, rates, np.zeros_like(rates), dt)[..., 6:10]
+        attitude = np.moveaxis(np.concatenate([begin[:, None, 6:10], turning], axis=1), -1, 0)
+        force = self.force + known_mean(self.accelerations(gravity)[:, 3:] - self.force)
+        push = np.stack(turned(attitude, tuple(np.moveaxis(force[rows], -1, 0))), axis=-1) - down
+        velocity = begin[:, None, 3:6] + dt * np.cumsum((push[:, 1:] + push[:, :-1]) / 2, axis=1)
+        reckoned = _moved(begin, rates, velocity, dt)
+        departed = np.abs(departures(reckoned, self.states[rows[:, 1:]]))[..., :9]
+        enough = np.isfinite(departed).sum(axis=0) >= _FEWEST
+        size = np.nanquantile(np.where(enough, departed, 0.0), _ONE_SIGMA, axis=0)
+        seconds, white = dt * np.arange(1, steps + 1)[:, None], np.nan_to_num([white_noise(x, 4) for x in self.force.T])
+        jerky, gyro = white**2 * dt * seconds, self.noise[9:] ** 2 * dt * seconds
+        known = np.concatenate([jerky * seconds**2 / 3, jerky, gyro], axis=1)
+        least = np.repeat(2 * self.noise[None, :9] ** 2, steps, axis=0)
+        least[:, :3] += (self.noise[3:6] * seconds) ** 2
+        return np.sqrt(np.maximum(size**2 - known, least))
 
 
 def constant_rates(

@@ -55,7 +55,8 @@ def predict(
     battery's voltage if the model needs it, and nothing else that was measured.
 
     The 95 % band holds what will be measured. It comes from 64 futures: parameters drawn from their covariance, errors
-    of the start, and disturbances drawn as the fit found them. The noise of the sensors is added.
+    of the rates at the start, and disturbances drawn as the fit found them. What the sensors contradict each other is
+    added: how far position, velocity and attitude are from dead reckoning with gyro and accelerometer.
 
     **Arguments:**
 
@@ -84,9 +85,11 @@ def predict(
     noise = vehicle.noise._replace(sensor=vehicle.noise.sensor + math.log(vehicle.sample_time / dt) / 2)
     begin, states, spread = _fly(problem, vehicle, measured, start, missing, noise, steps, seed)
     ahead = start[:, None] + np.arange(1, steps + 1)
+    gravity = float(vehicle.model.airframe.gravity)
     trained = Measured.of(found.problem.flight) if isinstance(found, Identification) else measured.first_half
-    regression = Regression.of(trained, float(vehicle.model.airframe.gravity))
-    sensors = np.append(measured.noise[:9], np.exp(noise.sensor[:3]))
+    regression = Regression.of(trained, gravity)
+    gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
+    sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(
         found=vehicle.name,
         flight=recording.name,
@@ -206,9 +209,8 @@ def _fly(
     known = _known(problem, vehicle, measured, noise, np.asarray(offset)[0], missing)._replace(unsure=unsure)
 
     after, added, absorbed = jax.tree.map(np.asarray, settled(own, problem.flight.dt))
-    begin = generator.standard_normal((_DRAWS, 12)) * np.nan_to_num(measured.noise)
     first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
-    begin[:, 9:] = first[:, :3, 0]
+    begin = np.pad(first[:, :3, 0], ((0, 0), (9, 0)))  # the rest is in `Measured.contradictions`
     gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
     off = generator.standard_normal((_DRAWS, 6))
     drawn = begin, first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts

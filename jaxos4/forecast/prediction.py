@@ -96,10 +96,10 @@ class FlightPrediction(NamedTuple):
 
         def mean(departed: np.ndarray, name: str) -> np.ndarray:
             length = np.linalg.norm(departed[..., QUANTITIES[name][1]], axis=-1)
-            return _mean(2 * np.arcsin(np.minimum(length / 2, 1.0)) if name == "attitude" else length)
+            return known_mean(2 * np.arcsin(np.minimum(length / 2, 1.0)) if name == "attitude" else length)
 
         return {
-            name: Quality(*(mean(x, name) for x in off), coverage=_mean(inside)[..., columns].mean(axis=-1))
+            name: Quality(*(mean(x, name) for x in off), coverage=known_mean(inside)[..., columns].mean(axis=-1))
             for name, (_, columns) in QUANTITIES.items()
             if name not in self.missing
         }
@@ -182,7 +182,7 @@ def check_suffix(path: str | os.PathLike[str], *suffixes: str) -> None:
         raise InputError(f"{path}: the name says the format; give one that ends with {' or '.join(suffixes)}.")
 
 
-def _mean(values: Float[np.ndarray, "starts *rest"]) -> Float[np.ndarray, "*rest"]:
+def known_mean(values: Float[np.ndarray, "starts *rest"]) -> Float[np.ndarray, "*rest"]:
     """The mean over the starts of what was measured; NaN if nothing was."""
     known = np.isfinite(values)
     count = known.sum(axis=0)
