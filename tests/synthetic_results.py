@@ -12,7 +12,8 @@ AIRFRAME = airframe_table(CRAZYFLIE) | {"rotor_positions": POSITIONS}
 VALUES = {"alpha3": 6.1e4, "alpha6": 5.9e4, "alpha8": 3.5e4}
 VALUES |= {"roll_offset": 0.9, "pitch_offset": -1.1, "yaw_offset": 0.3, "roll_thrust": -0.4, "pitch_thrust": 0.7}
 VALUES |= {"roll_damping": 0.4, "pitch_damping": 0.5, "yaw_damping": 0.7, "rotor_lag": 0.05, "rotor_delay": 0.01}
-VALUES |= {"rotor_reaction": 7e-4, "thrust_curve": 0.8, "thrust_gain": 1.1, "x_drag": 0.3, "y_drag": 0.4}
+VALUES |= {"rotor_reaction": 7e-4, "thrust_curve": 0.8, "thrust_gain": 1.1, "x_drag": 0.3, "y_drag": 0.4, "z_drag": 0.6}
+VALUES |= {"roll_velocity": 0.2, "pitch_velocity": -0.1}
 SHARE = 0.01
 
 

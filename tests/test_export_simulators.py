@@ -1,5 +1,6 @@
-"""Exported vehicles in MuJoCo and RotorPy: they accelerate as the model does."""
+"""Exported vehicles in MuJoCo and RotorPy: they accelerate as the model does, and fly what it predicts."""
 
+import importlib
 import json
 import pathlib
 import re
@@ -12,23 +13,39 @@ from scipy.spatial.transform import Rotation
 from synthetic_results import AIRFRAME, VALUES, vehicle_result
 
 import jaxos4
-from jaxos4.airframe import airframe_from_table, alpha_from_inertia
+from jaxos4.airframe import airframe_from_table, airframe_table, alpha_from_inertia
 from jaxos4.export import export_vehicle, read_result
+from jaxos4.forecast.motion import departures
 
 PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "into_your_simulator.md"
 # The simulators of the programs of the page, in their order.
-PROGRAMS = ("mujoco", "mujoco", "rotorpy")
+PROGRAMS = ("mujoco", "mujoco", "mujoco", "rotorpy")
 STATES = 1000
 # Terms that make a torque or a force.
-TERMS = ("offset", "center_of_mass", "damping", "motor", "accelerometer", "drag")
-# RotorPy has neither.
-NOT_ROTORPY = ("roll_offset", "pitch_offset", "yaw_offset", "roll_damping", "pitch_damping", "yaw_damping")
-DRAG = ("x_drag", "y_drag")
+TERMS = ("offset", "center_of_mass", "damping", "velocity", "accelerometer", "inflow", "drag")
+SAMPLE, SECONDS = 0.004, 2.0
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def mujoco():
-    return pytest.importorskip("mujoco", reason="pip install mujoco")
+    """MuJoCo, without callbacks after the test."""
+    yield pytest.importorskip("mujoco", reason="pip install mujoco")
+    importlib.import_module("mujoco").set_mjcb_passive(None)
+
+
+def mujoco_model(found):
+    """The exported model; the callback of the page acts on it."""
+    import mujoco
+
+    mujoco.set_mjcb_passive(None)
+    model = mujoco.MjModel.from_xml_string(export_vehicle(found, "mujoco").text)
+    exec(programs()[2], {})  # noqa: S102
+    return model
+
+
+def programs():
+    """The programs that the page prints."""
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def read(tmp_path, result):
@@ -55,19 +72,25 @@ def modelled(model, parameters, states, omega):
     return np.asarray(derivative(jnp.asarray(states), jnp.asarray(omega), parameters))[:, [1, 3, 5, 7, 9, 11]]
 
 
-def vehicle_acceleration(values, states, omega):
-    """Of the vehicle model with all terms, its alphas those of a rigid body without inertia of the rotors."""
-    airframe = airframe_from_table(AIRFRAME)
-    model = jaxos4.FlightModel(airframe, terms=TERMS)
-    inertia = [values["thrust_gain"] / values[name] for name in ("alpha3", "alpha6", "alpha8")]
-    rigid = dict(zip([f"alpha{i}" for i in range(1, 9)], alpha_from_inertia(np.array(inertia), 0.0), strict=True))
-    given = rigid | values
-    return modelled(model, jnp.array([given.get(name, 0.0) for name in model.parameter_names]), states, omega)
+def rigid_model(values, terms=TERMS, rotor_inertia=0.0):
+    """The vehicle model, and its parameters by name; its alphas are those of a rigid body."""
+    model = jaxos4.FlightModel(airframe_from_table(AIRFRAME | {"rotor_inertia": rotor_inertia}), terms=terms)
+    inertia = np.array([values["thrust_gain"] / values[name] for name in ("alpha3", "alpha6", "alpha8")])
+    given = dict(zip([f"alpha{i}" for i in range(1, 9)], alpha_from_inertia(inertia, rotor_inertia), strict=True))
+    given |= values
+    return model, {name: float(given.get(name, 0.0)) for name in model.parameter_names}
+
+
+def vehicle_acceleration(values, states, omega, **options):
+    """Of the vehicle model with all terms."""
+    model, given = rigid_model(values, ("motor", *TERMS), **options)
+    return modelled(model, jnp.array(list(given.values())), states, omega)
 
 
 def mujoco_acceleration(found, states, omega):
-    mujoco = pytest.importorskip("mujoco", reason="pip install mujoco")
-    model = mujoco.MjModel.from_xml_string(export_vehicle(found, "mujoco").text)
+    import mujoco
+
+    model = mujoco_model(found)
     data, accelerations = mujoco.MjData(model), []
     thrusts = found.vehicle.thrust_coefficient * omega**2
     for state, quaternion, thrust in zip(states, quaternions(states), thrusts, strict=True):
@@ -81,15 +104,15 @@ def mujoco_acceleration(found, states, omega):
     return np.array(accelerations)
 
 
-def rotorpy_vehicle(found):
-    multirotor = pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy").Multirotor
+def rotorpy_vehicle(found, name="Vehicle", **options):
+    pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     defined = {}
     exec(export_vehicle(found, "rotorpy").text, defined)  # noqa: S102
-    return multirotor(defined["quad_params"])
+    return defined[name](defined["quad_params"], **options)
 
 
-def rotorpy_acceleration(found, states, omega):
-    vehicle, accelerations = rotorpy_vehicle(found), []
+def rotorpy_acceleration(found, states, omega, name="Vehicle"):
+    vehicle, accelerations = rotorpy_vehicle(found, name), []
     for state, quaternion, speed in zip(states, quaternions(states), omega, strict=True):
         now = {"x": state[[0, 2, 4]], "v": state[[1, 3, 5]], "q": quaternion, "w": state[[7, 9, 11]]}
         now |= {"wind": np.zeros(3), "rotor_speeds": speed}
@@ -108,18 +131,18 @@ def agree(found, expected):
 
 
 @every_simulator
-def test_a_vehicle_accelerates_as_the_model(target, tmp_path):
-    """With all effects that the simulator has: RotorPy has no offsets, no damping and, except in hover, no drag."""
+def test_a_vehicle_accelerates_as_the_model(target, mujoco, tmp_path):
+    """With all effects that the simulator has. MuJoCo has no gyroscopic torque of the rotors."""
+    states, omega = random_states(500, 2500)
+    u = omega / AIRFRAME["max_rotor_speed"]
+    effective = 2 * omega / (0.8 + np.sqrt(0.8**2 + 4 * (1 - 0.8) * u))  # they make the thrust
+    inertia = 0.0
     values = VALUES
     if target == "rotorpy":
-        # An offset that cancels the constant part of the torque of the centre of mass.
-        values = VALUES | dict.fromkeys((*NOT_ROTORPY, *DRAG), 0.0)
-        values |= {f"{axis}_offset": 9.81 * VALUES[f"{axis}_thrust"] for axis in ("roll", "pitch")}
-    states, omega = random_states(500, 2500)
-    curve = values["thrust_curve"]
-    u = omega / AIRFRAME["max_rotor_speed"]
-    effective = 2 * omega / (curve + np.sqrt(curve**2 + 4 * (1 - curve) * u))  # they make the thrust
-    expected = vehicle_acceleration(values, states, omega)
+        # The residual speed is that of the rotors, and the curve changes it.
+        effective, values, inertia = omega, VALUES | {"thrust_curve": 1.0}, 2e-8
+    values = values | {"rotor_reaction": inertia * values["alpha8"] / values["thrust_gain"]}
+    expected = vehicle_acceleration(values, states, omega, rotor_inertia=inertia)
     assert agree(SIMULATORS[target](read(tmp_path, vehicle_result(values)), states, effective), expected)
     # The comparison can fail: rotors that turn the other way, or a heavier vehicle.
     for change in ({"rotor_spins": [-1, 1, -1, 1]}, {"mass": 0.0271}):
@@ -127,14 +150,71 @@ def test_a_vehicle_accelerates_as_the_model(target, tmp_path):
         assert not agree(SIMULATORS[target](other, states, effective), expected)
 
 
-def test_the_drag_of_rotorpy_is_right_at_the_hover_speed(tmp_path):
-    values = VALUES | dict.fromkeys(NOT_ROTORPY, 0.0) | {"x_drag": 0.3, "y_drag": 0.3, "thrust_curve": 1.0}
+def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
+    """`Multirotor(quad_params)` has no class of the file."""
+    values = VALUES | {"x_drag": 0.3, "y_drag": 0.3, "thrust_curve": 1.0}
     found = read(tmp_path, vehicle_result(values))
     states, _ = random_states(0, 1)
     states[:, [7, 9, 11]] = 0.0
     hover = np.full((STATES, 4), found.vehicle.hover_speed)
-    simulated = rotorpy_acceleration(found, states, hover)[:, :3]
+    simulated = rotorpy_acceleration(found, states, hover, "Multirotor")[:, :3]
     assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
+
+
+def predicted_flight(tmp_path):
+    """The exported vehicle, its rotor speeds, and the flight from the first sample as `jaxos4.predict` predicts it."""
+    model, values = rigid_model({name: VALUES[name] for name in VALUES if not name.startswith(("rotor", "thrust_cu"))})
+    level = dict(zip(("strength", "time_constant", "sensor"), (0.0, 0.25, 0.01), strict=True))
+    about = {"terms": list(TERMS), "sample_time": SAMPLE}
+    known = {"disturbances": dict.fromkeys(("p", "q", "r", "ax", "ay", "az"), level), "provenance": about, "held": {}}
+    result = vehicle_result(values, airframe=airframe_table(model.airframe), **known)
+    found = read(tmp_path, result)
+    time = SAMPLE * np.arange(round(SECONDS / SAMPLE) + 250)
+    steer = np.sin(2 * np.pi * time[:, None] * [1.1, 1.7, 2.3, 0.9] + [0, 1, 2, 3])
+    hover = np.sqrt(found.vehicle.hover_thrust / float(model.airframe.thrust_coefficient) / VALUES["thrust_gain"])
+    omega = hover * (1 + 0.02 * steer)
+    states = np.zeros((time.size, 12))
+    states[:, [6, 8, 10]], states[:, 1:6:2] = [0.5, 0.3, -2.0], [1.0, -2.0, 0.5]
+    states[1:, 1:6:2] = np.nan  # no changes that the model would have to learn
+    flight = jaxos4.Flight(time=time, omega=omega, states=states, specific_force=np.full((time.size, 3), 9.81))
+    prediction = jaxos4.predict(tmp_path / "found.json", flight, horizon=SECONDS, spacing=1.0)
+    assert prediction.time[0] == 0
+    return found, omega, np.vstack([prediction.begin[0], prediction.unaware[0]])
+
+
+def flown_by_mujoco(found, omega, begin):
+    import mujoco
+
+    model = mujoco_model(found)
+    model.opt.timestep, model.opt.integrator = SAMPLE / 20, mujoco.mjtIntegrator.mjINT_RK4
+    data, states = mujoco.MjData(model), []
+    data.qpos[:], data.qvel[:] = begin[[0, 1, 2, 6, 7, 8, 9]], begin[[3, 4, 5, 10, 11, 12]]
+    for speeds in omega:
+        data.ctrl[:4] = found.vehicle.thrust_coefficient * speeds**2
+        mujoco.mj_step(model, data, 20)
+        states.append(np.concatenate([data.qpos[:3], data.qvel[:3], data.qpos[3:], data.qvel[3:]]))
+    return np.array(states)
+
+
+def flown_by_rotorpy(found, omega, begin):
+    vehicle = rotorpy_vehicle(found, integrator_kwargs={"method": "DOP853", "rtol": 1e-10, "atol": 1e-12})
+    state = {"x": begin[:3], "v": begin[3:6], "q": np.roll(begin[6:10], -1), "w": begin[10:], "wind": np.zeros(3)}
+    states = []
+    for speeds in omega:
+        state = vehicle.step(state | {"rotor_speeds": speeds}, {"cmd_motor_speeds": speeds}, SAMPLE)
+        states.append(np.concatenate([state["x"], state["v"], np.roll(state["q"], 1), state["w"]]))
+    return np.array(states)
+
+
+@pytest.mark.parametrize("fly", [flown_by_mujoco, flown_by_rotorpy])
+def test_a_vehicle_flies_the_predicted_flight(mujoco, tmp_path, fly):
+    """For 2 s, from the same start, with the same rotor speeds."""
+    found, omega, predicted = predicted_flight(tmp_path)
+    flown = fly(found, omega[: len(predicted) - 1], predicted[0])
+    assert np.abs(departures(predicted[1:], flown)).max() < 1e-6
+    assert np.abs(departures(predicted[:1], flown))[-1].min() > 0.05  # it flies somewhere
+    heavier = found._replace(airframe=eqx.tree_at(lambda a: a.mass, found.airframe, 1.001 * found.airframe.mass))
+    assert np.abs(departures(predicted[1:], fly(heavier, omega[: len(predicted) - 1], predicted[0]))).max() > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -177,14 +257,13 @@ def test_the_vehicle_rests_in_the_hover_of_mujoco(mujoco, tmp_path):
 
 
 @pytest.mark.parametrize(("target", "suffix"), [("mujoco", "xml"), ("rotorpy", "py")])
-def test_the_programs_of_the_page_run(run, monkeypatch, tmp_path, target, suffix):
+def test_the_programs_of_the_page_run(run, mujoco, monkeypatch, tmp_path, target, suffix):
     """The vehicle hovers in each simulator, and every sample of it too, by the programs that the page prints."""
     pytest.importorskip(target)
     read(tmp_path, vehicle_result())
     code, _, err = run("export", "found.json", "--to", target, "--out", f"vehicle.{suffix}", "--samples", "3")
     assert code == 0, err
-    programs = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-    mine = [program for name, program in zip(PROGRAMS, programs, strict=True) if name == target]
+    mine = [program for name, program in zip(PROGRAMS, programs(), strict=True) if name == target]
     monkeypatch.syspath_prepend(tmp_path)
     defined = {}
     for program in mine:

@@ -20,6 +20,7 @@ from jaxos4.logs.csv import write_flight
 
 DT = 0.004
 GYRO_NOISE, FORCE_NOISE, ATTITUDE_NOISE = 0.01, 0.1, 0.002
+POSITION_NOISE, VELOCITY_NOISE = 0.002, 0.02  # of motion capture
 # The gusts are sums of sines with the spectrum of a first-order process with this correlation time [s].
 GUST_TIME, SINES = 0.5, 12
 # Frequencies [Hz] of the sines of the references, and their largest accelerations [m/s^2] and [rad/s^2].
@@ -85,8 +86,11 @@ class Gusts:
         return sum((wind.update(t, None) for wind in self.winds), np.zeros(3))
 
 
-def fly(gust: float, duration: float, seed: int) -> jaxos4.Flight:
-    """A flight with gyro, attitude, accelerometer, and the mean speed of each rotor in each sample."""
+def fly(gust: float, duration: float, seed: int, *, captured: bool = False) -> jaxos4.Flight:
+    """A flight with gyro, attitude, accelerometer, and the mean speed of each rotor in each sample.
+
+    `captured`: with position and velocity too. All other columns are the same.
+    """
     random = np.random.default_rng(seed)
     references, gusts = References(duration, random), Gusts(gust, random)
     vehicle, controller = Multirotor(quad_params), SE3Control(quad_params)
@@ -103,21 +107,26 @@ def fly(gust: float, duration: float, seed: int) -> jaxos4.Flight:
         means = command + (state["rotor_speeds"] - command) * late
         turn, vdot = Rotation.from_quat(state["q"]), vehicle.statedot(state, control, DT)["vdot"]
         specific = turn.inv().apply(vdot + [0, 0, vehicle.g])
-        rows.append(np.concatenate([means, state["w"], turn.as_euler("ZYX")[::-1], specific]))
+        angles = turn.as_euler("ZYX")[::-1]
+        rows.append(np.concatenate([means, state["w"], angles, specific, state["x"], state["v"]]))
         state = vehicle.step(state, control, DT)
-    omega, rates, angles, specific = np.split(np.array(rows), [4, 7, 10], axis=1)
+    omega, rates, angles, specific, position, velocity = np.split(np.array(rows), [4, 7, 10, 13, 16], axis=1)
     states = np.full((len(omega), len(STATE_NAMES)), np.nan)
     states[:, [STATE_NAMES.index(name) for name in "pqr"]] = rates + random.normal(0, GYRO_NOISE, rates.shape)
     measured = np.unwrap(angles, axis=0) + random.normal(0, ATTITUDE_NOISE, angles.shape)
     states[:, [STATE_NAMES.index(name) for name in ("phi", "theta", "psi")]] = measured
     force = specific + random.normal(0, FORCE_NOISE, specific.shape)
+    if captured:
+        for names, true, noise in (("x y z", position, POSITION_NOISE), ("vx vy vz", velocity, VELOCITY_NOISE)):
+            places = [STATE_NAMES.index(name) for name in names.split()]
+            states[:, places] = true + random.normal(0, noise, true.shape)
     return jaxos4.Flight(time=DT * np.arange(len(omega)), omega=omega, states=states, specific_force=force)
 
 
-def recorded(folder: Path, gust: float, i: int, duration: float, seed: int) -> Path:
+def recorded(folder: Path, gust: float, i: int, duration: float, seed: int, *, captured: bool = False) -> Path:
     """The file of flight `i`, which is flown only if there is none."""
-    path = folder / f"gust{gust:g}_{duration:g}s_seed{seed}_{i:03}.csv"
+    path = folder / f"gust{gust:g}_{duration:g}s_seed{seed}_{i:03}{'_captured' * captured}.csv"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_flight(fly(gust, duration, 1000 * seed + i), path)
+        write_flight(fly(gust, duration, 1000 * seed + i, captured=captured), path)
     return path

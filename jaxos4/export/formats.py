@@ -108,21 +108,23 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
 
 def _limits(vehicle: RigidVehicle, to: str) -> tuple[str, ...]:
     """The notes on what a simulator does not have, or has differently."""
-    no_rotors = "not carried: no gyroscopic torque (alpha2, alpha5), no yaw torque of rotors that accelerate"
-    some: list[tuple[object, str]] = [(to != "sdf" and vehicle.rotor_inertia, f"rotor inertia: {no_rotors}")]
-    some.append((vehicle.thrust_share, vehicle.curve(TARGETS[to].curve)))
-    if to != "mujoco":
-        name, damped, late = {"rotorpy": ("RotorPy", "", "give"), "sdf": ("SDF", " of one axis", "send")}[to]
-        some += [
-            (vehicle.torque.any(), f"offsets: not carried: {name} has no constant torque"),
-            (vehicle.damping.any(), f"damping: not carried: {name} has no torque against the body rates{damped}"),
-            (
-                vehicle.drag.any(),
-                "drag: as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw",
-            ),
-            (vehicle.delay, f"rotor_delay: not carried: {late} commands {vehicle.delay:.4g} s late"),
-        ]
-    return tuple(line for applies, line in (*some, *TARGETS[to].limits(vehicle)) if applies)
+    curve = vehicle.thrust_share, vehicle.curve(TARGETS[to].curve)
+    return tuple(line for applies, line in (curve, *TARGETS[to].limits(vehicle)) if applies)
+
+
+def _inertia_of_rotors(vehicle: RigidVehicle, lost: str) -> tuple[object, str]:
+    inertia = f"{vehicle.rotor_inertia:.3g} kg m^2"
+    return (
+        vehicle.rotor_inertia,
+        f"rotor inertia: not carried: {lost}no yaw torque of rotors that accelerate: {inertia}",
+    )
+
+
+def _in_plane(vehicle: RigidVehicle, what: str) -> str:
+    roll, pitch = vehicle.flapping
+    return (
+        f"flapping: {what}: {roll:.3g} N m about x for each m/s along y, {pitch:.3g} N m about y for each m/s along x"
+    )
 
 
 def _mujoco_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
@@ -131,22 +133,28 @@ def _mujoco_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
         "older versions refuse `delay`, `nsample` and `interp`: remove them"
     )
     lag = "rotor_lag: acts on the thrust and not on the rotor speed; the same for small changes"
-    return (vehicle.lag, lag), (vehicle.delay, late)
+    flapping = _in_plane(vehicle, "the numeric `flapping`, for a callback as in docs/into_your_simulator.md")
+    rotors = _inertia_of_rotors(vehicle, "no gyroscopic torque (alpha2, alpha5), ")
+    return rotors, (vehicle.flapping.any(), flapping), (vehicle.lag, lag), (vehicle.delay, late)
 
 
 def _mujoco(vehicle: RigidVehicle) -> dict[str, Any]:
     """Controls 1 to 4 are the thrusts of the rotors [N]; the others have no effect."""
-    names, directions = ("x_drag", "y_drag", *(f"{axis}_torque" for axis in AXES)), np.eye(6)[[0, 1, 3, 4, 5]]
-    constants, slopes = (0.0, 0.0, *vehicle.torque), (*vehicle.drag, *vehicle.damping)
-    rows = zip(names, directions, constants, slopes, strict=True)
+    names = ("x_drag", "y_drag", "z_drag", *(f"{axis}_torque" for axis in AXES))
+    constants, slopes = (0.0, 0.0, 0.0, *vehicle.torque), (*vehicle.drag, *vehicle.damping)
+    rows = zip(names, np.eye(6), constants, slopes, strict=True)
     delayed = math.ceil(vehicle.delay / _SHORTEST_TIMESTEP) + 1
     return {"passive": [row for row in rows if row[2] or row[3]], "delayed": delayed}
 
 
 def _rotorpy_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
     lag = f"rotor_lag: none was identified; tau_m is {_NO_LAG:g} s, because RotorPy needs one"
-    gravity = f"gravity: RotorPy has {_GRAVITY:g} m/s^2, the airframe {vehicle.gravity:g}"
-    return (not vehicle.lag, lag), (vehicle.gravity != _GRAVITY, gravity)
+    alone = (
+        "quad_params: without the class `Vehicle` of this file, RotorPy has no offsets, no damping, no flapping, no "
+        f"gyroscopic torque, {_GRAVITY:g} m/s^2 of gravity, and x_drag, y_drag, z_drag by k_d and k_z: right at the "
+        "hover speed, and damping the rates"
+    )
+    return (True, alone), _inertia_of_rotors(vehicle, ""), (not vehicle.lag, lag), _late(vehicle, "give")
 
 
 def _sdf_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
@@ -155,7 +163,23 @@ def _sdf_limits(vehicle: RigidVehicle) -> tuple[tuple[object, str], ...]:
         "that their gyroscopic torque (alpha2, alpha5) is too small by this factor"
     )
     gravity = f"gravity: the world's; the vehicle was identified with {vehicle.gravity:g} m/s^2"
-    return (True, gravity), (vehicle.rotor_inertia, slow)
+    torque, damping = (", ".join(f"{x:.3g}" for x in row) for row in (vehicle.torque, vehicle.damping))
+    x, y, z = vehicle.drag
+    drag = "as drag of the rotors, the mean of x and y, right at the hover speed; it also damps yaw"
+    return (
+        (vehicle.torque.any(), f"offsets: not carried: SDF has no constant torque: {torque} N m about x, y, z"),
+        (vehicle.damping.any(), f"damping: not carried: SDF has no torque against one body rate: {damping} N m s"),
+        (x or y, f"x_drag, y_drag: {drag}: {x:.3g}, {y:.3g} N s/m"),
+        (z, f"z_drag: not carried: SDF has no force against the velocity along z: {z:.3g} N s/m"),
+        (vehicle.flapping.any(), _in_plane(vehicle, "not carried: SDF has no such moment")),
+        _late(vehicle, "send"),
+        (True, gravity),
+        (vehicle.rotor_inertia, slow),
+    )
+
+
+def _late(vehicle: RigidVehicle, verb: str) -> tuple[object, str]:
+    return vehicle.delay, f"rotor_delay: not carried: {verb} commands {vehicle.delay:.4g} s late"
 
 
 def _sdf(vehicle: RigidVehicle) -> dict[str, Any]:

@@ -22,11 +22,10 @@ _VEHICLE = "flight"
 # differs from 1 by as many.
 _SIGNIFICANT = 3.0
 # Parameters that no vehicle has below 0, although an estimate can be negative.
-_NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping", "x_drag", "y_drag")
+_NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping")
+_NOT_NEGATIVE += ("x_drag", "y_drag", "z_drag")
 # Parameters without a place in a simulator's vehicle, and why. Notes on the rotors' inertia name alpha2 and alpha5.
 _NOT_EXPORTED = {
-    ("roll_velocity", "pitch_velocity"): "no simulator has a moment proportional to the body velocity",
-    ("roll_flapping", "pitch_flapping"): "no simulator has a moment proportional to the lateral specific force",
     ("voltage_exponent", "battery_fade"): "no simulator has the battery's voltage",
     ("motor_braking",): "is not carried: exported motors brake as they drive",
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
@@ -245,6 +244,8 @@ def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], 
         some = [name for name in found if name.startswith(names)]
         if some:
             notes.append(f"{', '.join(some)}: {why}")
+    if {"roll_flapping", "pitch_flapping"} & found.keys() and not {"x_drag", "y_drag"} & values.keys():
+        notes.append("roll_flapping, pitch_flapping: 0 here: they need a lateral force, and no drag was identified")
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
     apart = tuple(itertools.chain(("alpha2", "alpha5"), *_NOT_EXPORTED))

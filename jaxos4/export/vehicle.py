@@ -31,7 +31,8 @@ class RigidVehicle(NamedTuple):
     - `lag`, `delay`: lag and delay of the rotors behind their commands [s].
     - `torque`: constant, about each axis [N m].
     - `damping`: torque against the body rate about each axis [N m s].
-    - `drag`: force against the body velocity along x and y [N s/m].
+    - `drag`: force against the body velocity along each axis [N s/m]. Along z it is the inflow of the rotors.
+    - `flapping`: roll torque from the body velocity along y, pitch torque from that along x [N s].
     - `thrust_curve`: c. A command u of full scale makes the speed w `max_rotor_speed` with c w + (1 - c) w^2 = u.
     """
 
@@ -48,7 +49,8 @@ class RigidVehicle(NamedTuple):
     delay: float
     torque: Float[np.ndarray, "3"]
     damping: Float[np.ndarray, "3"]
-    drag: Float[np.ndarray, "2"]
+    drag: Float[np.ndarray, "3"]
+    flapping: Float[np.ndarray, "2"]
     thrust_curve: float
 
     @property
@@ -89,12 +91,12 @@ class RigidVehicle(NamedTuple):
         return f"thrust_curve: for the u-th part of a full command, {formula.format(self.thrust_share)}"
 
     @property
-    def rotor_drag(self) -> float:
-        """The in-plane drag of one rotor over its speed and velocity [N s^2/(rad m)].
+    def rotor_drag(self) -> Float[np.ndarray, "2"]:
+        """The drag of one rotor in its plane and along its axis, over its speed and velocity [N s^2/(rad m)].
 
-        It makes the mean of `drag` along x and y when the rotors turn at the hover speed.
+        It makes the mean of `drag` along x and y, and that along z, when the rotors turn at the hover speed.
         """
-        return float(self.drag.mean() / (4 * self.hover_speed))
+        return np.array([self.drag[:2].mean(), self.drag[2]]) / (4 * self.hover_speed)
 
     @property
     def impossible(self) -> str:
@@ -139,6 +141,12 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     reaction = values.get("rotor_reaction")
     rotor_inertia = float(airframe.rotor_inertia) if reaction is None else reaction * inertia[2]
     speed = float(airframe.max_rotor_speed)
+    drag = np.array([values.get(f"{axis}_drag", 0.0) for axis in "xyz"])
+    # A lateral specific force is that of the drag.
+    moment = [
+        values.get(f"{axis}_velocity", 0.0) - values.get(f"{axis}_flapping", 0.0) * along
+        for axis, along in zip(AXES, drag[1::-1], strict=False)
+    ]
     vehicle = RigidVehicle(
         mass=mass,
         gravity=float(airframe.gravity),
@@ -153,7 +161,8 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
         delay=values.get("rotor_delay", 0.0),
         torque=inertia * offset,
         damping=inertia * np.array([values.get(f"{axis}_damping", 0.0) for axis in AXES]),
-        drag=mass * np.array([values.get("x_drag", 0.0), values.get("y_drag", 0.0)]),
+        drag=mass * drag,
+        flapping=inertia[:2] * moment,
         thrust_curve=values.get("thrust_curve", 1.0),
     )
     if not np.isfinite(speed) and gain > 0:
