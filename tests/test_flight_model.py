@@ -296,7 +296,7 @@ def test_an_estimate_uses_the_terms_that_the_logs_allow():
     force = frozenset({LATERAL_FORCE, VERTICAL_FORCE})
     for available, terms in (
         (force, (*basic, "flapping", "accelerometer")),
-        (force | {BODY_VELOCITY, FULL_SCALE}, (*basic, "velocity", "accelerometer")),
+        (force | {BODY_VELOCITY, FULL_SCALE}, (*basic, "velocity", "accelerometer", "drag")),
         (force | {AXIAL_VELOCITY}, (*basic, "flapping", "accelerometer", "inflow")),
         (frozenset({AXIAL_VELOCITY, VOLTAGE}), basic),
         (frozenset({COMMANDS, VOLTAGE}), (*rotors, "voltage")),

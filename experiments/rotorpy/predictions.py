@@ -9,7 +9,6 @@ from flights import VEHICLE, quad_params
 import jaxos4
 
 QUANTITIES = ("position", "velocity", "attitude", "rates")
-TERMS = ("offset", "center_of_mass", "damping", "velocity", "delay", "reaction", "accelerometer", "inflow", "drag")
 
 
 def true_parameters(vehicle: jaxos4.forecast.Vehicle) -> np.ndarray:
@@ -34,9 +33,7 @@ def predictions(flights: Sequence[jaxos4.Flight], horizon: float = 0.5) -> list[
     """Identify each flight and predict the next one. Errors and shares inside the 95 % band at the horizon."""
     rows = []
     for i, flight in enumerate(flights):
-        whole = jaxos4.VehicleSettings(
-            terms=TERMS, begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0
-        )
+        whole = jaxos4.VehicleSettings(begin=float(flight.time[0]), end=float(flight.time[-1]), holdout=0.0)
         found = jaxos4.identify(flight, given_airframe(VEHICLE, i), settings=whole, estimator="filter-error")
         vehicle = jaxos4.forecast.vehicle_of(found)
         true = vehicle._replace(parameters=true_parameters(vehicle), covariance=0 * vehicle.covariance)

@@ -319,8 +319,7 @@ TERMS: dict[str, Term] = {
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
         (TermParameter("x_drag", "1/s", 1.0), TermParameter("y_drag", "1/s", 1.0)),
-        needs=frozenset({BODY_VELOCITY, LATERAL_FORCE}),
-        by_default=lambda available: False,
+        needs=frozenset({BODY_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
         force_axes=(0, 1),
         specific_force=_add_drag,
     ),
