@@ -13,8 +13,7 @@ from ..estimate import Estimate
 from ..results import result_names
 from ..shooting import ShootingProblem
 
-# Results without an estimate.
-NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")
+NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
 
 
 def has_answer(estimate: Estimate) -> bool:

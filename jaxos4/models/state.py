@@ -60,7 +60,7 @@ class Forcing(NamedTuple):
     Only a `FlightModel` has the other fields:
 
     - `spin_up`: Omega_r' [rad/s^2].
-    - `specific_thrust`: U_c/m at the sample itself [m/s^2], as an accelerometer measures it.
+    - `specific_thrust`: U_c/m around the time of the sample [m/s^2], as an accelerometer measures it.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
     - `velocity`: measured, along the body's axes [m/s].
     - `lateral`: the measured specific force along x and y [m/s^2], if a term needs it.
