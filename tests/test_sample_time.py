@@ -105,3 +105,5 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
         assert row.estimate == pytest.approx(vehicle_constants(fit).constants[name].estimate)
         assert row.std > 0.4 * row.estimate
     assert not answer_of(case, weak).constants
+    # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
+    assert not answer_of(case, fit._replace(bound=np.asarray(fit.problem.unknowns.half_width))).constants

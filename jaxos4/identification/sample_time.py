@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..airframe import Airframe
+from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import REACH
 from ..flight import Flight
 from ..models.state import CASCADE_ORDER
@@ -93,9 +94,13 @@ def moved(answer: SampleTime, other: SampleTime) -> list[str]:
 
 
 def answer_of(case: Case, fit: Fit) -> SampleTime:
-    """The answer of one sample time. Without a thrust there is no scale of torques, and so no answer."""
+    """The answer of one sample time.
+
+    Without a thrust there is no scale of torques, and so no answer. Nor if the flight says nothing of any parameter.
+    """
     scales = [each.name for each in fit.problem.model.parameters if each.scales_torque]
-    answered = fit.answered and not any(name in fit.held for name in scales)
+    says = is_identifiable(fit.bound, np.asarray(fit.problem.unknowns.half_width), GAUSSIAN_PRIOR)
+    answered = fit.answered and bool(np.any(says)) and not any(name in fit.held for name in scales)
     constants = vehicle_constants(fit).constants if answered else {}
     if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
