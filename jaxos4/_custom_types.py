@@ -91,6 +91,8 @@ def integer(name: str, least: int, *, static: bool = False) -> Callable[[Any], A
             if isinstance(value, Tracer):
                 return value
             value = int(value)
+        if isinstance(value, np.integer) and not static:
+            value = int(value)
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
         if value > LARGEST:

@@ -249,6 +249,10 @@ def test_settings_out_of_range_are_named(make, setting, values, message):
             make(**{setting: value})
 
 
+def test_a_setting_may_be_an_integer_of_numpy():
+    assert jaxos4.IBSS(max_sweeps=np.int64(5)).max_sweeps == 5
+
+
 def test_settings_out_of_range_are_named_while_a_function_is_traced():
     for make, setting, value in (
         (jaxos4.IBSS, "max_sweeps", 0),

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import CRAZYFLIE
 from scipy.spatial.transform import Rotation
 
@@ -94,6 +95,9 @@ def test_the_weight_tells_the_error_of_the_accelerometer():
     weak = eqx.tree_at(lambda a: a.thrust_coefficient, CRAZYFLIE, 0.8 * CRAZYFLIE.thrust_coefficient)
     (other,) = prepare(as_recordings(flight), weak, sample_time=DT, holdout=0.0)
     assert other.level == prepared.level
+    lighter = eqx.tree_at(lambda a: a.gravity, CRAZYFLIE, 9.7)
+    (other,) = prepare(as_recordings(flight), lighter, sample_time=DT, holdout=0.0)
+    assert other.level[0] - value == pytest.approx(0.11, rel=0.1)
 
 
 def test_a_vehicle_that_leans_is_carried_by_its_drag_too():

@@ -1,7 +1,7 @@
 """A small network that predicts body rates, for comparison: trained on the flights that are identified.
 
-It maps what is known at a start (body rates, commands and voltage of the last 0.1 s) and the commands until the horizon
-to the change of the rates, one step after another (MLP of equinox, trained over 50 steps, Adam).
+An MLP of equinox maps the rates at a step, and the commands of the last 0.1 s and of this step, to the change of the
+rates. It is trained over 50 steps, by Adam.
 """
 
 import equinox as eqx
@@ -10,15 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxos4.flight import STATE_NAMES
 from jaxos4.forecast import FlightPrediction
 from jaxos4.recording import Recording
 
 PAST, STEPS, BATCH, WIDTH, RATE = 10, 50, 256, 32, 2e-3
-COLUMNS = [7, 9, 11]  # p, q, r among the states
+COLUMNS = [STATE_NAMES.index(name) for name in "pqr"]
 
 
 class RateNetwork(eqx.Module):
-    """The change of the rates in a step, from the rates and the commands of the last 0.1 s."""
+    """The rates after each of `STEPS` steps, by their changes."""
 
     layers: eqx.nn.MLP
     scale: jax.Array

@@ -35,8 +35,6 @@ jax.config.update("jax_enable_x64", True)
 AIRFRAME = jaxos4.load_airframe("crazyflie")
 FITTED = ("B8_star_fast_rep1", "B5_helix_fast_mell_rep1", "B9_trefoil_fast_rep4")
 PREDICTED = ("B2_circle_fast_rep2", "B3_figure8_fast_rep1", "B3_figure8_fast_rep2", "B8_star_fast_rep2")
-TERMS = ("offset", "center_of_mass", "damping", "velocity", "voltage", "motor", "delay", "reaction", "accelerometer")
-TERMS += ("inflow", "drag")
 STEP = 0.01  # [s]
 INERTIAS = "Ix", "Iy"
 BOOTSTRAPS, SEEDS = 2000, 3
@@ -44,7 +42,7 @@ BOOTSTRAPS, SEEDS = 2000, 3
 
 def alone(recordings: list[Recording], end: float | None) -> dict[str, Any]:
     """The result, the doubts and the moments of inertia of these recordings; or why they are refused."""
-    settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=STEP, end=end)
+    settings = jaxos4.VehicleSettings(sample_time=STEP, end=end)
     try:
         found = jaxos4.identify(recordings, AIRFRAME, settings=settings).to_dict()
     except jaxos4.InputError as error:
@@ -117,7 +115,7 @@ def main(
     names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
     paths = flight_files(flights, [f"nanobench/{name}.csv" for name in names])
     recordings = {name: read_recording(path, AIRFRAME) for name, path in zip(names, paths, strict=True)}
-    settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=STEP, end=end)
+    settings = jaxos4.VehicleSettings(sample_time=STEP, end=end)
     found = jaxos4.identify([recordings[name] for name in fitted], AIRFRAME, settings=settings)
     print(f"{', '.join(fitted)}: {found.result}, {found.seconds:.0f} s", flush=True)
     vehicle = jaxos4.forecast.vehicle_of(found)

@@ -13,7 +13,7 @@ from .._xla import quick_jit
 from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
-from ..shooting.gains import LogNoise, Observed, gains_of, transition
+from ..shooting.gains import LogNoise, Observed, gains_of, is_rate, transition
 from .frequency_response import modelled_acceleration
 
 HORIZONS = (0.1, 0.25, 0.5)
@@ -237,7 +237,7 @@ def _filtered(
     dt: Scalar,
 ) -> tuple[Float[Array, "samples channels"], Float[Array, "samples channels"]]:
     """Rates and disturbances. A specific force is measured less its model; its rate is the disturbance's mean."""
-    is_known, is_rate = ~jnp.isnan(measured), np.arange(measured.shape[1]) < len(RATES)
+    is_known, memory = ~jnp.isnan(measured), is_rate(measured.shape[1])
     observed = Observed(measured[:, :, None], begins[:, None], begins[:, None])
     gains = gains_of(observed, noise, dt)
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
@@ -247,7 +247,7 @@ def _filtered(
         rate, disturbance = (jnp.where(begins, 0.0, x) for x in (rate, disturbance))
         error = jnp.where(is_known, y - rate, 0.0)
         rate, disturbance = rate + by_rate * error, disturbance + by_disturbance * error
-        return (is_rate * rate + added * dt + reach * disturbance, kept * disturbance), (rate, disturbance)
+        return (memory * rate + added * dt + reach * disturbance, kept * disturbance), (rate, disturbance)
 
     zero = jnp.zeros(measured.shape[1], dtype=float)
     rows = measured, is_known, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]

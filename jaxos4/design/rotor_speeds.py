@@ -244,6 +244,17 @@ def fly_finely(
     return jax.vmap(lambda a: simulate(model, a, held, dt=dt / finer).states)(vehicles)
 
 
+def _standard_envelope(model: AbstractModel, vehicles: Array, duration: float, dt: float) -> Envelope:
+    try:
+        omega = multisine(model.airframe, duration=duration, dt=dt)
+    except ValueError as error:
+        raise InputError(f"the standard multisine, which sets the envelope: {error}") from None
+    states = np.asarray(fly_finely(model, vehicles, omega, as_float(dt)))
+    if not np.isfinite(states).all():
+        raise InputError("`bracket`: some of its vehicles turn over in the standard multisine; narrow it.")
+    return Envelope.of(omega, states, dt)
+
+
 def design_input(
     model: AbstractModel,
     *,
@@ -290,14 +301,7 @@ def design_input(
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model) if bracket is None else bracket
     vehicles = drawn(bracket, key, VEHICLES)
-    try:
-        omega = multisine(model.airframe, duration=duration, dt=dt)
-    except ValueError as error:
-        raise InputError(f"the standard multisine, which sets the envelope: {error}") from None
-    states = np.asarray(fly_finely(model, vehicles, omega, as_float(dt)))
-    if not np.isfinite(states).all():
-        raise InputError("`bracket`: some of its vehicles turn over in the standard multisine; narrow it.")
-    envelope = Envelope.of(omega, states, dt).limited(limits or {})
+    envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
     center, others = np.asarray(bracket.center)[None], drawn(bracket, jax.random.fold_in(key, 1), _DRAWS - 1)
     make = Multisine.within(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
     rotor_speeds = RotorSpeeds(

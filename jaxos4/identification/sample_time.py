@@ -24,8 +24,8 @@ from .fit import Fit, fit_innovations
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
 
-# Innovations are white if they correlate by less than this beyond chance, which is so many standard errors: the largest
-# correlation is that of 24.
+# The limit of a correlation of white innovations: the first number plus so many standard errors. The largest of 24
+# correlations (3 rates, 8 lags) is compared.
 WHITE, _CHANCE = 0.06, 3.0
 # Two answers agree within so many standard deviations and this share, which allows for errors of discretisation.
 AGREE, _DISCRETE = 2.0, 0.03

@@ -64,7 +64,8 @@ class Speeds(NamedTuple):
 class SquaredSpeeds(NamedTuple):
     """The thrust of each rotor divided by b [rad^2/s^2].
 
-    `mean`: over the sample. `around`: over the same time around the begin of the sample, if a speed jumps there.
+    `mean`: over the sample. `around`: at the begin of the sample, where measurements are; the mean before and after a
+    jump.
     """
 
     mean: RotorSpeeds

@@ -16,7 +16,7 @@ from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
 from .usable import Stretch, nothing_usable, stretches
-from .velocity import GRAVITY, Motion, motion_of
+from .velocity import Motion, motion_of
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -172,7 +172,9 @@ def _sampled(
         whole_time,
         length,
         _available_inputs(whole, pieces, airframe, motions if moved else []),
-        _level(whole, np.concatenate([motion.up for motion in motions]), len(pieces)) if moved else None,
+        _level(whole, np.concatenate([motion.up for motion in motions]), len(pieces), float(airframe.gravity))
+        if moved
+        else None,
         (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
         *about,
     )
@@ -195,8 +197,10 @@ def _available_inputs(
     return frozenset(name for name, offered in offers.items() if offered)
 
 
-def _level(whole: Recording, up: Float[np.ndarray, "samples 3"], stretches: int) -> tuple[float, float] | None:
-    """The constant error of the accelerometer along z: what its upright part exceeds gravity by, on average.
+def _level(
+    whole: Recording, up: Float[np.ndarray, "samples 3"], stretches: int, gravity: float
+) -> tuple[float, float] | None:
+    """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
 
     Over a stretch of flight a vehicle gains little velocity, so all forces together carry its weight.
     """
@@ -205,7 +209,7 @@ def _level(whole: Recording, up: Float[np.ndarray, "samples 3"], stretches: int)
         return None
     upright, cosine = np.nansum(force * up, axis=1)[known].mean(), up[known, 2].mean()
     gained = _GAINED * math.sqrt(stretches) / (np.count_nonzero(known) * whole.dt)
-    return (upright - GRAVITY) / cosine, math.hypot(gained, _CARRIED * GRAVITY) / cosine
+    return (upright - gravity) / cosine, math.hypot(gained, _CARRIED * gravity) / cosine
 
 
 def _seconds(recording: Recording) -> float:

@@ -12,7 +12,7 @@ from .reading import Recording
 # Dead reckoning forgets its velocity with the first time constant, and turns its upright direction towards the mean
 # specific force with the second [s].
 _FORGETS, _LEVELS = 2.0, 2.0
-GRAVITY = 9.81
+_GRAVITY = 9.81
 
 
 class Motion(NamedTuple):
@@ -80,7 +80,7 @@ def _dead_reckoned(
 
     Plain numbers: in a loop of few operations they are ten times faster than arrays.
     """
-    push = force - GRAVITY * up
+    push = force - _GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
     kept, (vx, vy, vz), velocities = math.exp(-dt / _FORGETS), (0.0, 0.0, 0.0), []
     for (p, q, r), (ax, ay, az) in zip(rates.tolist(), push.tolist(), strict=True):

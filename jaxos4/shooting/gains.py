@@ -91,11 +91,16 @@ class Step(NamedTuple):
     memory: Channels
 
 
+def is_rate(channels: int) -> Bool[np.ndarray, " channels"]:
+    """Which channels are body rates; the others are specific force."""
+    return np.arange(channels) < RATES
+
+
 def transition(time_constant: Float[Array, "channels *segments"], dt: Float[Array, "..."]) -> tuple[Array, Array]:
     """The share of a disturbance that remains after one sample, and what a unit of it adds: see `Step`."""
     share = dt / time_constant
-    is_rate = (np.arange(len(time_constant)) < RATES).reshape(-1, *(1,) * (time_constant.ndim - 1))
-    return jnp.exp(-share), -time_constant * jnp.expm1(-share) / jnp.where(is_rate, 1.0, dt)
+    rate = is_rate(len(time_constant)).reshape(-1, *(1,) * (time_constant.ndim - 1))
+    return jnp.exp(-share), -time_constant * jnp.expm1(-share) / jnp.where(rate, 1.0, dt)
 
 
 def step_of(noise: LogNoise, dt: Float[Array, "..."]) -> Step:
@@ -107,12 +112,12 @@ def step_of(noise: LogNoise, dt: Float[Array, "..."]) -> Step:
     # For long time constants a difference of nearly equal numbers, and so its Taylor series.
     series = share**3 / 3 * (1 - share * (3 / 4 - share * (7 / 20 - share * (1 / 8 - share * (31 / 840)))))
     spread = jnp.where(share < _SHORT, series, share - 2 * lost + lost_twice / 2)
-    is_rate = np.arange(strength.shape[0])[:, None] < RATES
-    unit = jnp.where(is_rate, 1.0, 1 / dt)
+    rate = is_rate(strength.shape[0])[:, None]
+    unit = jnp.where(rate, 1.0, 1 / dt)
     added = Covariance(
         2 * variance * jnp.square(tau * unit) * spread, variance * tau * unit * lost**2, variance * lost_twice
     )
-    memory = jnp.broadcast_to(as_float(is_rate), variance.shape)
+    memory = jnp.broadcast_to(as_float(rate), variance.shape)
     return Step(kept, reach, added, variance, jnp.exp(2 * sensor), memory)
 
 
@@ -138,16 +143,17 @@ def _predict(p: Covariance, step: Step) -> Covariance:
 
 
 def first_covariance(step: Step, segments: int) -> Covariance:
-    """The covariance before the first measurement of a segment, whose rates are known."""
+    """The covariance before the first measurement of a segment whose rates are known then."""
     zero = jnp.zeros((step.variance.shape[0], segments), dtype=float)
-    settled = Covariance(zero, zero, zero + step.variance)
-    return jax.tree.map(lambda rate, mean: jnp.where(step.memory > 0, rate, mean), settled, _predict(settled, step))
+    begin = Covariance(zero, zero, zero + step.variance)
+    return jax.tree.map(lambda now, later: jnp.where(step.memory > 0, now, later), begin, _predict(begin, step))
 
 
 def next_gains(
     p: Covariance, step: Step, is_measured: Bool[Array, "channels segments"], restart: Bool[Array, " segments"]
 ) -> tuple[Covariance, Gains]:
     """The covariance one sample later, and the gains of this sample, from the covariance before it."""
+    # After a restart the rates are unknown. XLA takes no longer than if this came before the loop.
     first = first_covariance(step, p.rate.shape[-1])
     first = first._replace(rate=first.rate + step.memory * _UNKNOWN_RATE**2)
     p = jax.tree.map(lambda anew, known: jnp.where(restart, anew, known), first, p)
@@ -172,7 +178,6 @@ def basis(noise: LogNoise) -> LogNoise:
 
 def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_constant: float) -> LogNoise:
     """Rough noise levels from differences of the measurements. `time_constant`: of all disturbances [s]."""
-    is_rate = np.arange(measured.shape[1]) < RATES
 
     def power(values: Float[Array, "rows channels"]) -> Float[Array, " channels"]:
         known = ~jnp.isnan(values)
@@ -186,5 +191,5 @@ def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_con
     change = jnp.sqrt(power(jnp.diff(measured, axis=0))) / dt / 2
     mean = jnp.nansum(measured, axis=0) / jnp.maximum((~jnp.isnan(measured)).sum(axis=0), 1)
     spread = jnp.sqrt(power(measured - mean)) / 2
-    strength = jnp.where(is_rate, change, spread)
+    strength = jnp.where(is_rate(measured.shape[1]), change, spread)
     return LogNoise(logarithm(strength), jnp.full(strength.shape, np.log(time_constant)), logarithm(sensor))

@@ -23,10 +23,10 @@ from .._custom_types import InitialStates, Parameters, Scalar, as_float
 from ..bracket import PROPER_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
-from ..models.state import CHANNELS, Forcing
+from ..models.state import Forcing
 from .abstract import AbstractProblem, Stages, WindowUnknowns
 from .filters import Innovations, innovate
-from .gains import LogNoise, Observed, first_noise
+from .gains import LogNoise, Observed, first_noise, is_rate
 from .problem import ShootingProblem
 from .rows import Rows, windowed
 from .scans import Curvature, Parts, Shot
@@ -133,8 +133,7 @@ class InnovationsProblem(AbstractProblem):
         own, dt = self.problem.unknowns, self.flight.dt
         first = jnp.stack(first_noise(self.problem.measured(), dt, _TIMES[0]), axis=1)
         lowest, highest = first - np.log(_NOISE_REACH), first + np.log(_NOISE_REACH)
-        is_rate = np.arange(first.shape[0]) < CHANNELS["rates"]
-        shortest = jnp.where(is_rate, jnp.log(_SHORTEST * dt), np.log(_FORCE_SHORTEST))
+        shortest = jnp.where(is_rate(first.shape[0]), jnp.log(_SHORTEST * dt), np.log(_FORCE_SHORTEST))
         lowest, highest = lowest.at[:, 1].set(shortest), highest.at[:, 1].set(np.log(_LONGEST))
         levels = [(f"log_{name}_{level}", "1") for name in self.channels for level in ("strength", "time", "sensor")]
         precision = jnp.full(first.size, NOISE_PRECISION)
