@@ -100,6 +100,31 @@ def test_the_weight_tells_the_error_of_the_accelerometer():
     assert other.level[0] - value == pytest.approx(0.11, rel=0.1)
 
 
+@pytest.mark.parametrize("measured", [ANGLES_AND_RATES, ANGLES_AND_RATES[3:]], ids=["attitude", "rates alone"])
+@pytest.mark.parametrize(("tilt", "period"), [(0.0, 12.0), (0.1, 6.0), (0.35, 12.0), (0.35, 6.0), (0.5, 8.0)])
+def test_a_vehicle_that_circles_is_carried_by_its_force(measured, tilt, period):
+    """Two rounds and more, banked and back. The force exceeds the weight by the accelerometer's error of 0.1."""
+    time = np.arange(0.0, 30.0, DT)
+    bank = tilt * np.minimum(1.0, np.minimum(time, time[-1] - time))
+    turn = 2 * np.pi / period * (bank / tilt if tilt else 0.0)
+    states = np.full((time.size, 12), np.nan)
+    states[:, ANGLES_AND_RATES] = np.stack(
+        [bank, 0 * time, np.cumsum(turn * np.ones_like(time)) * DT, np.gradient(bank, DT), turn * np.sin(bank),
+         turn * np.cos(bank)], axis=1,
+    )  # fmt: skip
+    states[:, [i for i in ANGLES_AND_RATES if i not in measured]] = np.nan
+    force = np.stack([0 * time, 0 * time, 9.81 / np.cos(bank) + 0.1], axis=1)
+    force += 1e-3 * np.random.default_rng(0).normal(size=force.shape)
+    flight = jaxos4.Flight(time=time, omega=np.full((time.size, 4), 1500.0), states=states, specific_force=force)
+    (prepared,) = prepare(as_recordings(flight), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
+    value, error = prepared.level
+    assert abs(value - 0.1) < min(error, 0.06)
+    assert error < (0.06 if len(measured) == 6 or not tilt else 0.5)
+    upside_down = dataclasses.replace(flight, specific_force=force * [1.0, 1.0, -1.0])
+    (prepared,) = prepare(as_recordings(upside_down), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
+    assert prepared.level is None  # no calibration: the fit says that the axis points down
+
+
 def test_a_vehicle_that_leans_is_carried_by_its_drag_too():
     """In steady flight all forces carry the weight, whatever the tilt; what is left is the accelerometer's error."""
     samples, tilt = 400, (0.1, -0.2, 0.0)
@@ -113,6 +138,14 @@ def test_a_vehicle_that_leans_is_carried_by_its_drag_too():
     )
     (prepared,) = prepare(as_recordings(flight), CRAZYFLIE, begin=0.0, sample_time=DT, holdout=0.0)
     assert abs(prepared.level[0] - 0.1) < 1e-3
+
+
+def test_a_wrong_accelerometer_is_doubted():
+    """It is known from the weight, so that the fit does not estimate it."""
+    flight = dataclasses.replace(flown(), specific_force=np.asarray(flown().specific_force) + [0.0, 0.0, 1.5])
+    found = jaxos4.identify(flight, CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS, sample_time=0.008))
+    assert "az_bias" in found.held
+    assert [d.cause for d in found.doubts if "levelled accelerometer" in d.cause] != []
 
 
 def test_padding_changes_the_likelihood_by_rounding_only():

@@ -222,11 +222,18 @@ def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
         )
 
 
-def _held_at_zero(fit: Fit) -> Iterator[Doubt]:
-    """Parameters that are held at 0, although their values contradict physics beyond chance."""
+def _held(fit: Fit) -> Iterator[Doubt]:
+    """Parameters that were not estimated, although what is known of them contradicts physics beyond chance.
+
+    One that is held at 0 came out negative. What is known of another one is its bracket.
+    """
+    brackets = dict(zip(fit.problem.unknowns.names, np.asarray(fit.problem.unknowns.half_width).tolist(), strict=True))
     for parameter in fit.problem.model.parameters:
-        value, std = fit.negative.get(parameter.name, (0.0, 0.0))
-        if value < 0 and parameter.contradiction and (verdict := parameter.contradiction(value, _SURE * std)):
+        if parameter.contradiction is None or parameter.name not in fit.held:
+            continue
+        known = fit.held[parameter.name].value, brackets[parameter.name]
+        value, std = fit.negative.get(parameter.name, known)
+        if verdict := parameter.contradiction(value, _SURE * std):
             yield _implausible(f"{parameter.name} = {value:.2g} {verdict[0]}", verdict[1])
 
 
@@ -321,7 +328,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     doubts = (
         *(_implausible(cause, remedy) for cause, remedy in case.doubts),
         *(_implausible(why, f"fly more {axis}, or in calmer air") for axis, why in weak.items()),
-        *_held_at_zero(fit),
+        *_held(fit),
         *doubts_of(fit.problem.model, trusted, body.constants, skill, still, case.log_step),
     )
     step = float(fit.problem.flight.dt)

@@ -140,7 +140,7 @@ class Disturbance(msgspec.Struct, frozen=True):
 class SampleTime(msgspec.Struct, frozen=True):
     """The moments of inertia of a vehicle at one sample time [s].
 
-    - `correlation`: the largest of the innovations of a body rate. `samples`: how many were fitted.
+    - `correlation`: the largest of the innovations of a body rate. `samples`: how many innovations of a rate count.
     - `speed_noise`: the share of noise in the changes of measured rotor speeds from sample to sample.
     """
 

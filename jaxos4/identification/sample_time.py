@@ -17,7 +17,6 @@ from ..airframe import Airframe
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import REACH
 from ..flight import Flight
-from ..models.state import CASCADE_ORDER
 from ..shooting import InnovationsProblem
 from .answers import AXES, overwhelmed, vehicle_constants
 from .fit import Fit, fit_innovations
@@ -67,7 +66,7 @@ def shortest(answers: Sequence[SampleTime]) -> int:
 
 
 def _is_clean(answer: SampleTime) -> bool:
-    chance = _CHANCE / math.sqrt(answer.samples)
+    chance = _CHANCE / math.sqrt(max(answer.samples, 1))
     return abs(answer.correlation) <= WHITE + chance and answer.speed_noise <= NOISY
 
 
@@ -107,6 +106,12 @@ def answer_of(case: Case, fit: Fit) -> SampleTime:
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
     flight = case.shooting.flight
-    fitted = int(np.isfinite(np.asarray(flight.states)[:, CASCADE_ORDER[0]]).sum())
     noise = noise_of_speeds(flight, fit.problem.model.airframe)
-    return SampleTime(float(flight.dt), constants, largest, fitted, noise)
+    return SampleTime(float(flight.dt), constants, largest, _samples(fit), noise)
+
+
+def _samples(fit: Fit) -> int:
+    """How many innovations of a body rate count: the sum of their squares, which has a mean of 1."""
+    if not fit.answered or fit.estimate.parts is None:
+        return 0
+    return round(float(np.asarray(fit.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))

@@ -30,6 +30,8 @@ _FEWEST_SAMPLES = 4
 _NEARLY_EQUAL = 1.01
 # The velocity that a stretch gains [m/s], and the share of the weight that is not carried by other causes.
 _GAINED, _CARRIED = 1.0, 0.003
+# The least mean cosine of the tilt of a vehicle whose weight says how its accelerometer errs.
+_LEAST_UPRIGHT = 0.5
 # The share of time of a rotor at its limit, and how close to full speed that is.
 _OFTEN, _FULL = 0.01, 0.999
 
@@ -172,9 +174,7 @@ def _sampled(
         whole_time,
         length,
         _available_inputs(whole, pieces, airframe, motions if moved else []),
-        _level(whole, np.concatenate([motion.up for motion in motions]), len(pieces), float(airframe.gravity))
-        if moved
-        else None,
+        _level(fitted, motions, float(airframe.gravity)) if moved else None,
         (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
         *about,
     )
@@ -197,19 +197,21 @@ def _available_inputs(
     return frozenset(name for name, offered in offers.items() if offered)
 
 
-def _level(
-    whole: Recording, up: Float[np.ndarray, "samples 3"], stretches: int, gravity: float
-) -> tuple[float, float] | None:
+def _level(fitted: Recording, motions: Sequence[Motion], gravity: float) -> tuple[float, float] | None:
     """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
 
     Over a stretch of flight a vehicle gains little velocity, so all forces together carry its weight.
     """
-    force = whole.specific_force
-    if force is None or not (known := np.isfinite(force[:, 2])).any():
+    force = fitted.specific_force
+    if force is None or not (known := np.isfinite(force).all(axis=1)).any():
         return None
-    upright, cosine = np.nansum(force * up, axis=1)[known].mean(), up[known, 2].mean()
-    gained = _GAINED * math.sqrt(stretches) / (np.count_nonzero(known) * whole.dt)
-    return (upright - gravity) / cosine, math.hypot(gained, _CARRIED * gravity) / cosine
+    ups = [np.concatenate(each)[known] for each in zip(*(motion.ups for motion in motions), strict=True)]
+    other, upright = ((force[known] * up).sum(axis=1).mean() for up in ups)
+    cosine = ups[-1][:, 2].mean()
+    if cosine < _LEAST_UPRIGHT or force[known, 2].mean() < 0:  # the second: the z axis points down
+        return None
+    gained = _GAINED * math.sqrt(len(motions)) / (np.count_nonzero(known) * fitted.dt)
+    return (upright - gravity) / cosine, math.hypot(gained, _CARRIED * gravity, upright - other) / cosine
 
 
 def _seconds(recording: Recording) -> float:

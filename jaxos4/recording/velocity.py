@@ -9,9 +9,11 @@ from jaxtyping import Float
 from ..flight import STATE_NAMES
 from .reading import Recording
 
-# Dead reckoning forgets its velocity with the first time constant, and turns its upright direction towards the mean
-# specific force with the second [s].
-_FORGETS, _LEVELS = 2.0, 2.0
+# Dead reckoning forgets its velocity with this time constant [s].
+_FORGETS = 2.0
+# The upright direction is drawn to the specific force with these time constants [s]: the first forgets errors of the
+# gyro sooner, the second holds in longer turns.
+_LEVELS = (2.0, 8.0)
 _GRAVITY = 9.81
 
 
@@ -19,12 +21,13 @@ class Motion(NamedTuple):
     """How a vehicle moved through still air.
 
     - `velocity`: along the body's axes [m/s].
-    - `up`: the upright direction in the body's axes.
+    - `ups`: the upright direction in the body's axes, by each time constant. They differ in long turns, and if the gyro
+      errs. Both are the same if the attitude was measured.
     - `measured`: whether the velocity was measured. If not, only its part along z is of use.
     """
 
     velocity: Float[np.ndarray, "samples 3"]
-    up: Float[np.ndarray, "samples 3"]
+    ups: tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]
     measured: bool
 
 
@@ -38,13 +41,16 @@ def motion_of(recording: Recording) -> Motion | None:
     if angles is not None and velocity is not None:
         to_body = _to_body(*angles.T)
         up = to_body[:, :, 2]
-        return Motion(np.einsum("tij,tj->ti", to_body, velocity), up, measured=True)
+        return Motion(np.einsum("tij,tj->ti", to_body, velocity), (up, up), measured=True)
     rates, force = _filled(recording, ("p", "q", "r")), recording.specific_force
     if rates is None or force is None or np.isnan(force).all(axis=0).any():
         return None
     force = _without_gaps(force)
-    up = _upright(rates, force, recording.dt) if angles is None else _to_body(*angles.T)[:, :, 2]
-    return Motion(_dead_reckoned(rates, force, up, recording.dt), up, measured=False)
+    if angles is None:
+        up, slow = (_upright(rates, force, recording.dt, levels) for levels in _LEVELS)
+    else:
+        up = slow = _to_body(*angles.T)[:, :, 2]
+    return Motion(_dead_reckoned(rates, force, up, recording.dt), (up, slow), measured=False)
 
 
 def _filled(recording: Recording, names: tuple[str, ...]) -> Float[np.ndarray, "samples 3"] | None:
@@ -94,10 +100,13 @@ def _dead_reckoned(
 
 
 def _upright(
-    rates: Float[np.ndarray, "samples 3"], force: Float[np.ndarray, "samples 3"], dt: float
+    rates: Float[np.ndarray, "samples 3"], force: Float[np.ndarray, "samples 3"], dt: float, levels: float
 ) -> Float[np.ndarray, "samples 3"]:
-    """The upright direction: fixed in the earth, so it turns against the body; slowly drawn to the specific force."""
-    x, y, z, turn, directions = 0.0, 0.0, 1.0, dt / _LEVELS, []
+    """The upright direction: fixed in the earth, so it turns against the body; slowly drawn to the specific force.
+
+    `levels`: the time constant of this [s].
+    """
+    x, y, z, turn, directions = 0.0, 0.0, 1.0, dt / levels, []
     drawn = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-3)
     for (p, q, r), (ax, ay, az) in zip(rates.tolist(), drawn.tolist(), strict=True):
         directions.append((x, y, z))
