@@ -332,7 +332,8 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         *doubts_of(fit.problem.model, trusted, body.constants, skill, still, case.log_step),
     )
     step = float(fit.problem.flight.dt)
-    noise = noise_of_speeds(fit.problem.flight, airframe)
+    known = [each.speed_noise for each in sample_times if each.sample_time == step]
+    noise = known[0] if known else noise_of_speeds(fit.problem.flight, fit.problem.flight, airframe)
     doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(noise), *_moved(sample_times, step, body))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
     return Judgement(

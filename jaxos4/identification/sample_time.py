@@ -28,8 +28,8 @@ from .results import Constant, SampleTime
 WHITE, _CHANCE = 0.06, 3.0
 # Two answers agree within so many standard deviations and this share, which allows for errors of discretisation.
 AGREE, _DISCRETE = 2.0, 0.03
-# Noise may be this share of the changes of the rotors' torque from sample to sample. More makes inertias too large.
-NOISY = 0.1
+# Noise may be this share of the changes of the rotors' torque in a sample; inertias are too large by about this share.
+NOISY = 0.05
 # The share of the way to its limit at which an unknown counts as being there.
 _NEAR = 0.95
 
@@ -46,7 +46,8 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
         if fits and fits[0].answered and _is_inside(problem, found := np.asarray(fits[0].estimate.parameters)):
             problem = problem.starting_from(found)
         fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
-    answers = tuple(answer_of(case, fit) for case, fit in zip(cases, fits, strict=True))
+    finest = cases[0].shooting.flight
+    answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
 
@@ -70,16 +71,22 @@ def _is_clean(answer: SampleTime) -> bool:
     return abs(answer.correlation) <= WHITE + chance and answer.speed_noise <= NOISY
 
 
-def noise_of_speeds(flight: Flight, airframe: Airframe) -> float:
+def noise_of_speeds(flight: Flight, finest: Flight, airframe: Airframe) -> float:
     """The share of white noise in the changes of the rotors' roll or pitch torque from sample to sample.
 
     Commands have no noise. White noise has second differences of 6 times its variance, and first differences of twice.
+    Its variance falls as samples of `finest` are averaged to longer ones. There the rotors are smoother.
     """
     if flight.commanded:
         return 0.0
-    torque = np.square(np.asarray(flight.omega)) @ np.asarray(airframe.mixer, dtype=float)[:2].T
-    noise, changes = (np.median(np.abs(np.diff(torque, order, axis=0)), axis=0) ** 2 for order in (2, 1))
-    return float(np.max(noise / 3 / np.where(changes > 0, changes, np.inf)))
+    mixer = np.asarray(airframe.mixer, dtype=float)[:2].T
+
+    def median_square(each: Flight, order: int) -> np.ndarray:
+        return np.median(np.abs(np.diff(np.square(np.asarray(each.omega)) @ mixer, order, axis=0)), axis=0) ** 2
+
+    changes = median_square(flight, 1)
+    noise = median_square(finest, 2) / 6 * float(finest.dt) / float(flight.dt)
+    return float(np.max(2 * noise / np.where(changes > 0, changes, np.inf)))
 
 
 def moved(answer: SampleTime, other: SampleTime) -> list[str]:
@@ -92,8 +99,8 @@ def moved(answer: SampleTime, other: SampleTime) -> list[str]:
     return [name for name in both if differs(answer.constants[name], other.constants[name])]
 
 
-def answer_of(case: Case, fit: Fit) -> SampleTime:
-    """The answer of one sample time.
+def answer_of(case: Case, fit: Fit, finest: Flight) -> SampleTime:
+    """The answer of one sample time. `finest`: the flight with the shortest samples.
 
     Without a thrust there is no scale of torques, and so no answer. Nor if the flight says nothing of any parameter.
     """
@@ -106,7 +113,7 @@ def answer_of(case: Case, fit: Fit) -> SampleTime:
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
     flight = case.shooting.flight
-    noise = noise_of_speeds(flight, fit.problem.model.airframe)
+    noise = noise_of_speeds(flight, finest, fit.problem.model.airframe)
     return SampleTime(float(flight.dt), constants, largest, _samples(fit), noise)
 
 
