@@ -68,7 +68,7 @@ def test_a_measured_velocity_is_turned_by_the_attitude():
     assert found.measured
     np.testing.assert_allclose(found.velocity, true, atol=1e-9)
     upright = to_earth(recording.states[:, ANGLES]).apply([0.0, 0.0, 1.0], inverse=True)
-    np.testing.assert_allclose(found.up, upright, atol=1e-12)
+    np.testing.assert_allclose(found.ups[0], upright, atol=1e-12)
     gaps = recording._replace(states=recording.states.copy())
     gaps.states[20:24] = np.nan  # a gap has the value before it
     np.testing.assert_allclose(motion_of(gaps).velocity[20:24], true[[19] * 4], atol=1e-9)
@@ -93,13 +93,13 @@ def test_the_velocity_along_z_is_found(known):
     error, size = (found.velocity - true)[late, 2].std(), true[late, 2].std()
     assert error < 0.3 * size
     assert (
-        np.abs(found.up[late, 2] - np.cos(recording.states[late, 6]) * np.cos(recording.states[late, 8])).max() < 0.03
+        np.abs(found.ups[0][late, 2] - np.cos(recording.states[late, 6]) * np.cos(recording.states[late, 8])).max() < 0.03
     )
 
 
 def test_a_constant_error_of_the_accelerometer_is_left_out():
     recording = without(trajectory(0.004)[0], VELOCITY)
-    up = motion_of(recording).up
+    up = motion_of(recording).ups[0]
     biased = recording._replace(specific_force=recording.specific_force + 0.5 * up)
     np.testing.assert_allclose(motion_of(biased).velocity, motion_of(recording).velocity, atol=1e-9)
 
