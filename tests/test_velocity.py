@@ -93,7 +93,8 @@ def test_the_velocity_along_z_is_found(known):
     error, size = (found.velocity - true)[late, 2].std(), true[late, 2].std()
     assert error < 0.3 * size
     assert (
-        np.abs(found.ups[0][late, 2] - np.cos(recording.states[late, 6]) * np.cos(recording.states[late, 8])).max() < 0.03
+        np.abs(found.ups[0][late, 2] - np.cos(recording.states[late, 6]) * np.cos(recording.states[late, 8])).max()
+        < 0.03
     )
 
 
