@@ -33,10 +33,7 @@ _FIRST_BYTES = 1 << 18
 def read_log(
     path: Path, airframe: Airframe | None = None, *, full_scale: float | None = None
 ) -> tuple[Flight, tuple[str, ...]]:
-    """Read a log of any known format, recognised from the first bytes of the file.
-
-    The columns of each format are listed in `jaxos4.logs.csv`, `jaxos4.logs.ulog` (PX4), `jaxos4.logs.blackbox`
-    (Betaflight and INAV) and `jaxos4.logs.crazyflie` (micro-SD card).
+    """Read a log of any known format, recognised from the first bytes of the file. Its columns: docs/logs.md.
 
     **Arguments:**
 
@@ -60,7 +57,7 @@ def read_recording(path: Path, airframe: Airframe | None = None, *, full_scale: 
 
 
 def read_flight(path: Path, airframe: Airframe | None = None) -> Flight:
-    """Read a flight from a CSV file. The columns are listed in `jaxos4.logs.csv`.
+    """Read a flight from a CSV file. Its columns: docs/index.md.
 
     Rows within 1 % of a uniform time grid keep their values. Other rows are resampled to such a grid. Jumps of 2 pi in
     roll and yaw are removed. Each change to the data is a `UserWarning`. Arguments and errors are those of `read_log`.

@@ -1,32 +1,7 @@
 """Blackbox logs of Betaflight and INAV: `.bbl` and `.BFL` files, or CSV of `blackbox_decode` or Blackbox Explorer.
 
-| column | column of the log | unit in the log |
-| --- | --- | --- |
-| `t` | `time (us)`, or Explorer's `time`; 0 at the first row | us |
-| `p, q, r` | `gyroUnfilt[0..2]`, or `gyroADC[0..2]` | deg/s |
-| `ax, ay, az` | `accSmooth[0..2]` | `acc_1G` for 1 g |
-| `omega1..4` | `eRPM[0..3]`, measured | 100 electrical revolutions a minute |
-| `command1..4` | `motor[0..3]`, if there is no `eRPM` | DShot 48..2047, or PWM 1000..2000 |
-| `voltage` | `vbatLatest` of Betaflight 4 | 0.01 V |
-
-The unfiltered gyro is preferred: the filters of the flight controller delay the rates by some milliseconds, which the
-estimators would attribute to the vehicle. Commands count as fractions of the airframe's `max_rotor_speed`.
-
-**Settings.** A `.bbl` or `.BFL` file holds the settings, and Explorer writes them above the header of its CSV. The
-reader uses `acc_1G` (0: the accelerometer is off), `motor_poles`, `motorOutput`, `maxthrottle` and
-`blackbox_high_resolution` (rates are in tenths of a deg/s). The CSV of `blackbox_decode` has no settings. Then the
-reader assumes 14 poles, deg/s, 1 g from the accelerometer's median and the protocol from the range, and notes it.
-
-**Sessions.** A vehicle writes one session each time that it is armed. The sessions of a file follow each other in one
-flight, with an unmeasured second between them.
-
-**Frames.** Gyro and accelerometer have x forward, y left, z up, as ours: roll is positive to the right, pitch nose
-down, yaw counter-clockwise seen from above. (The firmware's own telemetry has the opposite signs of pitch and yaw.)
-
-**Rotors.** They keep the log's numbers (Betaflight's quad X: 1 rear right, 2 front right, 3 rear left, 4 front left).
-The airframe's `rotor_positions` and `rotor_spins` must have the same order.
-
-Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight and INAV.
+Columns, settings and frames: docs/logs.md. Reference: the sources of blackbox-tools, blackbox-log-viewer, Betaflight
+and INAV.
 """
 
 import contextlib

@@ -1,30 +1,4 @@
-"""Logs of the Crazyflie's micro-SD card, versions 1 and 2.
-
-| column | variable of the log | unit in the log |
-| --- | --- | --- |
-| `p, q, r` | `gyro.x, y, z` | deg/s |
-| `ax, ay, az` | `acc.x, y, z` | g |
-| `phi, theta, psi` | `stateEstimate.roll, pitch, yaw` | deg |
-| `x, y, z` | `stateEstimate.x, y, z` | m |
-| `vx, vy, vz` | `stateEstimate.vx, vy, vz` | m/s |
-| `omega1..4` | `rpm.m1..m4`, measured, interpolated linearly in the square | rpm |
-| `voltage` | `pm.vbat` | V |
-| `command1..4` | `motor.m1..m4`, or `pwm.m1_pwm..m4_pwm`, if there is no `omega1..4` | 0..65535 |
-
-Any event may hold a variable; if several do, the one with the most samples is used. A command is held until the next
-one, and counts as a fraction of the airframe's `max_rotor_speed`. `t` is 0 at the first sample used. The samples of
-the body rates are the rows; samples at other rates are brought to them (`jaxos4.logs.sampling`).
-
-**Frames.** The body has x forward, y left, z up, as ours, and rates follow the right hand. `stateEstimate.pitch` is
-positive nose up, so theta is its negative.
-
-**Rotors.** They keep the firmware's numbers (1 front right, 2 rear right, 3 rear left, 4 front left). The airframe's
-`rotor_positions` and `rotor_spins` must have the same order.
-
-**File.** All numbers are little-endian. A file starts with 0xBC, the version and the number of event types (16 bits
-each). For each type follow its number (16 bits), its name, the number of its variables (16 bits), and their names
-with their types, as `gyro.x(f)`; all names end with a zero. Then come the events: number of the type, time stamp
-(version 1: 32 bits, ms; version 2: 64 bits, us), values. A CRC-32 of the file ends it, unless power was lost.
+"""Logs of the Crazyflie's micro-SD card, versions 1 and 2. Variables, frames and the file: docs/logs.md.
 
 Reference: the usdlog tools and the micro-SD deck of the Crazyflie firmware.
 """

@@ -1,22 +1,4 @@
-"""The flight CSV: the project's own log format.
-
-The first row holds the names of the columns, in any order. Cells are separated by commas.
-
-| column | unit | content |
-| --- | --- | --- |
-| `t` | s | time; it must increase |
-| `omega1..4` | rad/s | measured rotor speeds |
-| `command1..4` | 0..1 | commands, as fractions of the airframe's `max_rotor_speed` |
-| `x, y, z` | m | position |
-| `vx, vy, vz` | m/s | velocity |
-| `phi, theta, psi` | rad | roll, pitch, yaw |
-| `p, q, r` | rad/s | body rates |
-| `ax, ay, az` | m/s^2 | specific force |
-| `voltage` | V | the battery's voltage |
-
-A missing column or an empty cell means that the value was not measured. Voltage is interpolated over empty cells. A
-flight needs `t`, all four rotors (speeds or commands), and at least one of the twelve states of Eq. (14).
-"""
+"""The flight CSV, the project's own log format. Its columns: docs/index.md."""
 
 import array
 import contextlib

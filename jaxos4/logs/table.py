@@ -111,7 +111,7 @@ PITCH = {"theta": Limit(-_RIGHT_ANGLE, _RIGHT_ANGLE, "rad", _PITCH)}
 class Table(NamedTuple):
     """Columns of a log. NaN means not measured; all other values are finite.
 
-    - `columns`: arrays of one length, with the names, units and frame of the flight CSV (see `jaxos4.logs.csv`).
+    - `columns`: arrays of one length, with the names, units and frame of the flight CSV (docs/index.md).
     - `unknown`: names of the columns that the reader ignored.
     - `first_row`: the row of the file, counted from 1, that holds entry 0; `None` if the format has no rows.
     - `names`: the log's own name of a column, if it is another.
