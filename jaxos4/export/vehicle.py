@@ -86,10 +86,6 @@ class RigidVehicle(NamedTuple):
         c = self.thrust_curve
         return "" if c == 1 else f"(2 u / ({c:.4g} + sqrt({c * c:.4g} {'+-'[c > 1]} {4 * abs(1 - c):.4g} u)))^2"
 
-    def curve(self, formula: str) -> str:
-        """The note on the thrust curve, with the simulator's `formula` for a function {} of the command."""
-        return f"thrust_curve: for the u-th part of a full command, {formula.format(self.thrust_share)}"
-
     @property
     def rotor_drag(self) -> Float[np.ndarray, "2"]:
         """The drag of one rotor in its plane and along its axis, over its speed and velocity [N s^2/(rad m)].
