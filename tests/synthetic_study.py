@@ -6,7 +6,6 @@ import numpy as np
 import xarray as xr
 
 import jaxos4
-from jaxos4.flight import STATE_NAMES, STATE_UNITS
 from jaxos4.study import OUTCOMES as RESULTS
 from jaxos4.study.cell import LEVELS
 from jaxos4.study.metrics import SCENARIO
@@ -45,7 +44,6 @@ def synthetic_study(
     seed=0,
     spoiled=True,
     drawn=False,
-    example=True,
 ):
     """A synthetic Dataset.
 
@@ -136,8 +134,6 @@ def synthetic_study(
             "failures": json.dumps(failures),
         },
     )
-    if example:
-        dataset = dataset.merge(_example(rng, estimators))
     for name in dataset.variables:
         dataset[name].attrs = {"long_name": str(name).replace("_", " "), "units": "1"}
     for name in ("truth", "center", "bracket_half_width", "estimate", "std", "half_width", "bound"):
@@ -145,26 +141,3 @@ def synthetic_study(
     flags = {"flag_values": np.arange(len(RESULTS), dtype=np.int8), "flag_meanings": " ".join(RESULTS)}
     dataset["result"].attrs |= flags
     return dataset
-
-
-def _example(rng, estimators):
-    time = np.arange(0, 5.001, 0.02)
-    phase = np.arange(12)[:, None]
-    true = (np.sin(2 * np.pi * (0.3 + 0.05 * phase) * time + phase) * (0.2 + 0.05 * phase)).T
-    growth = 0.002 + 0.003 * np.arange(len(estimators))[:, None, None]
-    drift = growth * time[:, None] * np.cos(3 * time[:, None] + phase.T)
-    noise = np.asarray(jaxos4.SENSOR_SIGMA) * rng.standard_normal(true.shape)
-    variables = {
-        "example_true": (("sample", "state"), true),
-        "example_measured": (("sample", "state"), true + noise),
-        "example_simulated": (("estimator", "sample", "state"), true + drift),
-    }
-    state = {"state": list(STATE_NAMES), "state_unit": ("state", list(STATE_UNITS))}
-    coordinates = {"time": ("sample", time), **state}
-    if "ibss" in estimators:
-        coordinates["sweep"] = sweeps = np.arange(9)
-        shrink = np.maximum(0.35 ** sweeps[:, None], 2e-4) * (1 + 0.3 * rng.random((9, 8)))
-        variables["search_half_width"] = (("sweep", "parameter"), HALF_WIDTH * shrink)
-        errors = HALF_WIDTH * 0.4 * 0.3 ** sweeps[:, None] * rng.standard_normal((9, 8)) + BOUND["all"]
-        variables["search_estimate"] = (("sweep", "parameter"), TRUTH + errors)
-    return xr.Dataset(variables, coords=coordinates)

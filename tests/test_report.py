@@ -19,18 +19,17 @@ from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.estimators import ESTIMATORS as REGISTRY
-from jaxos4.report import error_table, read_results, study_page, write_report
+from jaxos4.report import error_table, read_results, study_figures, study_page, write_report
+from jaxos4.report.study_data import scenarios
 from jaxos4.report.style import drawing, grid, log_axis, styles
 from jaxos4.report.text import percent, plain
 from jaxos4.study import metrics
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
-OF_EXAMPLE = {"deviations", "search"}
 
 
 def few(study):
-    study = study.isel(parameter=[0, 1, 6])
-    return study.isel(state=[0, 2, 4, 7]) if "state" in study.dims else study
+    return study.isel(parameter=[0, 1, 6])
 
 
 def tables(text):
@@ -86,14 +85,14 @@ def page(report):
 def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_path, run):
     folder = report[0].parent
     names = {path.relative_to(folder).as_posix() for path in report}
-    assert names == {"report.html"} | {f"figures/{n}.{s}" for n in OF_SCENARIO | OF_EXAMPLE for s in ("svg", "pdf")}
+    assert names == {"report.html"} | {f"figures/{n}.{s}" for n in OF_SCENARIO for s in ("svg", "pdf")}
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == names
     assert all(p.read_bytes().startswith(b"%PDF") for p in report if p.suffix == ".pdf")
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     xr.testing.assert_equal(read_results(tmp_path), study)
     code, out, err = run("report", str(tmp_path))
     assert (code, err) == (0, "")
-    assert "6 figures" in out
+    assert "4 figures" in out
     for path in report:
         assert (tmp_path / path.relative_to(folder)).read_bytes() == path.read_bytes(), path.name
 
@@ -159,7 +158,7 @@ def test_trouble_is_named(report):
 
 
 def test_the_terminal_has_the_same_errors_in_80_columns():
-    study = synthetic_study(flights=8, estimators=tuple(ESTIMATORS), example=False)
+    study = synthetic_study(flights=8, estimators=tuple(ESTIMATORS))
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(error_table(study))
     text = console.export_text()
@@ -175,7 +174,7 @@ def test_the_terminal_has_the_same_errors_in_80_columns():
 
 def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(study_page, "MOST_DRAWN", 1)
-    options = {"flights": 4, "estimators": ("ibss", "svsf"), "scales": (1.0,), "spoiled": False, "example": False}
+    options = {"flights": 4, "estimators": ("ibss", "svsf"), "scales": (1.0,), "spoiled": False}
     study = few(synthetic_study(models=("published", "corrected"), **options))
     written = write_report(study, tmp_path, with_pdf=False)
     assert {path.stem for path in written[1:]} == {f"{name}-1" for name in OF_SCENARIO}
@@ -187,7 +186,7 @@ def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypa
 
 def test_names_cannot_break_out_of_the_page(tmp_path):
     evil = "</script><script>alert(1)</script>"
-    options = {"flights": 3, "estimators": ("ibss", "svsf"), "scales": (0.0, 1.0), "spoiled": False, "example": False}
+    options = {"flights": 3, "estimators": ("ibss", "svsf"), "scales": (0.0, 1.0), "spoiled": False}
     study = few(synthetic_study(**options))
     study = study.assign_coords(
         estimator=["ibss", evil],
@@ -227,12 +226,13 @@ def test_what_is_not_a_study_is_refused_and_nothing_is_written(write, tmp_path, 
 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
-    study = study[["search_half_width", "search_estimate"]]
-    before = study_page.draw(study_page.EXAMPLE_FIGURES, study)
-    assert list(before) == ["search"]
+    (scenario,) = scenarios(study)
+    figures = {"coverage": study_figures.coverage}
+    before = study_page.draw(figures, scenario.data)
+    assert list(before) == ["coverage"]
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):
         settings = dict(matplotlib.rcParams)
-        assert study_page.draw(study_page.EXAMPLE_FIGURES, study) == before
+        assert study_page.draw(figures, scenario.data) == before
         assert dict(matplotlib.rcParams) == settings
 
 

@@ -86,7 +86,7 @@ DESIGNS = {
 def addresses(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     study = synthetic_study(flights=12, estimators=tuple(ESTIMATORS), scales=(0.1, 1.0))
-    files = {"study": write_report(study.isel(state=[0, 7]), folder, with_pdf=False)[0]}  # the page has the SVG
+    files = {"study": write_report(study, folder, with_pdf=False)[0]}  # the page has the SVG
     for name, found in {
         "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
         "without predictions": identified_vehicle(predictions=None),
@@ -170,7 +170,7 @@ def test_it_follows_the_theme(opened, name, scheme):
 def test_a_checkbox_hides_an_estimator_everywhere(opened):
     page = opened()
     assert page.locator("tr[data-estimator='1']").count() == 5 * 2
-    for figure in ("overview", "error", "efficiency", "coverage", "deviations"):
+    for figure in ("overview", "error", "efficiency", "coverage"):
         assert page.locator(f"#figure-{figure} [data-estimator='1']").count() > 1, figure
     shown = """place => [...document.querySelectorAll(`[data-estimator="${place}"]`)]
         .map(element => getComputedStyle(element).display !== "none")"""

@@ -1,7 +1,4 @@
-"""Figures of a study: of one scenario, and of the example flight.
-
-Each function returns `None` if its data are absent.
-"""
+"""Figures of a scenario of a study. Each function returns `None` if its data are absent."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -9,11 +6,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ..study import metrics
 from .study_data import accuracy, bounds, error_unit, names, positive_scales
-from .style import BOUND_DASHES, INK, Style, estimator_gid, grid, label, legend, log_axis, scale_axis, style, styles
+from .style import BOUND_DASHES, INK, Style, estimator_gid, grid, label, legend, log_axis, scale_axis, styles
 from .text import plain
 
 _COLUMNS = 4
@@ -174,47 +171,3 @@ def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
 def _looks(data: xr.Dataset) -> Iterator[tuple[int, Style]]:
     """The index and the style of each estimator."""
     return enumerate(styles(names(data, "estimator")).values())
-
-
-def search(data: xr.Dataset) -> Figure | None:
-    """Half-widths and centres of the brackets of IBSS after each sweep, in units of the first half-widths."""
-    if "search_half_width" not in data:
-        return None
-    width = data["search_half_width"].transpose("sweep", "parameter")
-    first = width.isel(sweep=0)
-    moves = abs(data["search_estimate"] - data["search_estimate"].isel(sweep=-1)) / first
-    figure, axes = grid(2, columns=2, height=3.2)
-    titles = ("half-width of the bracket", "distance to the last estimate")
-    for panel, values, title in zip(axes, (width / first, moves.transpose("sweep", "parameter")), titles, strict=True):
-        for place, name in enumerate(names(data, "parameter")):
-            y = values.isel(parameter=place).values
-            panel.plot(data["sweep"].values, np.where(y > 0, y, np.nan), label=name, markersize=4, **style(place).line)
-        panel.set_title(title)
-        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
-        log_axis(panel, "y")
-    label(figure, x="sweep", y="in first half-widths")
-    axes[0].legend(loc="lower left", ncols=2, handlelength=2.5, fontsize=7)
-    return figure
-
-
-def deviations(data: xr.Dataset) -> Figure | None:
-    """The example flight simulated with each estimate, minus its truth: a panel for each state that was measured."""
-    if "example_measured" not in data:
-        return None
-    known = data["example_measured"].notnull() & data["example_true"].notnull()
-    shown = np.flatnonzero(known.any("sample").values).tolist()
-    if not shown:
-        return None
-    figure, axes = grid(len(shown), columns=3, height=1.75)
-    for panel, state in zip(axes, shown, strict=True):
-        one = data.isel(state=state)
-        panel.axhline(0, color=INK, linewidth=0.8)
-        for row, look in _looks(data):
-            y = (one["example_simulated"].isel(estimator=row) - one["example_true"]).values
-            if np.isfinite(y).any():
-                line = {"color": look.color, "linestyle": look.dash, "linewidth": 1.1, "gid": estimator_gid(row)}
-                panel.plot(one["time"], y, **line)
-        panel.set_title(f"{one['state'].item()} [{one['state_unit'].item()}]")
-    label(figure, x="time [s]")
-    legend(figure, names(data, "estimator"))
-    return figure

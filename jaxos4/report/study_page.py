@@ -20,17 +20,12 @@ MOST_DRAWN = 12
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
 
 
-# The figures of each scenario, and those of the example flight. Each draws nothing if its data are
-# absent. `study.html.j2` has their titles and captions.
+# The figures of each scenario. Each draws nothing if its data are absent. `study.html.j2` has titles and captions.
 SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "overview": study_figures.overview,
     "error": study_figures.errors,
     "efficiency": study_figures.efficiency,
     "coverage": study_figures.coverage,
-}
-EXAMPLE_FIGURES: dict[str, Callable[..., Figure | None]] = {
-    "deviations": study_figures.deviations,
-    "search": study_figures.search,
 }
 
 
@@ -56,9 +51,8 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
         shown = SCENARIO_FIGURES if scenario.number <= MOST_DRAWN else {}
         suffix = f"-{scenario.number}" if len(every) > 1 else ""
         sections.append((scenario, draw(shown, scenario.data, suffix=suffix, with_pdf=with_pdf)))
-    example = draw(EXAMPLE_FIGURES, dataset, with_pdf=with_pdf)
-    files = {target: _page(dataset, sections, example).encode()}
-    for drawn in [drawn for figures in (*(of for _, of in sections), example) for drawn in figures.values()]:
+    files = {target: _page(dataset, sections).encode()}
+    for drawn in [drawn for _, figures in sections for drawn in figures.values()]:
         contents = {"svg": drawn.drawing.svg, "pdf": drawn.pdf}
         files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in contents.items() if content}
     folder.mkdir(exist_ok=True)
@@ -79,8 +73,8 @@ def draw(
     return made
 
 
-def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]], example: Mapping[str, Drawn]) -> str:
-    """The page. `sections`: each scenario with its figures; `example`: figures that belong to no scenario."""
+def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]) -> str:
+    """The page. `sections`: each scenario with its figures."""
     attributes = {name: str(value) for name, value in dataset.attrs.items()}
     estimators = names(dataset, "estimator")
     missing, cells = study_tables.cells_not_run(dataset)
@@ -100,7 +94,6 @@ def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]
             for scenario, drawn in sections
         ],
         level=f"{100 * study_tables.shown_level(dataset):g} %",
-        example=example,
         failed=study_tables.failed_cells(dataset),
         missing=missing,
         cells=cells,

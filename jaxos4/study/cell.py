@@ -5,7 +5,6 @@ each of its programs, on one device. Last digits depend on the length of a batch
 a program; with whole cells they are the same in any order and in any process.
 """
 
-import dataclasses
 import functools
 import math
 import threading
@@ -41,10 +40,8 @@ OUTCOMES = (*NAMES, "failed", "not_run")
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 """The levels of the intervals that are kept."""
 
-# Sweeps of IBSS that are kept, for a scenario's first flight.
-_RECORDED_SWEEPS = 64
 # Attributes of an estimate that are kept.
-_KEPT = ("parameters", "std", "cost", "rollouts", "initial_state", "result", "seed", "brackets")
+_KEPT = ("parameters", "std", "cost", "rollouts", "result", "seed")
 # An estimator with more flights computes for longer than its fully optimised program compiles.
 _FEW_FLIGHTS = 2000
 # The largest offset of a bracket from the parameters that all flights have, as a share of its half-width.
@@ -159,18 +156,6 @@ def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "la
     return jax.vmap(one)(flights.exact, flights.truth)
 
 
-def fly_again(study: Study, scenario: Scenario, results: dict[str, np.ndarray]) -> Float[np.ndarray, "samples 12"]:
-    """A scenario's first flight as simulated with the estimate in the `results` of its cell; NaN without one."""
-    with jax.enable_x64(True):
-        fleet, start = fleet_of(study, scenario), np.zeros(12)
-        parameters, known = results["estimate"][0], results["initial_state"][0]
-        if not np.isfinite(parameters).all():
-            return np.full((fleet.omega.shape[0], 12), np.nan)
-        start[CASCADE_ORDER[: known.size]] = known
-        settings = {"dt": fleet.dt, "initial_state": as_float(start), "method": study.fit_method}
-        return np.asarray(simulate(fleet.model, as_float(parameters), fleet.omega, **settings).states)
-
-
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
     """Identifies the flights of a cell on the default device; `network`: that of `Study.job`."""
     scenario = cell.scenario
@@ -204,7 +189,7 @@ def _answers(
     if isinstance(estimator, Hybrid):
         looked_at = blank_problem(study, fleet, cell.scenario.scale or 1.0, channels)
         _, seeds = identify(estimator.network, looked_at, fleet.bracket, states)
-        return search(estimator.ibss, blank, fleet.bracket, states, seeds) | {"brackets": None}
+        return search(estimator.ibss, blank, fleet.bracket, states, seeds)
     if isinstance(estimator, IBSS):
         # Without an answer near which to search, it searches the whole bracket.
         none = Seed.none(len(fleet.model.parameter_names), CHANNELS[channels])
@@ -226,8 +211,7 @@ def _identify(
 
 
 def _search(ibss: IBSS, blank: ShootingProblem, bracket: Bracket, states: Lanes, seeds: Seed) -> dict[str, Any]:
-    """The results as in `_answers`, of a search near the seeds. Its sweeps are recorded."""
-    ibss = dataclasses.replace(ibss, record=_RECORDED_SWEEPS)
+    """The results as in `_answers`, of a search near the seeds."""
 
     def one(states: States, seed: Seed) -> dict[str, Any]:
         return _kept(search_near(ibss, problem_of(blank, states).within(bracket), seed))
@@ -259,14 +243,10 @@ def _results(
     results = {
         "truth": truth,
         "estimate": kept("parameters"),
-        **{name: kept(name) for name in ("std", "half_width", "initial_state", "cost")},
+        **{name: kept(name) for name in ("std", "half_width", "cost")},
         "bound": bound,
         "rollouts": found["rollouts"].astype(np.int32),
         "result": np.array([OUTCOMES.index(name) for name in result_names(found["result"])], np.int8),
         "hit": hit.astype(np.int8),
     }
-    results = {name: value[: study.flights - cell.first] for name, value in results.items()}
-    if cell.first == 0:  # the example flight of the report
-        results |= {"true": np.asarray(flights.exact)[0], "measured": np.asarray(flights.measured)[0]}
-        results |= {} if found["brackets"] is None else {"brackets": found["brackets"][0]}
-    return results
+    return {name: value[: study.flights - cell.first] for name, value in results.items()}

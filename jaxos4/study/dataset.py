@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,8 @@ import xarray as xr
 from .._files import write_netcdf
 from .._version import __version__
 from ..errors import InputError
-from ..flight import STATE_NAMES, STATE_UNITS
 from ..models import MODELS
-from .cell import LEVELS, OUTCOMES, fleet_of, fly, fly_again
+from .cell import LEVELS, OUTCOMES, fleet_of, fly
 from .metrics import SCENARIO
 from .specification import AXES, Study
 from .store import RESULTS_FILE, Store
@@ -54,7 +52,7 @@ _AXES = {
 def assemble(store: Store) -> xr.Dataset:
     """The Dataset of a study's finished cells; the result of all others is `not_run`.
 
-    Its dimensions are all axes of the grid, `flight`, `parameter`, `level`, and those of the example flight.
+    Its dimensions are all axes of the grid, `flight`, `parameter` and `level`.
 
     **Raises:** `InputError` if a cell's file is damaged.
     """
@@ -93,7 +91,7 @@ def assemble(store: Store) -> xr.Dataset:
     named["result"] |= {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
     variables = {name: (_dims(name), arrays[name], attributes) for name, attributes in named.items()}
     command = {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)}
-    variables |= _brackets(study) | _example(store)
+    variables |= _brackets(study)
     return xr.Dataset(variables, coords=coordinates, attrs=provenance(study, store.device) | command)
 
 
@@ -144,45 +142,6 @@ def _brackets(study: Study) -> dict[str, tuple]:
         "bracket_half_width": (dims, (upper - lower) / 2, _named("half the width of the bracket", "unit")),
         "seen": (("channels", "estimator"), seen, _named("channels that the estimator looks at", "1")),
     }
-
-
-def _example(store: Store) -> dict[str, tuple]:
-    """The first flight of the first scenario whose noise is nearest the standard one, and a recorded search on it."""
-    study = store.study
-    scale = min(study.scales, key=lambda s: abs(math.log(s)) if s > 0 else math.inf)
-    first = study.cell(0).scenario._replace(scale=scale)
-    numbers = {
-        cell.scenario.estimator: cell.number
-        for cell in study.cells()
-        if cell.first == 0 and cell.scenario._replace(estimator=first.estimator) == first
-    }
-    found = {name: results for name, number in numbers.items() if "true" in (results := store.read(number) or {})}
-    if not found:
-        return {}
-    true, measured = (next(iter(found.values()))[name] for name in ("true", "measured"))
-    simulated = np.full((len(study.estimators), *true.shape), np.nan)
-    for name, results in found.items():
-        simulated[study.estimators.index(name)] = fly_again(study, first, results)
-    both, along = ("sample", "state"), ("sweep", "parameter")
-    about = _named("its states as simulated with the estimate", "state_unit")
-    variables = {
-        "time": ("sample", study.dt * np.arange(len(true)), _named("time", "s")),
-        "state": ("state", list(STATE_NAMES), _named("state", "1")),
-        "state_unit": ("state", list(STATE_UNITS), _named("unit of the state", "1")),
-        "example_true": (both, true, _named("true states of the example flight", "state_unit")),
-        "example_measured": (both, measured, _named("its measured states", "state_unit")),
-        "example_simulated": (("estimator", *both), simulated, about),
-    }
-    recorded = [results["brackets"] for results in found.values() if "brackets" in results]
-    if recorded:
-        brackets = recorded[0][np.isfinite(recorded[0]).all(axis=(1, 2))]
-        lower, upper = brackets[:, 0], brackets[:, 1]
-        variables |= {
-            "sweep": ("sweep", np.arange(1, len(brackets) + 1), _named("sweep of IBSS over the example flight", "1")),
-            "search_half_width": (along, (upper - lower) / 2, _named("half the width of the sweep's bracket", "unit")),
-            "search_estimate": (along, (upper + lower) / 2, _named("middle of the sweep's bracket", "unit")),
-        }
-    return variables
 
 
 def _named(long_name: str, units: str) -> dict[str, Any]:
