@@ -16,6 +16,9 @@ from ._custom_types import Numeric, Scalar, as_constant
 from ._files import read_toml
 from .errors import InputError
 
+GRAVITY, STANDARD_GRAVITY = 9.81, 9.80665
+"""The gravity of an airframe that gives none, and the unit g [m/s^2]."""
+
 ALTERNATING_SPINS = (1.0, -1.0, 1.0, -1.0)
 
 GUESS = "guess"
@@ -45,7 +48,7 @@ class Airframe(eqx.Module):
     thrust_coefficient: Float[Numeric, ""] = eqx.field(converter=as_constant)
     drag_coefficient: Float[Numeric, ""] = eqx.field(converter=as_constant)
     rotor_inertia: Float[Numeric, ""] = eqx.field(converter=as_constant)
-    gravity: Float[Numeric, ""] = eqx.field(converter=as_constant, default=9.81)
+    gravity: Float[Numeric, ""] = eqx.field(converter=as_constant, default=GRAVITY)
     max_rotor_speed: Float[Numeric, ""] = eqx.field(converter=as_constant, default=math.inf)
 
     @property
@@ -196,7 +199,7 @@ def _thrust_coefficient(hover_speed: Any, constants: dict[str, np.ndarray]) -> n
     speed = _numbers("hover_speed", hover_speed, ()).item()
     if not 1e-3 < speed < 1e6:
         raise InputError(f"`hover_speed` must be positive and of a rotor's size in rad/s, got {_short(hover_speed)}.")
-    return np.asarray(constants["mass"] * constants.get("gravity", 9.81) / (4 * speed**2))
+    return np.asarray(constants["mass"] * constants.get("gravity", GRAVITY) / (4 * speed**2))
 
 
 def _guesses(constants: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -15,8 +15,9 @@ import numpy as np
 
 from .._version import __version__
 from ..errors import InputError
+from ..excitation import AXES
 from .result import Identified
-from .vehicle import AXES, RigidVehicle
+from .vehicle import RigidVehicle
 
 _FRAME = "SI units. x forward, y left, z up. The origin is the centre of mass. Rotor 1 is the airframe's first."
 # RotorPy and Gazebo need a lag: this one is too short to notice [s].

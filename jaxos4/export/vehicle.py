@@ -6,14 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..airframe import Airframe
+from ..airframe import GRAVITY, Airframe
 from ..analysis.inertia import center_of_mass
+from ..excitation import AXES
 
-AXES = ("roll", "pitch", "yaw")
 # Moments of inertia, each with the parameter that is `thrust_gain` divided by it.
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
-# At this specific thrust, the term `center_of_mass` adds no torque (`FlightModel`) [m/s^2].
-_HOVER = 9.81
 # The full-scale rotor speed, in hover speeds, if the airframe does not have it.
 _FULL_SCALE = 2.0
 
@@ -129,7 +127,7 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     offsets = ([x for name, x in values.items() if name.startswith(f"{axis}_offset")] for axis in AXES)
     offset = np.array([np.mean(of_axis or [0.0]) for of_axis in offsets])
     slopes = {name: values.get(name, 0.0) for name in ("roll_thrust", "pitch_thrust")}
-    offset[:2] -= _HOVER * np.array(list(slopes.values()))
+    offset[:2] -= GRAVITY * np.array(list(slopes.values()))
     # The centre of mass, x and y, in the frame of the airframe's rotor positions [m].
     named = slopes | {"alpha3": gain / inertia[0], "alpha6": gain / inertia[1]}
     found = center_of_mass(tuple(named), np.array(list(named.values())), np.zeros((4, 4)), airframe)

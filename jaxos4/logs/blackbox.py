@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..airframe import STANDARD_GRAVITY
 from .blackbox_frames import BadHeader, decode_frames
 from .csv import read_table
 from .sampling import in_order
@@ -24,7 +25,7 @@ _MOST_SETTINGS = 5000  # lines above the header
 _LONGEST_LINE = 1 << 16
 _LARGEST = 1 << 29  # bytes of a file: more than an hour of flight
 _BETWEEN = 1.0  # [s], put between sessions
-_DEGREE, _GRAVITY = math.pi / 180, 9.80665
+_DEGREE = math.pi / 180
 _POLES = 14
 _COMMON_1G = (256, 512, 1024, 2048, 4096, 8192)
 _TIMES = ("time (us)", "time")
@@ -246,7 +247,7 @@ def _add_force(log: _Log) -> None:
         median = float(np.nanmedian(np.sqrt(sum(log.raw[name] ** 2 for name in names))))
         one = min(_COMMON_1G, key=lambda g: abs(math.log(g / max(median, 1e-9))))
         log.notes.append(f"accSmooth is taken as {one} units for 1 g, because its median is {median:.4g}")
-    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), _GRAVITY / one)
+    log.add(dict(zip(("ax", "ay", "az"), names, strict=True)), STANDARD_GRAVITY / one)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import zlib
 
 import numpy as np
 
+from ..airframe import STANDARD_GRAVITY
 from .sampling import Series, gyro_rows, in_order, logged_rate, unwrapped
 from .table import LogFacts, LogFormat, Path, Sampling, Table, needed, quoted, read_bytes, refuse
 
@@ -20,10 +21,10 @@ _PAIR = re.compile(rb"(..)(..)", re.DOTALL)
 _TYPE = re.compile(rb"(..)[^\0]{0,255}\0(..)", re.DOTALL)
 _NAME = re.compile(rb"([^\0]{0,255})\0")
 _VARIABLE = re.compile(rb"([\x21-\x27\x2a-\x7e]{1,80})\(([bBhHiIqQefd])\)")
-_DEGREE, _GRAVITY, _RPM, _FULL = math.pi / 180, 9.80665, 2 * math.pi / 60, 65535.0
+_DEGREE, _RPM, _FULL = math.pi / 180, 2 * math.pi / 60, 65535.0
 _RATES = {"p": ("gyro.x", _DEGREE), "q": ("gyro.y", _DEGREE), "r": ("gyro.z", _DEGREE)}
 _OTHERS = {  # each is read by itself
-    **{name: (f"acc.{name[1]}", _GRAVITY) for name in ("ax", "ay", "az")},
+    **{name: (f"acc.{name[1]}", STANDARD_GRAVITY) for name in ("ax", "ay", "az")},
     **{name: (f"stateEstimate.{name}", 1.0) for name in ("x", "y", "z", "vx", "vy", "vz")},
     "voltage": ("pm.vbat", 1.0),
 }

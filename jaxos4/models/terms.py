@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import RotorSpeeds, Scalar
-from ..airframe import Airframe
+from ..airframe import GRAVITY, Airframe
+from ..excitation import AXES
 from .abstract import Contradiction
 from .rotors import Grid, Motor, Speeds, delayed, driven
 from .state import Forcing, Rates, Samples, Vector
@@ -27,8 +28,6 @@ VOLTAGE = "battery voltage"
 
 # Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a body velocity of 5 m/s.
 _AUTHORITY, _FAST = 0.2, 5.0
-# The specific thrust in hover [m/s^2]. Torque proportional to it belongs to the term `offset`.
-_HOVER = 9.81
 # A time constant or delay this far below 0 is neither chance nor rounding [s].
 _EARLY = 0.002
 # A thrust gain beyond this factor, or its reciprocal, is no error of a scale or of a propeller's table. An
@@ -39,7 +38,6 @@ STEEPEST = 1.2
 _BIAS = 0.3  # no levelled accelerometer has twice this bias [m/s^2]
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 _YAW = 0.2  # the yaw torque of the rotors as a share of their roll torque
-_AXES = ("roll", "pitch", "yaw")
 # The half-width of the damping [1/s]: rotors resist roll and pitch by their thrust, and yaw by their drag only.
 _DAMPING = (5.0, 5.0, 2.0)
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
@@ -169,7 +167,7 @@ def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[
     """Adds to each axis its parameter of this name times a number; there is none for an axis without a parameter."""
 
     def add(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
-        axes = zip(_AXES, total, (*per_unit(rates, forcing), None), strict=False)
+        axes = zip(AXES, total, (*per_unit(rates, forcing), None), strict=False)
         return Rates(*(old if x is None else old + values[f"{axis}_{name}"] * x for axis, old, x in axes))
 
     return add
@@ -218,23 +216,23 @@ _LAG = TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits(
 TERMS: dict[str, Term] = {
     "offset": Term(
         "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
-        tuple(TermParameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(_AXES)),
+        tuple(TermParameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(AXES)),
         angular_acceleration=_torque("offset", lambda rates, forcing: (1.0, 1.0, 1.0)),
     ),
     "center_of_mass": Term(
         "a torque proportional to thrust above hover, from an offset centre of mass: roll_thrust, pitch_thrust [rad/m]",
         # The bracket is an offset of 10 % of the arm.
-        tuple(TermParameter(f"{x}_thrust", "rad/m", _authority(i, _HOVER)) for i, x in enumerate(_AXES[:2])),
-        angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - _HOVER,) * 2),
+        tuple(TermParameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(AXES[:2])),
+        angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - GRAVITY,) * 2),
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
-        tuple(TermParameter(f"{x}_damping", "1/s", y, nonnegative=True) for x, y in zip(_AXES, _DAMPING, strict=True)),
+        tuple(TermParameter(f"{x}_damping", "1/s", y, nonnegative=True) for x, y in zip(AXES, _DAMPING, strict=True)),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
     ),
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
-        tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(_AXES[:2])),
+        tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(AXES[:2])),
         needs=frozenset({BODY_VELOCITY}),
         angular_acceleration=_torque(
             "velocity", lambda rates, forcing: _swapped(forcing.velocity, BODY_VELOCITY, "body_velocity")
@@ -242,7 +240,7 @@ TERMS: dict[str, Term] = {
     ),
     "flapping": Term(
         "a moment proportional to the measured lateral specific force: roll_flapping, pitch_flapping [rad/m]",
-        tuple(TermParameter(f"{x}_flapping", "rad/m", _authority(i)) for i, x in enumerate(_AXES[:2])),
+        tuple(TermParameter(f"{x}_flapping", "rad/m", _authority(i)) for i, x in enumerate(AXES[:2])),
         needs=frozenset({LATERAL_FORCE}),
         # The drag of the rotors is proportional to the body velocity: the force replaces a missing velocity.
         by_default=lambda available: BODY_VELOCITY not in available,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..airframe import GUESS
+from ..airframe import GRAVITY, GUESS
 from .motion import RotorSigns, rotor_signs
 from .pieces import cut
 from .reading import Recording
@@ -16,7 +16,6 @@ from .usable import stretches
 FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""
 
-_GRAVITY = 9.81
 _PLAUSIBLE = (0.5, 2.0)  # [g], the median of the accelerometer in flight
 
 
@@ -91,7 +90,7 @@ def _hover(parts: Sequence[Recording]) -> tuple[float, bool] | None:
     squares = np.concatenate([(part.omega**2).mean(axis=1) for part in parts])
     force = [part.specific_force[:, 2] for part in parts if part.specific_force is not None]
     vertical = np.concatenate(force) if len(force) == len(parts) else np.full(1, np.nan)
-    share = float(np.median(vertical[np.isfinite(vertical)])) / _GRAVITY if np.isfinite(vertical).any() else np.nan
+    share = float(np.median(vertical[np.isfinite(vertical)])) / GRAVITY if np.isfinite(vertical).any() else np.nan
     felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
     return float(np.sqrt(np.median(squares) / (share if felt else 1.0))), felt
 

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import Airframe
+from ..excitation import AXES
 from ..flight import STATE_NAMES, Flight
 from ..logs.sampling import average
 from .reading import Recording, as_recording
 
 RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
-AXES = ("roll", "pitch", "yaw")
 WEAK = 0.1  # [rad/s], standard deviation of a body rate; less is not excited
 _GOOD = 0.3  # [rad/s]
 OVER_NOISE = 5.0  # a rate below this many times the gyro's noise is not excited

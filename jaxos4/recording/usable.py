@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from ..airframe import Airframe
+from ..airframe import STANDARD_GRAVITY, Airframe
 from ..flight import Flight
 from .motion import RATE_COLUMNS
 from .reading import Recording, as_recording
@@ -31,7 +31,6 @@ _FULL = 0.995  # share of the airframe's `max_rotor_speed`
 _IMPACT_FORCE, _IMPACT_RATE = 50.0, 15.0  # [m/s^2], and [rad/s] within `_IMPACT_TIME`
 _IMPACT_TIME = 0.02  # [s]
 _AFTER_IMPACT, _BEFORE_IMPACT = 1.0, 0.5  # [s], until the rotors stop; not trusted before the impact
-_GRAVITY = 9.80665  # [m/s^2], the unit "g" below
 _BIN, _SMOOTH = 0.05, 4  # [s], means over this time; bins, longer than the lag of any rotor
 _REST, _FILLED = 2.0, 5.0  # [s], a window; a gap between two resting windows is filled up to this length
 _VARIES = 0.2  # standard deviation of thrust in a window, as a share of its mean
@@ -208,7 +207,7 @@ def _resting(
     bins = size // length
     if bins < 2 or np.ptp(np.nan_to_num(force), axis=0).max() == 0:  # no accelerometer lies still to the last bit
         return np.zeros(size, dtype=bool)
-    sensed = np.column_stack([omega.mean(axis=1) ** 2, force / _GRAVITY, np.abs(rates).max(axis=1)])
+    sensed = np.column_stack([omega.mean(axis=1) ** 2, force / STANDARD_GRAVITY, np.abs(rates).max(axis=1)])
     sensed[~airborne] = np.nan
     means = sensed[: bins * length].reshape(bins, length, -1).mean(axis=1)  # NaN where a sample is
     step, weight = length * dt, np.linalg.norm(means[:, 1:4], axis=1)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..airframe import GRAVITY
 from ..flight import STATE_NAMES
 from .reading import Recording
 
@@ -14,7 +15,6 @@ _FORGETS = 2.0
 # The upright direction is drawn to the specific force with these time constants [s]: the first forgets errors of the
 # gyro sooner, the second holds in longer turns.
 _LEVELS = (2.0, 8.0)
-_GRAVITY = 9.81
 
 
 class Motion(NamedTuple):
@@ -86,7 +86,7 @@ def _dead_reckoned(
 
     Plain numbers: in a loop of few operations they are ten times faster than arrays.
     """
-    push = force - _GRAVITY * up
+    push = force - GRAVITY * up
     push -= (push * up).sum(axis=1).mean() * up  # a flight does not climb for ever
     kept, (vx, vy, vz), velocities = math.exp(-dt / _FORGETS), (0.0, 0.0, 0.0), []
     for (p, q, r), (ax, ay, az) in zip(rates.tolist(), push.tolist(), strict=True):
