@@ -1,6 +1,4 @@
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import equinox as eqx
@@ -10,14 +8,7 @@ import numpy as np
 import pytest
 
 import jaxos4
-from jaxos4.airframe import (
-    OS4,
-    OS4_SIMULATOR,
-    PRESETS,
-    VOOS,
-    alpha_from_inertia,
-    load_airframe,
-)
+from jaxos4.airframe import OS4, PRESETS, alpha_from_inertia, load_airframe
 from jaxos4.errors import InputError
 
 GOOD = """
@@ -31,44 +22,27 @@ rotor_inertia = 6e-5
 
 
 @pytest.mark.parametrize(
-    ("airframe", "expected"),
+    ("name", "expected", "arm"),
     [
-        (OS4, (-0.73333, 6.0e-9, 133.33, 0.73333, 6.0e-9, 133.33, 0, 76.923)),
-        (OS4_SIMULATOR, (-0.79994, 7.2375e-9, 160.565, 0.79994, 7.2375e-9, 160.565, 0, 89.206)),
-        (VOOS, (-0.81649, 7.7592e-10, 206.186, 0.81649, 7.7592e-10, 206.186, 0, 113.507)),
+        ("os4", (-0.73333, 6.0e-9, 133.33, 0.73333, 6.0e-9, 133.33, 0, 76.923), 0.23),
+        ("os4-simulator", (-0.79994, 7.2375e-9, 160.565, 0.79994, 7.2375e-9, 160.565, 0, 89.206), 0.232),
+        ("voos", (-0.81649, 7.7592e-10, 206.186, 0.81649, 7.7592e-10, 206.186, 0, 113.507), 0.2),
     ],
 )
-def test_published_alpha(airframe, expected):
-    """The values for OS4 are published. Those for the others were computed by hand from their constants."""
+def test_presets_have_the_published_alpha_and_the_printed_mixer(name, expected, arm):
+    """The alphas for OS4 are published, those for the others follow from their constants. Mixer: Eqs. (10)-(13)."""
+    airframe = PRESETS[name]
+    assert load_airframe(name) is airframe
     alpha = alpha_from_inertia(airframe.inertia, airframe.rotor_inertia * airframe.drag_coefficient)
     np.testing.assert_allclose(alpha, expected, rtol=2e-4)
-
-
-def test_physical_alpha_and_hover():
-    np.testing.assert_allclose(alpha_from_inertia(OS4.inertia, OS4.rotor_inertia)[jnp.array([1, 4])], 8.0e-3)
-    np.testing.assert_allclose(OS4.hover_speed, 225.7, atol=0.05)
-    np.testing.assert_allclose(4 * OS4.thrust_coefficient * OS4.hover_speed**2, 0.650 * 9.81, rtol=1e-14)
-
-
-@pytest.mark.parametrize(("name", "arm"), [("os4", 0.23), ("os4-simulator", 0.232), ("voos", 0.2)])
-def test_mixer_is_the_printed_one(name, arm):
-    """Eqs. (10)-(13), at random rotor speeds."""
-    airframe = PRESETS[name]
     b, d = float(airframe.thrust_coefficient), float(airframe.drag_coefficient)
-    omega = np.asarray(jax.random.uniform(jax.random.key(0), (20, 4), minval=100.0, maxval=300.0))
-    w1, w2, w3, w4 = omega.T
-    printed = np.stack(
-        [
-            arm * b * (w4**2 - w2**2),
-            arm * b * (w3**2 - w1**2),
-            d * (w4**2 + w2**2 - w3**2 - w1**2),
-            b * (w1**2 + w2**2 + w3**2 + w4**2),
-        ]
-    )
-    np.testing.assert_allclose(airframe.mixer @ (omega.T**2), printed, rtol=1e-12, atol=1e-15)
+    printed = [[0, -arm * b, 0, arm * b], [-arm * b, 0, arm * b, 0], [-d, d, -d, d], [b, b, b, b]]
+    np.testing.assert_allclose(airframe.mixer, printed, rtol=1e-12, atol=1e-20)
 
 
-def test_hover_speed_and_mixer_differentiate():
+def test_hover_and_derivatives():
+    np.testing.assert_allclose(alpha_from_inertia(OS4.inertia, OS4.rotor_inertia)[np.array([1, 4])], 8.0e-3)
+    np.testing.assert_allclose(OS4.hover_speed, 225.7, atol=0.05)
     slope = jax.jit(jax.grad(lambda mass: eqx.tree_at(lambda a: a.mass, OS4, mass).hover_speed))(jnp.asarray(0.65))
     np.testing.assert_allclose(slope, OS4.hover_speed / (2 * 0.65), rtol=1e-12)
 
@@ -77,21 +51,6 @@ def test_hover_speed_and_mixer_differentiate():
 
     slope = jax.grad(roll_authority)(jnp.asarray(OS4.rotor_positions))
     np.testing.assert_allclose(slope, np.array([[0, 0], [0, 0], [0, 0], [0, OS4.thrust_coefficient]]))
-
-
-def test_presets_outlive_a_change_of_precision():
-    """A preset is made at import, when JAX still rounds to float32. The user chooses double precision later."""
-    script = (
-        "import jax, numpy as np\n"
-        "from jaxos4.airframe import OS4\n"
-        "assert jax.numpy.asarray(OS4.mixer).dtype == np.float32\n"
-        "jax.config.update('jax_enable_x64', True)\n"
-        "assert jax.numpy.asarray(OS4.mixer).dtype == np.float64\n"
-        "assert float(OS4.mixer[3, 0]) == 3.13e-5 and float(OS4.inertia[2]) == 1.3e-2\n"
-        "assert abs(float(OS4.hover_speed) / (0.65 * 9.81 / 4 / 3.13e-5) ** 0.5 - 1) < 1e-15\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 def test_toml_with_an_arm_and_with_positions(tmp_path):
@@ -129,10 +88,6 @@ def test_guessed_inertias_are_within_40_percent(tmp_path, name):
     path.write_text("\n".join(f"{key} = {json.dumps(value)}" for key, value in keys.items()))
     ratio = np.asarray(load_airframe(path).inertia) / np.asarray(preset.inertia)
     assert (np.abs(ratio - 1) < 0.4).all(), ratio
-
-
-def test_presets_by_name():
-    assert all(load_airframe(name) is preset for name, preset in PRESETS.items())
 
 
 def _replaced(key, line):

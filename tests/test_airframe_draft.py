@@ -6,7 +6,6 @@ import pytest
 import tomlkit
 from helpers import CRAZYFLIE, refused
 from hypothesis import given, settings, strategies as st
-from test_inspect import LOGS
 from test_signs import flown, turned
 
 import jaxos4
@@ -44,46 +43,29 @@ def test_a_flight_shows_where_its_rotors_are(seed, gust, order):
     assert found.spins is not None or gust == 40
 
 
-def test_props_in_and_props_out_are_told_apart():
-    found = rotor_signs([flown(turned(CRAZYFLIE, "rotor_spins"), 0)])
-    assert found == SIGNS._replace(spins=(-1, 1, -1, 1))
-
-
-def test_a_flight_that_does_not_show_its_rotors():
+def test_props_in_and_props_out_and_flights_that_do_not_show_their_rotors():
+    assert rotor_signs([flown(turned(CRAZYFLIE, "rotor_spins"), 0)]) == SIGNS._replace(spins=(-1, 1, -1, 1))
     flight = flown(CRAZYFLIE, 0)
-    still = flight._replace(states=0.001 * flight.states)
-    assert rotor_signs([still]) is None
-    assert rotor_signs([]) is None
-    plus = eqx.tree_at(
-        lambda a: a.rotor_positions, CRAZYFLIE, np.array([[0.04, 0.0], [0.0, -0.04], [-0.04, 0.0], [0.0, 0.04]])
-    )
-    assert rotor_signs([flown(plus, 0)]) is None
+    places = np.array([[0.04, 0.0], [0.0, -0.04], [-0.04, 0.0], [0.0, 0.04]])
+    plus = eqx.tree_at(lambda a: a.rotor_positions, CRAZYFLIE, places)
+    for pieces in ([], [flight._replace(states=0.001 * flight.states)], [flown(plus, 0)]):
+        assert rotor_signs(pieces) is None
 
 
-def drafted(log, signs, run, folder):
-    """The airframe that the draft of a log becomes; the draft has these signs, and is no airframe before."""
-    code, out, err = run("inspect", str(log), "--airframe-out", "mine.toml")
+@pytest.mark.parametrize("name", ["rollpitch", "hover"])
+def test_real_logs_give_airframes(name, shared_flights, run, tmp_path):
+    """The draft of a log has its signs, is no airframe before it is filled in, and then is that of the vehicle."""
+    log = str(shared_flights / f"arpl_crazyflie_{name}.csv")
+    code, out, err = run("inspect", log, "--airframe-out", "mine.toml")
     assert (code, err) == (0, "")
     assert "airframe: mine.toml; weigh or measure, and fill in: mass, rotor_positions" in out
-    text = (folder / "mine.toml").read_text()
-    x, y = ([{1: name, -1: f"-{name}"}[sign] for sign in each] for name, each in zip("xy", signs, strict=False))
+    text = (tmp_path / "mine.toml").read_text()
+    x, y = ([{1: name, -1: f"-{name}"}[sign] for sign in each] for name, each in zip("xy", SIGNS, strict=False))
     assert f"# rotor_positions = [{', '.join(f'[{a}, {b}]' for a, b in zip(x, y, strict=True))}]" in text
-    refused(run("estimate", str(log), "--airframe", "mine.toml"), "mine.toml: `mass` is missing")
-    (folder / "mine.toml").write_text(filled(text))
-    airframe = jaxos4.load_airframe(folder / "mine.toml")
-    np.testing.assert_array_equal(airframe.rotor_spins, signs.spins)
-    return airframe
-
-
-@pytest.mark.parametrize(
-    ("name", "signs"),
-    [
-        ("arpl_crazyflie_rollpitch.csv", SIGNS),
-        ("arpl_crazyflie_hover.csv", SIGNS),
-    ],
-)
-def test_real_logs_give_airframes(name, signs, shared_flights, run, tmp_path):
-    airframe = drafted(shared_flights / name, signs, run, tmp_path)
+    refused(run("estimate", log, "--airframe", "mine.toml"), "mine.toml: `mass` is missing")
+    (tmp_path / "mine.toml").write_text(filled(text))
+    airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
+    np.testing.assert_array_equal(airframe.rotor_spins, SIGNS.spins)
     assert 200 < float(airframe.hover_speed) < 700
     # Its data sheet says 0.150 N at full command.
     full_thrust = float(airframe.thrust_coefficient * airframe.max_rotor_speed**2)
@@ -132,14 +114,3 @@ def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
         refused(run("inspect", "log", "--airframe", "mine.toml"), f"`{key}` is missing")
     (tmp_path / "mine.toml").write_text(f"hover_speed = 500\n{text}")
     refused(run("inspect", "log", "--airframe", "mine.toml"), "`rotor_spins` must be finite numbers of shape [4]")
-
-
-def test_an_airframe_overwrites_no_input(run, tmp_path):
-    (tmp_path / "log").write_bytes(LOGS["Crazyflie"])
-    refused(run("inspect", "log", "--airframe-out", "log"), "would overwrite an input")
-    refused(run("inspect", "log", "--out", "a", "--airframe-out", "a"), "--out and --airframe-out name one file")
-    refused(run("inspect", "log", "--airframe-out", "none/mine.toml"), "none/mine.toml")
-    refused(run("inspect", "log", "--airframe-out", "log2", "--airframe", "os4"), "leave out --airframe")
-    (tmp_path / "mine.toml").write_text("mass = 1")
-    refused(run("inspect", "log", "--airframe-out", "mine.toml"), "mine.toml: exists")
-    assert (tmp_path / "log").read_bytes() == LOGS["Crazyflie"]

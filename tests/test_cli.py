@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import typer
 from helpers import CRAZYFLIE_TOML, refused
+from synthetic_results import vehicle_result
+from test_logs_crazyflie import one_event
 
 import jaxos4
 from jaxos4.cli import _app, main
@@ -162,6 +164,9 @@ INPUTS = {
     "tiny.toml": "mass = 0.65\ninertia = [1e-320, 1e-320, 1e-320]\narm = 0.23\nthrust_coefficient = 3e-5\n"
     "drag_coefficient = 7e-7\nrotor_inertia = 6e-5\n",
 }
+CLOSED, EXPORT = "simulate --out new.csv --closed-loop", "export found.json --to mujoco"
+DESIGN = "design --out new.csv --initial-state known"
+REFERENCES = "design --out new.csv --closed-loop --airframe mine.toml"
 # A command line, and what its message names. `test_flight_csv.py` has all kinds of bad flights.
 REFUSED = {
     "estimate none.csv": ["none.csv"],
@@ -207,6 +212,48 @@ REFUSED = {
     "simulate --out x.csv y.csv": ["y.csv"],
     "simulate --frob": ["--frob; see `jaxos4 simulate --help`"],
     "none": ["'none'; see `jaxos4 --help`"],
+    "inspect log --out log": ["would overwrite an input"],
+    "inspect log --airframe nothing.toml": ["nothing.toml"],
+    "inspect log --airframe-out log": ["would overwrite an input"],
+    "inspect log --out a --airframe-out a": ["--out and --airframe-out name one file"],
+    "inspect log --airframe-out none/mine.toml": ["none/mine.toml"],
+    "inspect log --airframe-out log2 --airframe os4": ["leave out --airframe"],
+    "inspect log --airframe-out mine.toml": ["mine.toml: exists"],
+    f"{CLOSED} --gust -1": ["--gust"],
+    f"{CLOSED} --lag nan": ["--lag"],
+    f"{CLOSED} --delay 5": ["--delay"],
+    f"{CLOSED} --duration -1": ["duration"],
+    f"{CLOSED} --dt 0": ["dt"],
+    f"{CLOSED} --duration 0.001": ["at least two samples"],
+    f"{CLOSED} --sensors commands": ["--sensors", "os4", "max_rotor_speed"],
+    f"{CLOSED} --excitation chirp": ["--excitation", "leave it out"],
+    f"{CLOSED} --noise 1": ["--noise", "leave it out"],
+    "simulate --out new.csv --gust 3": ["--gust", "--closed-loop"],
+    "simulate --out new.csv --sensors speeds": ["--sensors", "--closed-loop"],
+    f"{DESIGN} --duration 0": ["--duration", "50 to 2500 samples"],
+    f"{DESIGN} --duration 2 --fastest 150": ["cannot hover", "225.7"],
+    f"{DESIGN} --duration 2 --rate -1": ["--rate must be positive"],
+    f"{DESIGN} --accuracy 0": ["--accuracy"],
+    f"{DESIGN} --bandwidth 100": ["--bandwidth", "0.2 to 25 Hz"],  # by default 5 s, sampled every 0.01 s
+    f"{DESIGN} --figure new.csv": ["--figure", "--out"],
+    f"{DESIGN} --figure new.png": ["--figure new.png", ".svg"],
+    f"{DESIGN} --gust 5": ["--gust", "with --closed-loop; add that"],
+    f"{REFERENCES} --duration 1000": ["--duration", "250 to 20000 samples"],
+    f"{REFERENCES} --angle 2": ["--angle", "at most 1"],
+    f"{REFERENCES} --fastest 300": ["cannot hover"],
+    f"{REFERENCES} --slew 5": ["--slew", "without --closed-loop"],
+    f"{REFERENCES} --channels rates": ["--channels", "without --closed-loop"],
+    f"{REFERENCES} --sensors commands --airframe os4": ["--sensors", "max_rotor_speed"],
+    f"{EXPORT} --samples 2": ["--samples", "--out"],
+    f"{EXPORT} --samples -1 --out vehicle.xml": ["--samples: must be an integer of at least 0", "-1"],
+    f"{EXPORT} --samples 100001 --out vehicle.xml": ["--samples", "at most 100000"],
+    f"{EXPORT} --seed -1": ["--seed", "-1"],
+    f"{EXPORT} --out found.json": ["would overwrite an input"],
+    f"{EXPORT} --out nowhere/vehicle.xml": ["nowhere/vehicle.xml", "no such folder"],
+    f"{EXPORT} --out . --samples 2": [".: is a folder"],
+    f"{EXPORT} --out taken.xml --samples 2": ["taken-samples: exists", "remove it"],
+    f"{EXPORT} --to gazebo": ["'gazebo' is not one of 'mujoco', 'rotorpy', 'sdf'"],
+    "export none.json --to sdf": ["none.json", "give a path"],
 }
 
 
@@ -217,8 +264,11 @@ def inputs(tmp_path_factory):
     model = jaxos4.PublishedOS4()
     omega = jaxos4.multisine(model.airframe, duration=2.0, dt=0.01)
     jaxos4.write_flight(jaxos4.simulate(model, model.alpha, omega, dt=0.01), folder / "flight.csv")
-    for name, text in INPUTS.items():
+    others = {"mine.toml": CRAZYFLIE_TOML, "found.json": json.dumps(vehicle_result())}
+    for name, text in (INPUTS | others).items():
         (folder / name).write_text(text)
+    (folder / "log").write_bytes(one_event(0.004 * np.arange(750)))
+    (folder / "taken-samples").mkdir()
     return folder
 
 

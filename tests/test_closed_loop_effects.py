@@ -3,7 +3,6 @@
 Unless a test says otherwise: no gusts, no noise, and a controller that knows the true rates.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,18 +10,12 @@ import pytest
 from helpers import CRAZYFLIE
 from scipy.signal import lsim
 from scipy.spatial.transform import Rotation
+from test_closed_loop import ANGLES, DT, LEVEL, QUIET, RATES, SAMPLES, SUCCESS, VELOCITY, references
 
 import jaxos4
 
-DT, SAMPLES = 0.004, 4001
-TIME = DT * np.arange(SAMPLES)
-RATES, ANGLES, VELOCITY = [7, 9, 11], [6, 8, 10], [1, 3, 5]
+TIME, RANDOM = DT * np.arange(SAMPLES), np.asarray(references())
 GRAVITY, HOVER = float(CRAZYFLIE.gravity), float(CRAZYFLIE.hover_speed)
-QUIET = {"gyro_noise": 0.0, "attitude_noise": 0.0, "force_noise": 0.0}
-LEVEL = np.zeros((SAMPLES, 4))
-CLIMB = LEVEL + [0, 0, 0, 2.0]
-RANDOM = np.asarray(jaxos4.random_references(duration=16.0, dt=DT, key=jax.random.key(0)))
-SUCCESS = jaxos4.RESULTS.successful
 
 
 def loop_of(*, air=None, loop=None, **sensors):
@@ -56,7 +49,7 @@ def test_still_air_and_perfect_sensors_change_nothing():
 def test_a_climb_ends_at_the_speed_at_which_inflow_takes_the_thrust():
     """Commands that accelerate by 2 m/s^2 in still air: v = 2 / k_z (1 - exp(-k_z t)), and the force falls to g."""
     inflow = 0.8
-    _, states, force = fly(CLIMB, air={"inflow": inflow})
+    _, states, force = fly(LEVEL + [0, 0, 0, 2.0], air={"inflow": inflow})
     late = TIME > 1
     expected = 2 / inflow * (1 - np.exp(-inflow * (TIME - 0.06)))  # the rotors follow after lag and delay
     np.testing.assert_allclose(states[late, 5], expected[late], rtol=5e-3)
@@ -78,14 +71,6 @@ def test_wind_has_its_strength_and_its_correlation_time():
 
 
 # Vibration and filters.
-
-
-def line(values, speed):
-    """The complex amplitudes of the sine with this angular speed, and what it does not explain."""
-    waves = np.exp(1j * speed * TIME)
-    design = np.stack([waves.real, waves.imag], axis=1)
-    coefficients, *_ = np.linalg.lstsq(design, values, rcond=None)
-    return np.hypot(*coefficients), np.abs(values - design @ coefficients).max()
 
 
 def test_vibration_is_a_line_at_the_speed_of_the_rotors():
@@ -185,11 +170,13 @@ def test_a_clock_offset_moves_the_rotors_against_the_gyro(offset):
     assert np.abs(late - exact).max() > 10
 
 
-def test_rotor_speeds_are_noisy_and_rounded():
+def test_rotor_speeds_and_velocities_have_their_noise_and_speeds_are_rounded():
     exact, noisy, rounded = (fly(speed_noise=noise, speed_step=step)[0] for noise, step in ((0, 0), (3, 0), (0, 25)))
     # 16004 draws: the standard deviation has an error of 0.6 %.
     np.testing.assert_allclose(np.std(noisy - exact), 3, rtol=0.025)
     np.testing.assert_array_equal(rounded, 25 * np.round(exact / 25))
+    true, measured = (fly(velocity_noise=noise)[1][:, VELOCITY] for noise in (0.0, 0.1))
+    np.testing.assert_allclose((measured - true).std(axis=0), 0.1, rtol=4 / np.sqrt(2 * SAMPLES))
 
 
 def test_samples_are_lost_and_impossible():
@@ -213,28 +200,3 @@ def test_a_battery_sags_linearly():
     omega, _, force = fly(LEVEL, loop={"sag": sag})
     np.testing.assert_allclose(omega, HOVER, rtol=1e-9)
     np.testing.assert_allclose(force[:, 2], GRAVITY * (1 - sag * TIME / TIME[-1]), rtol=1e-9)
-
-
-def test_the_velocity_has_noise():
-    exact, noisy = (fly(velocity_noise=noise)[1][:, VELOCITY] for noise in (0.0, 0.1))
-    np.testing.assert_allclose((noisy - exact).std(axis=0), 0.1, rtol=4 / np.sqrt(2 * SAMPLES))
-
-
-def test_flights_with_all_effects_and_with_none_are_one_batch():
-    every = loop_of(
-        air={"wind": 1.0, "drag": 0.3, "inflow": 0.4, "flapping": (-3.0, 3.0)},
-        loop={"gyro_noise": 0.02, "sag": 0.1, "gust": 5.0},
-        **{"gyro_vibration": 0.1, "force_vibration": 0.3, "gyro_filter": 0.005, "force_filter": 0.01},
-        **{"speed_noise": 3.0, "speed_step": 1.0, "clock_offset": 0.003, "dropouts": 0.05, "bad_samples": 3},
-        **{"controller_gyro_noise": None, "velocity_noise": None},
-    )
-    loops = [loop_of(), every]
-    batch = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *loops)
-    key = jax.random.key(4)
-    together = eqx.filter_vmap(lambda loop: jaxos4.fly_closed_loop(loop, jnp.asarray(RANDOM), dt=DT, key=key))(batch)
-    for i, loop in enumerate(loops):
-        alone = jaxos4.fly_closed_loop(loop, jnp.asarray(RANDOM), dt=DT, key=key)
-        assert alone.result == SUCCESS
-        for field in ("states", "specific_force"):
-            found, expected = np.asarray(getattr(together, field))[i], np.asarray(getattr(alone, field))
-            np.testing.assert_allclose(found[:500], expected[:500], rtol=1e-6, atol=1e-9)

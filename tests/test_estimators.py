@@ -18,7 +18,6 @@ from lanes import HALF, assert_chi_square, assert_nothing_invented, bound, error
 import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
 from jaxos4.estimators import ESTIMATORS, make_estimator
-from jaxos4.models.state import CHANNELS
 
 MODEL, P = jaxos4.PublishedOS4(), jaxos4.STATE_NAMES.index("p")
 NAMES = [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
@@ -198,7 +197,3 @@ def test_a_truth_far_from_the_bracket_is_reported(name):
     problem = standard_problem(channels="rates", free=True)
     narrow = jaxos4.Bracket.around(MODEL.alpha + 0.75 * HALF, 0.15 * HALF)
     assert names(make_estimator(name)(problem, narrow)) == "at_bound"
-
-
-def test_every_estimator_says_what_it_looks_at():
-    assert {kind.looks_at for kind in ESTIMATORS.values()} <= set(CHANNELS)

@@ -10,7 +10,6 @@ import jaxos4.logs.csv as csv_module
 import jaxos4.logs.table as table_module
 from jaxos4.airframe import OS4
 from jaxos4.errors import InputError
-from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import read_flight, read_recording
 
 HEADER = "t,omega1,omega2,omega3,omega4,p,q,psi"
@@ -47,40 +46,55 @@ def refusal(path, airframe=None):
 # What a file may look like
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        csv().replace("\n", "\r\n"),
-        csv().replace("\n", "\r"),
-        "\ufeff" + csv(),
-        csv().rstrip("\n"),
-        csv() + "\n  \n\n",
-        csv().replace(",", " ,\t"),
-        "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in csv().split()),
-        csv().replace(",-0.2,", ",-2.0E-01,").replace(",100,", ",+100.,"),
-        "\n".join(",".join(line.split(",")[i] for i in (7, 3, 1, 0, 2, 5, 6, 4)) for line in csv().split()),
-    ],
-    ids=["crlf", "cr", "bom", "no-end", "blank-end", "padded", "quoted", "forms", "shuffled"],
-)
-def test_what_does_not_matter(content, save):
-    assert same(read_flight(save(content)), read_flight(save(csv())))
+SAME = {
+    "crlf": csv().replace("\n", "\r\n"),
+    "cr": csv().replace("\n", "\r"),
+    "bom": "\ufeff" + csv(),
+    "no end": csv().rstrip("\n"),
+    "blank end": csv() + "\n  \n\n",
+    "padded": csv().replace(",", " ,\t"),
+    "quoted": "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in csv().split()),
+    "forms": csv().replace(",-0.2,", ",-2.0E-01,").replace(",100,", ",+100.,"),
+    "shuffled": "\n".join(",".join(line.split(",")[i] for i in (7, 3, 1, 0, 2, 5, 6, 4)) for line in csv().split()),
+}
+# The note of the reader, and the file.
+NOTED = {
+    "measured omega1..omega4 are used; command1, command2 are ignored": csv(
+        HEADER + ",command1,command2", [row + ",0.5,0.5" for row in ROWS]
+    ),
+    "omega2: 2 empty cells hold the value before them, for up to 0.02 s": edited(4, "omega2", "").replace(
+        "0.03,100,101", "0.03,100,"
+    ),
+    "unknown columns are ignored: 'P', 'roll', 'mode', 'Omega_1', 'mode', ''": csv(
+        HEADER + ",P,roll,mode,Omega_1,mode,", [row + ',1,2,"a, b",4,é_1,' for row in ROWS]
+    ),
+}
 
 
-def test_voltage_is_interpolated_over_what_was_not_measured(save):
-    def voltage(cells, rows=ROWS):
-        lines = [f"{row},{cell}" for row, cell in zip(rows, cells, strict=True)]
-        return read_flight_and_notes(save(csv(HEADER + ",voltage", lines)))[0].voltage
+@pytest.mark.parametrize("case", [*SAME, *NOTED])
+def test_what_does_not_matter_and_what_the_reader_assumes_and_notes(case, save):
+    flight, notes = read_flight_and_notes(save(SAME[case] if case in SAME else NOTED[case]))
+    assert notes == (() if case in SAME else (case,))
+    assert same(flight, read_flight(save(csv())))
 
-    found = voltage(["", "12.0", "", "0", "11.7", ""])
-    assert found is not None
-    np.testing.assert_allclose(found, [12.0, 12.0, 11.9, 11.8, 11.7, 11.7], rtol=1e-12)
+
+VOLTAGES = [  # cells, and what is read
+    (["", "12.0", "", "0", "11.7", ""], [12.0, 12.0, 11.9, 11.8, 11.7, 11.7]),
+    (["12.0", "", "", "", "", "11.5"], np.linspace(12.0, 11.5, 6)),
+    ([""] * 6, None),
+    (["0", "", "-1", "0", "0", "0"], None),
+]
+
+
+@pytest.mark.parametrize(("cells", "expected"), VOLTAGES)
+def test_voltage_is_interpolated_over_what_was_not_measured(cells, expected, save):
     uneven = [row.replace("0.03,", "0.034,", 1) for row in ROWS]
-    found = voltage(["12.0", "", "", "", "", "11.5"], uneven)
-    assert found is not None
-    np.testing.assert_allclose(found, np.linspace(12.0, 11.5, 6), rtol=1e-12)
-    assert voltage([""] * 6) is None
-    assert voltage(["0", "", "-1", "0", "0", "0"]) is None
-    assert read_flight(save(csv())).voltage is None
+    for rows in (ROWS, uneven) if cells[-1] else (ROWS,):
+        lines = [f"{row},{cell}" for row, cell in zip(rows, cells, strict=True)]
+        voltage = read_flight_and_notes(save(csv(HEADER + ",voltage", lines)))[0].voltage
+        assert (voltage is None) == (expected is None)
+        if expected is not None:
+            np.testing.assert_allclose(voltage, expected, rtol=1e-12)
 
 
 def test_commands_are_fractions_of_full_scale(save):
@@ -89,28 +103,6 @@ def test_commands_are_fractions_of_full_scale(save):
     np.testing.assert_allclose(flight.omega[0], 2500 * np.array([0.100, 0.101, 0.102, 0.103]), rtol=1e-15)
     for airframe in (None, OS4):
         assert "set max_rotor_speed [rad/s] in the airframe's TOML file" in refusal(save(text), airframe)
-
-
-# Notes
-
-
-HELD = edited(4, "omega2", "").replace("0.03,100,101", "0.03,100,")
-NOTES = {
-    "measured omega1..omega4 are used; command1, command2 are ignored": csv(
-        HEADER + ",command1,command2", [row + ",0.5,0.5" for row in ROWS]
-    ),
-    "omega2: 2 empty cells hold the value before them, for up to 0.02 s": HELD,
-    "unknown columns are ignored: 'P', 'roll', 'mode', 'Omega_1', 'mode', ''": csv(
-        HEADER + ",P,roll,mode,Omega_1,mode,", [row + ',1,2,"a, b",4,é_1,' for row in ROWS]
-    ),
-}
-
-
-@pytest.mark.parametrize("note", NOTES)
-def test_what_the_reader_assumes_is_noted_and_the_rest_is_read(note, save):
-    flight, notes = read_flight_and_notes(save(NOTES[note]))
-    assert notes == (note,)
-    assert same(flight, read_flight(save(csv())))
 
 
 def test_warnings_point_at_the_caller(save):
@@ -191,29 +183,23 @@ BAD = {
 }
 
 
-def test_paths_that_are_no_readable_file(tmp_path, monkeypatch):
+def test_paths_that_are_no_readable_file_and_too_many_rows(tmp_path, save, monkeypatch):
     assert "no such file" in refusal(tmp_path / "none.csv")
     assert "is a folder" in refusal(tmp_path)
     assert "no such file" in refusal(tmp_path / "none" / "none.csv")
-    with pytest.raises(InputError, match=r"a\\nb: there is no such file"):
-        read_flight("a\nb")
-    with pytest.raises(InputError, match="null character"):
-        read_flight("a\0b")
-    with pytest.raises(InputError, match="cannot be read"):
-        read_flight("a" * 5000)
-    with pytest.raises(InputError, match="cannot be read"):
-        read_flight("\ud800")
+    paths = {"a\nb": r"a\\nb: there is no such file", "a\0b": "null character", "a" * 5000: "cannot be read"}
+    for path, words in (paths | {"\ud800": "cannot be read"}).items():
+        with pytest.raises(InputError, match=words):
+            read_flight(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(csv_module, "MAX_ROWS", 5)
+        assert "more than 5 rows" in refusal(save(csv()))
 
     def forbidden(*arguments, **options):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(table_module, "open", forbidden, raising=False)
     assert "permission denied" in refusal(tmp_path / "f.csv")
-
-
-def test_too_many_rows_are_refused(save, monkeypatch):
-    monkeypatch.setattr(csv_module, "MAX_ROWS", 5)
-    assert "more than 5 rows" in refusal(save(csv()))
 
 
 # Real flights
@@ -232,17 +218,17 @@ def test_a_real_flight_is_read(name, shared_flights):
     path = shared_flights / f"arpl_crazyflie_{name}.csv"
     flight, notes = read_flight_and_notes(path, CRAZYFLIE)
     raw = np.loadtxt(path, delimiter=",", skiprows=1)
-    assert len(notes) == 1
-    assert f"{rows} rows were resampled to {flight.time.size} samples, one every {step} ms" in notes[0]
-    assert (f"{gaps} gaps" in notes[0]) == (gaps > 0)
+    (note,) = notes
+    assert f"{rows} rows were resampled to {flight.time.size} samples, one every {step} ms" in note
+    assert (f"{gaps} gaps" in note) == (gaps > 0)
     time, states = np.asarray(flight.time), np.asarray(flight.states)
     assert abs(time[-1] - raw[-1, 0]) < 2e-3
-    for name, column in (("p", 5), ("q", 6), ("r", 7)):
-        got = states[:, STATE_NAMES.index(name)]
-        assert np.isnan(got).mean() < 1e-3
-        kept = ~np.isnan(got)
-        np.testing.assert_allclose(got[kept], np.interp(time[kept], raw[:, 0], raw[:, column]), atol=1e-9)
-    assert np.isnan(states[:, [STATE_NAMES.index(n) for n in ("x", "vz", "phi", "theta", "psi")]]).all()
+    for state, column in ((7, 5), (9, 6), (11, 7)):
+        kept = ~np.isnan(states[:, state])
+        assert kept.mean() > 1 - 1e-3
+        expected = np.interp(time[kept], raw[:, 0], raw[:, column])
+        np.testing.assert_allclose(states[kept, state], expected, atol=1e-9)
+    assert np.isnan(np.delete(states, [7, 9, 11], axis=1)).all()
     impulse = (np.asarray(flight.omega)[:-1] ** 2).sum(axis=0) * float(flight.dt)
     held = ((2500 * raw[:-1, 1:5]) ** 2 * np.diff(raw[:, 0])[:, None]).sum(axis=0)
     np.testing.assert_allclose(impulse, held, rtol=1e-3)

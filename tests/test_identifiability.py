@@ -26,44 +26,23 @@ def analysed(problem):
     return jaxos4.identifiability(problem, jaxos4.Bracket.default(problem.model), problem.model.alpha)
 
 
-def notes_of(problem):
-    return analysed(problem).notes(problem.model.parameter_names)
-
-
-def not_excited(problem):
-    reasons = analysed(problem).reasons(problem.model.parameter_names)
-    return {name for name, reason in reasons.items() if reason == "not excited"}
-
-
 def test_a_hover_excites_nothing():
     omega = jnp.full((301, 4), jaxos4.OS4.hover_speed)
     problem = problem_of(omega, channels="all")
     for one in (problem, eqx.tree_at(lambda p: p.initial_state, problem, None)):
-        assert notes_of(one) == {f"alpha{i}": "not identifiable: not excited" for i in range(1, 9)}
+        notes = analysed(one).notes(problem.model.parameter_names)
+        assert notes == {f"alpha{i}": "not identifiable: not excited" for i in range(1, 9)}
         bound = np.asarray(jaxos4.cramer_rao_bound(one, one.model.alpha))
         assert np.isfinite(bound).all()
         assert (np.sqrt(np.diagonal(bound)) > jaxos4.DEFAULT_HALF_WIDTH).all()
 
 
-@pytest.mark.parametrize(
-    ("axis", "lost"),
-    [
-        ("yaw", {"alpha1", "alpha2", "alpha3", "alpha4", "alpha6", "alpha7"}),
-        ("roll", {"alpha1", "alpha2", "alpha4", "alpha5", "alpha6", "alpha7", "alpha8"}),
-        ("pitch", {"alpha1", "alpha3", "alpha4", "alpha5", "alpha7", "alpha8"}),
-    ],
-)
+@pytest.mark.parametrize(("axis", "lost"), [("yaw", "123467"), ("roll", "1245678"), ("pitch", "134578")])
 def test_one_axis_excites_its_own_parameters_only(axis, lost):
     """Eqs. (1)-(3): alpha2 multiplies q in p', alpha5 multiplies r in q', so pitch and yaw excite those too."""
-    assert not_excited(problem_of(jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=[axis]))) == lost
-
-
-def test_without_yaw_the_parameters_that_need_yaw_are_named():
-    omega = jaxos4.multisine(jaxos4.OS4, duration=5.0, dt=DT, tones=((0.6, 1.1, 1.9), (0.7, 1.3, 2.3), ()))
-    published, corrected = (set(analysed(problem_of(omega, m)).reasons(m(jaxos4.OS4).parameter_names)) for m in MODELS)
-    # p q alpha7 would excite yaw a little, but alpha7 is 0 for the OS4.
-    assert published == {"alpha1", "alpha4", "alpha5", "alpha8"}
-    assert {"alpha1", "alpha4", "alpha8"} <= corrected
+    problem = problem_of(jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=[axis]))
+    reasons = analysed(problem).reasons(problem.model.parameter_names)
+    assert {name for name, why in reasons.items() if why == "not excited"} == {f"alpha{i}" for i in lost}
 
 
 def test_a_parameter_that_is_identifiable_only_together_is_named_with_its_partner():
@@ -86,25 +65,21 @@ def test_a_parameter_that_is_identifiable_only_together_is_named_with_its_partne
     assert "alpha3" not in notes
 
 
-@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("scale", [1.0, 10.0])
 def test_the_published_gyroscopic_parameters_lie_below_the_noise_and_the_figure_is_right(scale):
-    problem = problem_of(standard_flight().omega, channels="all", scale=scale)
-    found = analysed(problem)
-    notes = found.notes(problem.model.parameter_names)
-    below = {name for name, note in notes.items() if note.startswith("below the noise floor")}
-    assert below == {"alpha2", "alpha5"}  # not alpha7, which is 0 for the OS4
-    # At the limit, the 95 % interval of the parameter just reaches 0.
+    below = {}
+    for model_class in MODELS:
+        problem = problem_of(standard_flight(model_class).omega, model_class, channels="all", scale=scale)
+        notes = analysed(problem).notes(problem.model.parameter_names)
+        below[model_class] = {name for name, note in notes.items() if note.startswith("below the noise floor")}
+    assert below[jaxos4.PublishedOS4] == {"alpha2", "alpha5"}  # not alpha7, which is 0 for the OS4
+    assert scale == 10.0 or not {"alpha2", "alpha5"} & below[jaxos4.CorrectedOS4]
+    # At the limit, the 95 % interval of the parameter just reaches 0; in absolute units it is no matter of the noise.
+    found, standard = (analysed(problem_of(standard_flight().omega, channels="all", scale=x)) for x in (scale, 1.0))
     limit = float(found.noise_limit[1])
     quieter = analysed(problem_of(standard_flight().omega, channels="all", scale=scale * limit))
-    np.testing.assert_allclose(1.959964 * quieter.std[1], abs(problem.model.alpha[1]), rtol=1e-6)
-    # The limit in absolute units does not depend on the problem's noise.
-    standard = analysed(problem_of(standard_flight().omega, channels="all"))
+    np.testing.assert_allclose(1.959964 * quieter.std[1], abs(jaxos4.PublishedOS4().alpha[1]), rtol=1e-6)
     np.testing.assert_allclose(scale * limit, float(standard.noise_limit[1]), rtol=1e-9)
-
-
-def test_the_corrected_models_gyroscopic_parameters_lie_above_it():
-    problem = problem_of(standard_flight(jaxos4.CorrectedOS4).omega, jaxos4.CorrectedOS4, channels="all")
-    assert not {"alpha2", "alpha5"} & set(notes_of(problem))
 
 
 @pytest.mark.parametrize("model_class", MODELS)
@@ -123,9 +98,8 @@ def test_the_scaled_informations_inverse_is_the_bound(model_class):
     assert np.all(found.std_alone <= found.std * (1 + 1e-9))
 
 
-@pytest.mark.parametrize("estimator", [jaxos4.IBSS(), jaxos4.OutputError()])
-def test_a_profile_is_the_parabola_of_the_bound(estimator):
-    problem = standard_problem(channels="rates", states=noisy_states(1, seed=3)[0])
+def test_a_profile_is_the_parabola_of_the_bound():
+    problem, estimator = standard_problem(channels="rates", states=noisy_states(1, seed=3)[0]), jaxos4.OutputError()
     bracket = jaxos4.Bracket.default(problem.model)
     best = estimator(problem, bracket)
     steps = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -163,37 +137,25 @@ def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_no
     assert 0.85 < covered[1] < 0.98
 
 
-def robust_ratio(problem):
-    """A fit, its robust covariance, and the ratio of robust standard deviations to those of the bound."""
-    found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
-    robust = jaxos4.robust_covariance(problem, found.parameters, found.initial_state)
-    return found, robust, np.sqrt(np.diagonal(robust)) / found.std
-
-
 def test_robust_is_the_bound_under_white_noise():
     problem = standard_problem(channels="attitude", states=noisy_states(1, seed=9)[0], free=True)
-    found, robust, ratio = robust_ratio(problem)
-    assert np.all((ratio > 0.7) & (ratio < 1.3))
+    found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
     # The robust covariance does not depend on sigma: here it is wrong by a factor of three.
     wrong = eqx.tree_at(lambda p: p.sigma, problem, problem.sigma / 3)
-    again = jaxos4.robust_covariance(wrong, found.parameters, found.initial_state)
+    robust, again = (jaxos4.robust_covariance(p, found.parameters, found.initial_state) for p in (problem, wrong))
+    assert np.all(np.abs(np.sqrt(np.diagonal(robust)) / found.std - 1) < 0.3)
     np.testing.assert_allclose(again, robust, rtol=1e-6)
 
 
-def test_robust_is_infinite_without_measurements_or_a_trajectory():
-    problem = standard_problem(channels="rates")
-    blank = eqx.tree_at(lambda p: p.flight.states, problem, jnp.full((501, 12), jnp.nan))
-    for broken, alpha in ((blank, problem.model.alpha), (problem, problem.model.alpha.at[2].set(1e9))):
-        assert np.isposinf(jaxos4.robust_covariance(broken, alpha)).all()
-
-
-def test_nothing_is_identifiable_without_a_trajectory_or_a_bracket():
+def test_nothing_is_identifiable_without_measurements_a_trajectory_or_a_bracket():
     problem = standard_problem(channels="rates")
     names, bracket = problem.model.parameter_names, jaxos4.Bracket.default(problem.model)
-    upside_down = jaxos4.Bracket(bracket.upper, bracket.lower)
-    runaway = problem.model.alpha.at[2].set(1e9)
-    for where, alpha in ((bracket, runaway), (upside_down, problem.model.alpha)):
-        found = jaxos4.identifiability(problem, where, alpha)
+    alpha, runaway = problem.model.alpha, problem.model.alpha.at[2].set(1e9)
+    blank = eqx.tree_at(lambda p: p.flight.states, problem, jnp.full((501, 12), jnp.nan))
+    for broken, at in ((blank, alpha), (problem, runaway)):
+        assert np.isposinf(jaxos4.robust_covariance(broken, at)).all()
+    for where, at in ((bracket, runaway), (jaxos4.Bracket(bracket.upper, bracket.lower), alpha)):
+        found = jaxos4.identifiability(problem, where, at)
         assert np.isposinf(found.std).all()
         reason = "the trajectory is not finite, or the bracket is not valid"
         assert found.reasons(names) == dict.fromkeys(names, reason)

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from helpers import refused
 from recorded_logs import VEHICLE, blackbox_csv
 from test_logs_blackbox import T as BLACKBOX_TIME, recorded
 from test_logs_crazyflie import one_event
@@ -53,10 +52,3 @@ def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
     assert (code, err) == (0, "")
     assert "up to 0.6 of full scale (commands)" in out
     assert "usable" in out
-
-
-def test_an_output_that_would_overwrite_the_log_is_refused(run, tmp_path):
-    (tmp_path / "log").write_bytes(LOGS["Crazyflie"])
-    refused(run("inspect", "log", "--out", "log"), "would overwrite an input")
-    assert (tmp_path / "log").read_bytes() == LOGS["Crazyflie"]
-    refused(run("inspect", "log", "--airframe", "nothing.toml"), "nothing.toml")

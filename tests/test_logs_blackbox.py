@@ -5,7 +5,7 @@ import pytest
 from helpers import CRAZYFLIE, usable_stretches
 from recorded_logs import GRAVITY, RPM, blackbox_csv, check, force, rates, speeds
 
-from jaxos4.logs import log_format, read_log, read_recording
+from jaxos4.logs import read_log, read_recording
 from jaxos4.logs.blackbox_frames import Numbers
 from jaxos4.recording import cut
 from jaxos4.recording.motion import RotorSigns, rotor_signs
@@ -14,15 +14,15 @@ RATES = ("p", "q", "r")
 SETTINGS = {"Product": "Blackbox flight data recorder by Nicholas Sherlock", "acc_1G": "2048", "motor_poles": "12"}
 
 
-def recorded(t, *, poles=14, scale=1.0):
+def recorded(t, *, poles=14, scale=1.0, gyro=rates, accelerometer=force, rotors=speeds):
     """What a Betaflight would log, in its own integers."""
     out = {"loopIteration": np.arange(t.size), "time (us)": np.rint(1e6 * t + 7e6).astype(int)}
     for i in range(3):  # about forward, left and up: right-handed, as gyroscopes are mounted
-        out[f"gyroADC[{i}]"] = np.round(np.rad2deg(rates(t)[:, i]) * scale, 3)
-        out[f"accSmooth[{i}]"] = np.rint(force(t)[:, i] / GRAVITY * 2048).astype(int)
+        out[f"gyroADC[{i}]"] = np.round(np.rad2deg(gyro(t)[:, i]) * scale, 3)
+        out[f"accSmooth[{i}]"] = np.rint(accelerometer(t)[:, i] / GRAVITY * 2048).astype(int)
     for i in range(4):
         out[f"motor[{i}]"] = np.rint(48 + (2047 - 48) * (0.3 + 0.1 * i + 0.05 * np.sin(t))).astype(int)
-        out[f"eRPM[{i}]"] = np.rint(speeds(t)[:, i] / RPM * (poles / 2) / 100).astype(int)
+        out[f"eRPM[{i}]"] = np.rint(rotors(t)[:, i] / RPM * (poles / 2) / 100).astype(int)
     return out
 
 
@@ -33,14 +33,10 @@ def without(columns, *prefixes):
     return {name: values for name, values in columns.items() if not name.startswith(prefixes)}
 
 
-def test_a_decoded_log_without_settings_says_what_is_assumed(save):
-    _, notes = read_log(save(blackbox_csv(recorded(T))))
-    text = " ".join(notes)
+def test_what_is_assumed_of_units_is_said_unless_an_export_says_its_settings(save):
+    text = " ".join(read_log(save(blackbox_csv(recorded(T))))[1])
     for words in ("14 motor poles", "2048 units for 1 g", "blackbox_high_resolution", "eRPM[0] is rotor 1"):
         assert words in text
-
-
-def test_an_export_says_its_settings(save):
     fine = SETTINGS | {"blackbox_high_resolution": "1", "fields": "[1,2,3]", "note": "motor[0], and more"}
     columns = recorded(T, poles=12, scale=10)
     columns["time"] = columns.pop("time (us)")
@@ -50,10 +46,15 @@ def test_an_export_says_its_settings(save):
     assert not any("taken as" in note or "default" in note for note in notes)
 
 
-def test_the_unfiltered_gyro_is_preferred(save):
+def test_the_unfiltered_gyro_is_preferred_and_missing_values_are_not_measured(save):
     columns = recorded(T) | {f"gyroUnfilt[{i}]": np.full(T.size, 57.2957795 * (i + 1)) for i in range(3)}
     flight, _ = read_log(save(blackbox_csv(columns)))
     np.testing.assert_allclose(np.asarray(flight.states)[:, [7, 9, 11]], np.tile([1.0, 2, 3], (T.size, 1)), rtol=1e-6)
+    text = blackbox_csv(recorded(T)).splitlines()
+    for row in (50, 51):
+        text[row] = ", ".join("NaN" if 2 <= i <= 4 else cell for i, cell in enumerate(text[row].split(", ")))
+    flight, _ = read_log(save("\n".join(text)))
+    assert np.isnan(np.asarray(flight.states)[49:51, 7]).all()
 
 
 @pytest.mark.parametrize(
@@ -130,18 +131,14 @@ def bbl(columns, *, settings=None, interval=32, end=True):
     predictors = [{"loopIteration": 6, "time": 2}.get(name, 3 if name[:5] == "motor" else 1) for name in columns]
     others = [i for i, name in enumerate(columns) if name[:5] == "motor" and name != "motor[0]"]
     lines = {
-        "Product": "Blackbox flight data recorder by Nicholas Sherlock",
-        "Data version": 2,
+        **{"Product": "Blackbox flight data recorder by Nicholas Sherlock", "Data version": 2},
         "Field I name": ",".join(columns),
         "Field I predictor": ",".join("5" if i in others else "0" for i in range(len(columns))),
         "Field I encoding": ",".join("0" for _ in columns),
         "Field P predictor": ",".join(map(str, predictors)),
         "Field P encoding": ",".join("9" if name == "loopIteration" else "0" for name in columns),
-        "Field S name": "flightModeFlags,stateFlags",
-        "Field S predictor": "0,0",
-        "Field S encoding": "1,1",
-        "I interval": 4 * interval,
-        "P interval": 4,
+        **{"Field S name": "flightModeFlags,stateFlags", "Field S predictor": "0,0", "Field S encoding": "1,1"},
+        **{"I interval": 4 * interval, "P interval": 4},
         **(settings or {"acc_1G": 2048, "motor_poles": 14, "motorOutput": "48,2047"}),
     }
     out = bytearray("".join(f"H {key}:{value}\n" for key, value in lines.items()).encode())
@@ -155,10 +152,11 @@ def bbl(columns, *, settings=None, interval=32, end=True):
         # The frame after a complete one knows no frame before it.
         before, earlier = table[k - 1], table[k - 1 - (k % interval > 1)]
         guesses = {1: before, 2: 2 * before - earlier, 3: np.trunc((before + earlier) / 2).astype(int)}
-        deltas = [
-            int(value - guesses[p][i]) for i, (value, p) in enumerate(zip(row, predictors, strict=True)) if p != 6
-        ]
-        out += b"P" + b"".join(map(signed, deltas))
+        out += b"P" + b"".join(
+            signed(int(value - guesses[p][i]))
+            for i, (value, p) in enumerate(zip(row, predictors, strict=True))
+            if p != 6
+        )
     return bytes(out) + (b"E\xffEnd of log\0" if end else b"")
 
 
@@ -166,11 +164,9 @@ def test_a_log_that_is_not_decoded_is_the_same_flight(save):
     columns = recorded(T, scale=1)
     direct, notes = read_log(save(bbl(columns), "a.bbl"))
     check(direct, names=RATES, atol=2e-2)  # the gyro's unit is 1 deg/s
-    integers = {name: np.rint(values).astype(int) for name, values in columns.items()}
-    decoded, _ = read_log(save(blackbox_csv(integers)))
-    for ours, other in ((direct.omega, decoded.omega), (direct.states, decoded.states), (direct.time, decoded.time)):
-        np.testing.assert_allclose(ours, other, atol=1e-12)
-    assert log_format(save(bbl(columns))).name == "blackbox"
+    decoded, _ = read_log(save(blackbox_csv({name: np.rint(x).astype(int) for name, x in columns.items()})))
+    for name in ("omega", "states", "time"):
+        np.testing.assert_allclose(getattr(direct, name), getattr(decoded, name), atol=1e-12)
     assert not any("taken as" in note or "default" in note for note in notes)
 
 
@@ -217,14 +213,6 @@ def test_differences_after_a_lost_frame_are_ignored(accident, save):
     np.testing.assert_allclose(np.asarray(flight.states)[~lost], np.asarray(whole.states)[~lost], atol=1e-9)
 
 
-def test_missing_values_are_not_measured(save):
-    text = blackbox_csv(recorded(T)).splitlines()
-    for row in (50, 51):
-        text[row] = ", ".join("NaN" if 2 <= i <= 4 else cell for i, cell in enumerate(text[row].split(", ")))
-    flight, _ = read_log(save("\n".join(text)))
-    assert np.isnan(np.asarray(flight.states)[49:51, 7]).all()
-
-
 # Real logs. Decoding takes seconds: once for each log.
 
 # Rear right, front right, rear left, front left; props out.
@@ -261,36 +249,24 @@ def replaced(row, old, new):
     return "\n".join([*LINES[:row], LINES[row].replace(old, new, 1), *LINES[row + 1 :]])
 
 
+FEW = recorded(T[:50])
+SIX = FEW | {"motor[4]": np.arange(50), "motor[5]": np.arange(50)}
 BAD = {
     "raw": (b"H Product:Blackbox flight data recorder by Nicholas Sherlock\nH ...", "decode it by blackbox_decode"),
-    "no frames": (bbl(recorded(T[:50]))[:600], "no frame of it can be decoded"),
-    "unknown encoding": (
-        bbl(recorded(T[:50])).replace(b"Field S encoding:1,1", b"Field S encoding:1,5"),
-        "an encoding that is not known, 5",
-    ),
-    "no fields": (bbl(recorded(T[:50])).replace(b"Field I name", b"Field I nom"), "its header is damaged"),
-    "six raw motors": (
-        bbl(recorded(T[:50]) | {"motor[4]": np.arange(50), "motor[5]": np.arange(50)}),
-        "more than four motors",
-    ),
+    "no frames": (bbl(FEW)[:600], "no frame of it can be decoded"),
+    "unknown encoding": (bbl(FEW).replace(b"encoding:1,1", b"encoding:1,5"), "an encoding that is not known, 5"),
+    "no fields": (bbl(FEW).replace(b"Field I name", b"Field I nom"), "its header is damaged"),
+    "six raw motors": (bbl(SIX), "more than four motors"),
     "header only": (LINES[0], "has a header and no data"),
     "a cut line": ("\n".join(LINES)[:-20], "row 51"),
     "text": (replaced(5, LINES[5].split(", ")[2], "fast"), "row 6, column gyroADC[0]"),
     "time backward": ("\n".join([*LINES[:5], LINES[2], *LINES[5:]]), "row 6, column time (us)"),
     "no time": (replaced(0, "time (us)", "elapsed"), "there is no time"),
     "no gyro": (replaced(0, "gyroADC[1]", "other"), "there are no body rates"),
-    "no motors": (blackbox_csv(without(recorded(T[:50]), "motor", "eRPM")), "column motor[0]: is missing"),
-    "six motors": (
-        blackbox_csv(recorded(T[:50]) | {"motor[4]": np.arange(50), "motor[5]": np.arange(50)}),
-        "more than four motors",
-    ),
+    "no motors": (blackbox_csv(without(FEW, "motor", "eRPM")), "column motor[0]: is missing"),
+    "six motors": (blackbox_csv(SIX), "more than four motors"),
     "settings above": ('"acc_1G","2048"\n' + "\n".join(LINES[:5]) + "\n1,2", "row 7"),
-    "too fast": (
-        blackbox_csv(recorded(T[:50], scale=200)),
-        ["beyond 60 rad/s", "28 of 50 values", "its unit is not the one"],
-    ),
+    "too fast": (blackbox_csv(recorded(T[:50], scale=200)), ["beyond 60 rad/s", "28 of 50 values", "is not the one"]),
 }
-
-
 SMALL = blackbox_csv(recorded(T[:30]), settings=SETTINGS).encode()
-SMALL_RAW = bbl(recorded(T[:50])) * 2
+SMALL_RAW = bbl(FEW) * 2

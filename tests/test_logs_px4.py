@@ -26,13 +26,6 @@ from jaxos4.logs import Sampling, read_log, read_recording
 # Commands
 
 
-def outputs(t, values, *, channels=(0, 1, 2, 3), others=0.0):
-    rows = np.full((t.size, 16), others)
-    rows[:, list(channels)] = values
-    name, fields, code, _, _ = pwm(t, [])
-    return name, fields, code, [(16, *row) for row in rows.tolist()], t
-
-
 def as_motors(t, curve):
     return [motors(t, thrusts(t).tolist())], {}
 
@@ -40,7 +33,7 @@ def as_motors(t, curve):
 def as_old_pwm(t, curve):
     ends = {"PWM_MIN": 1075, "PWM_MAX": 1950, "PWM_MAIN_MIN1": -1, "PWM_MAIN_MIN2": 1100}
     low = np.array([1075.0, 1100.0, 1075.0, 1075.0])
-    return [outputs(t, low + (1950 - low) * signals(thrusts(t), curve), others=1500.0)], ends
+    return [pwm(t, low + (1950 - low) * signals(thrusts(t), curve), others=1500.0)], ends
 
 
 def as_pwm(t, curve):
@@ -48,13 +41,13 @@ def as_pwm(t, curve):
     channels = (4, 1, 0, 6)
     found = {f"PWM_AUX_FUNC{c + 1}": 101 + i for i, c in enumerate(channels)} | {"PWM_AUX_FUNC3": 201}
     found |= {f"PWM_AUX_MIN{c + 1}": 1100 for c in channels} | {f"PWM_AUX_MAX{c + 1}": 1900 for c in channels}
-    other = outputs(t, np.full((t.size, 4), 1500.0))
-    moving = outputs(t, 1100 + 800 * signals(thrusts(t), curve), channels=channels, others=1500.0)
+    other = pwm(t, np.full((t.size, 4), 1500.0))
+    moving = pwm(t, 1100 + 800 * signals(thrusts(t), curve), channels=channels, others=1500.0)
     return [other, moving], found
 
 
 def as_dshot(t, curve):
-    return [outputs(t, 1999 * (0.055 + 0.945 * signals(thrusts(t), curve)))], {"DSHOT_MIN": 0.055, "DSHOT_CONFIG": 600}
+    return [pwm(t, 1999 * (0.055 + 0.945 * signals(thrusts(t), curve)))], {"DSHOT_MIN": 0.055, "DSHOT_CONFIG": 600}
 
 
 def as_new_dshot(t, curve):
@@ -64,7 +57,7 @@ def as_new_dshot(t, curve):
 
 
 def as_uavcan(t, curve):
-    return [outputs(t, 1 + 8190 * signals(thrusts(t), curve), others=4095.5)], {"UAVCAN_ENABLE": 3}
+    return [pwm(t, 1 + 8190 * signals(thrusts(t), curve), others=4095.5)], {"UAVCAN_ENABLE": 3}
 
 
 @pytest.mark.parametrize("curve", [0.0, 0.3, 1.0])

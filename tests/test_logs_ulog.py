@@ -60,15 +60,10 @@ def local_position(t, valid=True):
 
 def escs(t, order=(0, 1, 2, 3), speeds=speeds):
     """ESC number i turns motor order[i]; speeds are signed by the sense of rotation."""
-    signed = speeds(t) / RPM * [1, -1, 1, -1]
-    rows = []
-    for row in np.rint(signed).astype(int).tolist():
-        cells = []
-        for i in range(4):
-            cells += [0, row[order[i]], 101 + order[i], 0, 0, 0]
-        rows.append(tuple(cells))
+    signed = np.rint(speeds(t) / RPM * [1, -1, 1, -1]).astype(int).tolist()
+    rows = [(4, *(x for motor in order for x in (0, row[motor], 101 + motor, 0, 0, 0))) for row in signed]
     fields = "uint64_t timestamp;uint8_t esc_count;uint8_t[7] _padding0;esc_report[4] esc;"
-    return "esc_status", fields, "QB7x" + "QiBBBB" * 4, [(4, *row) for row in rows], t
+    return "esc_status", fields, "QB7x" + "QiBBBB" * 4, rows, t
 
 
 def motors(t, command, more=0):
@@ -76,9 +71,25 @@ def motors(t, command, more=0):
     return "actuator_motors", "uint64_t timestamp;float[12] control;", "Q" + "f" * 12, rows, t
 
 
-def pwm(t, output):
-    rows = [(4, *row, *[0.0] * 12) for row in output]
-    return "actuator_outputs", "uint64_t timestamp;uint8_t noutputs;float[16] output;", "QB" + "f" * 16, rows, t
+def pwm(t, values, *, channels=(0, 1, 2, 3), others=0.0):
+    """Sixteen outputs, of which these channels have these values."""
+    rows = np.full((t.size, 16), others)
+    rows[:, list(channels)] = values
+    fields = "uint64_t timestamp;uint8_t noutputs;float[16] output;"
+    return "actuator_outputs", fields, "QB" + "f" * 16, [(16, *row) for row in rows.tolist()], t
+
+
+def parameter(name, value):
+    """A parameter of the autopilot: a whole number, or a float."""
+    kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+    key = f"{kind} {name}".encode()
+    return message("P", bytes([len(key)]) + key + struct.pack(code, value))
+
+
+def log(*topics, **parameters):
+    """A ULog file of these topics, with the autopilot's parameters."""
+    settings = b"".join(parameter(name, value) for name, value in parameters.items())
+    return ulog(list(topics), before=message("F", ESC) + settings)
 
 
 def everything(**changes):
@@ -88,9 +99,8 @@ def everything(**changes):
         "attitude": vehicle_attitude(grid(0.01, offset=0.002)),
         "position": local_position(grid(0.02, offset=0.003)),
         "esc": escs(grid(0.01, 3.2, offset=-0.1)),
-    }
-    parts.update(changes)
-    return ulog([part for part in parts.values() if part is not None], before=message("F", ESC))
+    } | changes
+    return log(*(part for part in parts.values() if part is not None))
 
 
 def test_speeds_are_put_in_the_motors_order_and_need_no_curve(save):
@@ -100,26 +110,18 @@ def test_speeds_are_put_in_the_motors_order_and_need_no_curve(save):
     assert not any("THR_MDL_FAC" in note for note in notes)
 
 
-def test_commands_need_a_full_scale(save):
-    t = grid(0.05, 3.2, offset=-0.1)
-    path = save(everything(esc=None, motors=motors(t, [[0.3] * 4] * t.size)))
-    np.testing.assert_allclose(read_log(path, full_scale=1.0)[0].omega, 0.3, rtol=1e-6)
-    with pytest.raises(InputError, match=r"field actuator_motors.control\[0\]: the rotor speed of full command"):
-        read_log(path)
-
-
-def test_idle_escs_give_way_to_commands(save):
+def test_idle_escs_give_way_to_commands_which_need_a_full_scale_and_invalid_positions_are_not_measured(save):
     t = grid(0.01, 3.2, offset=-0.1)
-    idle = escs(t)
-    idle = (*idle[:3], [(4, *[0] * 24) for _ in t], t)
-    flight, notes = read_log(save(everything(esc=idle, motors=motors(t, [[0.4] * 4] * t.size))), CRAZYFLIE)
+    idle = (*escs(t)[:3], [(4, *[0] * 24) for _ in t], t)
+    invalid, command = local_position(grid(0.02), valid=False), motors(t, [[0.4] * 4] * t.size)
+    path = save(everything(esc=idle, motors=command, position=invalid))
+    flight, notes = read_log(path, CRAZYFLIE)
     assert any("commands are used" in note for note in notes)
     np.testing.assert_allclose(flight.omega, 0.4 * T, rtol=1e-6)
-
-
-def test_invalid_positions_are_not_measured(save):
-    flight, _ = read_log(save(everything(position=local_position(grid(0.02), valid=False))))
     check(flight, names=("p", "q", "r", "phi", "theta", "psi", "z", "vx", "vy", "vz"))
+    np.testing.assert_allclose(read_log(path, full_scale=1.0)[0].omega, 0.4, rtol=1e-6)
+    with pytest.raises(InputError, match=r"field actuator_motors.control\[0\]: the rotor speed of full command"):
+        read_log(path)
 
 
 def test_what_was_appended_after_a_restart_does_not_break_it(save):
@@ -190,13 +192,6 @@ BOMBS = {  # formats that announce much
 }
 
 
-def parameter(name, value):
-    """A parameter of the autopilot: a whole number, or a float."""
-    kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
-    key = f"{kind} {name}".encode()
-    return message("P", bytes([len(key)]) + key + struct.pack(code, value))
-
-
 def states(topic, times, **fields):
     """A topic of whole numbers, such as vehicle_status: for each field, its value at each time."""
     layout = "uint64_t timestamp;" + "".join(f"uint8_t {name};" for name in fields)
@@ -206,27 +201,6 @@ def states(topic, times, **fields):
 def battery(t, volts):
     rows = [(float(each), 4) for each in np.broadcast_to(volts, t.shape)]
     return "battery_status", "uint64_t timestamp;float voltage_v;uint8_t cell_count;", "QfB", rows, t
-
-
-SMALL = ulog(
-    [
-        combined(grid(0.02, 0.6)),
-        vehicle_attitude(grid(0.04, 0.6)),
-        local_position(grid(0.1, 0.6)),
-        escs(grid(0.05, 0.7, offset=-0.05)),
-        motors(grid(0.1, 0.6), [[0.5] * 4] * 6),
-        states("vehicle_status", [0.0, 0.3], is_vtol=[0, 0], vehicle_type=[1, 1], system_type=[2, 2]),
-        states("vehicle_land_detected", [0.0, 0.3], landed=[1, 0], maybe_landed=[1, 0]),
-        battery(grid(0.2, 0.6), 15.0),
-    ],
-    before=message("F", ESC) + parameter("THR_MDL_FAC", 0.3) + parameter("CA_ROTOR_COUNT", 4),
-)
-
-
-def log(*topics, **parameters):
-    """A ULog file of these topics, with the autopilot's parameters."""
-    settings = b"".join(parameter(name, value) for name, value in parameters.items())
-    return ulog(list(topics), before=message("F", ESC) + settings)
 
 
 def thrusts(t):
@@ -241,6 +215,17 @@ def signals(thrust, curve):
     return -(1 - curve) / (2 * curve) + np.sqrt((1 - curve) ** 2 / (4 * curve**2) + thrust / curve)
 
 
+SMALL = log(
+    combined(grid(0.02, 0.6)),
+    vehicle_attitude(grid(0.04, 0.6)),
+    local_position(grid(0.1, 0.6)),
+    escs(grid(0.05, 0.7, offset=-0.05)),
+    motors(grid(0.1, 0.6), [[0.5] * 4] * 6),
+    states("vehicle_status", [0.0, 0.3], is_vtol=[0, 0], vehicle_type=[1, 1], system_type=[2, 2]),
+    states("vehicle_land_detected", [0.0, 0.3], landed=[1, 0], maybe_landed=[1, 0]),
+    battery(grid(0.2, 0.6), 15.0),
+    **{"THR_MDL_FAC": 0.3, "CA_ROTOR_COUNT": 4},
+)
 ROTORS = escs(grid(0.01, 3.4, offset=-0.2))
 
 # The vehicle

@@ -70,14 +70,18 @@ def test_sensor_sigma_is_in_the_order_of_the_states():
 
 
 @every_noise
-def test_the_key_decides_the_states_and_nothing_else_changes(noise):
-    flight = make_flight()
-    first, again, other = (noise(flight, key=jax.random.key(seed)) for seed in (1, 1, 2))
+def test_the_key_decides_the_states_and_nothing_else_changes_in_a_batch_too(noise):
+    flight, keys = make_flight(), [jax.random.key(seed) for seed in (1, 1, 2)]
+    first, again, other = (noise(flight, key=key) for key in keys)
     assert same(first, again)
     assert isinstance(noise, Quantisation) == np.array_equal(first.states, other.states, equal_nan=True)
     assert not np.array_equal(first.states, flight.states)
     assert same(eqx.tree_at(lambda f: f.states, first, flight.states), flight)
     assert first.states.dtype == flight.states.dtype
+    batch = eqx.filter_jit(eqx.filter_vmap(lambda n, f, k: n(f, key=k), in_axes=(None, None, 0)))
+    states = batch(noise, flight, jnp.stack(keys)).states
+    for one, alone in zip(states, (first, again, other), strict=True):
+        np.testing.assert_allclose(one, alone.states, rtol=1e-14, atol=1e-16)
 
 
 @every_noise
@@ -89,15 +93,6 @@ def test_what_was_not_measured_stays_nan(noise):
     noisy, complete = noise(flight, key=key).states, noise(make_flight(), key=key).states
     assert jnp.isnan(noisy)[holes].all()
     np.testing.assert_array_equal(noisy[~holes], complete[~holes])
-
-
-@every_noise
-def test_compiled_batch_is_a_loop(noise):
-    flight, keys = make_flight(), jax.random.split(jax.random.key(3), 4)
-    batch = eqx.filter_jit(eqx.filter_vmap(lambda n, f, k: n(f, key=k), in_axes=(None, None, 0)))(noise, flight, keys)
-    assert batch.states.shape == (4, 50, 12)
-    for i in range(4):
-        np.testing.assert_allclose(batch.states[i], noise(flight, key=keys[i]).states, rtol=1e-14, atol=1e-16)
 
 
 def test_numbers_of_any_kind_share_a_trace_and_can_be_a_batch():

@@ -51,8 +51,9 @@ def start(*arguments: str, code: str = COMMAND, cwd=None, **environment: str) ->
 
 def loaded(code: str, **environment: str) -> tuple[str, set[str]]:
     """What the code prints, and the names of the packages that it imports."""
-    printed = start(code=LIST + code, **environment).stdout
-    return printed, set(printed.splitlines()[-1].split()[1:])
+    process = start(code=LIST + code, **environment)
+    assert process.returncode == 0, process.stderr
+    return process.stdout, set(process.stdout.splitlines()[-1].split()[1:])
 
 
 LINES = (
@@ -100,10 +101,21 @@ def test_shell_completion_offers_estimators_and_imports_no_library():
     assert not packages & (HEAVY | CORE)
 
 
-def test_the_package_imports_what_is_used():
-    _, packages = loaded("import jaxos4")
-    assert not packages & (HEAVY | {"jax", "numpy"})
-    _, packages = loaded("import jaxos4; jaxos4.IBSS; jaxos4.identify; jaxos4.simulate; jaxos4.read_flight")
+def test_the_package_imports_what_is_used_and_presets_outlive_a_change_of_precision():
+    """A preset is made at import, when JAX still rounds to float32. The user chooses double precision later."""
+    code = """
+import sys, jaxos4
+print(*{name.split(".")[0] for name in sys.modules})
+jaxos4.IBSS, jaxos4.identify, jaxos4.simulate, jaxos4.read_flight
+import jax, numpy as np
+assert jax.numpy.asarray(jaxos4.OS4.mixer).dtype == np.float32
+jax.config.update("jax_enable_x64", True)
+assert jax.numpy.asarray(jaxos4.OS4.mixer).dtype == np.float64
+assert float(jaxos4.OS4.mixer[3, 0]) == 3.13e-5 and float(jaxos4.OS4.inertia[2]) == 1.3e-2
+assert abs(float(jaxos4.OS4.hover_speed) / (0.65 * 9.81 / 4 / 3.13e-5) ** 0.5 - 1) < 1e-15
+"""
+    printed, packages = loaded(code)
+    assert not set(printed.split("\n")[0].split()) & (HEAVY | {"jax", "numpy"})
     assert "equinox" in packages
     assert not packages & HEAVY
 
@@ -206,7 +218,6 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
     """It ends the process without the clean-up of Python: nothing that was printed or written may be lost."""
     console = [sys.executable, "-c", "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import console; console()"]
     for arguments, code, expected in (
-        (["--version"], 0, "jaxos4 "),
         (["estimate", "nowhere.csv"], 2, "nowhere.csv: there is no such file"),
         (["simulate", "--out", "flight.csv", "--duration", "0.5"], 0, "flight.csv: 51 samples"),
     ):
@@ -239,13 +250,6 @@ def test_the_import_makes_loops_native_and_replaces_no_flag(variables, flags, mo
     # JAX has computed in this process, so that a new flag comes too late.
     assert len(recwarn) == (flags != variables.get("XLA_FLAGS"))
     assert all("JAX has computed before `import jaxos4`" in str(each.message) for each in recwarn)
-
-
-def test_one_warning_says_that_the_import_comes_too_late():
-    code = "import jax; jax.devices(); import jaxos4; from jaxos4 import IBSS, _xla; _xla.make_loops_native()"
-    process = start(code=code, XLA_FLAGS="")
-    assert process.returncode == 0
-    assert process.stderr.count("RuntimeWarning: JAX has computed before `import jaxos4`") == 1
 
 
 @pytest.mark.parametrize("off", [False, True])

@@ -50,6 +50,10 @@ def test_a_flight_without_noise_is_predicted(model):
     assert np.abs(found.predicted - found.measured).max() < 3 * off
     assert np.all(skill.skill > 1 - 1e-3)
     assert skill.starts == found.start.size == len(found.initial)
+    # Windows and channels do not matter.
+    arguments = {"sigma": jaxos4.SENSOR_SIGMA, "channels": "all", "method": "rk4", "windows": 5}
+    other = jaxos4.predictions(jaxos4.ShootingProblem(model, flight, **arguments), model.alpha)
+    np.testing.assert_allclose(other.predicted, found.predicted, rtol=1e-12, atol=1e-13)
 
 
 def test_at_a_step_so_long_that_the_start_is_one_sample_predictions_are_exact():
@@ -65,34 +69,17 @@ def test_at_a_step_so_long_that_the_start_is_one_sample_predictions_are_exact():
     np.testing.assert_allclose(found.horizons, np.rint(np.array(HORIZONS) / 0.025) * 0.025)
 
 
-def test_a_model_without_motion_has_no_skill():
-    model = jaxos4.CorrectedOS4()
-    still = jnp.zeros(8)
-    found = jaxos4.predictions(problem_of(model, flown(model)), still, horizons=HORIZONS)
+def test_a_model_without_motion_has_no_skill_and_a_gyros_bias_is_not_taken_for_motion():
+    model, biased_model = jaxos4.CorrectedOS4(), jaxos4.FlightModel(terms=("gyro_bias",))
+    found = jaxos4.predictions(problem_of(model, flown(model)), jnp.zeros(8), horizons=HORIZONS)
     np.testing.assert_array_equal(found.predicted, np.repeat(found.initial[:, None], 3, axis=1))
     skill = jaxos4.skill(found)
     np.testing.assert_array_equal(skill.skill, 0.0)
     np.testing.assert_array_equal(skill.rmse, skill.persistence)
-
-
-def test_a_gyros_bias_is_not_taken_for_motion():
-    model = jaxos4.FlightModel(terms=("gyro_bias",))
-    plain = jaxos4.CorrectedOS4()
-    flight = flown(plain, dt=0.025)
-    bias = jnp.array([0.05, -0.03, 0.02])
+    flight, bias = flown(model, dt=0.025), jnp.array([0.05, -0.03, 0.02])
     biased = jaxos4.Flight(flight.time, flight.omega, flight.states.at[:, jnp.array(RATES)].add(bias))
-    found = jaxos4.predictions(problem_of(model, biased), jnp.concatenate([plain.alpha, bias]))
+    found = jaxos4.predictions(problem_of(biased_model, biased), jnp.concatenate([model.alpha, bias]))
     np.testing.assert_allclose(found.predicted, found.measured, atol=1e-12)
-
-
-def test_windows_and_channels_do_not_matter():
-    model = jaxos4.CorrectedOS4()
-    flight = flown(model)
-    one = spread(model, flight)
-    for windows in (5, 1):
-        arguments = {"sigma": jaxos4.SENSOR_SIGMA, "channels": "all", "method": "rk4", "windows": windows}
-        other = jaxos4.predictions(jaxos4.ShootingProblem(model, flight, **arguments), model.alpha)
-        np.testing.assert_allclose(other.predicted, one.predicted, rtol=1e-12, atol=1e-13)
 
 
 def test_no_prediction_crosses_into_another_stretch():
@@ -148,11 +135,8 @@ def test_the_skill_compares_errors_with_changes(errors, changes, expected):
     np.testing.assert_allclose(skill.skill, np.broadcast_to(expected, (1, 3)))
     assert skill.starts == len(errors)
     assert np.isnan(skill.std).all() or skill.starts > 1
-
-
-def test_a_prediction_that_diverges_has_a_very_bad_skill():
+    # A prediction that diverges counts as an error that no gyro could measure.
     skill = jaxos4.skill(synthetic(np.where(np.arange(40) == 7, np.nan, 0.1)[:, None, None], 1.0))
-    # It counts as an error that no gyro could measure.
     assert np.all(np.isfinite(skill.skill) & (skill.skill < -1e4))
     np.testing.assert_allclose(skill.rmse, np.sqrt((1e6 + 39 * 0.01) / 40), rtol=1e-2)
 
