@@ -17,9 +17,8 @@ from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem
 from .network import GivenNetwork, loaded, network_for, network_provenance
 from .problem import Intervals, bracket_of, flight_problem
-from .provenance import airframe_name, class_name, name_and_class, versions
 from .results import Provenance
-from .settings import FlightSettings
+from .settings import FlightSettings, airframe_name, class_name, name_and_class, versions
 
 Progress = Callable[[str], None]
 

@@ -1,15 +1,20 @@
-"""Settings of an identification: of one flight of an OS4, and of recordings of a vehicle."""
+"""Settings of an identification, of one flight of an OS4 and of recordings of a vehicle; names and versions."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..airframe import Airframe
+import jax
+
+from .._version import __version__
+from ..airframe import PRESETS, Airframe
 from ..errors import InputError
+from ..estimate import AbstractEstimator
+from ..estimators import ESTIMATORS
 from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..recording.preparation import HOLDOUT
-from .provenance import class_name
+from ..shooting import ShootingProblem
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,3 +90,32 @@ def vehicle_settings(settings: Settings | None) -> VehicleSettings:
     if isinstance(settings, FlightSettings):
         raise InputError("`settings`: must be VehicleSettings for an airframe as `subject`, got FlightSettings.")
     return VehicleSettings() if settings is None else settings
+
+
+def versions(problem: ShootingProblem) -> dict[str, Any]:
+    """Versions, device and precision."""
+    return {
+        "version": __version__,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "precision": str(problem.flight.time.dtype),
+    }
+
+
+def airframe_name(airframe: Airframe) -> str:
+    """The name of a preset, or "custom"."""
+    return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")
+
+
+def class_name(instance: object, kinds: Mapping[str, type]) -> str:
+    """The name of an object's class in a table of classes, or else the class's own name."""
+    return next((name for name, kind in kinds.items() if type(instance) is kind), type(instance).__name__)
+
+
+def name_and_class(estimator: str | AbstractEstimator) -> tuple[str, type[AbstractEstimator]]:
+    """The name and the class of an estimator. Raises `InputError` for an unknown name."""
+    if not isinstance(estimator, str):
+        return class_name(estimator, ESTIMATORS), type(estimator)
+    if estimator not in ESTIMATORS:
+        raise InputError(f"`estimator`: must be one of {', '.join(ESTIMATORS)}, got {estimator!r}.")
+    return estimator, ESTIMATORS[estimator]

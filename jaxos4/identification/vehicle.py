@@ -23,9 +23,8 @@ from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_o
 from .network import GivenNetwork, vehicle_network_for
 from .prepare import Case, HeldOut, Progress
 from .problem import Intervals, bracket_of
-from .provenance import airframe_name, name_and_class, versions
 from .results import Provenance
-from .settings import VehicleSettings
+from .settings import VehicleSettings, airframe_name, name_and_class, versions
 
 # The scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
 _FIRST_SIGMA = 0.5

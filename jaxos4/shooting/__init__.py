@@ -5,7 +5,14 @@ from .batching import cores as cores, in_blocks as in_blocks, on_all_cores as on
 from .innovations import InnovationsProblem as InnovationsProblem
 from .padding import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded
 from .problem import ShootingProblem as ShootingProblem
-from .rows import Rows as Rows, each_window as each_window
-from .scans import FASTEST as FASTEST, Curvature as Curvature, Length as Length, Parts as Parts, Shot as Shot
+from .scans import (
+    FASTEST as FASTEST,
+    Curvature as Curvature,
+    Length as Length,
+    Parts as Parts,
+    Rows as Rows,
+    Shot as Shot,
+    each_window as each_window,
+)
 from .stages import ROUNDING as ROUNDING
 from .unknowns import Unknowns as Unknowns

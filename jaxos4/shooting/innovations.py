@@ -28,8 +28,7 @@ from .abstract import AbstractProblem, Stages, WindowUnknowns
 from .filters import Innovations, innovate
 from .gains import LogNoise, Observed, first_noise, is_rate
 from .problem import ShootingProblem
-from .rows import Rows, windowed
-from .scans import Curvature, Parts, Shot
+from .scans import Curvature, Parts, Rows, Shot, windowed
 from .segments import Segments, observe_in_segments
 from .unknowns import Unknowns, Values
 

@@ -20,8 +20,7 @@ from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
 from .abstract import AbstractProblem, Stages
-from .rows import Rows, each_window, windowed
-from .scans import Curvature, Length, Shot, predict_window, shoot, shoot_with_derivatives
+from .scans import Curvature, Length, Rows, Shot, each_window, predict_window, shoot, shoot_with_derivatives, windowed
 from .stages import ROUNDING, shooting_stages
 from .unknowns import Unknowns
 

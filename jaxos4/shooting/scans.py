@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import InitialState, Parameters, Scalar
+from .._custom_types import InitialState, Numeric, Parameters, Scalar
 from ..models.state import Forcing, State, unstack
 from .batching import computed_once, with_batch
-from .rows import Rows
 
 # A body rate [rad/s] that no quadrotor reaches and no gyro measures: a faster trajectory has diverged.
 FASTEST = 1e3
@@ -28,11 +27,24 @@ _PANEL = 4
 # From a state, the forcing and the parameters: the state one sample later, and the output of noise-free sensors.
 Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
 Carry = TypeVar("Carry")
+Series = TypeVar("Series", Forcing, tuple[Array, ...])
 # One value, or one for each lane of a batch.
 Lanes = Float[Array, "*#lanes"]
 # The number of rows that count in a padded flight. It is data and not a shape, so that flights of different lengths
 # share one compiled program.
 Length = Int[Array, ""] | None
+
+
+class Rows(NamedTuple):
+    """One window, or a batch of windows: one leaf for each channel, one row for each sample.
+
+    `forcing` acts from each sample to the next. A missing measurement is NaN. `forcing_tangents` is the derivative of
+    the forcing in the parameters on which it depends, along the last axis.
+    """
+
+    forcing: Forcing
+    measured: tuple[Float[Array, "*windows rows"], ...]
+    forcing_tangents: Forcing | None = None
 
 
 class Shot(NamedTuple):
@@ -285,3 +297,20 @@ def _errors(
 
 def _half_square(errors: list[Lanes]) -> Lanes:
     return functools.reduce(lambda total, e: total + e * e, errors, jnp.zeros_like(errors[0])) / 2
+
+
+def each_window(function: Callable, *arguments: Any) -> Any:
+    """`function` of each window. The only window of a flight needs no `vmap`, which takes long to trace."""
+    if jax.tree.leaves(arguments[0])[0].shape[0] > 1:
+        return jax.vmap(function)(*arguments)
+    only = jax.tree.map(lambda leaf: leaf[0], arguments)
+    return jax.tree.map(lambda leaf: leaf[None], function(*only))
+
+
+def windowed(series: Series, index: Int[Numeric, "windows length"]) -> Series:
+    """The series of each window, from those of the flight. Windows of equal length need no copy."""
+
+    def rows(leaf: Float[Array, "samples ..."]) -> Float[Array, "windows length ..."]:
+        return leaf.reshape(index.shape) if index.size == leaf.shape[0] else leaf[index]
+
+    return jax.tree.map(rows, series)

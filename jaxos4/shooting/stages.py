@@ -15,8 +15,7 @@ from jaxtyping import Array, Int
 
 from .._custom_types import Scalar
 from .abstract import Stages, WindowUnknowns
-from .rows import Rows, each_window
-from .scans import Curvature
+from .scans import Curvature, Rows, each_window
 
 if TYPE_CHECKING:
     from .problem import ShootingProblem
