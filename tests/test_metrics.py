@@ -16,7 +16,7 @@ CONVERGED = (RESULTS.index("successful"), RESULTS.index("unidentifiable"))
 @pytest.fixture(scope="module", params=[False, True], ids=["one truth", "a truth each"])
 def study(request):
     estimators = ("ibss", "network", "hybrid", "svsf")
-    return synthetic_study(flights=12, drawn=request.param, scales=(0.1, 10.0), estimators=estimators, example=False)
+    return synthetic_study(flights=12, drawn=request.param, scales=(0.1, 10.0), estimators=estimators)
 
 
 def cells(study):
@@ -111,7 +111,7 @@ def test_monte_carlo_intervals_hold_the_truth_as_often_as_they_say():
 
 
 def test_metrics_of_a_study_without_results_or_noise_are_nan_without_a_warning():
-    study = synthetic_study(flights=4, scales=(0.0, 1.0), spoiled=False, example=False)
+    study = synthetic_study(flights=4, scales=(0.0, 1.0), spoiled=False)
     assert metrics.efficiency(study)["efficiency"].isel(scale=0).isnull().all()
     assert metrics.estimator_error(study)["percent"].sel(parameter="alpha2").isel(scale=0).notnull().all()
     study["result"][:] = RESULTS.index("not_run")
