@@ -71,7 +71,7 @@ def searched(estimator, flights, airframes):
 @functools.cache
 def found_by(name):
     """The estimates of all unknowns: parameters, and the logarithms of the noise."""
-    estimator = {"filter error": jaxos4.FilterError(), "ibss": jaxos4.IBSS(tolerance=0.05)}[name]
+    estimator = {"filter error": jaxos4.FilterError(), "ibss": jaxos4.IBSS()}[name]
     return searched(estimator, *flown())
 
 
@@ -123,14 +123,13 @@ def one_flight(i, **arguments):
 
 
 @pytest.mark.usefixtures("optimised")
-@pytest.mark.parametrize("i", [0, 5])
-def test_bisection_finds_what_newtons_method_finds(i):
-    problem = one_flight(i)
-    count = problem.problem.unknowns.count
-    newton, ibss = (estimator(problem) for estimator in (jaxos4.FilterError(), jaxos4.IBSS(tolerance=0.05)))
-    assert names(newton) == names(ibss) == "successful"
-    assert (np.abs(ibss.parameters - newton.parameters) / newton.std)[:count].max() < 0.05
-    np.testing.assert_allclose(ibss.std[:count], newton.std[:count], rtol=0.1)
+def test_bisection_finds_what_newtons_method_finds():
+    """IBSS ends within 0.005 standard deviations of the minimum, Newton's method within 0.04."""
+    newton, ibss = (found_by(name) for name in ("filter error", "ibss"))
+    count = len(jaxos4.FlightModel(CRAZYFLIE, terms=TERMS).parameter_names)
+    off = (np.asarray(ibss.parameters) - np.asarray(newton.parameters)) / np.asarray(newton.std)
+    assert np.abs(off[:, :count]).max() < 0.05
+    np.testing.assert_allclose(ibss.std[:, :count], newton.std[:, :count], rtol=0.1)
 
 
 @pytest.mark.usefixtures("optimised")
@@ -141,7 +140,7 @@ def test_the_hybrid_finds_it_too():
     bracket = jaxos4.Bracket.around(unknowns.center, 0.5 * unknowns.half_width)
     settings = jaxos4.NetworkEstimator(steps=100, batch=64, noise=(1.0, 1.0), held_out=1000)
     network = settings.fit(problem.problem, bracket, key=jax.random.key(0))
-    hybrid = jaxos4.Hybrid(network, jaxos4.IBSS(tolerance=0.05))
+    hybrid = jaxos4.Hybrid(network)
     found, newton = hybrid(problem), jaxos4.FilterError()(problem)
     assert names(found) == "successful"
     assert (np.abs(found.parameters - newton.parameters) / newton.std)[: unknowns.count].max() < 0.05

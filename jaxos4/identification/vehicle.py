@@ -12,7 +12,7 @@ from ..analysis.prediction import HORIZONS, starts
 from ..bracket import Bracket
 from ..errors import InputError, TrainingError
 from ..estimate import AbstractEstimator
-from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
+from ..estimators import ESTIMATORS, IBSS, FilterError, make_estimator
 from ..flight import Flight
 from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, default_terms
 from ..models.vehicle import FlightModel
@@ -32,10 +32,8 @@ _FIRST_SIGMA = 0.5
 _SEGMENTS = 16
 _FEW_RECORDINGS = 4  # from twice this number of recordings on, there are more segments
 _SHORTEST_SEGMENT = 1.25  # no segment is shorter than this [s]
-# The cost has kinks where a delay passes a sample. Closer to the minimum than this, slopes jump [standard deviations].
-_KINKS = 0.05
-# The estimator of a vehicle, which flies in closed loop.
-DEFAULT = "filter-error"
+# The estimator of a vehicle, which flies in closed loop. It stops within 0.05 standard deviations of the minimum.
+DEFAULT, _NEWTON = "filter-error", FilterError(tolerance=1e-3)
 
 
 def prepare_vehicle(
@@ -104,7 +102,7 @@ def _case(
     recording = np.asarray(prepared.recordings)[number]
     problem = _innovations(shooting, prepared, room)
     return Case(
-        problem, shooting, FilterError(), name, "flight", FilterError.prior, held_out, recording, provenance,
+        problem, shooting, _NEWTON, name, "flight", FilterError.prior, held_out, recording, provenance,
         doubts=prepared.doubts, log_step=prepared.log_step,
     )  # fmt: skip
 
@@ -114,7 +112,7 @@ def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int,
     if not isinstance(estimator, str):
         return case._replace(estimator=estimator)
     if not ESTIMATORS[estimator].needs_network:
-        return case._replace(estimator=_coarser(make_estimator(estimator)))
+        return case._replace(estimator=make_estimator(estimator))
     progress("training a network for these flights")
     try:
         name = str((case.provenance.flights or ["flight"])[0])
@@ -122,8 +120,8 @@ def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int,
     except TrainingError as error:
         note = f"no network for these flights ({error}); IBSS searched the whole bracket"
         provenance = msgspec.structs.replace(case.provenance, notes=[*case.provenance.notes, note])
-        return case._replace(estimator=_coarser(IBSS()), provenance=provenance)
-    return case._replace(problem=_unpadded(case), estimator=_coarser(make_estimator(estimator, trained)))
+        return case._replace(estimator=IBSS(), provenance=provenance)
+    return case._replace(problem=_unpadded(case), estimator=make_estimator(estimator, trained))
 
 
 def _levelled(bracket: Intervals, prepared: Prepared, model: FlightModel) -> Intervals:
@@ -137,13 +135,6 @@ def _levelled(bracket: Intervals, prepared: Prepared, model: FlightModel) -> Int
 def _unpadded(case: Case) -> InnovationsProblem:
     """The likelihood without padding: a network answers flights of the length that it was trained for."""
     return dataclasses.replace(case.innovations, problem=case.shooting)
-
-
-def _coarser(method: AbstractEstimator) -> AbstractEstimator:
-    """The estimator, which ends a bisection where the kinks of a vehicle's cost begin to matter."""
-    if isinstance(method, Hybrid):
-        return dataclasses.replace(method, ibss=dataclasses.replace(method.ibss, tolerance=_KINKS))
-    return dataclasses.replace(method, tolerance=_KINKS) if isinstance(method, IBSS) else method
 
 
 def _vehicle_shooting(model: FlightModel, prepared: Prepared, bracket: Bracket, name: str) -> ShootingProblem:

@@ -106,7 +106,11 @@ def _advance(
     """What is known one sample later, and the innovations of this sample."""
     outputs = observe(State(known.rates), forcing, scalars)
     means = zip(feedback.reach, feedback.kept, known.disturbance, strict=True)  # of the disturbance over this sample
-    force = (h + a / kept * d for h, (a, kept, d) in zip(outputs[RATES:], tuple(means)[RATES:], strict=True))
+    least = np.finfo(known.rates[0].dtype).tiny  # a disturbance that fades within the sample is 0 at its end
+    force = (
+        h + a / jnp.maximum(kept, least) * d
+        for h, (a, kept, d) in zip(outputs[RATES:], tuple(means)[RATES:], strict=True)
+    )
     # What was not measured has no gain.
     errors = tuple(z - h for z, h in zip(row.measured, (*outputs[:RATES], *force), strict=True))
     disturbance = tuple(
