@@ -236,36 +236,6 @@ def test_the_command_writes_references_that_simulate_flies(references, run, tmp_
     assert "2501 samples of 0.004 s" in out
 
 
-# Mistakes.
-
-OPEN = ("--initial-state", "known")
-
-
-@pytest.mark.parametrize(
-    ("options", "line", "said"),
-    [
-        (OPEN, "--duration 0", ("--duration", "50 to 2500 samples")),
-        (OPEN, "--duration 2 --fastest 150", ("cannot hover", "225.7")),
-        (OPEN, "--duration 2 --rate -1", ("--rate must be positive",)),
-        (OPEN, "--accuracy 0", ("--accuracy",)),
-        (OPEN, "--bandwidth 100", ("--bandwidth", "0.2 to 25 Hz")),  # by default 5 s, sampled every 0.01 s
-        (OPEN, "--figure new.csv", ("--figure", "--out")),
-        (OPEN, "--figure new.png", ("--figure new.png", ".svg")),
-        (OPEN, "--gust 5", ("--gust", "with --closed-loop; add that")),
-        (CLOSED, "--duration 1000", ("--duration", "250 to 20000 samples")),
-        (CLOSED, "--angle 2", ("--angle", "at most 1")),
-        (CLOSED, "--fastest 300", ("cannot hover",)),
-        (CLOSED, "--slew 5", ("--slew", "without --closed-loop")),
-        (CLOSED, "--channels rates", ("--channels", "without --closed-loop")),
-        (CLOSED, "--sensors commands --airframe os4", ("--sensors", "max_rotor_speed")),
-    ],
-)
-def test_mistakes_are_one_line_and_write_nothing(run, tmp_path, options, line, said):
-    (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
-    refused(run("design", *options, "--out", "new.csv", *line.split()), *said)
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]
-
-
 @pytest.mark.parametrize(
     ("read", "text", "said"),
     [

@@ -19,18 +19,9 @@ every_airframe = pytest.mark.parametrize("airframe", AIRFRAMES.values(), ids=AIR
 every_in_turn = pytest.mark.parametrize("excite", IN_TURN.values(), ids=IN_TURN)
 
 
-def with_largest_speed(speed):
-    return eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(speed))
-
-
 def accelerations(airframe, omega):
     """Angular accelerations [rad/s^2] that the rotor speeds cause at zero rates."""
     return np.asarray(omega) ** 2 @ np.asarray(airframe.mixer)[:3].T / np.asarray(airframe.inertia)
-
-
-def named(pattern, caught):
-    """The number that a message names."""
-    return float(re.findall(pattern, str(caught.value))[0])
 
 
 def rates_and_angles(airframe, omega, dt=0.01):
@@ -68,17 +59,11 @@ def test_default_flights(airframe, excite):
 @every_in_turn
 @every_airframe
 @pytest.mark.parametrize("duration", [5.0, 11.37])
-def test_one_axis_at_a_time_and_back_to_rest(airframe, excite, duration):
+def test_one_axis_at_a_time_in_the_order_given_and_back_to_rest(airframe, excite, duration):
     rates, angles = rates_and_angles(airframe, excite(airframe, duration=duration))
-    moving = np.abs(rates) > 1e-9
-    assert moving.sum(axis=1).max() == 1
-    np.testing.assert_allclose(rates[-1], 0, atol=1e-10)
-    np.testing.assert_allclose(angles[-1], 0, atol=1e-10)
+    assert (np.abs(rates) > 1e-9).sum(axis=1).max() == 1
+    np.testing.assert_allclose([rates[-1], angles[-1]], 0, atol=1e-10)
     np.testing.assert_allclose(np.abs(rates).max(axis=0), (1, 1, 0.5 if excite is chirp else 1), rtol=1e-9)
-
-
-@every_in_turn
-def test_axes_are_flown_in_the_order_given(excite):
     rates, _ = rates_and_angles(OS4, excite(OS4, axes=("yaw", "roll"), amplitude=0.5))
     first = [np.flatnonzero(np.abs(rates[:, axis]) > 1e-9) for axis in range(3)]
     assert first[2][0] < first[0][0]
@@ -132,17 +117,15 @@ def test_amplitude_scales_every_axis_by_itself(excite):
 
 
 @every_excitation
-@pytest.mark.parametrize(
-    ("airframe", "amplitude"), [(OS4, (0.0, 0.0, 9.0)), (OS4, 30.0), (with_largest_speed(260.0), 4.0)]
-)
-def test_unflyable_amplitudes_name_the_scale_that_flies(airframe, amplitude, excite):
-    with pytest.raises(ValueError, match=r"too large to fly: rotor \d .*max_rotor_speed") as caught:
+@pytest.mark.parametrize(("speed", "amplitude"), [(np.inf, (0.0, 0.0, 9.0)), (np.inf, 30.0), (260.0, 4.0)])
+def test_unflyable_amplitudes_name_the_scale_that_flies(speed, amplitude, excite):
+    airframe = eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(speed))
+    with pytest.raises(ValueError, match=r"^[^\n]*too large to fly: rotor \d .*max_rotor_speed[^\n]*$") as caught:
         excite(airframe, amplitude=amplitude)
-    assert "\n" not in str(caught.value)
-    scale = named(r"multiply it by (\S+) or less", caught)
+    scale = float(re.findall(r"multiply it by (\S+) or less", str(caught.value))[0])
     omega = np.asarray(excite(airframe, amplitude=np.multiply(amplitude, scale)))
     assert np.isfinite(omega).all()
-    assert omega.max() <= airframe.max_rotor_speed
+    assert omega.max() <= speed
     with pytest.raises(ValueError, match="too large to fly"):
         excite(airframe, amplitude=np.multiply(amplitude, 1.02 * scale))
 

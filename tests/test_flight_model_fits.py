@@ -15,16 +15,15 @@ from jaxos4.models.rotors import Grid, Motor, driven
 from jaxos4.models.state import CASCADE_ORDER
 
 
-@pytest.mark.parametrize("counts", [(1,), (2,), (37,), (5, 1, 20, 11), (1, 1, 1), (64, 64)])
+@pytest.mark.parametrize("counts", [(1,), (37,), (5, 1, 20, 11), (64, 64)])
 def test_the_filter_is_the_recursion(counts):
     samples, dt, lag = sum(counts), 0.004, 0.05
     omega = np.random.default_rng(0).uniform(100, 400, (samples, 4))
     stretch = np.repeat(np.arange(len(counts)), counts)
     model = jaxos4.FlightModel(FULL, terms=("lag", "reaction", "accelerometer"))
-    values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True)) | {"rotor_lag": lag}
-    given = None if len(counts) == 1 else jnp.asarray(stretch)
-    inputs = Inputs(jnp.asarray(omega), jnp.asarray(dt), stretches=None if given is None else Stretches.of(given))
-    found = forcing_of(model, inputs, jnp.array(list(values.values())))
+    values = truth(model).at[model.parameter_names.index("rotor_lag")].set(lag)
+    stretches = None if len(counts) == 1 else Stretches.of(jnp.asarray(stretch))
+    found = forcing_of(model, Inputs(jnp.asarray(omega), jnp.asarray(dt), stretches=stretches), values)
     decay, here = np.exp(-dt / lag), np.empty_like(omega)
     for k in range(samples):
         restart = k == 0 or stretch[k] != stretch[k - 1]
@@ -62,7 +61,7 @@ def delayed(omega, delay, dt=0.01, stretch=None):
     return model.forcing(inputs, model.alpha.at[8].set(delay)).residual_speed
 
 
-@pytest.mark.parametrize("samples", [-3, -1, 0, 1, 2, 7])
+@pytest.mark.parametrize("samples", [-3, 0, 1, 7])
 def test_whole_delays_are_exact(samples):
     counts = (30, 12, 1, 4)
     omega = np.random.default_rng(0).uniform(100, 400, (sum(counts), 4))
@@ -129,18 +128,16 @@ RIGID = ("alpha1", "alpha2", "alpha4", "alpha5", "alpha7")
 def two_flights(model, *, windows=2, dt=0.01, seconds=2.0, noise=0.0, channels="rates"):
     """Two stretches, flown by the model itself and seen by its sensors."""
     parts, rng = [], np.random.default_rng(0)
-    recordings = model.recordings if len(model.recordings) == 2 else (0, 0)
-    for i, recording in enumerate(recordings):
+    alone = jaxos4.FlightModel(model.airframe, terms=model.terms, battery_voltage=model.battery_voltage)
+    values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True))
+    for i, recording in enumerate(model.recordings if len(model.recordings) == 2 else (0, 0)):
         omega = commands(seconds, dt, hold=dt)[:: 1 - 2 * i][:-1]
-        alone = jaxos4.FlightModel(model.airframe, terms=model.terms, battery_voltage=model.battery_voltage)
-        voltage = battery(omega.shape[0], dt) - 0.5 * i
-        values = dict(zip(model.parameter_names, truth(model).tolist(), strict=True))
+        time, voltage = dt * np.arange(omega.shape[0]), battery(omega.shape[0], dt) - 0.5 * i
         own = jnp.array([values.get(n, values.get(f"{n}_{recording + 1}")) for n in alone.parameter_names])
-        time = dt * np.arange(omega.shape[0])
-        blank = jaxos4.Flight(time, omega, np.full((omega.shape[0], 12), np.nan), voltage=voltage)
+        states, force = np.full((time.size, 12), np.nan), np.full((time.size, 3), np.nan)
+        blank = jaxos4.Flight(time, omega, states, voltage=voltage)
         problem = jaxos4.ShootingProblem(alone, blank, sigma=np.ones(12), channels=channels)
         found = np.asarray(problem.predict(own, jnp.zeros(problem.size)))
-        states, force = np.full((omega.shape[0], 12), np.nan), np.full((omega.shape[0], 3), np.nan)
         states[:, CASCADE_ORDER[: problem.size]] = found[:, : problem.size]
         force[:, list(alone.force_axes)] = found[:, problem.size :]
         states, force = states + rng.normal(0, noise, states.shape), force + rng.normal(0, 10 * noise, force.shape)
@@ -191,7 +188,6 @@ def assert_held(found, values):
 @pytest.mark.parametrize(
     ("estimator", "terms", "channels"),
     [
-        (jaxos4.IBSS(), ("offset", "lag", "delay"), "rates"),
         (jaxos4.OutputError(), ("offset", "lag", "delay"), "rates"),
         (jaxos4.IBSS(), ("offset", "gyro_bias"), "attitude"),
     ],

@@ -142,17 +142,11 @@ def test_a_fit_without_skill_is_not_believed(rates, axes):
     assert doubt.result == "no_skill"
     assert axes in str(doubt)
     assert doubts(skill=skill(**dict.fromkeys(rates))) == ()  # not measured
-
-
-def test_an_axis_that_the_held_out_part_hardly_shows_has_no_skill_to_lose():
+    # An axis that the held-out part hardly shows has no skill to lose, and the cause comes before the missing skill.
     poor = skill(p=0.5, q=0.5, r=-2.0)
     assert doubts(skill=poor, still=["yaw"]) == ()
     (doubt,) = doubts(skill=poor, still=["roll", "pitch", "yaw"])
-    assert doubt.result == "no_skill"
-    assert "`validate`" in doubt.remedy
-
-
-def test_the_cause_comes_before_the_missing_skill():
+    assert (doubt.result, "`validate`" in doubt.remedy) == ("no_skill", True)
     first, second = doubts({"rotor_lag": (0.002, 0.001)}, skill=skill(p=-1.0), log_step=0.01)
     assert "rotor_lag = 0.002 s is shorter than a sample of the log, 0.01 s" in first.cause
     assert second.result == "no_skill"
@@ -182,13 +176,13 @@ def test_a_disturbance_larger_than_the_control_is_named():
 # The jackknife of a straight line, for which one Gauss-Newton step is exact.
 
 
-def segments_of_a_line(rng, lanes=40, samples=50, *, spread=0.0):
-    """Gradient and information of y = a x + b + noise in each segment, at the joint least-squares estimate.
+def segments_of_a_line(rng, slopes=1.0):
+    """Gradient and information of y = slope x + b + noise in 40 segments, at the joint least-squares estimate.
 
-    `spread`: standard deviation of the slope between segments. Also the data.
+    Also the data.
     """
-    x = rng.standard_normal((lanes, samples))
-    y = (1.0 + spread * rng.standard_normal((lanes, 1))) * x + 0.5 + rng.standard_normal((lanes, samples))
+    x = rng.standard_normal((40, 50))
+    y = slopes * x + 0.5 + rng.standard_normal(x.shape)
     regressors = np.stack([x, np.ones_like(x)], axis=-1)
     information = np.einsum("lsi,lsj->lij", regressors, regressors)
     estimate = np.linalg.solve(information.sum(axis=0), np.einsum("lsi,ls->i", regressors, y))
@@ -197,7 +191,8 @@ def segments_of_a_line(rng, lanes=40, samples=50, *, spread=0.0):
 
 
 def test_the_jackknife_is_that_of_repeated_fits():
-    gradient, information, regressors, y = segments_of_a_line(np.random.default_rng(3), spread=0.5)
+    rng = np.random.default_rng(3)
+    gradient, information, regressors, y = segments_of_a_line(rng, 1.0 + 0.5 * rng.standard_normal((40, 1)))
     (part,) = parts_of(40, np.zeros(40, dtype=int))
     factor = disagreement(gradient, information, np.zeros((2, 2)), part)
     fits = []
@@ -221,23 +216,17 @@ def test_parts_that_agree_widen_one_interval_in_twenty():
     assert np.max(factors) < 2
 
 
-def test_recordings_are_parts_of_their_own_if_there_are_enough():
+def test_recordings_are_parts_of_their_own_if_there_are_enough_and_widen_more_than_their_blocks():
+    """A slope that differs from recording to recording, and not within one."""
     lanes = np.arange(12)
     assert len(parts_of(12, lanes // 6)) == 1
     blocks, recordings = parts_of(12, lanes // 3)
     assert np.unique(blocks).size == 12
     assert recordings.tolist() == (lanes // 3).tolist()
     assert parts_of(3, np.zeros(3, dtype=int)) == []
-
-
-def test_recordings_that_differ_widen_more_than_their_blocks():
-    """A slope that differs from recording to recording, and not within one."""
-    rng = np.random.default_rng(5)
-    gradient, information, regressors, y = segments_of_a_line(rng)
-    recording = np.arange(40) // 8
-    y = y + np.repeat(rng.standard_normal(5), 8)[:, None] * regressors[..., 0]
-    estimate = np.linalg.solve(information.sum(axis=0), np.einsum("lsi,ls->i", regressors, y))
-    gradient = -np.einsum("lsi,ls->li", regressors, y - regressors @ estimate)
+    rng, recording = np.random.default_rng(5), np.arange(40) // 8
+    slopes = 1.0 + np.repeat(rng.standard_normal(5), 8)[:, None]
+    gradient, information, *_ = segments_of_a_line(rng, slopes)
     by_block, by_recording = (
         disagreement(gradient, information, np.zeros((2, 2)), part)[0] for part in parts_of(40, recording)
     )

@@ -18,13 +18,11 @@ THETA, Q = jaxos4.STATE_NAMES.index("theta"), jaxos4.STATE_NAMES.index("q")
 SUCCESS, SINGULAR, NONFINITE = "successful", "attitude_singularity", "nonfinite_trajectory"
 
 
-SAMPLES, LANES = 26, 6  # one size, so that each method compiles once
-
-
 def name(flight):
     return jaxos4.result_names(flight.result).tolist()
 
 
+SAMPLES, LANES = 26, 6  # one size, so that each method compiles once
 COARSE, STEPS = 0.04, (1, 2, 4)
 
 
@@ -98,14 +96,22 @@ def test_each_row_is_held_until_the_next(method):
 
 
 @every_method
-def test_begins_at_the_initial_state(method):
-    model = jaxos4.PublishedOS4()
-    start, hover = jnp.linspace(-0.3, 0.4, 12), jnp.full((SAMPLES, 4), model.airframe.hover_speed)
-    flight = jaxos4.simulate(model, model.alpha, hover, dt=DT, initial_state=start, method=method)
+def test_begins_at_the_initial_state_and_a_loop_is_a_batch(method):
+    model, omega = jaxos4.PublishedOS4(), standard_flight().omega[:SAMPLES]
+    alphas, start = model.alpha * jnp.linspace(0.8, 1.2, LANES)[:, None], jnp.linspace(-0.3, 0.4, 12)
+
+    def fly(alpha, start, omega=omega):
+        return jaxos4.simulate(model, alpha, omega, dt=DT, initial_state=start, method=method)
+
+    batched = batch(method, alphas, np.tile(omega, (LANES, 1, 1)), np.tile(start, (LANES, 1)))
+    each = [fly(alpha, start) for alpha in alphas]
+    np.testing.assert_allclose(batched.states, [one.states for one in each], rtol=1e-12, atol=1e-14)
+    flight = each[0]
     np.testing.assert_array_equal(flight.states[0], start)
     np.testing.assert_allclose(flight.time, DT * np.arange(SAMPLES))
     assert float(flight.dt) == pytest.approx(DT)
-    resumed = jaxos4.simulate(model, model.alpha, hover, dt=DT, initial_state=flight.states[5], method=method)
+    later = jnp.concatenate([omega[5:], omega[:5]])
+    resumed = fly(alphas[0], flight.states[5], later)
     np.testing.assert_allclose(resumed.states[:-5], flight.states[5:], rtol=1e-13, atol=1e-14)
 
 
@@ -116,16 +122,6 @@ def batch(method, *arguments):
         return jaxos4.simulate(jaxos4.PublishedOS4(), alpha, omega, dt=DT, initial_state=start, method=method)
 
     return eqx.filter_vmap(fly)(*map(jnp.asarray, arguments))
-
-
-@every_method
-def test_loop_and_vmap_agree(method):
-    model, omega = jaxos4.PublishedOS4(), standard_flight().omega[:SAMPLES]
-    alphas = model.alpha * jnp.linspace(0.8, 1.2, LANES)[:, None]
-    batched = batch(method, alphas, np.tile(omega, (LANES, 1, 1)), np.zeros((LANES, 12)))
-    each = [jaxos4.simulate(model, alpha, omega, dt=DT, method=method).states for alpha in alphas]
-    np.testing.assert_allclose(batched.states, each, rtol=1e-12, atol=1e-14)
-    assert name(batched) == [SUCCESS] * LANES
 
 
 def test_vmaps_over_flights_models_and_sample_times_and_runs_without_jit():
@@ -178,31 +174,21 @@ def test_agrees_with_the_library_to_about_one_ulp(dtype, turns):
     anywhere = rng.uniform(-turns, turns, 20_000)
     quarters = np.round(rng.uniform(-4 * turns, 4 * turns, 2_000)) / 4
     angle = (2 * np.pi * np.concatenate([anywhere, quarters])).astype(dtype)
-    sin, cos = sincos(jnp.asarray(angle))
-    assert sin.dtype == cos.dtype == dtype
-    exact = angle.astype(DOUBLE)
-    eps = np.finfo(dtype).eps
-    np.testing.assert_allclose(sin, np.sin(exact), rtol=0, atol=1.5 * eps)
-    np.testing.assert_allclose(cos, np.cos(exact), rtol=0, atol=1.5 * eps)
-    if dtype == DOUBLE and turns <= 1e3:  # and near the zeros, in their own units
-        np.testing.assert_allclose(sin, np.sin(exact), rtol=3 * eps)
-        np.testing.assert_allclose(cos, np.cos(exact), rtol=3 * eps)
+    exact, eps = angle.astype(DOUBLE), np.finfo(dtype).eps
+    for found, expected in zip(sincos(jnp.asarray(angle)), (np.sin(exact), np.cos(exact)), strict=True):
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1.5 * eps)
+        if dtype == DOUBLE and turns <= 1e3:  # and near the zeros, in their own units
+            np.testing.assert_allclose(found, expected, rtol=3 * eps)
+        with pytest.raises(AssertionError):  # a coarser one would be caught
+            np.testing.assert_allclose(found * (1 + 10 * eps), expected, rtol=0, atol=1.5 * eps)
 
 
-def test_nan_and_infinity_give_nan():
-    for value in sincos(jnp.array([jnp.nan, jnp.inf, -jnp.inf])):
-        assert np.isnan(value).all()
-    for value in jax.jvp(lambda x: sincos(x)[0], (jnp.array([jnp.nan, jnp.inf]),), (jnp.ones(2),)):
-        assert np.isnan(value).all()
-
-
-def test_derivatives_of_any_order_and_mode():
+def test_derivatives_of_any_order_and_mode_and_nan_for_infinity():
     angle = jnp.array([-4.0, -0.3, 0.0, 0.78, np.pi / 2, 2.5, 100.0])
     check_grads(lambda x: sincos(jnp.asarray(x)), (angle,), order=3, modes=("fwd", "rev"))
-    np.testing.assert_allclose(jax.vmap(jax.grad(lambda x: sincos(x)[0]))(angle), jnp.cos(angle), atol=1e-15)
-    np.testing.assert_allclose(jax.vmap(jax.grad(lambda x: sincos(x)[1]))(angle), -jnp.sin(angle), atol=1e-15)
-
-
-def test_the_reference_would_catch_a_coarser_one():
-    angle = jnp.linspace(-1, 1, 101)
-    assert np.abs(sincos(angle)[0] - jnp.sin(angle * (1 + 1e-14))).max() > 1.5 * np.finfo(DOUBLE).eps
+    for part, slope in ((0, np.cos(angle)), (1, -np.sin(angle))):
+        np.testing.assert_allclose(jax.vmap(jax.grad(lambda x, part=part: sincos(x)[part]))(angle), slope, atol=1e-15)
+    bad = jnp.array([jnp.nan, jnp.inf, -jnp.inf])
+    for value in (*sincos(bad), *jax.jvp(lambda x: sincos(x)[0], (bad,), (jnp.ones(3),))):
+        assert np.isnan(value).all()

@@ -110,20 +110,17 @@ def test_a_full_disk_is_one_line_and_the_study_resumes_later(whole, run, tmp_pat
     xr.testing.assert_identical(results(tmp_path / "out"), results(whole))
 
 
-def test_a_folder_that_cannot_be_written_to_is_refused(run, tmp_path, monkeypatch):
-    specification(tmp_path)
-    (tmp_path / "out").mkdir()
+def test_a_second_run_is_refused_during_the_first_and_where_nothing_can_be_written(copy, run, monkeypatch):
+    command = ("study", "spec.toml", "--out", "out")
+    with open_store(copy, load_study(copy.parent / "spec.toml"), "the first"):
+        refused(run(*command), "out", "another run is at work")
+        code, out, _ = run(*command, "--dry-run")
+        assert (code, "0 of 48 cells" in out) == (0, True)
+    assert run(*command)[0] == 0
     # Root may write anywhere, so that the refusal must be simulated.
     monkeypatch.setattr("os.access", lambda path, mode, **options: mode != os.W_OK)
-    refused(run("study", "spec.toml", "--out", "out"), "study.json", "not writable")
-
-
-def test_a_second_run_is_refused_during_the_first(copy, run):
-    with open_store(copy, load_study(copy.parent / "spec.toml"), "the first"):
-        refused(run("study", "spec.toml", "--out", "out"), "out", "another run is at work")
-        code, out, _ = run("study", "spec.toml", "--out", "out", "--dry-run")
-        assert (code, "0 of 48 cells" in out) == (0, True)
-    assert run("study", "spec.toml", "--out", "out")[0] == 0
+    (copy.parent / "empty").mkdir()
+    refused(run(*command[:-1], "empty"), "study.json", "not writable")
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "array", "other"])

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import noisy_states, standard_flight, standard_problem
+from helpers import noisy_states, standard_problem
 
 import jaxos4
 from jaxos4 import estimators
@@ -41,13 +41,8 @@ def test_a_held_parameter_keeps_its_value_and_has_no_variance(name):
 @pytest.mark.parametrize("name", ["ibss", "output-error", "kalman", "equation-error"])
 def test_the_others_are_estimated_without_error_if_the_held_values_are_true(name):
     model = jaxos4.CorrectedOS4()
-    flight = standard_flight(jaxos4.CorrectedOS4)
-    start = flight.states[0]
-    problem = jaxos4.ShootingProblem(
-        model, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=start, channels="rates"
-    ).hold({"alpha2": model.alpha[1], "alpha7": 0.0})
-    bracket = jaxos4.Bracket.around(model.alpha + 0.5 * model.half_width, model.half_width)
-    found = ESTIMATORS[name](problem, bracket)
+    problem = standard_problem(jaxos4.CorrectedOS4, "rates").hold({"alpha2": model.alpha[1], "alpha7": 0.0})
+    found = ESTIMATORS[name](problem, jaxos4.Bracket.around(model.alpha + 0.5 * model.half_width, model.half_width))
     # A Gaussian prior moves the answer by its share of the information.
     tolerance = 0.05 * np.asarray(found.std) + 1e-12 if name == "kalman" else 1e-5 * np.asarray(model.half_width)
     assert (np.abs(found.parameters - model.alpha) <= tolerance).all()
@@ -98,24 +93,14 @@ def test_a_bracket_moves_free_unknowns_only():
     assert eqx.tree_equal(twice, problem.unknowns)
 
 
-ALPHA = jaxos4.PublishedOS4().alpha
-HALF = jaxos4.DEFAULT_HALF_WIDTH
-
-
-def test_a_bracket_reaches_one_half_width_to_each_side():
-    bracket = jaxos4.Bracket.around(ALPHA, HALF)
-    np.testing.assert_array_equal(bracket.lower, ALPHA - HALF)
-    np.testing.assert_array_equal(bracket.upper, ALPHA + HALF)
-    np.testing.assert_allclose(bracket.center, ALPHA, rtol=1e-15, atol=1e-15)
-    np.testing.assert_allclose(bracket.half_width, HALF, rtol=1e-13)
-
-
-def test_the_default_bracket_is_the_models_own():
+def test_the_default_bracket_is_the_models_own_to_each_side():
     for airframe in (jaxos4.OS4, jaxos4.VOOS):
         model = jaxos4.CorrectedOS4(airframe)
         bracket = jaxos4.Bracket.default(model)
-        np.testing.assert_allclose(bracket.center, model.alpha)
-        np.testing.assert_allclose(bracket.half_width, model.half_width)
+        np.testing.assert_allclose(bracket.lower, model.alpha - model.half_width, rtol=1e-14)
+        np.testing.assert_allclose(bracket.upper, model.alpha + model.half_width, rtol=1e-14)
+        np.testing.assert_allclose(bracket.center, model.alpha, rtol=1e-15, atol=1e-15)
+        np.testing.assert_allclose(bracket.half_width, model.half_width, rtol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -126,9 +111,7 @@ def test_the_default_bracket_is_the_models_own():
         ([0.0, jnp.nan], [1.0, 1.0]),
         ([0.0, 0.0], [1.0, jnp.nan]),
         ([0.0, 0.0], [1.0, jnp.inf]),
-        ([-jnp.inf, 0.0], [1.0, 1.0]),
         ([-jnp.inf, -jnp.inf], [jnp.inf, jnp.inf]),
-        ([0.0, jnp.inf], [1.0, jnp.inf]),
     ],
 )
 def test_says_when_it_is_none(lower, upper):
@@ -140,23 +123,12 @@ def test_says_when_it_is_none(lower, upper):
 # Results.
 
 
-def test_every_result_has_a_name_and_a_message():
+def test_every_result_has_a_name_and_a_message_in_a_batch_too():
     assert len(jaxos4.RESULTS) == len(NAMES)
     for name in NAMES:
         result = getattr(jaxos4.RESULTS, name)
         assert jaxos4.result_names(result).tolist() == name
         assert (jaxos4.RESULTS[result] == "") is (name == "successful")
-
-
-def test_names_a_whole_batch():
-    codes = jnp.array([[0, 1, 2], [2, 1, 0]])
-
-    def result(code):
-        chosen = jaxos4.RESULTS.where(code == 1, jaxos4.RESULTS.at_bound, jaxos4.RESULTS.successful)
-        return jaxos4.RESULTS.where(code == 2, jaxos4.RESULTS.max_sweeps, chosen)
-
-    batch = eqx.filter_vmap(eqx.filter_vmap(result))(codes)
-    assert jaxos4.result_names(batch).tolist() == [
-        ["successful", "at_bound", "max_sweeps"],
-        ["max_sweeps", "at_bound", "successful"],
-    ]
+    where, codes = jaxos4.RESULTS.where, jnp.array([[0, 1], [1, 0]])
+    batch = jax.vmap(jax.vmap(lambda code: where(code == 1, jaxos4.RESULTS.at_bound, jaxos4.RESULTS.successful)))(codes)
+    assert jaxos4.result_names(batch).tolist() == [["successful", "at_bound"], ["at_bound", "successful"]]
