@@ -83,9 +83,7 @@ from .estimators import (
     Hybrid as Hybrid,
     JointEKF as JointEKF,
     OutputError as OutputError,
-    Profile as Profile,
     RecursiveLeastSquares as RecursiveLeastSquares,
-    profile_likelihood as profile_likelihood,
 )
 from .excitation import chirp as chirp, doublet as doublet, multisine as multisine, step3211 as step3211
 from .flight import STATE_NAMES as STATE_NAMES, STATE_UNITS as STATE_UNITS, Flight as Flight

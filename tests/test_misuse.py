@@ -145,10 +145,6 @@ MISUSE = [
     *(("`network` must be a trained network", lambda n=n: make_estimator(n)) for n in ("network", "hybrid")),
     ("`name` must be one of ibss, .*, got 'newton'", lambda: make_estimator("newton")),
     (r"`start` must hold 8 unknowns, got shape \(7,\)", lambda: jaxos4.IBSS()(shoot(), BRACKET, start=jnp.zeros(7))),
-    (
-        "`name` must be one of alpha1",
-        lambda: jaxos4.profile_likelihood(jaxos4.IBSS(), shoot(), BRACKET, "a", MODEL.alpha),
-    ),
     # Networks.
     ("`features` must be one of score, raw, got 'fourier'", lambda: fit(features="fourier")),
     ("`steps` must be an integer of at least 1", lambda: fit(steps=0)),

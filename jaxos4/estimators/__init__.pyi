@@ -4,6 +4,5 @@ from .hybrid import Hybrid as Hybrid
 from .ibss import IBSS as IBSS
 from .kalman import JointEKF as JointEKF
 from .newton import FilterError as FilterError, OutputError as OutputError
-from .profile import Profile as Profile, profile_likelihood as profile_likelihood
 from .registry import ESTIMATORS as ESTIMATORS, make_estimator as make_estimator
 from .svsf import SVSF as SVSF

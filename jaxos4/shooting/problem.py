@@ -296,20 +296,17 @@ class ShootingProblem(AbstractProblem):
             length=self.length,
         )
 
-    def reweighted(self, residuals: Float[ArrayLike, "..."], *, fitted: int | None = None) -> "ShootingProblem":
+    def reweighted(self, residuals: Float[ArrayLike, "..."]) -> "ShootingProblem":
         """The problem with each channel's sigma estimated from the weighted `residuals` of a fit, by NumPy.
 
         Alternating this with the fit is maximum likelihood with unknown noise levels, corrected for the degrees of
         freedom of the unknowns. A channel with fewer than two measurements keeps its sigma. No sigma falls below the
         rounding errors that add up over a flight.
-
-        `fitted`: how many parameters were fitted; by default all of the model's.
         """
         columns, before = self.columns, np.asarray(self.sigma)
         measured, squares = self.recorded(), np.square(np.reshape(residuals, (-1, columns.size))).sum(axis=0)
         known = ~np.isnan(measured)
-        fitted = len(self.model.parameter_names) if fitted is None else fitted
-        count, unknowns = known.sum(axis=0), fitted + self.windows * self.free_size
+        count, unknowns = known.sum(axis=0), len(self.model.parameter_names) + self.windows * self.free_size
         freedom = max(1 - unknowns / max(count.sum(), 1), 1e-3)
         sigma = before[columns] * np.sqrt(squares / np.maximum(count * freedom, 1))
         rounding = ROUNDING * np.finfo(before.dtype).eps * np.where(known, np.abs(measured), 0.0).max(axis=0)
@@ -321,10 +318,6 @@ class ShootingProblem(AbstractProblem):
     def step(self, state: State, forcing: Forcing, parameters) -> State:
         """The state one sample later, down to the same level of the cascade."""
         return STEPPERS[self.method](self.model, state, forcing, parameters, self.flight.dt)
-
-    def window_of_samples(self) -> Int[np.ndarray, " samples"]:
-        """The window of each sample."""
-        return np.nonzero(self.cut()[1])[0]
 
     def cut(self) -> tuple[Int[np.ndarray, "windows length"], Bool[np.ndarray, "windows length"]]:
         """The samples of each window, and which of them belong to it. A shorter window repeats its last sample."""

@@ -220,20 +220,9 @@ def _linearised_shot(
         state = jax.tree.map(lambda x: jnp.where(sound, x, 0.0), carry.state)
         forcing = jax.tree.map(along_lanes, row.forcing)
 
-        def shot():
-            if row.forcing_tangents is None:
-                (following, predicted), push = jax.linearize(
-                    lambda state, scalars: advance(state, forcing, scalars), state, scalars
-                )
-            else:
-                (following, predicted), push = jax.linearize(advance, state, forcing, scalars)
-            errors = _errors(row, predicted, weights, sound)
-            known = [jnp.where(jnp.isnan(y) | ~sound, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
-            pull = [w * e for w, e in zip(known, errors, strict=True)]
-            return following, push, _half_square(errors), pull, [w * w for w in known]
-
         # The rates alone are cheaper to repeat.
         repeated = not lanes or state.attitude is None
+        shot = functools.partial(_linearised_sample, advance, row, (state, forcing, scalars), weights, sound)
         following, push, cost, pull, squares = shot() if repeated else computed_once(sound, shot)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
@@ -262,6 +251,26 @@ def _linearised_shot(
     )
     last = _fold(step, first, rows, length)
     return Curvature(last.shot, last.gradient, _symmetric(last.information))
+
+
+def _linearised_sample(
+    advance: Advance,
+    row: Rows,
+    at: tuple[State, Forcing, tuple[Lanes, ...]],
+    weights: tuple[Lanes, ...],
+    sound: Bool[Array, "*lanes"],
+) -> tuple[State, Callable, Lanes, list[Lanes], list[Lanes]]:
+    """The next state, the derivative of `advance`, the cost, and the weighted errors and squared weights."""
+    state, forcing, scalars = at
+    if row.forcing_tangents is None:
+        linear = jax.linearize(lambda state, scalars: advance(state, forcing, scalars), state, scalars)
+    else:
+        linear = jax.linearize(advance, *at)
+    (following, predicted), push = linear
+    errors = _errors(row, predicted, weights, sound)
+    known = [jnp.where(jnp.isnan(y) | ~sound, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
+    pull = [w * e for w, e in zip(known, errors, strict=True)]
+    return following, push, _half_square(errors), pull, [w * w for w in known]
 
 
 def _symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *lanes"]:
