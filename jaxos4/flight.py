@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -40,7 +39,6 @@ class Inputs(NamedTuple):
     """The inputs of a vehicle on the time grid of its flight: rotor speeds [rad/s], and the sample time [s].
 
     - `velocity`: along the body's axes [m/s]. `None`: unknown.
-    - `force`: the measured specific force along the body's axes [m/s^2], an input of some models. `None`: not measured.
     - `stretches`: `None`: the flight is one stretch.
     - `voltage`: of the battery [V]. `None`: not logged.
     - `length`: the number of samples that count; the others are padding. `None`: all count.
@@ -49,7 +47,6 @@ class Inputs(NamedTuple):
     omega: RotorSpeeds
     dt: Scalar
     velocity: Float[Array, "samples 3"] | None = None
-    force: Float[Array, "samples 3"] | None = None
     stretches: Stretches | None = None
     voltage: Float[Array, " samples"] | None = None
     length: Count | None = None
@@ -107,10 +104,9 @@ class Flight(eqx.Module):
 
     @property
     def inputs(self) -> Inputs:
-        """The inputs of the vehicle, with gaps in the specific force filled."""
+        """The inputs of the vehicle."""
         stretches = None if self.stretch is None else Stretches.of(self.stretch)
-        force = None if self.specific_force is None else fill_gaps(self.specific_force, stretches)
-        return Inputs(self.omega, self.dt, self.body_velocity, force, stretches, self.voltage)
+        return Inputs(self.omega, self.dt, self.body_velocity, stretches, self.voltage)
 
     @property
     def channels(self) -> Float[Array, "samples 15"]:
@@ -128,17 +124,3 @@ def with_force(states: Any, force: Any, numpy: Any) -> Any:
     """The channels of a flight as one array of `numpy` or `jax.numpy`; NaN: not measured."""
     nothing = numpy.full((*states.shape[:-1], len(FORCE_NAMES)), numpy.nan, states.dtype)
     return numpy.concatenate([states, nothing if force is None else force], axis=-1)
-
-
-def fill_gaps(
-    values: Float[Array, "samples columns"], stretches: Stretches | None = None
-) -> Float[Array, "samples columns"]:
-    """Fill each gap (NaN) with the previous value in the stretch, or the next if there is none, or 0 if all is NaN."""
-    count = values.shape[0]
-    index, measured = jnp.arange(count)[:, None], ~jnp.isnan(values)
-    first, last = (0, count - 1) if stretches is None else (stretches.first[:, None], stretches.last[:, None])
-    previous = jax.lax.cummax(jnp.where(measured, index, -1))
-    following = jax.lax.cummin(jnp.where(measured, index, count), reverse=True)
-    exists = (previous >= first) | (following <= last)
-    source = jnp.where(previous >= first, previous, jnp.minimum(following, count - 1))
-    return jnp.where(exists, jnp.nan_to_num(jnp.take_along_axis(values, source, axis=0)), 0.0)

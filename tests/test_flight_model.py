@@ -15,18 +15,18 @@ import jaxos4
 from jaxos4.models import Term, TermParameter, default_terms
 from jaxos4.models.state import Rates
 from jaxos4.models.terms import (
-    AXIAL_VELOCITY,
-    BODY_VELOCITY,
     COMMANDS,
     FULL_SCALE,
     LATERAL_FORCE,
+    MEASURED_VELOCITY,
+    VELOCITY,
     VERTICAL_FORCE,
     VOLTAGE,
 )
 from jaxos4.models.vehicle import DEFAULT_TERMS
 
 ALL = tuple(term for term in jaxos4.TERMS if term != "lag")  # the motor has a lag of its own
-RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "flapping", "inflow", "drag"))
+RATE_TERMS = tuple(term for term in ALL if term not in ("velocity", "inflow", "drag"))
 FULL = eqx.tree_at(lambda a: a.max_rotor_speed, jaxos4.OS4, np.asarray(500.0))
 VOLTS = 11.1
 # Forces along x and y have a bias only if there is a drag.
@@ -36,7 +36,7 @@ NAMES_XY = ("ax_bias", "ay_bias")
 VALUES = {
     **{"roll_offset": 0.3, "pitch_offset": -0.2, "yaw_offset": 0.1, "roll_thrust": -0.5, "pitch_thrust": 0.9},
     **{"roll_damping": 1.5, "pitch_damping": 0.8, "yaw_damping": 0.4, "roll_velocity": 0.3, "pitch_velocity": -0.4},
-    **{"roll_flapping": 0.2, "pitch_flapping": -0.1, "voltage_exponent": 0.7, "battery_fade": 0.02},
+    **{"voltage_exponent": 0.7, "battery_fade": 0.02},
     **{"rotor_lag": 0.06, "rotor_delay": 0.02, "rotor_reaction": 0.02, "thrust_curve": 0.97, "motor_braking": 0.3},
     **{"thrust_gain": 1.2, "x_drag": 0.4, "y_drag": 0.3, "z_drag": 0.6, "ax_bias": 0.5, "ay_bias": -0.4},
     **{"az_bias": 0.2, "p_bias": 0.03, "q_bias": -0.02, "r_bias": 0.01},
@@ -170,7 +170,7 @@ TOLERANCES = {
     ("fade", "accelerometer"): 1e-7,
     ("accelerometer", "drag", "inflow"): 1e-7,
     ("lag", "delay", "reaction"): 2e-3,
-    tuple(term for term in ALL if term != "flapping"): 2e-3,
+    ALL: 2e-3,
 }
 
 
@@ -188,22 +188,22 @@ def test_terms_are_their_equations(terms):
     assert errors.max() < TOLERANCES[terms], dict(zip(range(15), errors, strict=False))
 
 
-def rates_with(term, field, measured, channels):
-    """The rates of a flight with a measured input."""
-    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), np.full((51, 12), np.nan), **{field: measured})
+def rates_with(velocity, channels):
+    """The rates of a flight with a measured velocity."""
+    nothing = np.full((51, 12), np.nan)
+    flight = jaxos4.Flight(0.01 * np.arange(51), commands(0.5, 0.01), nothing, body_velocity=velocity)
     given = {"sigma": np.ones(12), "channels": channels, "initial_state": np.zeros(12)}
-    problem = jaxos4.ShootingProblem(jaxos4.FlightModel(terms=(term,)), flight, **given)
+    problem = jaxos4.ShootingProblem(jaxos4.FlightModel(terms=("velocity",)), flight, **given)
     return np.asarray(problem.predict(truth(problem.model), jnp.zeros(problem.size)))[:, :3]
 
 
 @pytest.mark.parametrize("channels", ["rates", "all"])
-@pytest.mark.parametrize("measured", [("velocity", "body_velocity"), ("flapping", "specific_force")])
-def test_a_measured_input_acts_in_its_own_step(measured, channels):
+def test_a_measured_velocity_acts_in_its_own_step(channels):
     once = np.zeros((51, 3))
     once[7] = x, y, _ = 0.7, -0.4, 0.2
-    moved = rates_with(*measured, once, channels) - rates_with(*measured, np.zeros((51, 3)), channels)
+    moved = rates_with(once, channels) - rates_with(np.zeros((51, 3)), channels)
     assert not moved[:8].any()
-    expected = [0.01 * VALUES[f"roll_{measured[0]}"] * y, 0.01 * VALUES[f"pitch_{measured[0]}"] * x, 0.0]
+    expected = [0.01 * VALUES["roll_velocity"] * y, 0.01 * VALUES["pitch_velocity"] * x, 0.0]
     np.testing.assert_allclose(moved[8], expected, rtol=1e-9, atol=1e-15)
 
 
@@ -261,15 +261,16 @@ def test_an_estimate_uses_the_terms_that_the_logs_allow():
     assert default_terms(frozenset()) == default_terms(frozenset({FULL_SCALE})) == basic
     assert default_terms(frozenset({COMMANDS, FULL_SCALE})) == rotors == DEFAULT_TERMS
     force = frozenset({LATERAL_FORCE, VERTICAL_FORCE})
+    moving = force | {VELOCITY}
     for available, terms in (
-        (force, (*basic, "flapping", "accelerometer")),
-        (force | {BODY_VELOCITY, FULL_SCALE}, (*basic, "velocity", "accelerometer", "drag")),
-        (force | {AXIAL_VELOCITY}, (*basic, "flapping", "accelerometer", "inflow")),
-        (frozenset({AXIAL_VELOCITY, VOLTAGE}), basic),
+        (force, (*basic, "accelerometer")),
+        (moving | {MEASURED_VELOCITY, FULL_SCALE}, (*basic, "velocity", "accelerometer", "inflow", "drag")),
+        (moving, (*basic, "velocity", "accelerometer", "inflow")),
+        (frozenset({VELOCITY, VOLTAGE}), (*basic, "velocity")),
         (frozenset({COMMANDS, VOLTAGE}), (*rotors, "voltage")),
-        (force | {COMMANDS}, (*rotors, "fade", "flapping", "accelerometer")),
-        (force | {COMMANDS, FULL_SCALE}, (*basic, "fade", "motor", "flapping", "accelerometer")),
-        (force | {COMMANDS, FULL_SCALE, VOLTAGE}, (*basic, "voltage", "motor", "flapping", "accelerometer")),
+        (force | {COMMANDS}, (*rotors, "fade", "accelerometer")),
+        (force | {COMMANDS, FULL_SCALE}, (*basic, "fade", "motor", "accelerometer")),
+        (force | {COMMANDS, FULL_SCALE, VOLTAGE}, (*basic, "voltage", "motor", "accelerometer")),
     ):
         assert set(default_terms(available)) == set(terms)
         assert list(default_terms(available)) == [name for name in jaxos4.TERMS if name in terms]

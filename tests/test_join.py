@@ -11,7 +11,6 @@ from hypothesis import given, settings, strategies as st
 
 import jaxos4
 from jaxos4.errors import InputError
-from jaxos4.flight import Stretches, fill_gaps
 from jaxos4.logs.sampling import average
 from jaxos4.recording import Recording
 from jaxos4.recording.pieces import averaged, cut
@@ -124,15 +123,6 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     np.testing.assert_allclose(grid, t[0] + dt * np.arange(grid.size), rtol=1e-12)
     assert grid[-1] <= t[-1] + 1e-6 < grid[-1] + dt + 1e-6
     np.testing.assert_allclose(found, averaged_slowly(t, channels, grid, dt), rtol=1e-9, atol=1e-9)
-
-
-def test_gaps_are_filled_from_their_own_stretch():
-    nan = np.nan
-    values = jnp.array([[nan, 1.0, nan, 2.0, nan, nan, nan, nan, 5.0, nan]]).T
-    number = jnp.array([0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
-    found = fill_gaps(values, Stretches.of(number))[:, 0]
-    np.testing.assert_array_equal(found, [1, 1, 1, 2, 0, 0, 5, 5, 5, 5])
-    np.testing.assert_array_equal(fill_gaps(values)[:, 0], [1, 1, 1, 2, 2, 2, 2, 2, 5, 5])
 
 
 def test_impossible_values_of_a_flight_are_missing():

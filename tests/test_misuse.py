@@ -129,8 +129,7 @@ MISUSE = [
     ("`terms` must be some of", lambda: vehicle(terms=("lag", "lag"))),
     ("`terms` must be some of", lambda: vehicle(terms=("lag", "Lag"))),
     *(("`recordings` must count from 0", lambda r=r: vehicle(recordings=r)) for r in ((), (1,), (0, 2), (-1, 0))),
-    ("velocity, drag need `Flight.body_vel", lambda: vehicle(terms=("velocity",))),
-    ("need `Flight.specific_force", lambda: vehicle(terms=("flapping",))),
+    ("velocity, inflow need `Flight.body_vel", lambda: vehicle(terms=("velocity",))),
     ("voltage need `Flight.voltage`", lambda: vehicle(terms=("voltage",), battery_voltage=11.1)),
     # Brackets, results and estimators.
     *(

@@ -76,7 +76,7 @@ def predictions(
     horizons: tuple[float, ...] = HORIZONS,
     disturbance: Disturbances | None = None,
 ) -> Predictions:
-    """Predict the body rates from many starts, with the recorded rotor speeds.
+    """Predict the body rates from many starts, with the recorded rotor speeds. The velocity stays that of the start.
 
     Starts are 0.05 s apart. The initial rates are the mean of the rates measured within 0.01 s of the start. A start is
     omitted if one of these rates is missing, or if the longest horizon reaches beyond the stretch.
@@ -135,12 +135,13 @@ def _predict(
 
     def fly(first: Int[Array, ""], measured: Array, pushed: Array) -> Float[Array, "steps_and_one 3"]:
         rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps + 1), forcing)
-        row = jax.tree.map(lambda leaf: leaf[0], rows)
+        begin = jax.tree.map(lambda leaf: leaf[0], rows)
         # A gyro bias is part of the measurement, not of the state.
-        added = jnp.stack(model.observe(unstack(measured), row, scalars)[:3]) - measured
+        added = jnp.stack(model.observe(unstack(measured), begin, scalars)[:3]) - measured
 
         def step(carry: tuple[State, Array], row) -> tuple[tuple[State, Array], Float[Array, "3"]]:
             state, pushed = carry
+            row = row._replace(velocity=begin.velocity)
             rates = jnp.stack(problem.step(state, row, scalars).rates) + reach * pushed
             return (unstack(rates), kept * pushed), jnp.stack(model.observe(state, row, scalars)[:3])
 

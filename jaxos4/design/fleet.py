@@ -19,7 +19,7 @@ from ..flight import Flight
 from ..models.abstract import PARAMETER_NAMES
 from ..models.rotation import to_earth
 from ..models.state import Attitude
-from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, default_terms
+from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
 from ..models.vehicle import FlightModel
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
@@ -47,8 +47,8 @@ _STILL = 16
 
 
 def model_of(loop: ClosedLoop) -> FlightModel:
-    """The model that `jaxos4.identify` chooses for the log of this vehicle."""
-    offers = {LATERAL_FORCE, VERTICAL_FORCE}
+    """The model that `jaxos4.identify` chooses for the log of this vehicle, without the effects of its velocity."""
+    offers = {VERTICAL_FORCE}
     offers |= {COMMANDS} if loop.logged == "commands" else set()
     offers |= {FULL_SCALE} if loop.airframe.has_full_scale else set()
     return FlightModel(loop.airframe, terms=default_terms(frozenset(offers)))

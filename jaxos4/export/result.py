@@ -244,8 +244,6 @@ def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], 
         some = [name for name in found if name.startswith(names)]
         if some:
             notes.append(f"{', '.join(some)}: {why}")
-    if {"roll_flapping", "pitch_flapping"} & found.keys() and not {"x_drag", "y_drag"} & values.keys():
-        notes.append("roll_flapping, pitch_flapping: 0 here: they need a lateral force, and no drag was identified")
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
     apart = tuple(itertools.chain(("alpha2", "alpha5"), *_NOT_EXPORTED))

@@ -136,11 +136,7 @@ def rigid_vehicle(airframe: Airframe, values: Mapping[str, float]) -> RigidVehic
     rotor_inertia = float(airframe.rotor_inertia) if reaction is None else reaction * inertia[2]
     speed = float(airframe.max_rotor_speed)
     drag = np.array([values.get(f"{axis}_drag", 0.0) for axis in "xyz"])
-    # A lateral specific force is that of the drag.
-    moment = [
-        values.get(f"{axis}_velocity", 0.0) - values.get(f"{axis}_flapping", 0.0) * along
-        for axis, along in zip(AXES, drag[1::-1], strict=False)
-    ]
+    moment = [values.get(f"{axis}_velocity", 0.0) for axis in AXES[:2]]
     vehicle = RigidVehicle(
         mass=mass,
         gravity=float(airframe.gravity),

@@ -45,7 +45,6 @@ class Known(NamedTuple):
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: by the filters [rad/s], [rad/s^2; m/s^2].
     - `unsure`: the standard deviation of the offsets.
-    - `lateral`: the measured specific force along x and y [m/s^2], which lasts, for the terms that need it.
     """
 
     first: Int[Numeric, "*starts"]
@@ -53,7 +52,6 @@ class Known(NamedTuple):
     rates: Float[Numeric, "*starts 3"]
     disturbance: Float[Numeric, "*starts channels"]
     unsure: Float[Numeric, "*starts 6"]
-    lateral: Float[Numeric, "*starts 2"]
 
 
 class Lanes(NamedTuple):
@@ -151,12 +149,12 @@ def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
 def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Scalar) -> Float[Array, "steps 13"]:
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
-    scalars, lateral, axes = tuple(lane.parameters), tuple(start.lateral), model.force_axes
+    scalars, axes = tuple(lane.parameters), model.force_axes
     p, v, q, w = (start.state[places] for places in PARTS.values())
     # A gyro bias is part of the measurement, not of the state.
     steps = lane.gusts.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start.first, steps), lane.forcing)
-    still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0), lateral=lateral)
+    still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
     biased = jnp.stack(model.observe(State(Rates(*w)), still, scalars)[:3])
     w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin[9:]
     error, absorbed = start.unsure * lane.off
@@ -169,7 +167,7 @@ def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Sca
         pushed = reach * disturbance + gust[:, 0]
         turning = offset[:3] + pushed[:3] / dt
         pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(pushed[3:])
-        acting = _Acting(forcing._replace(lateral=lateral), tuple(turning), tuple(pushing))
+        acting = _Acting(forcing, tuple(turning), tuple(pushing))
         moved = rk4_step(_Free(model), motion, acting, scalars, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
         values = jnp.stack(jax.tree.leaves(moved))
@@ -225,8 +223,8 @@ def forcing_and_offsets(
     """The forcing and the offsets of `Lanes` for each row of parameters.
 
     An offset is a weighted sum of what the `measured` accelerations before a sample exceed the model's by: each sample
-    earlier has less weight by the factor `kept`, and `weight` multiplies the sum. Velocity and lateral force are left
-    out of the forcing: they will be those of the prediction. `length`: the samples of the flight that are no padding.
+    earlier has less weight by the factor `kept`, and `weight` multiplies the sum. The velocity is left out of the
+    forcing: it will be that of the prediction. `length`: the samples of the flight that are no padding.
     """
     rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
@@ -241,7 +239,7 @@ def forcing_and_offsets(
             return kept * total + row, total
 
         past = jax.lax.scan(gather, jnp.zeros(6), jnp.where(jnp.isnan(residual), 0.0, residual))[1]
-        return forcing._replace(velocity=None, lateral=None, recording=()), weight * past
+        return forcing._replace(velocity=None, recording=()), weight * past
 
     return jax.vmap(of_lane)(parameters)
 

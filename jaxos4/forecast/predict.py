@@ -62,8 +62,8 @@ def predict(
 
     - `found`: the identification of a vehicle, or the file that `jaxos4 estimate --out` wrote, or what
       `jaxos4.forecast.vehicle_of` makes of one of these.
-    - `flight`: has body rates and attitude at least. Without a velocity, predictions begin with that of dead reckoning
-      along the body's z axis, or at rest; what was not measured is not compared.
+    - `flight`: has body rates and attitude at least. Without a velocity, predictions begin with that of dead
+      reckoning, or at rest; what was not measured is not compared.
     - `horizon`: how far ahead [s].
     - `sample_time`: the log is averaged to it [s]. Default: that of the fit.
     - `spacing`: the time between two starts [s]; 0: at each sample.
@@ -136,8 +136,6 @@ def _problem(vehicle: Vehicle, prepared: Prepared) -> ShootingProblem:
     flight, recordings = prepared.fitted, (0,) * len(prepared.recordings)
     if flight.body_velocity is None:
         flight = dataclasses.replace(flight, body_velocity=np.zeros((flight.time.size, 3)))
-    if flight.specific_force is None:
-        flight = dataclasses.replace(flight, specific_force=np.full((flight.time.size, 3), np.nan))
     model = dataclasses.replace(vehicle.model, recordings=recordings)
     return ShootingProblem(model, flight, sigma=np.ones(12), channels="rates", method="rk4")
 
@@ -237,15 +235,14 @@ def _known(
     """The knowledge at each sample, in NumPy; `unsure` is missing. A position that was not measured is 0."""
     samples = slice(len(measured.stretch))
     filtered = disturbances(problem, as_float(vehicle.parameters), noise, offset=offset[:, :3], memory=_MEMORY)
-    state, flight = measured.states.copy(), problem.flight
+    state = measured.states.copy()
     if "velocity" in missing:
-        axial = np.asarray(flight.body_velocity)[samples, 2]
-        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, (0 * axial, 0 * axial, axial)), 1)
+        reckoned = np.asarray(problem.flight.body_velocity)[samples].T
+        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
     if "position" in missing:
         state[:, PARTS["position"]] = 0.0
-    lateral = np.nan_to_num(np.asarray(flight.specific_force)[samples, :2])
     rates, value = np.asarray(filtered.rates)[samples], filtered.value[samples]
-    return Known(np.arange(len(state)), state, rates, value, np.zeros((len(state), 6)), lateral)
+    return Known(np.arange(len(state)), state, rates, value, np.zeros((len(state), 6)))
 
 
 def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:

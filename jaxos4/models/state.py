@@ -62,8 +62,7 @@ class Forcing(NamedTuple):
     - `spin_up`: Omega_r' [rad/s^2].
     - `specific_thrust`: U_c/m around the time of the sample [m/s^2], as an accelerometer measures it.
     - `recording`: for each recording, 1 if the sample belongs to it and 0 if not.
-    - `velocity`: measured, along the body's axes [m/s].
-    - `lateral`: the measured specific force along x and y [m/s^2], if a term needs it.
+    - `velocity`: along the body's axes, measured or by dead reckoning [m/s].
     """
 
     roll: Samples
@@ -75,7 +74,6 @@ class Forcing(NamedTuple):
     specific_thrust: Samples | None = None
     recording: tuple[Samples, ...] = ()
     velocity: Vector | None = None
-    lateral: tuple[Samples, Samples] | None = None
 
 
 # The positions of the leaves of a `State` in the paper's order, Eq. (14).

@@ -19,15 +19,15 @@ from .state import Forcing, Rates, Samples, Vector
 
 # What a term can need from the logs or from the airframe.
 COMMANDS = "commands"
-BODY_VELOCITY = "body velocity"
-AXIAL_VELOCITY = "axial velocity"
+VELOCITY = "velocity"
+MEASURED_VELOCITY = "measured velocity"
 LATERAL_FORCE = "lateral specific force"
 VERTICAL_FORCE = "vertical specific force"
 FULL_SCALE = "full scale"
 VOLTAGE = "battery voltage"
 
-# Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a body velocity of 5 m/s.
-_AUTHORITY, _FAST = 0.2, 5.0
+# Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a velocity of 2 m/s.
+_AUTHORITY, _FAST = 0.2, 2.0
 # A time constant or delay this far below 0 is neither chance nor rounding [s].
 _EARLY = 0.002
 # A thrust gain beyond this factor, or its reciprocal, is no error of a scale or of a propeller's table. An
@@ -173,9 +173,9 @@ def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[
     return add
 
 
-def _swapped(vector: tuple[Samples, ...] | None, need: str, field: str) -> tuple[Samples, Samples]:
+def _across(velocity: Vector | None) -> tuple[Samples, Samples]:
     """Along x the vehicle pitches, along y it rolls."""
-    x, y, *_ = _measured(vector, need, field)
+    x, y, _ = _known(velocity, VELOCITY, "body_velocity")
     return y, x
 
 
@@ -185,7 +185,7 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
 
 
 def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpeeds:
-    return omega * (_measured(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"])[:, None]
+    return omega * (_known(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"])[:, None]
 
 
 def _drive(speeds: Speeds, values: Values, grid: Grid, airframe: Airframe) -> Speeds:
@@ -195,14 +195,14 @@ def _drive(speeds: Speeds, values: Values, grid: Grid, airframe: Airframe) -> Sp
 
 
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    vx, vy, _ = _measured(forcing.velocity, BODY_VELOCITY, "body_velocity")
+    vx, vy, _ = _known(forcing.velocity, VELOCITY, "body_velocity")
     x, y, z = force
     return x - values["x_drag"] * vx, y - values["y_drag"] * vy, z
 
 
 def _add_inflow(force: Vector, values: Values, forcing: Forcing) -> Vector:
     x, y, z = force
-    return x, y, z - values["z_drag"] * _measured(forcing.velocity, AXIAL_VELOCITY, "body_velocity")[2]
+    return x, y, z - values["z_drag"] * _known(forcing.velocity, VELOCITY, "body_velocity")[2]
 
 
 def _add_force_bias(force: Vector, values: Values) -> Vector:
@@ -233,20 +233,8 @@ TERMS: dict[str, Term] = {
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
         tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(AXES[:2])),
-        needs=frozenset({BODY_VELOCITY}),
-        angular_acceleration=_torque(
-            "velocity", lambda rates, forcing: _swapped(forcing.velocity, BODY_VELOCITY, "body_velocity")
-        ),
-    ),
-    "flapping": Term(
-        "a moment proportional to the measured lateral specific force: roll_flapping, pitch_flapping [rad/m]",
-        tuple(TermParameter(f"{x}_flapping", "rad/m", _authority(i)) for i, x in enumerate(AXES[:2])),
-        needs=frozenset({LATERAL_FORCE}),
-        # The drag of the rotors is proportional to the body velocity: the force replaces a missing velocity.
-        by_default=lambda available: BODY_VELOCITY not in available,
-        angular_acceleration=_torque(
-            "flapping", lambda rates, forcing: _swapped(forcing.lateral, LATERAL_FORCE, "specific_force")
-        ),
+        needs=frozenset({VELOCITY}),
+        angular_acceleration=_torque("velocity", lambda rates, forcing: _across(forcing.velocity)),
     ),
     "voltage": Term(
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
@@ -311,13 +299,13 @@ TERMS: dict[str, Term] = {
         "thrust falls with the velocity along z, which changes the inflow of the rotors: z_drag [1/s]",
         # g over twice the induced velocity, which is 4 to 10 m/s in hover.
         (TermParameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
-        needs=frozenset({AXIAL_VELOCITY, VERTICAL_FORCE}),
+        needs=frozenset({VELOCITY, VERTICAL_FORCE}),
         specific_force=_add_inflow,
     ),
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
         (TermParameter("x_drag", "1/s", 1.0), TermParameter("y_drag", "1/s", 1.0)),
-        needs=frozenset({BODY_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
+        needs=frozenset({MEASURED_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
         force_axes=(0, 1),
         specific_force=_add_drag,
     ),
@@ -342,6 +330,6 @@ def required(value: T | None, message: str) -> T:
     return value
 
 
-def _measured(value: T | None, need: str, field: str) -> T:
+def _known(value: T | None, need: str, field: str) -> T:
     names = ", ".join(name for name, term in TERMS.items() if need in term.needs)
     return required(value, f"`terms`: {names} need `Flight.{field}`, which this flight does not have; leave them out.")

@@ -17,11 +17,10 @@ from .rotation import attitude_rates, to_body, to_earth
 from .rotors import Grid, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector
 from .terms import (
-    BODY_VELOCITY,
     COMMANDS,
     FULL_SCALE,
-    LATERAL_FORCE,
     TERMS,
+    VELOCITY,
     VOLTAGE,
     Constant,
     Term,
@@ -41,9 +40,9 @@ class FlightModel(AbstractModel):
     """`CorrectedOS4` and the effects that real vehicles show. Each term is optional.
 
         p' = alpha1 q r - alpha2 Omega_r q + alpha3 d_roll + roll_offset + roll_thrust (U_c / m - 9.81)
-             - roll_damping p + roll_velocity v_y + roll_flapping a_y
+             - roll_damping p + roll_velocity v_y
         q' = alpha4 p r + alpha5 Omega_r p + alpha6 d_pitch + pitch_offset + pitch_thrust (U_c / m - 9.81)
-             - pitch_damping q + pitch_velocity v_x + pitch_flapping a_x
+             - pitch_damping q + pitch_velocity v_x
         r' = alpha7 p q + alpha8 d_yaw + yaw_offset - yaw_damping r - rotor_reaction Omega_r'
         rotor_lag w_i' = g(u_i(t - rotor_delay) - thrust_curve w_i) - (1 - thrust_curve) w_i^2
         u_i = command_i (V / V_0)^voltage_exponent (1 - battery_fade t)
@@ -59,10 +58,9 @@ class FlightModel(AbstractModel):
 
     **Arguments:**
 
-    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity` and `drag` need
-      `Flight.body_velocity`. `flapping` needs `Flight.specific_force`, and replaces `velocity` if there is none.
-      `gyro_bias` and `offset` can be distinguished only if the attitude is compared too. Leave out `motor`, `lag`
-      and `delay` if rotor speeds were measured.
+    - `terms`: the terms that are estimated, by their names in `jaxos4.TERMS`. `velocity`, `inflow` and `drag`
+      need `Flight.body_velocity`. `gyro_bias` and `offset` can be distinguished only if the attitude is compared too.
+      Leave out `motor`, `lag` and `delay` if rotor speeds were measured.
     - `recordings`: for each stretch of the flight, the number of its recording, counted from 0. Each recording has its
       own offsets and gyro biases. All other parameters are the vehicle's.
     - `battery_voltage`: V_0, at which a command gives the rotor speed that the flight says [V]. The term `voltage`
@@ -145,7 +143,6 @@ class FlightModel(AbstractModel):
         roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
         recording = jnp.asarray(self.recordings)[grid.stretch]
-        force = inputs.force if self._needs(LATERAL_FORCE) else None
         return Forcing(
             roll=roll,
             pitch=pitch,
@@ -156,7 +153,6 @@ class FlightModel(AbstractModel):
             specific_thrust=squares.around.sum(axis=1) * airframe.thrust_coefficient / mass,
             recording=tuple((recording == i).astype(omega.dtype) for i in range(max(self.recordings) + 1)),
             velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
-            lateral=None if force is None else tuple(force.T[:2]),
         )
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
@@ -244,7 +240,7 @@ class FlightModel(AbstractModel):
     def _with_velocity(self, forcing: Forcing, state: State) -> Forcing:
         """Take the body velocity from `state` if a term needs it and it was not measured."""
         t, attitude = state.translation, state.attitude
-        if not self._needs(BODY_VELOCITY) or forcing.velocity is not None or attitude is None or t is None:
+        if not self._needs(VELOCITY) or forcing.velocity is not None or attitude is None or t is None:
             return forcing
         return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
 

@@ -11,7 +11,7 @@ from ..airframe import Airframe
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
-from ..models.terms import AXIAL_VELOCITY, BODY_VELOCITY, COMMANDS, FULL_SCALE, LATERAL_FORCE, VERTICAL_FORCE, VOLTAGE
+from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .motion import opposite_axes, refused_note, yaw_doubt
 from .pieces import averaged, cut, hold_out, joined, whole_windows
 from .reading import Recording
@@ -187,8 +187,8 @@ def _available_inputs(
     force = np.all([~np.isnan(piece.channels[:, len(STATE_NAMES) :]).all(axis=0) for piece in pieces], axis=0)
     offers = {
         COMMANDS: whole.commanded,
-        AXIAL_VELOCITY: bool(motions),
-        BODY_VELOCITY: bool(motions) and all(motion.measured for motion in motions),
+        VELOCITY: bool(motions),
+        MEASURED_VELOCITY: bool(motions) and all(motion.measured for motion in motions),
         LATERAL_FORCE: force[0] and force[1],
         VERTICAL_FORCE: force[2],
         FULL_SCALE: airframe.has_full_scale,

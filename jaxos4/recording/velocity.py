@@ -23,7 +23,7 @@ class Motion(NamedTuple):
     - `velocity`: along the body's axes [m/s].
     - `ups`: the upright direction in the body's axes, by each time constant. They differ in long turns, and if the gyro
       errs. Both are the same if the attitude was measured.
-    - `measured`: whether the velocity was measured. If not, only its part along z is of use.
+    - `measured`: whether the velocity was measured. If not, its slow changes are missing.
     """
 
     velocity: Float[np.ndarray, "samples 3"]
@@ -35,7 +35,7 @@ def motion_of(recording: Recording) -> Motion | None:
     """The motion of a recording in one piece, without gaps; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
-    this sum are forgotten. The thrust's answer to axial velocity is faster.
+    this sum are forgotten. The answers of torque and thrust to the velocity are faster.
     """
     angles, velocity = (_filled(recording, names) for names in (("phi", "theta", "psi"), ("vx", "vy", "vz")))
     if angles is not None and velocity is not None:

@@ -191,11 +191,11 @@ class ShootingProblem(AbstractProblem):
 
         def forcing(values: Float[Array, " positions"]) -> Forcing:
             new = self.model.forcing(inputs, parameters.at[positions].set(values))
-            return windowed(new._replace(recording=(), velocity=None, lateral=None), index)
+            return windowed(new._replace(recording=(), velocity=None), index)
 
         def completed(forcing: Forcing, source: Forcing) -> Forcing:
             # No parameter changes these fields: they are copied instead of computed again.
-            return forcing._replace(recording=source.recording, velocity=source.velocity, lateral=source.lateral)
+            return forcing._replace(recording=source.recording, velocity=source.velocity)
 
         slopes, new = jax.jacfwd(lambda x: (forcing(x),) * 2, has_aux=True)(parameters[positions])
         zeros = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), rows.forcing)
