@@ -67,6 +67,11 @@ def small(name):
     return EXPERIMENTS / name / "small.toml"
 
 
+def near(found, expected, errors):
+    """Whether all numbers are within these errors."""
+    return bool(np.all(np.abs(np.asarray(found) - expected) < errors))
+
+
 @pytest.fixture
 def study(tmp_path, plot):
     """Runs and plots the small configuration of an experiment that is a study."""
@@ -102,7 +107,7 @@ def test_configurations(name):
 def test_comparison(study):
     accuracy = metrics.accuracy(study("comparison", suffixes=(".svg", ".pdf")))
     # On the rates of one second both are at the bound, within chance: 8 parameters of 32 flights.
-    assert (abs(accuracy.sel(scale=1.0) - 1) < 3 / np.sqrt(2 * 8 * 32)).all()
+    assert near(accuracy.sel(scale=1.0), 1, 3 / np.sqrt(2 * 8 * 32))
     # At ten times the noise IBSS ends at its limits around the bracket.
     assert (accuracy.sel(scale=10.0, estimator="ibss") < accuracy.sel(scale=10.0, estimator="equation-error")).all()
 
@@ -123,10 +128,10 @@ def test_noise_kinds(study):
 
 def test_scale(study):
     data = study("scale")
-    efficiency, covered = metrics.efficiency(data), metrics.mean_coverage(data).sel(level=0.95)["coverage"]
     # Each of eight parameters is within five Monte-Carlo errors of the bound.
-    assert (abs(efficiency["efficiency"] - 1) < 5 / np.sqrt(2 * 128)).all()
-    assert (abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 128)).all()
+    assert near(metrics.efficiency(data)["efficiency"], 1, 5 / np.sqrt(2 * 128))
+    covered = metrics.mean_coverage(data).sel(level=0.95)["coverage"]
+    assert near(covered, 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
 
 
 def test_frontier(run):
@@ -197,9 +202,9 @@ def test_efficiency(report_of):
     row = report_of("efficiency", flights=48, seed=0, scale=1.0, cases=[case])["cases"][case]
     assert row["results"] == {"successful": 48}
     # Within four Monte-Carlo standard errors of the bound, on each of the eight parameters.
-    assert np.all(np.abs(np.array(row["efficiency"]) - 1) < 4 * row["monte_carlo_error"])
-    assert np.all(np.abs(row["bias"]) < 4 / np.sqrt(48))
-    assert abs(row["covered"] - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 48)
+    assert near(row["efficiency"], 1, 4 * row["monte_carlo_error"])
+    assert near(row["bias"], 0, 4 / np.sqrt(48))
+    assert near(row["covered"], 0.95, 4 * np.sqrt(0.95 * 0.05 / 48))
 
 
 def test_speed(report_of):
@@ -216,8 +221,7 @@ def test_networks(report_of):
     assert report["one_call"]["flights"] == 100
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
     # Each of eight parameters within five Monte-Carlo errors of the bound.
-    for name in ("hybrid", "ibss"):
-        assert np.all(np.abs(np.array(rows[name]["efficiency"]) - 1) < 5 * rows[name]["monte_carlo_error"])
+    assert all(near(rows[n]["efficiency"], 1, 5 * rows[n]["monte_carlo_error"]) for n in ("hybrid", "ibss"))
     assert rows["hybrid"]["rollouts"] < rows["ibss"]["rollouts"]
     assert rows["hybrid"]["hit_rate"] > 0.9
 
@@ -239,23 +243,22 @@ def test_coverage(report_of):
     assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
         assert row["results"] == {"successful": 100}
-        np.testing.assert_allclose(row["std"], 1, atol=0.05)  # the intervals are not too wide
-        covered = np.array(row["covered"] + row["constants_covered"])
-        assert np.all(np.abs(covered - 0.95) < 4.5 * np.sqrt(0.95 * 0.05 / 100))
+        assert near(row["std"], 1, 0.05)  # the intervals are not too wide
+        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 100))
 
 
 def test_dirty_flights(report_of, plot):
     report = report_of("dirty_flights", flights=2, duration=6.0, seed=17, airframes=["os4"])
     plot("dirty_flights")
-    found = report["airframes"]["os4"]
-    assert {flight["result"] for flight in found["flights"]} == {"successful"}
-    assert max(flight["fastest"] for flight in found["flights"]) < 5
+    found, summary = (report["airframes"]["os4"][name] for name in ("flights", "summary"))
+    assert {flight["result"] for flight in found} == {"successful"}
+    assert max(flight["fastest"] for flight in found) < 5
     # The lag of 60 ms and the delay of 8 ms are found within a few standard errors.
     for name in ("rotor_lag", "rotor_delay", "alpha3", "alpha6", "roll_damping", "thrust_gain"):
-        assert found["summary"][name]["identified"] == 2
-        assert abs(found["summary"][name]["bias"]) < 4
-    assert abs(found["summary"]["rotor_lag"]["mean_error"]) < 3e-3
-    assert abs(found["summary"]["rotor_delay"]["mean_error"]) < 2e-3
+        assert summary[name]["identified"] == 2
+        assert abs(summary[name]["bias"]) < 4
+    assert abs(summary["rotor_lag"]["mean_error"]) < 3e-3
+    assert abs(summary["rotor_delay"]["mean_error"]) < 2e-3
 
 
 def test_long_flight(report_of):
@@ -273,12 +276,11 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
     def row(value):
         return {"constants": {name: {"estimate": value, "std": 1.0} for name in ("Ix", "Iy")}}
 
-    rows = {"a": row(0.0), "b": row(2.7), "c": row(2.9), "refused": {"constants": {}}}
-    found = load("public_flights").agreement(rows)  # 1.96 sqrt(2) = 2.77
-    assert found["pairs"] == 6
-    assert found["share"] == pytest.approx(2 / 3)
+    agreement, rows = load("public_flights").agreement, {"a": row(0.0), "b": row(2.7), "c": row(2.9)}
+    found = agreement(rows | {"refused": {"constants": {}}})  # 1.96 sqrt(2) = 2.77
+    assert (found["pairs"], found["share"]) == (6, pytest.approx(2 / 3))
     assert found["ci95"][0] <= found["share"] <= found["ci95"][1]
-    assert load("public_flights").agreement({})["share"] is None
+    assert agreement({})["share"] is None
 
 
 @pytest.mark.usefixtures("quickly_compiled")
