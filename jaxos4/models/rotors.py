@@ -1,15 +1,18 @@
 """Rotors between command and thrust: a delay, the motor, and the thrust that the speeds make."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from .._custom_types import Count, RotorSpeeds, Scalar
+from .._custom_types import RotorSpeeds, Scalar
 from ..flight import Inputs
 
 Speed = Float[Array, "*samples"]
+Commands = Callable[[Int[Array, " rows"]], RotorSpeeds]
+"""The commands [rad/s] at the samples with these numbers."""
 
 # The lag that acts is at least this share of a sample, so that a step stays finite wherever a search looks.
 _SHORTEST_LAG = 0.05
@@ -23,7 +26,7 @@ class Grid(NamedTuple):
     """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that.
 
     `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by the voltage
-    to which the airframe's rotor speeds belong. `length`: see `Inputs`.
+    to which the airframe's rotor speeds belong.
     """
 
     dt: Scalar
@@ -32,7 +35,6 @@ class Grid(NamedTuple):
     last: Int[Array, " samples"]
     elapsed: Float[Array, " samples"]
     voltage: Float[Array, " samples"] | None = None
-    length: Count | None = None
 
     @classmethod
     def of(
@@ -50,7 +52,25 @@ class Grid(NamedTuple):
         row = jnp.arange(samples)
         begins = jnp.full(max(recordings or (0,)) + 1, samples).at[recording].min(row)
         elapsed = inputs.dt * (row - begins[recording])
-        return cls(inputs.dt, *stretches, elapsed, voltage, inputs.length)
+        return cls(inputs.dt, *stretches, elapsed, voltage)
+
+    def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"] | None = None) -> "Part":
+        """Some samples in a row. `before`: see `Part`."""
+        first, last = (rows == edge[rows] for edge in (self.first, self.last))
+        return Part(self.dt, rows, first, last, jnp.zeros(4, self.elapsed.dtype) if before is None else before)
+
+
+class Part(NamedTuple):
+    """Some samples in a row: the sample time [s], their numbers, and which begin or end a stretch.
+
+    `before`: the rotor speeds at the end of the sample before them [rad/s]; without effect where a stretch begins.
+    """
+
+    dt: Scalar
+    rows: Int[Array, " rows"]
+    is_first: Bool[Array, " rows"]
+    is_last: Bool[Array, " rows"]
+    before: Float[Array, "4"]
 
 
 class Speeds(NamedTuple):
@@ -72,22 +92,22 @@ class SquaredSpeeds(NamedTuple):
     around: RotorSpeeds
 
 
-def measured_speeds(omega: RotorSpeeds, grid: Grid) -> Speeds:
+def measured_speeds(omega: Commands, part: Part) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing."""
-    is_last = (jnp.arange(omega.shape[0]) == grid.last)[:, None]
-    following = jnp.where(is_last, omega, jnp.roll(omega, -1, axis=0))
-    return Speeds(omega, omega, following - omega)
+    speed = omega(part.rows)
+    following = omega(jnp.where(part.is_last, part.rows, part.rows + 1))
+    return Speeds(speed, speed, following - speed)
 
 
-def squared(speeds: Speeds, grid: Grid) -> SquaredSpeeds:
+def squared(speeds: Speeds, part: Part) -> SquaredSpeeds:
     """Squares of speeds that change linearly over a sample: the mean square makes the mean torque."""
     begin, end, _ = speeds
-    is_first = (jnp.arange(begin.shape[0]) == grid.first)[:, None]
-    before = jnp.where(is_first, begin, jnp.roll(end, 1, axis=0))
+    before = jnp.concatenate([part.before[None], end[:-1]])
+    before = jnp.where(part.is_first[:, None], begin, before)
     return SquaredSpeeds((begin * begin + begin * end + end * end) / 3, (before * before + begin * begin) / 2)
 
 
-def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:
+def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
     """Commands that act `delay` [s] later.
 
     Before its first command, a stretch has its first command. After its last command, it has its last command.
@@ -95,7 +115,7 @@ def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:
     Cubics interpolate between samples (Catmull and Rom 1974): a delay of whole samples is exact, and the derivative in
     the delay has no jumps at which a search could end.
     """
-    count, samples = omega.shape[0], delay / grid.dt
+    count, samples = grid.first.shape[0], delay / grid.dt
     floor = jnp.floor(jax.lax.stop_gradient(samples))
     f = samples - floor
     weights = (
@@ -104,18 +124,14 @@ def delayed(omega: RotorSpeeds, delay: Scalar, grid: Grid) -> RotorSpeeds:
         f * (0.5 + 2 * f - 1.5 * f * f),
         f * f * (f - 1) / 2,
     )
-    # One slice holds the four samples around each point; samples beyond the stretch are replaced below.
     shift = jnp.clip(floor, -count, count).astype(int)
-    padded = jnp.pad(omega, ((count + 2, count + 2), (0, 0)))
-    near = jax.lax.dynamic_slice_in_dim(padded, count - shift, count + 3)
-    begin, end = omega[grid.first], omega[grid.last]
-    row = jnp.arange(count) - shift
-    total = jnp.zeros_like(omega)
-    for weight, ahead in zip(weights, (1, 0, -1, -2), strict=True):
-        value = near[2 + ahead : 2 + ahead + count]
-        value = jnp.where((row + ahead < grid.first)[:, None], begin, value)
-        total += weight * jnp.where((row + ahead > grid.last)[:, None], end, value)
-    return total
+
+    def at(rows: Int[Array, " rows"]) -> RotorSpeeds:
+        first, last = grid.first[rows], grid.last[rows]
+        near = (omega(jnp.clip(rows - shift + ahead, first, last)) for ahead in (1, 0, -1, -2))
+        return sum((weight * value for weight, value in zip(weights, near, strict=True)), jnp.zeros(()))
+
+    return at
 
 
 class Motor(NamedTuple):
@@ -166,24 +182,14 @@ class Motor(NamedTuple):
         return w * self.full
 
 
-def driven(omega: RotorSpeeds, motor: Motor, grid: Grid) -> Speeds:
+def driven(omega: RotorSpeeds, motor: Motor, part: Part) -> Speeds:
     """Speeds of rotors whose motors follow commands [rad/s]. A stretch begins at the speed of its first command."""
-    settled, is_first = motor.settled(omega), grid.first == jnp.arange(omega.shape[0])
-    rows = omega, settled, is_first
 
     def over_a_sample(speed: Speed, row):
         command, settled, is_first = row
         begin = jnp.where(is_first, settled, speed)
-        end = motor.step(begin, command, grid.dt)
+        end = motor.step(begin, command, part.dt)
         return end, (begin, end)
 
-    def fill(i: Count, carry):
-        speed, *filled = carry
-        speed, found = over_a_sample(speed, jax.tree.map(lambda leaf: leaf[i], rows))
-        return speed, *(before.at[i].set(now) for before, now in zip(filled, found, strict=True))
-
-    if grid.length is None:
-        begin, end = jax.lax.scan(over_a_sample, settled[0], rows)[1]
-    else:
-        begin, end = jax.lax.fori_loop(0, grid.length, fill, (settled[0], omega, omega))[1:]
+    begin, end = jax.lax.scan(over_a_sample, part.before, (omega, motor.settled(omega), part.is_first))[1]
     return Speeds(begin, end, end - begin)

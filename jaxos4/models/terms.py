@@ -10,11 +10,11 @@ from typing import NamedTuple, TypeVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import RotorSpeeds, Scalar
+from .._custom_types import Scalar
 from ..airframe import GRAVITY, Airframe
 from ..excitation import AXES
 from .abstract import Contradiction
-from .rotors import Grid, Motor, Speeds, delayed, driven
+from .rotors import Commands, Grid, Motor, Part, Speeds, delayed, driven
 from .state import Forcing, Rates, Samples, Vector
 
 # What a term can need from the logs or from the airframe.
@@ -83,15 +83,15 @@ class Term:
     without the term. Its second argument holds the values of the term's parameters by name. It returns the quantity
     with the term. The contributions act in this order:
 
-    - `command(omega, values, grid)`: the commands [rad/s].
-    - `speed(speeds, values, grid, airframe)`: the rotor speeds that follow from the commands.
+    - `command(omega, values, grid)`: the commands [rad/s], a function of the numbers of the samples.
+    - `speed(speeds, values, part, airframe)`: the rotor speeds that follow from the commands, over some samples.
     - `angular_acceleration(total, values, rates, forcing)`: p', q', r' [rad/s^2].
     - `specific_force(force, values, forcing)`: along the body's axes [m/s^2].
     - `gyro(rates, values)`: the measured body rates [rad/s].
     - `accelerometer(force, values)`: the measured specific force [m/s^2]. It makes specific force a measurement.
 
     If each recording has its own value of a parameter, `values` holds that of the sample's recording. This is not
-    possible in the first two contributions, which act on a whole flight at once: `ValueError`.
+    possible in the first two contributions, which act before the recordings are told apart: `ValueError`.
     """
 
     description: str
@@ -99,8 +99,8 @@ class Term:
     needs: frozenset[str] = frozenset()
     by_default: Callable[[frozenset[str]], bool] = lambda available: True
     force_axes: tuple[int, ...] = ()
-    command: Callable[[RotorSpeeds, Values, Grid], RotorSpeeds] | None = None
-    speed: Callable[[Speeds, Values, Grid, Airframe], Speeds] | None = None
+    command: Callable[[Commands, Values, Grid], Commands] | None = None
+    speed: Callable[[Speeds, Values, Part, Airframe], Speeds] | None = None
     angular_acceleration: Callable[[Rates, Values, Rates, Forcing], Rates] | None = None
     specific_force: Callable[[Vector, Values, Forcing], Vector] | None = None
     gyro: Callable[[Rates, Values], Rates] | None = None
@@ -184,14 +184,22 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
     return total._replace(r=total.r - values["rotor_reaction"] * spin_up)
 
 
-def _scale_commands(omega: RotorSpeeds, values: Values, grid: Grid) -> RotorSpeeds:
-    return omega * (_known(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"])[:, None]
+def _scaled(
+    share: Callable[[Values, Grid], Float[Array, " samples"]],
+) -> Callable[[Commands, Values, Grid], Commands]:
+    """The commands times a share, which is given for each sample of the flight."""
+
+    def command(omega: Commands, values: Values, grid: Grid) -> Commands:
+        shares = share(values, grid)
+        return lambda rows: omega(rows) * shares[rows][:, None]
+
+    return command
 
 
-def _drive(speeds: Speeds, values: Values, grid: Grid, airframe: Airframe) -> Speeds:
+def _drive(speeds: Speeds, values: Values, part: Part, airframe: Airframe) -> Speeds:
     full = jnp.asarray(airframe.max_rotor_speed)
     motor = Motor(values["rotor_lag"], values["thrust_curve"], values["motor_braking"], full)
-    return driven(speeds.begin, motor, grid)
+    return driven(speeds.begin, motor, part)
 
 
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
@@ -240,7 +248,7 @@ TERMS: dict[str, Term] = {
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
         (TermParameter("voltage_exponent", "1", 0.5, center=0.5),),
         needs=frozenset({VOLTAGE, COMMANDS}),
-        command=_scale_commands,
+        command=_scaled(lambda values, grid: _known(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"]),
     ),
     "fade": Term(
         "commands lose effect as the battery empties: battery_fade [1/s], the share of rotor speed lost in a second",
@@ -248,7 +256,7 @@ TERMS: dict[str, Term] = {
         needs=frozenset({COMMANDS, VERTICAL_FORCE}),
         # A logged voltage knows it.
         by_default=lambda available: VOLTAGE not in available,
-        command=lambda omega, values, grid: omega * (1 - values["battery_fade"] * grid.elapsed)[:, None],
+        command=_scaled(lambda values, grid: 1 - values["battery_fade"] * grid.elapsed),
     ),
     "motor": Term(
         "motors follow their commands under the load of the propellers: rotor_lag [s], thrust_curve, motor_braking",
@@ -267,7 +275,7 @@ TERMS: dict[str, Term] = {
         "rotors follow their commands as first-order systems: rotor_lag [s]; if no load can be found",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
-        speed=lambda speeds, values, grid, airframe: driven(speeds.begin, Motor(values["rotor_lag"]), grid),
+        speed=lambda speeds, values, part, airframe: driven(speeds.begin, Motor(values["rotor_lag"]), part),
     ),
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",

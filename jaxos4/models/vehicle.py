@@ -6,15 +6,15 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from .._custom_types import Parameters, Scalar, as_float
+from .._custom_types import Count, Parameters, RotorSpeeds, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from .os4 import CorrectedOS4
 from .rotation import attitude_rates, to_body, to_earth
-from .rotors import Grid, measured_speeds, squared
+from .rotors import Grid, Part, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector
 from .terms import (
     COMMANDS,
@@ -31,6 +31,8 @@ from .terms import (
 )
 
 DEFAULT_TERMS = default_terms(frozenset({COMMANDS}))
+# The samples of a padded flight that are computed together.
+_BLOCK = 512
 
 Row = tuple[Term, TermParameter, Parameter]
 """A row of the table of parameters: a term, the parameter in it, and the parameter of the model."""
@@ -132,18 +134,37 @@ class FlightModel(AbstractModel):
         return not any(term.gyro or term.accelerometer for term in self._terms)
 
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
-        """The chain from commands to torque and thrust: each term acts at its place."""
-        airframe, grid, omega = self.airframe, Grid.of(inputs, self.battery_voltage, self.recordings), inputs.omega
+        """The chain from commands to torque and thrust: each term acts at its place.
+
+        Of a padded flight (`Inputs.length`), only blocks with samples that count are computed; the others are 0.
+        """
+        grid, samples = Grid.of(inputs, self.battery_voltage, self.recordings), inputs.omega.shape[0]
+        if inputs.length is None:
+            found, _ = self._driven(inputs, grid, grid.part(jnp.arange(samples)), parameters)
+        else:
+            found = self._driven_in_blocks(inputs, inputs.length, grid, parameters)
+        recording = jnp.asarray(self.recordings)[grid.stretch]
+        return found._replace(
+            recording=tuple((recording == i).astype(inputs.omega.dtype) for i in range(max(self.recordings) + 1)),
+            velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
+        )
+
+    def _driven(self, inputs: Inputs, grid: Grid, part: Part, parameters) -> tuple[Forcing, Array]:
+        """What the rotors do over some samples, and their speeds at the end of the last."""
+        airframe = self.airframe
+
+        def omega(rows: Int[Array, " rows"]) -> RotorSpeeds:
+            return inputs.omega[rows]
+
         for change, values in self._contributions("command", parameters):
             omega = change(omega, values, grid)
-        speeds = measured_speeds(omega, grid)
+        speeds = measured_speeds(omega, part)
         for change, values in self._contributions("speed", parameters):
-            speeds = change(speeds, values, grid, airframe)
-        squares = squared(speeds, grid)
+            speeds = change(speeds, values, part, airframe)
+        squares = squared(speeds, part)
         roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
-        recording = jnp.asarray(self.recordings)[grid.stretch]
-        return Forcing(
+        found = Forcing(
             roll=roll,
             pitch=pitch,
             yaw=yaw,
@@ -151,9 +172,29 @@ class FlightModel(AbstractModel):
             residual_speed=(speeds.begin + speeds.end) @ spins / 2,
             spin_up=speeds.change @ spins / inputs.dt,
             specific_thrust=squares.around.sum(axis=1) * airframe.thrust_coefficient / mass,
-            recording=tuple((recording == i).astype(omega.dtype) for i in range(max(self.recordings) + 1)),
-            velocity=None if inputs.velocity is None else tuple(inputs.velocity.T),
         )
+        return found, speeds.end[-1]
+
+    def _driven_in_blocks(self, inputs: Inputs, length: Count, grid: Grid, parameters) -> Forcing:
+        """`_driven` of the samples that count, block by block, so that padding takes no time."""
+        samples = inputs.omega.shape[0]
+
+        def of_block(i: Count | int, before: Array) -> tuple[Forcing, Array]:
+            rows = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1)
+            return self._driven(inputs, grid, grid.part(rows, before), parameters)
+
+        def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
+            filled, before = carry
+            found, before = of_block(i, before)
+            place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * _BLOCK, axis=0)
+            return jax.tree.map(place, filled, found), before
+
+        before = jnp.zeros(inputs.omega.shape[1], inputs.omega.dtype)
+        shapes, _ = jax.eval_shape(of_block, 0, before)
+        room = -(-samples // _BLOCK) * _BLOCK
+        nothing = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape[1:]), leaf.dtype), shapes)
+        filled, _ = jax.lax.fori_loop(0, -(-length // _BLOCK), fill, (nothing, before))
+        return jax.tree.map(lambda leaf: leaf[:samples], filled)
 
     def angular_acceleration(self, rates: Rates, forcing: Forcing, parameters) -> Rates:
         """p', q', r' [rad/s^2]: the rigid body's, and the contribution of each term."""
