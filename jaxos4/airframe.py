@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ._custom_types import Numeric, Scalar, as_constant
 from ._files import read_toml
-from .errors import InputError
+from .errors import InputError, named
 
 GRAVITY, STANDARD_GRAVITY = 9.81, 9.80665
 """The gravity of an airframe that gives none, and the unit g [m/s^2]."""
@@ -144,10 +144,8 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
     except FileNotFoundError:
         presets = ", ".join((*PRESETS, *files))
         raise InputError(f"{source}: neither a file nor a preset; give a TOML file or one of {presets}.") from None
-    try:
+    with named(source):
         return airframe_from_table(table)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from None
 
 
 def airframe_from_table(table: dict[str, Any]) -> Airframe:

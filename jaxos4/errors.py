@@ -1,5 +1,8 @@
 """Errors that the user can fix. The message says in one line what is wrong, where, and what to do."""
 
+import contextlib
+from collections.abc import Iterator
+
 
 class InputError(ValueError):
     """A file or an argument cannot be used."""
@@ -7,3 +10,12 @@ class InputError(ValueError):
 
 class TrainingError(RuntimeError):
     """A network could not be trained."""
+
+
+@contextlib.contextmanager
+def named(place: object) -> Iterator[None]:
+    """Raises a `ValueError` of the block again, as an `InputError` that begins with its place."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{place}{': ' if place else ''}{error}") from None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from ..errors import InputError
+from ..errors import InputError, named
 from . import _options as options
 from ._output import check_outputs, stages
 
@@ -76,12 +76,10 @@ def _closed_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
     from ..design import read_references
 
     loop, references, dt = options.make_loop(asked), None, asked["dt"]
-    try:
+    with named("--closed-loop"):
         if asked["references"] is not None:
             references, dt = read_references(asked["references"])
         flight = fly_standard(loop, references=references, duration=asked["duration"], dt=dt, seed=asked["seed"])
-    except ValueError as error:
-        raise InputError(f"--closed-loop: {error}") from None
     return flight, f"{dt:g} s, closed loop, {loop.logged}, gusts of {asked['gust']:g} rad/s^2"
 
 
@@ -96,13 +94,11 @@ def _open_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
     from ..simulation import simulate as fly
 
     model, shape, dt = MODELS[asked["model"]](load_airframe(asked["airframe"])), asked["excitation"], asked["dt"]
-    try:
+    with named("" if asked["speeds"] else f"--excitation {shape}"):
         if asked["speeds"] is None:
             omega = EXCITATIONS[shape](model.airframe, duration=asked["duration"], dt=dt)
         else:
             omega = as_float(read_input(asked["speeds"], dt))
         flight = fly(model, model.alpha, omega, dt=dt, method=asked["method"].value)
-    except ValueError as error:
-        raise InputError(f"{'' if asked['speeds'] else f'--excitation {shape}: '}{error}") from None
     flight = measure(flight, WhiteNoise(asked["noise"] * SENSOR_SIGMA), seed=asked["seed"])
     return flight, f"{dt:g} s, {asked['model']} model, {asked['method']}, noise {asked['noise']:g}"

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from ..errors import InputError
+from ..errors import named
 from . import _options as options
 from ._output import check_outputs, option_names, stages
 
@@ -45,10 +45,8 @@ def train(
         from ..networks import NetworkEstimator, save_network
         from ..recording import read_recording
 
-        try:
+        with named("options"):
             settings = NetworkEstimator(features=features.value, noise=noise, steps=steps)
-        except ValueError as error:
-            raise InputError(f"options: {error}") from None
         check_outputs(flight, airframe, bracket, out=out)
         progress("reading")
         subject = MODELS[model](load_airframe(airframe))

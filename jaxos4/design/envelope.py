@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Numeric, RotorSpeeds, Scalar, setting
 from ..airframe import Airframe
-from ..errors import InputError
+from ..errors import InputError, named
 from ..flight import STATE_NAMES
 
 ANGLES, RATES, POSITION, VELOCITY = (
@@ -57,10 +57,8 @@ class Envelope(eqx.Module):
 
     def limited(self, limits: Mapping[str, Any]) -> "Envelope":
         """This envelope with some limits replaced. Raises `InputError` if one of them is impossible."""
-        try:
+        with named("the envelope"):
             return Envelope(**vars(self) | dict(limits))
-        except ValueError as error:
-            raise InputError(f"the envelope: {error}") from None
 
     def shares(
         self, omega: Float[Numeric, "*inputs samples 4"], states: Float[Numeric, "*flights times 12"], dt: float

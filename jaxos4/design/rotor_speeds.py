@@ -16,7 +16,7 @@ from .._custom_types import Key, Numeric, Parameters, RotorSpeeds as Speeds, Sca
 from .._xla import quick_jit
 from ..airframe import Airframe
 from ..bracket import Bracket
-from ..errors import InputError
+from ..errors import InputError, named
 from ..excitation import EXCITATIONS, multisine
 from ..flight import Inputs as Rotors
 from ..models.abstract import AbstractModel
@@ -245,10 +245,8 @@ def fly_finely(
 
 
 def _standard_envelope(model: AbstractModel, vehicles: Array, duration: float, dt: float) -> Envelope:
-    try:
+    with named("the standard multisine, which sets the envelope"):
         omega = multisine(model.airframe, duration=duration, dt=dt)
-    except ValueError as error:
-        raise InputError(f"the standard multisine, which sets the envelope: {error}") from None
     states = np.asarray(fly_finely(model, vehicles, omega, as_float(dt)))
     if not np.isfinite(states).all():
         raise InputError("`bracket`: some of its vehicles turn over in the standard multisine; narrow it.")

@@ -1,9 +1,7 @@
 """Result files of `jaxos4 estimate`, and vehicles drawn from the uncertainty of a result."""
 
-import contextlib
 import itertools
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import Airframe, airframe_from_table
-from ..errors import InputError
+from ..errors import InputError, named
 from ..linalg import covariance_root
 from ..results import NAMES, meaning
 from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
@@ -150,32 +148,21 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.
     """
-    with _named(path):
-        return _identified(Path(path).name, _decoded(path))
+    file = read_file(path)
+    with named(path):
+        return _identified(Path(path).name, file)
 
 
 def read_file(path: str | os.PathLike[str]) -> ResultFile:
     """The parts of a result file. Raises `InputError` if it is no result or has no estimate, as `read_result` does."""
-    with _named(path):
-        return _decoded(path)
-
-
-def _decoded(path: str | os.PathLike[str]) -> ResultFile:
-    return checked(msgspec.json.decode(Path(path).read_bytes(), type=ResultFile))
-
-
-@contextlib.contextmanager
-def _named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Raises an error of the result again, with the name of its file."""
     try:
-        yield
+        file = msgspec.json.decode(Path(path).read_bytes(), type=ResultFile)
     except msgspec.MsgspecError as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(
-            f"{path}: not a result ({reason}); give a file of this version's `jaxos4 estimate --out`."
-        ) from None
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        remedy = "give a file of this version's `jaxos4 estimate --out`"
+        raise InputError(f"{path}: not a result ({reason}); {remedy}.") from None
+    with named(path):
+        return checked(file)
 
 
 def checked(file: ResultFile) -> ResultFile:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from ..bracket import Bracket
-from ..errors import InputError
+from ..errors import named
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
@@ -80,7 +80,5 @@ def _seen_channels(problem: ShootingProblem) -> str:
 def _train(
     settings: NetworkEstimator, problem: ShootingProblem, bracket: Bracket, name: str, seed: int
 ) -> TrainedNetwork:
-    try:
+    with named(name):
         return settings.fit(problem, bracket, key=jax.random.key(seed))
-    except ValueError as error:
-        raise InputError(f"{name}: {error}") from None

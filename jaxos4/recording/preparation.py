@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..airframe import Airframe
-from ..errors import InputError
+from ..errors import InputError, named
 from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
@@ -227,10 +227,8 @@ def _usable_parts(
     """
     name, (first, last) = recording.name, recording.time[[0, -1]].tolist()
     if begin is not None or end is not None:
-        try:
+        with named(name):
             return [cut(recording, Stretch(first if begin is None else begin, last if end is None else end))], None
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from None
     every = stretches(recording, airframe)
     usable = [stretch for stretch in every if not stretch.reason]
     refused = sorted((stretch for stretch in every if stretch.reason), key=lambda stretch: -stretch.length)

@@ -16,7 +16,7 @@ import numpy as np
 from .._custom_types import RotorSpeeds, as_float
 from .._files import read_toml
 from ..airframe import PRESETS, Airframe, airframe_from_table
-from ..errors import InputError
+from ..errors import InputError, named
 from ..estimators import ESTIMATORS
 from ..excitation import EXCITATIONS
 from ..models import MODELS
@@ -185,18 +185,14 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def check_computable(self) -> None:
         """Raises `InputError` for an excitation that an airframe cannot fly."""
         for name, excitation, duration in itertools.product(self.airframes, self.excitations, self.durations):
-            try:
+            with named(f"`excitations`: {excitation} of {duration:g} s by {name}"):
                 self.omega(excitation, name, duration)
-            except ValueError as error:
-                raise InputError(f"`excitations`: {excitation} of {duration:g} s by {name}: {error}") from None
 
     def vehicle(self, name: str) -> Airframe:
         """The airframe of that name. Raises `InputError` if there is none, or if its table is not usable."""
         if name in self.airframe:
-            try:
+            with named(f"[airframe.{name}]"):
                 return airframe_from_table(self.airframe[name])
-            except InputError as error:
-                raise InputError(f"[airframe.{name}]: {error}") from None
         if name not in PRESETS:
             presets = ", ".join(PRESETS)
             raise InputError(f"`airframes`: unknown {name!r}; choose from {presets}, or add [airframe.{name}].")
