@@ -8,6 +8,8 @@ from .._custom_types import InitialStates, Parameters
 from ..shooting import ROUNDING, ShootingProblem
 from .evaluation import Evaluation, evaluate
 
+# Correlations of residuals are computed up to this many samples apart.
+_LAGS = 25
 # Residuals below this share of a channel's largest value are rounding errors, in double precision.
 _ROUNDING = 1e-9
 # A channel with fewer measurements than this has no diagnostics.
@@ -56,7 +58,7 @@ def residual_diagnostics(
     initial_state: InitialStates | None = None,
     *,
     fitted: bool = True,
-    lags: int = 25,
+    lags: int = _LAGS,
 ) -> Diagnostics:
     """Diagnostics of the residuals at `parameters`, computed by NumPy for one flight.
 
@@ -80,10 +82,11 @@ def residual_diagnostics(
     return diagnostics_of(evaluate(problem, parameters, initial_state), fitted=fitted, lags=lags)
 
 
-def diagnostics_of(evaluation: Evaluation, *, fitted: bool, lags: int) -> Diagnostics:
-    """`residual_diagnostics` of a flight that was simulated already."""
+def diagnostics_of(evaluation: Evaluation, *, fitted: bool, lags: int | None = None) -> Diagnostics:
+    """`residual_diagnostics` of a flight that was simulated already. `lags`: fewer in a short flight by default."""
     from scipy.special import gammainc, gammaincc  # slow to import, and few need it
 
+    lags = min(_LAGS, evaluation.measured.shape[0] // 2) if lags is None else lags
     problem, sound = evaluation.problem, evaluation.sound
     # A diverged trajectory counts as nothing measured.
     measured = ~np.isnan(evaluation.measured) & sound

@@ -1,19 +1,23 @@
-"""Parameters and moments of inertia with their intervals, from the estimate of a fit."""
+"""Parameters and moments of inertia with their intervals, and how well the model explains each channel."""
 
 import msgspec
 import numpy as np
 
 from .._custom_types import Parameters
 from .._xla import quick_jit
+from ..analysis.diagnostics import Diagnostics
 from ..analysis.identifiability import identifiability_of
 from ..analysis.inertia import fit_inertia
 from ..bracket import is_identifiable
 from ..estimate import Estimate
+from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.abstract import PARAMETER_NAMES
 from ..models.os4 import CorrectedOS4
+from ..models.state import CASCADE_ORDER
+from ..shooting import ShootingProblem
 from .fit import Fit
 from .prepare import Case
-from .results import Constant, ParameterEstimate, RigidBody, finite_or_none
+from .results import ChannelFit, Constant, ParameterEstimate, RigidBody, finite_or_none
 
 UNIT = "kg m^2"
 # The place of the alpha that is torque over this moment of inertia.
@@ -23,6 +27,8 @@ AXES = {"p": "roll", "q": "pitch", "r": "yaw"}
 _SCALE = 0.01
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
 _UNKNOWN = 1e3
+# A channel with fewer measurements has no diagnostics.
+_FEWEST_SAMPLES = 2
 
 
 def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
@@ -134,3 +140,24 @@ def vehicle_constants(fit: Fit) -> RigidBody:
         return RigidBody(constants)
     rigid = fit_inertia(CorrectedOS4(model.airframe), alpha, covariance)
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
+
+
+def channel_fits(problem: ShootingProblem, diagnostics: Diagnostics) -> dict[str, ChannelFit]:
+    """The diagnostics of each measured channel, by its name."""
+    return {
+        STATE_NAMES[column]: ChannelFit(
+            rms=float(diagnostics.rms[i]),
+            unit=STATE_UNITS[column],
+            percent=finite_or_none(diagnostics.percent[i]),
+            level=float(diagnostics.level[i]),
+            level_p=float(diagnostics.level_p[i]),
+            correlation=float(diagnostics.colour[i]),
+            white_p=float(diagnostics.white_p[i]),
+            input_correlation=dict(
+                zip(("roll", "pitch", "yaw"), diagnostics.input_correlation[i].tolist(), strict=True)
+            ),
+            input_p=float(diagnostics.input_p[i]),
+        )
+        for i, column in enumerate(CASCADE_ORDER[: problem.size])
+        if diagnostics.count[i] > _FEWEST_SAMPLES
+    }

@@ -14,19 +14,21 @@ from jaxtyping import Float, Int
 
 from .._custom_types import as_float
 from ..analysis.covariance import robust_covariance_of
-from ..analysis.diagnostics import Diagnostics
-from ..analysis.evaluation import Evaluation
+from ..analysis.diagnostics import Diagnostics, diagnostics_of
+from ..analysis.evaluation import Evaluation, evaluate
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
 from ..results import RESULTS
 from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
 from ..shooting.gains import LogNoise
-from .noise_levels import diagnose, evaluate_estimate, refine
 from .prepare import Case
 from .results import COLOURED, Disturbance, HeldParameter, has_answer
 
 # Noise levels are computed at most this often before the last estimate.
 _PASSES = 3
+# Noise levels have settled if none changes by more than this share. Weights this close to the right ones cost less
+# than 1 % of the efficiency.
+_SETTLED = 0.2
 # A parameter that must not be negative, and is so by this many standard deviations, is held at 0.
 _NEGATIVE = 2.0
 _PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
@@ -91,31 +93,37 @@ def fit_flight(
     The covariance of an estimator that shoots is the Cramer-Rao bound, or `robust_covariance` if residuals are
     coloured. The other estimators have their own, and estimate once more with the last noise levels.
     """
-    passes = 0
 
-    def search(weighted: ShootingProblem) -> Estimate:
-        nonlocal passes
-        progress(f"fitting with the noise levels of pass {passes}" if passes else "compiling and fitting")
-        passes += 1
+    def search(weighted: ShootingProblem, number: int) -> Estimate:
+        progress(f"fitting with the noise levels of pass {number}" if number else "compiling and fitting")
         shared = padded(weighted) if estimator.shoots and not estimator.needs_network else weighted
         return jax.block_until_ready(estimator(shared))
 
-    def failed(estimate: Estimate) -> bool:
-        return estimator.shoots and bool(estimate.result != RESULTS.successful)
+    def evaluated() -> Evaluation:
+        return evaluate(problem, estimate.parameters, estimate.initial_state)
 
-    refined = refine(problem, search, passes=_PASSES, stop=failed)
-    problem, estimate, rollouts = refined.problem, refined.estimate, refined.rollouts
+    estimate, settled, number = search(problem, 0), False, 0
+    rollouts = int(estimate.rollouts)
+    while has_answer(estimate) and not settled and number < _PASSES:
+        before, number = problem.sigma, number + 1
+        problem = problem.reweighted(evaluated().errors)
+        change = np.abs(np.asarray(problem.sigma) / np.asarray(before) - 1)
+        failed = estimator.shoots and bool(estimate.result != RESULTS.successful)
+        settled = bool((change < _SETTLED).all()) or failed
+        if not settled:
+            estimate = search(problem, number)
+            rollouts += int(estimate.rollouts)
     if has_answer(estimate):
-        if not refined.settled:
-            problem = problem.reweighted(evaluate_estimate(problem, estimate).errors)
+        if not settled:
+            problem = problem.reweighted(evaluated().errors)
         if not estimator.shoots:
-            estimate = search(problem)
+            estimate = search(problem, number + 1)
             rollouts += int(estimate.rollouts)
     if not has_answer(estimate):
         return Fit(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
-    evaluation = evaluate_estimate(problem, estimate)
+    evaluation = evaluated()
     bound, covariance = evaluation.covariance, estimate.covariance
-    diagnostics = diagnose(evaluation, fitted=True)
+    diagnostics = diagnostics_of(evaluation, fitted=True)
     if estimator.shoots:
         coloured = (diagnostics.colour > COLOURED).any()
         covariance = robust_covariance_of(evaluation) if coloured else bound

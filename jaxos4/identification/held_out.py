@@ -9,14 +9,15 @@ from jaxtyping import Array
 
 from .._custom_types import as_float
 from .._xla import quick_jit
+from ..analysis.diagnostics import diagnostics_of
 from ..analysis.evaluation import evaluate
 from ..analysis.prediction import Predictions, Skill, disturbances, predictions, skill
 from ..estimate import fit_start
 from ..estimators import EquationError
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import LogNoise
+from .answers import channel_fits
 from .fit import Fit
-from .noise_levels import channel_fits, diagnose
 from .prepare import HeldOut
 from .results import PredictionSkill, RateSkill, Validation, finite_or_none
 
@@ -79,5 +80,5 @@ def validate_on(fit: Fit, held_out: HeldOut) -> Validation:
     start, cost, sound, _ = quick_jit(fit_start)(padded(other), parameters)
     if not bool(sound):
         return Validation(held_out.name, None, None)
-    diagnostics = diagnose(evaluate(other, parameters, start), fitted=False)
+    diagnostics = diagnostics_of(evaluate(other, parameters, start), fitted=False)
     return Validation(held_out.name, finite_or_none(cost), channel_fits(other, diagnostics))

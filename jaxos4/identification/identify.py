@@ -15,9 +15,9 @@ from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
 from ..recording.reading import Recording, as_recordings
 from ..results import result_names
+from .answers import channel_fits
 from .fit import Fit, fit_case
 from .judge import Judgement, judge
-from .noise_levels import channel_fits
 from .prepare import Case, prepare_flight
 from .problem import Intervals
 from .results import Identification, SampleTime, finite_or_none
