@@ -92,21 +92,32 @@ def run_cases(
 
     `flights_of`: the flights of a kind; `None`: one that was lost.
     """
-    settings = settings | {"version": jaxos4.__version__, "precision": "float64"}
-    report: dict = {**settings, "cases": []}
-    if out is not None and out.exists():
-        report = json.loads(out.read_text())
-        if {name: report[name] for name in settings} != settings:
-            raise SystemExit(f"{out}: has other settings; give --out another name.")
+    report = continued(out, settings, "cases")
     for kind, estimator in cases:
         if any((case["kind"], case["estimator"]) == (kind, estimator) for case in report["cases"]):
             continue
         flown = [(i, flight) for i, flight in enumerate(flights_of(kind)) if flight is not None]
         rows = [fit(estimator, flight, vehicle, i) for i, flight in flown]
         report["cases"].append({"kind": kind, "estimator": estimator, "flights": rows, "summary": summary(rows)})
-        if out is not None:
-            out.write_text(json.dumps(report, indent=1) + "\n")
+        write_report(out, report)
     return report
+
+
+def continued(out: Path | None, settings: dict, rows: str) -> dict:
+    """A report with these settings and a list of `rows`: that of the file `out` if it exists, or a new one."""
+    settings = settings | {"version": jaxos4.__version__, "precision": "float64"}
+    if out is None or not out.exists():
+        return {**settings, rows: []}
+    report = json.loads(out.read_text())
+    if rows not in report or {name: report.get(name) for name in settings} != settings:
+        raise SystemExit(f"{out}: has other settings; give --out another name.")
+    return report
+
+
+def write_report(out: Path | None, report: dict) -> None:
+    """Write what there is of a report, if it has a file."""
+    if out is not None:
+        out.write_text(json.dumps(report, indent=1) + "\n")
 
 
 def print_table(title: str, report: dict) -> None:

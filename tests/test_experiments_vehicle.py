@@ -100,6 +100,19 @@ def test_rotorpy(report_of, tmp_path):  # noqa: F811
     assert path.stat().st_mtime_ns == recorded
 
 
+def test_an_interrupted_report_of_predictions_is_continued(tmp_path):
+    pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
+    rotorpy, out, settings = load("rotorpy"), tmp_path / "out.json", {"flights": 1, "duration": 1.0, "seed": 2}
+    done = rotorpy.continued(None, settings, "predictions")
+    row = {name: {"error": 1.0, "true": 1.0, "held": 0.95} for name in rotorpy.QUANTITIES}
+    done["predictions"].append({"flight": 0, "result": "successful", **row})
+    rotorpy.write_report(out, done)
+    rotorpy.main(tmp_path, **settings, predict=True, out=out)
+    assert rotorpy.continued(out, settings, "predictions") == done
+    with pytest.raises(SystemExit, match="other settings"):
+        rotorpy.main(tmp_path, **(settings | {"seed": 3}), predict=True, out=out)
+
+
 # Benchmarks.
 
 

@@ -221,6 +221,14 @@ def test_a_result_of_several_recordings_gives_their_mean(write):
     assert two.covariance[place, place] == pytest.approx(2 * (0.01 / 2) ** 2)
 
 
+def test_a_parameter_that_is_not_identified_is_noted(write):
+    rows = {name: {"estimate": value, "std": 0.01} for name, value in truth().items()}
+    rows["x_drag"] = {"estimate": None, "std": None}
+    vehicle = jaxos4.forecast.vehicle_of(write(result(parameters=rows)))
+    assert vehicle.notes == ("not identified, and predicted with the centre of the bracket: x_drag",)
+    assert vehicle.parameters[vehicle.model.parameter_names.index("x_drag")] == 0.0
+
+
 def test_another_flight_needs_no_other_program(write):
     path, flights = write(result()), (flown(2), flown(4, 12.0))
     jax.clear_caches()
@@ -273,6 +281,7 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
         (result(disturbances={}), (), ("found.json", "does not say its disturbances")),
         (result(provenance={"terms": ["warp"], "sample_time": DT}), (), ("found.json", "cannot have its terms, warp")),
         (result(covariance=None), (), ("holds no estimate",)),
+        (result({name: x for name, x in truth().items() if name != "x_drag"}), (), ("found.json", "has no x_drag")),
         (result(), ("--horizon", "30"), ("log.csv", "--horizon", "give at most")),
         (result(), ("--sample-time", "0.001"), ("--sample-time 0.001", "one sample every 0.01 s")),
         (result(), ("--horizon", "nan"), ("--horizon", "positive")),
@@ -297,7 +306,7 @@ def test_flights_without_attitude_or_with_measured_speeds_are_refused(write):
         jaxos4.predict(path, dataclasses.replace(flown(2), states=states))
     powered = write(
         result(
-            truth(),
+            truth() | {"voltage_exponent": 0.5},
             provenance={"terms": [*TERMS, "voltage"], "sample_time": DT, "battery_voltage": 3.7},
         )
     )

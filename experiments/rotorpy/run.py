@@ -7,7 +7,6 @@ and measured rotor speeds. RotorPy's vehicle has effects that the model has othe
 """
 
 import itertools
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -20,9 +19,9 @@ import jaxos4
 
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
 
-from fits import print_table, run_cases
+from fits import continued, print_table, run_cases, write_report
 from flights import VEHICLE, recorded
-from predictions import QUANTITIES, predictions
+from predictions import QUANTITIES, prediction
 from rich.console import Console
 from shared import table_of
 
@@ -53,18 +52,20 @@ def main(
     def flights_of(kind: str) -> list[jaxos4.Flight]:
         return [jaxos4.read_flight(recorded(recordings, GUSTS[kind], i, duration, seed)) for i in range(flights)]
 
+    settings = {"flights": flights, "duration": duration, "seed": seed}
     if predict:
         captured = [recorded(recordings, GUSTS["gusty"], i, duration, seed, captured=True) for i in range(flights)]
-        rows = predictions([jaxos4.read_flight(path) for path in captured])
-        if out is not None:
-            out.write_text(json.dumps(rows, indent=1) + "\n")
+        report = continued(out, settings, "predictions")
+        rows, known = report["predictions"], [jaxos4.read_flight(path) for path in captured]
+        for i in range(len(rows), flights):
+            rows.append(prediction(known, i))
+            write_report(out, report)
         table = table_of("0.5 s ahead", ("", "error", "of the true parameters", "ratio", "inside the 95 % band [%]"))
         for name in QUANTITIES:
             error, true, held = np.mean([list(row[name].values()) for row in rows], axis=0)
             table.add_row(name, f"{error:.3g}", f"{true:.3g}", f"{error / true:.2f}", f"{100 * held:.1f}")
         Console(width=150).print(table)
         return
-    settings = {"flights": flights, "duration": duration, "seed": seed}
     report = run_cases(out, settings, list(itertools.product(kinds, estimators)), VEHICLE, flights_of)
     print_table(f"RotorPy's Hummingbird, flights of {duration:g} s", report)
 

@@ -35,7 +35,7 @@ class Vehicle(NamedTuple):
     - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
     - `sample_time`: of the fit [s].
     - `result`: the name of the result code.
-    - `notes`: why the estimate cannot be trusted; one line each.
+    - `notes`: why the estimate cannot be trusted, and what it does not know; one line each.
     """
 
     name: str
@@ -83,13 +83,21 @@ def _vehicle(file: ResultFile, name: str) -> Vehicle:
     known |= {row: each.value for row, each in file.held.items()}
     alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))
     center, width = (dict(zip(model.parameter_names, each, strict=True)) for each in (alpha, half_width))
-    rows, covariance = list(file.parameters), np.array(file.covariance)
+    listed, rows, covariance = [*file.parameters, *file.held], list(file.parameters), np.array(file.covariance)
     # Each parameter is the mean of its rows: one, or one for each recording.
-    shares, values = np.zeros((len(center), len(rows))), []
+    shares, values, missing, guessed = np.zeros((len(center), len(rows))), [], [], []
     for place, each in enumerate(center):
-        own = [row for row in known if re.fullmatch(rf"{each}(_\d+)?", row)]
-        values.append(np.mean([known[row] for row in own]) if own else center[each])
-        shares[place, [rows.index(row) for row in own if row in file.parameters]] = 1 / max(len(own), 1)
+        own = [row for row in listed if re.fullmatch(rf"{each}(_\d+)?", row)]
+        estimated = [row for row in own if row in known]
+        if not own:
+            missing.append(each)
+        elif not estimated:
+            guessed.append(each)
+        values.append(np.mean([known[row] for row in estimated]) if estimated else center[each])
+        shares[place, [rows.index(row) for row in estimated if row in file.parameters]] = 1 / max(len(estimated), 1)
+    if missing:
+        raise InputError(f"has no {', '.join(missing)}; run `jaxos4 estimate` again.")
+    notes = [f"not identified, and predicted with the centre of the bracket: {', '.join(guessed)}"] * bool(guessed)
     return Vehicle(
         name,
         model,
@@ -99,7 +107,7 @@ def _vehicle(file: ResultFile, name: str) -> Vehicle:
         _noise(file, model.force_axes),
         used.sample_time,
         file.result,
-        file.reasons,
+        (*file.reasons, *notes),
     )
 
 
