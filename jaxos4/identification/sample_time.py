@@ -43,8 +43,8 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     for case in reversed(cases):
         problem = case.innovations
         progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-        if fits and fits[0].answered and _is_inside(problem, found := np.asarray(fits[0].estimate.parameters)):
-            problem = problem.starting_from(found)
+        if fits and fits[0].answered:
+            problem = problem.starting_from(_start(problem, np.asarray(fits[0].estimate.parameters)))
         fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
     finest = cases[0].shooting.flight
     answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
@@ -52,11 +52,16 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     return place, fits[place], answers
 
 
-def _is_inside(problem: InnovationsProblem, found: np.ndarray) -> bool:
-    """Whether no parameter went to its limit: it may have gone to another minimum, and another start may not."""
+def _start(problem: InnovationsProblem, found: np.ndarray) -> np.ndarray:
+    """Where the next fit starts: at the answer of the last one.
+
+    If a parameter went to its limit, the answer may be another minimum. The parameters then start at their centers, and
+    only the noise at that of the last answer.
+    """
     own = problem.problem.unknowns
     off = np.abs(found[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
-    return bool((off < _NEAR * REACH).all())
+    is_inside = (off < _NEAR * REACH).all()
+    return found if is_inside else np.concatenate([np.full(own.count, np.nan), found[own.count :]])
 
 
 def shortest(answers: Sequence[SampleTime]) -> int:
