@@ -14,6 +14,7 @@ from ..analysis.prediction import Predictions
 from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
+from ..shooting import with_room
 from .answers import AXES, overwhelmed, parameter_table, rigid_body
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
@@ -307,7 +308,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     predicted = skill = None
     if held_out is not None:
         progress("predicting what was not fitted")
-        predicted, skill = predict_held_out(fit, held_out)
+        predicted, skill = predict_held_out(fit, held_out, case.room)
     airframe = fit.problem.model.airframe
     still = () if predicted is None else _still_axes(fit, predicted)
     notes = [
@@ -343,5 +344,5 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         tuple(notes),
         skill=skill,
         predictions=predicted,
-        response=frequency_response(fit.problem, values),
+        response=frequency_response(with_room(fit.problem, case.room), values),
     )

@@ -68,6 +68,11 @@ class Case(NamedTuple):
         return isinstance(self.problem, InnovationsProblem)
 
     @property
+    def room(self) -> int:
+        """The number of samples of a padded flight: checks at all sample times share their programs."""
+        return self.problem.flight.time.shape[0]
+
+    @property
     def innovations(self) -> InnovationsProblem:
         """The likelihood of a vehicle.
 

@@ -10,6 +10,7 @@ shortest without vibration and noise. If all have it: the longest with an answer
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ..flight import Flight
 from ..shooting import InnovationsProblem
 from .answers import AXES, overwhelmed, vehicle_constants
 from .fit import Fit, fit_innovations
+from .held_out import compile_ahead
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
 
@@ -40,12 +42,15 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
     fits: list[Fit] = []
-    for case in reversed(cases):
-        problem = case.innovations
-        progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-        if fits and fits[0].answered:
-            problem = problem.starting_from(_start(problem, np.asarray(fits[0].estimate.parameters)))
-        fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
+    with ThreadPoolExecutor(1) as beside:
+        for case in reversed(cases):
+            problem = case.innovations
+            progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
+            if fits and fits[0].answered:
+                problem = problem.starting_from(_start(problem, np.asarray(fits[0].estimate.parameters)))
+            fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
+            if len(fits) == 1:
+                beside.submit(compile_ahead, case)
     finest = cases[0].shooting.flight
     answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 
-import jax
 import msgspec
 import numpy as np
 
@@ -19,7 +18,7 @@ from ..models.vehicle import FlightModel
 from ..recording import preparation
 from ..recording.preparation import Prepared
 from ..recording.reading import Recording
-from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, pad_flight
+from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from .network import GivenNetwork, vehicle_network_for
 from .prepare import Case, HeldOut, Progress
 from .problem import Intervals, bracket_of
@@ -155,17 +154,12 @@ def _vehicle_shooting(model: FlightModel, prepared: Prepared, bracket: Bracket, 
 
 def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) -> InnovationsProblem:
     """The likelihood of a vehicle, in a program for all flights that are not longer than `room`."""
-    samples, recordings = prepared.fitted.time.shape[0], max(prepared.recordings) + 1
-    capacity = capacity_of(room.fitted.time.shape[0])
+    recordings = max(prepared.recordings) + 1
     # Segments are as many for all sample times, and last a while at the longest.
     seconds = float(room.fitted.dt) * room.fitted.time.shape[0]
     most = _SEGMENTS * max(recordings // _FEW_RECORDINGS, 1)
     segments = int(np.clip(seconds / _SHORTEST_SEGMENT, 1, most))
-    # The likelihood knows no windows.
-    padded = dataclasses.replace(
-        shooting, flight=pad_flight(prepared.fitted, capacity), windows=1, length=jax.device_put(np.asarray(samples))
-    )
-    return InnovationsProblem(padded, segments=segments)
+    return InnovationsProblem(with_room(shooting, capacity_of(room.fitted.time.shape[0])), segments=segments)
 
 
 def _held_out(

@@ -3,7 +3,7 @@
 from .abstract import AbstractProblem as AbstractProblem, Stages as Stages
 from .batching import cores as cores, in_blocks as in_blocks, on_all_cores as on_all_cores
 from .innovations import InnovationsProblem as InnovationsProblem
-from .padding import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded
+from .padding import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded, with_room as with_room
 from .problem import ShootingProblem as ShootingProblem
 from .scans import (
     FASTEST as FASTEST,

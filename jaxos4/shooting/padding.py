@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -25,8 +24,13 @@ def padded(problem: ShootingProblem) -> ShootingProblem:
     capacity = capacity_of(samples)
     if capacity == samples or problem.windows > 1 or problem.length is not None:
         return problem
-    longer, length = pad_flight(problem.flight, capacity), jax.device_put(np.asarray(samples))
-    return eqx.tree_at(lambda p: (p.flight, p.length), problem, (longer, length), is_leaf=lambda leaf: leaf is None)
+    return with_room(problem, capacity)
+
+
+def with_room(problem: ShootingProblem, capacity: int) -> ShootingProblem:
+    """The problem in one window, with a flight that is padded to `capacity` samples."""
+    length = jax.device_put(np.asarray(problem.flight.time.shape[0]))
+    return dataclasses.replace(problem, flight=pad_flight(problem.flight, capacity), windows=1, length=length)
 
 
 def capacity_of(samples: int) -> int:
