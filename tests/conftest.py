@@ -1,7 +1,6 @@
 """Settings and fixtures of all tests: precision, platform, runtime shape checks, property tests, real flights."""
 
 import atexit
-import collections
 import gc
 import os
 import pathlib
@@ -60,45 +59,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
 
 
-PROGRAMS: collections.Counter[str] = collections.Counter()  # of this process; on the controller, of all workers
-
-
-def count_program(event: str, seconds: float, **_) -> None:
-    """Counts one program that XLA compiled or that the cache had, and the seconds that this took."""
-    if event == "/jax/core/compile/backend_compile_duration":
-        quickly = bool(jax.config.read("jax_disable_most_optimizations"))
-        PROGRAMS.update(programs=1, quickly=quickly, milliseconds=round(1000 * seconds))
-
-
-def count_cached(event: str, **_) -> None:
-    """Counts one program that the cache had."""
-    PROGRAMS["cached"] += event == "/jax/compilation_cache/cache_hits"
-
-
-jax.monitoring.register_event_duration_secs_listener(count_program)
-jax.monitoring.register_event_listener(count_cached)
-
-
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """A worker sends its counts to the controller."""
+    """A worker ends at once: freeing its programs takes ten seconds, after which the controller would kill it."""
     if hasattr(session.config, "workeroutput"):
-        session.config.workeroutput["programs"] = dict(PROGRAMS)
-        # It has sent its results. Freeing its programs takes ten seconds, after which the controller would kill it.
         atexit.register(os._exit, 0)
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node) -> None:
-    """The controller adds the counts of a worker; a worker that died sent none."""
-    PROGRAMS.update(getattr(node, "workeroutput", {}).get("programs", {}))
-
-
-def pytest_terminal_summary(terminalreporter) -> None:
-    """Says how many programs the tests needed. Those of processes that the tests start are not known here."""
-    cached = PROGRAMS["cached"]
-    compiled, seconds = PROGRAMS["programs"] - cached, PROGRAMS["milliseconds"] / 1000
-    what = f"{compiled} programs compiled, {cached} from the cache, in {seconds:.0f} s"
-    terminalreporter.write_line(f"{what}; of all these, {PROGRAMS['quickly']} hardly optimised")
 
 
 @pytest.hookimpl(optionalhook=True)

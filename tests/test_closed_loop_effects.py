@@ -76,33 +76,30 @@ def test_wind_has_its_strength_and_its_correlation_time():
 def test_vibration_is_a_line_at_the_speed_of_the_rotors():
     """Its amplitude is proportional to the squared speed. The line lies beyond half the rate of the log."""
     assert HOVER > np.pi / DT
-    sizes = {"gyro_vibration": 0.05, "force_vibration": 0.4}
+    sizes, late, amplitudes = {"gyro_vibration": 0.05, "force_vibration": 0.4}, slice(1000, None), []
     for climb, share in ((0.0, 1.0), (2.0, 1 + 2 / GRAVITY)):
         _, states, force = fly(LEVEL + [0, 0, 0, climb], **sizes)
-        late = slice(1000, None)
         shaken = np.concatenate([states[late, RATES], force[late] - [0, 0, GRAVITY + climb]], axis=1)
         waves = np.exp(1j * HOVER * np.sqrt(share) * TIME[late])
         design = np.stack([waves.real, waves.imag], axis=1)
         fitted = np.linalg.lstsq(design, shaken, rcond=None)[0]
         np.testing.assert_allclose(design @ fitted, shaken, atol=1e-5)
-        amplitude = np.hypot(*fitted) / np.repeat(list(sizes.values()), 3) / share
-        if climb == 0:
-            still = amplitude
-            # Four rotors with random phases.
-            assert 1 < np.sqrt(np.mean(still**2)) < 3
-    np.testing.assert_allclose(amplitude, still, rtol=1e-4)
+        amplitudes.append(np.hypot(*fitted) / np.repeat(list(sizes.values()), 3) / share)
+    assert 1 < np.sqrt(np.mean(amplitudes[0] ** 2)) < 3  # four rotors with random phases
+    np.testing.assert_allclose(*amplitudes, rtol=1e-4)
 
 
 def test_filters_are_of_first_order():
     """SciPy's simulation of 1 / (T s + 1) takes signals as linear between samples, too."""
     _, raw, raw_force = fly()
     _, states, force = fly(gyro_filter=0.008, force_filter=0.03)
-    for T, before, after in ((0.008, raw[:, RATES], states[:, RATES]), (0.03, raw_force - GRAVITY, force - GRAVITY)):
+    starts = np.array([[0, 0, 0], [0, 0, GRAVITY]])
+    pairs = (0.008, raw[:, RATES], states[:, RATES]), (0.03, raw_force, force)
+    for (T, before, after), start in zip(pairs, starts, strict=True):
         for axis in range(3):
-            start = 0 if axis == 2 or T == 0.008 else -GRAVITY
-            expected = lsim(([1], [T, 1]), before[:, axis] - start, TIME)[1] + start
+            expected = lsim(([1], [T, 1]), before[:, axis] - start[axis], TIME)[1] + start[axis]
             np.testing.assert_allclose(after[:, axis], expected, atol=1e-9)
-            assert np.abs(after - before)[:, axis].max() > (1e-3 if T == 0.008 or axis == 2 else -1)
+        assert np.abs(after - before)[:, 2].max() > 1e-3
 
 
 # The gyro of the controller.
@@ -120,24 +117,18 @@ def test_the_controller_can_have_a_gyro_of_its_own():
     """A controller with little gain answers its noise with the proportional gain. A filter makes the noise smaller."""
     gains = {"attitude_gain": 0.0, "rate_gain": 1.0, "integral_gain": 0.0, "gyro_noise": 0.02}
     sizes = []
-    for own in (0.0, 0.05):
-        for T in (0.0, 0.02):
-            omega, states, _ = fly(LEVEL, loop=gains, controller_gyro_noise=own, controller_gyro_filter=T)
-            torque = np.asarray(CRAZYFLIE.mixer)[:3] @ np.square(omega).T
-            sizes.append((torque.T / np.asarray(CRAZYFLIE.inertia)).std(axis=0))
-            # The noise of the log is another one.
-            assert np.abs(np.corrcoef(states[1000:, RATES[0]], torque[0, 1000:])[0, 1]) < 0.1 or own == 0.0
+    for own, T in ((0.0, 0.0), (0.0, 0.02), (0.05, 0.0), (0.05, 0.02)):
+        omega, states, _ = fly(LEVEL, loop=gains, controller_gyro_noise=own, controller_gyro_filter=T)
+        torque = np.asarray(CRAZYFLIE.mixer)[:3] @ np.square(omega).T
+        sizes.append((torque.T / np.asarray(CRAZYFLIE.inertia)).std(axis=0))
+        # The noise of the log is another one.
+        assert np.abs(np.corrcoef(states[1000:, RATES[0]], torque[0, 1000:])[0, 1]) < 0.1 or own == 0.0
     none, also_none, white, filtered = sizes
     np.testing.assert_allclose([none, also_none], 0, atol=1e-9)
     np.testing.assert_allclose(white, 0.05, rtol=0.05)
-    np.testing.assert_allclose(filtered / white, np.sqrt(filtered_share(0.02)), rtol=0.1)
-
-
-def filtered_share(T):
-    """The variance of filtered white noise of unit variance: the sum of the squared impulse response."""
-    impulse = np.zeros(500)
-    impulse[1] = 1
-    return np.square(lsim(([1], [T, 1]), impulse, DT * np.arange(500))[1]).sum()
+    # The variance of filtered white noise is the sum of the squared impulse response.
+    impulse = lsim(([1], [0.02, 1]), 1.0 * (np.arange(500) == 1), DT * np.arange(500))[1]
+    np.testing.assert_allclose(filtered / white, np.sqrt(np.square(impulse).sum()), rtol=0.1)
 
 
 @pytest.mark.parametrize("logged", ["commands", "speeds"])

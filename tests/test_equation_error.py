@@ -79,22 +79,6 @@ def test_equals_least_squares_in_numpy(estimator, model_class, form, forgetting)
 # Without noise.
 
 
-@pytest.mark.parametrize(
-    ("estimator", "model_class", "channels"),
-    [(EquationError(), PUBLISHED, "all"), (RecursiveLeastSquares(), CORRECTED, "rates")],
-)
-def test_exact_flights_give_the_truth(estimator, model_class, channels):
-    """To rounding: 1e-12 of each parameter, and 1e-14 in alpha2 and alpha5 as printed, which are 6e-9."""
-    problem = standard_problem(model_class, channels, free=True)
-    estimate = estimator(problem, bracket_of(model_class))
-    assert names(estimate) == "successful"
-    np.testing.assert_allclose(estimate.parameters, model_class().alpha, rtol=1e-12, atol=1e-14)
-    assert estimate.cost < 1e-15
-    # One to see whether it flies, one for the cost there, and four Gauss-Newton steps to where a free start lies.
-    assert int(estimate.rollouts) == 2 + 4 * (8 + problem.size)
-    assert estimate.initial_state.shape == (problem.size,)
-
-
 def test_the_trapezoidal_rule_is_for_flights_that_were_not_flown_by_eulers():
     """Truth in continuous time: a fifth of the bound at most, where Euler's rule is off by half of it."""
     model = PUBLISHED()

@@ -1,13 +1,23 @@
-"""`jaxos4 inspect` as a user types it: logs of each format, good and bad."""
+"""`jaxos4 inspect` as a user types it: logs of each format, and the airframe that a log knows of."""
 
 import json
 
+import equinox as eqx
 import numpy as np
 import pytest
+import tomlkit
+from helpers import CRAZYFLIE, refused
+from hypothesis import given, settings, strategies as st
 from recorded_logs import VEHICLE, blackbox_csv
 from test_logs_blackbox import T as BLACKBOX_TIME, recorded
 from test_logs_crazyflie import one_event
 from test_logs_ulog import everything
+from test_signs import flown, turned
+
+import jaxos4
+from jaxos4.logs import LogFacts
+from jaxos4.recording.drafting import FULL_SCALE, airframe_draft
+from jaxos4.recording.motion import RotorSigns, rotor_signs
 
 LOGS = {
     "ULog": everything(),
@@ -52,3 +62,106 @@ def test_commands_need_no_airframe_to_be_inspected(run, tmp_path):
     assert (code, err) == (0, "")
     assert "up to 0.6 of full scale (commands)" in out
     assert "usable" in out
+
+
+SIGNS = RotorSigns((1, -1, -1, 1), (-1, -1, 1, 1), (1, -1, 1, -1))
+
+
+def with_force(flight, airframe):
+    """The flight with an accelerometer that measures the rotors' thrust."""
+    thrust = float(airframe.thrust_coefficient) * (flight.omega**2).sum(axis=1)
+    return flight._replace(specific_force=np.outer(thrust / float(airframe.mass), [0, 0, 1.0]))
+
+
+def filled(text):
+    """The draft with its marked lines filled in, by the Crazyflie's numbers."""
+    text = text.replace("# mass = ", "mass = 0.027")
+    (line,) = [line for line in text.splitlines() if line.startswith("# rotor_positions = ")]
+    places, comment = line.removeprefix("# ").split("  # ")
+    return text.replace(line, f"{places.replace('x', '0.028').replace('y', '0.028')}  # {comment}")
+
+
+@given(seed=st.integers(0, 999), gust=st.sampled_from([0.0, 5.0, 40.0]), order=st.permutations(range(4)))
+@settings(max_examples=12, deadline=None)
+def test_a_flight_shows_where_its_rotors_are(seed, gust, order):
+    """In any order of the rotors, whatever a controller does against gusts: right, or not said."""
+    flight = flown(CRAZYFLIE, seed, gust=gust)
+    found = rotor_signs([flight._replace(omega=flight.omega[:, order])])
+    assert found is not None
+    forward, left, spins = (tuple(np.asarray(each)[order].tolist()) for each in SIGNS)
+    assert found[:2] == (forward, left)
+    assert found.spins in (spins, None)
+    assert found.spins is not None or gust == 40
+
+
+def test_props_in_and_props_out_and_flights_that_do_not_show_their_rotors():
+    assert rotor_signs([flown(turned(CRAZYFLIE, "rotor_spins"), 0)]) == SIGNS._replace(spins=(-1, 1, -1, 1))
+    flight = flown(CRAZYFLIE, 0)
+    places = np.array([[0.04, 0.0], [0.0, -0.04], [-0.04, 0.0], [0.0, 0.04]])
+    plus = eqx.tree_at(lambda a: a.rotor_positions, CRAZYFLIE, places)
+    for pieces in ([], [flight._replace(states=0.001 * flight.states)], [flown(plus, 0)]):
+        assert rotor_signs(pieces) is None
+
+
+@pytest.mark.parametrize("name", ["rollpitch", "hover"])
+def test_real_logs_give_airframes(name, shared_flights, run, tmp_path):
+    """The draft of a log has its signs, is no airframe before it is filled in, and then is that of the vehicle."""
+    log = str(shared_flights / f"arpl_crazyflie_{name}.csv")
+    code, out, err = run("inspect", log, "--airframe-out", "mine.toml")
+    assert (code, err) == (0, "")
+    assert "airframe: mine.toml; weigh or measure, and fill in: mass, rotor_positions" in out
+    text = (tmp_path / "mine.toml").read_text()
+    x, y = ([{1: name, -1: f"-{name}"}[sign] for sign in each] for name, each in zip("xy", SIGNS, strict=False))
+    assert f"# rotor_positions = [{', '.join(f'[{a}, {b}]' for a, b in zip(x, y, strict=True))}]" in text
+    refused(run("estimate", log, "--airframe", "mine.toml"), "mine.toml: `mass` is missing")
+    (tmp_path / "mine.toml").write_text(filled(text))
+    airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
+    np.testing.assert_array_equal(airframe.rotor_spins, SIGNS.spins)
+    assert 200 < float(airframe.hover_speed) < 700
+    # Its data sheet says 0.150 N at full command.
+    full_thrust = float(airframe.thrust_coefficient * airframe.max_rotor_speed**2)
+    assert full_thrust == pytest.approx(0.150, rel=0.15)
+
+
+@pytest.mark.parametrize("commanded", [True, False])
+@pytest.mark.parametrize("felt", [True, False])
+def test_the_median_thrust_carries_the_mass(commanded, felt, tmp_path):
+    flight = flown(CRAZYFLIE, 0)
+    flight = with_force(flight, CRAZYFLIE) if felt else flight
+    if commanded:  # as a reader gives them that knows of no airframe: shares of full scale
+        flight = flight._replace(omega=flight.omega / float(CRAZYFLIE.max_rotor_speed))
+    draft = airframe_draft(flight._replace(commanded=commanded))
+    assert draft.missing == ("mass", "rotor_positions")
+    assert ("Without an accelerometer this must be right" in draft.text) == (not felt)
+    (tmp_path / "mine.toml").write_text(filled(draft.text))
+    airframe = jaxos4.load_airframe(tmp_path / "mine.toml")
+    assert float(airframe.max_rotor_speed) == (FULL_SCALE if commanded else np.inf)
+    scale = float(CRAZYFLIE.max_rotor_speed) / FULL_SCALE if commanded else 1.0
+    thrust = float(CRAZYFLIE.thrust_coefficient) * scale**2
+    assert float(airframe.thrust_coefficient) == pytest.approx(thrust, rel=1e-3 if felt else 0.05)
+    np.testing.assert_array_equal(airframe.rotor_spins, CRAZYFLIE.rotor_spins)
+
+
+def test_settings_of_the_autopilot_are_taken():
+    positions = ((0.15, -0.2), (-0.15, 0.2), (0.15, 0.2), (-0.15, -0.2))
+    facts = LogFacts(rotor_positions=positions, rotor_spins=(1.0, 1.0, -1.0, -1.0))
+    draft = airframe_draft(flown(CRAZYFLIE, 0)._replace(facts=facts))
+    found = tomlkit.parse(draft.text)
+    assert draft.missing == ("mass",)
+    assert found["rotor_positions"] == [list(each) for each in positions]
+    assert found["rotor_spins"] == [1, 1, -1, -1]
+
+
+def test_a_log_that_never_flew_leaves_more_to_fill_in(run, tmp_path):
+    rows = [f"{0.01 * k:.2f},0,0,0,0,0" for k in range(200)]
+    (tmp_path / "log").write_text("\n".join(["t,command1,command2,command3,command4,p", *rows]))
+    code, out, err = run("inspect", "log", "--airframe-out", "mine.toml")
+    assert (code, err) == (0, "")
+    assert "fill in: mass, rotor_positions, rotor_spins, hover_speed" in out
+    text = (tmp_path / "mine.toml").read_text()
+    for line, key in (("", "mass"), ("mass = 1", "rotor_positions"), ("arm = 0.1", "thrust_coefficient")):
+        text = f"{line}\n{text}"
+        (tmp_path / "mine.toml").write_text(text)
+        refused(run("inspect", "log", "--airframe", "mine.toml"), f"`{key}` is missing")
+    (tmp_path / "mine.toml").write_text(f"hover_speed = 500\n{text}")
+    refused(run("inspect", "log", "--airframe", "mine.toml"), "`rotor_spins` must be finite numbers of shape [4]")

@@ -31,23 +31,14 @@ every_noise = pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
 
 
 def make_flight(samples=50, *, states=None):
-    if states is None:
-        states = jnp.sin(jnp.arange(samples * 12.0).reshape(samples, 12))
-    return Flight(
-        time=DT * jnp.arange(samples),
-        omega=jnp.full((samples, 4), 200.0),
-        states=states,
-        specific_force=jnp.ones((samples, 3)),
-    )
+    states = jnp.sin(jnp.arange(samples * 12.0).reshape(samples, 12)) if states is None else states
+    time, omega = DT * jnp.arange(samples), jnp.full((samples, 4), 200.0)
+    return Flight(time=time, omega=omega, states=states, specific_force=jnp.ones((samples, 3)))
 
 
-def still(samples):
-    return make_flight(samples, states=jnp.zeros((samples, 12)))
-
-
-def errors(noise, samples, *, trials=None, seed=0):
+def errors(noise, samples, *, trials=None):
     """The errors that `noise` adds: (samples, 12), or (trials, samples, 12). Trial i draws from `fold_in(key, i)`."""
-    key, flight = jax.random.key(seed), still(samples)
+    key, flight = jax.random.key(0), make_flight(samples, states=jnp.zeros((samples, 12)))
     if trials is None:
         return np.asarray(noise(flight, key=key).states)
     return np.asarray(measured(noise, flight, folded(key, jnp.arange(trials))))
@@ -57,13 +48,6 @@ def assert_within(estimate, truth, standard_error, limit=4.0):
     """All channels are within `limit` standard errors. By chance, one of 1,300 sets of 12 channels is not."""
     z = np.abs(np.asarray(estimate) - truth) / standard_error
     assert z.max() < limit, z
-
-
-def test_sensor_sigma_is_in_the_order_of_the_states():
-    sigma = dict(zip(STATE_NAMES, SENSOR_SIGMA.tolist(), strict=True))
-    for names, value in (("x y z", 0.005), ("vx vy vz", 0.02), ("phi theta psi", 0.005), ("p q r", 0.01)):
-        assert all(sigma[name] == value for name in names.split())
-    assert SENSOR_SIGMA.dtype == np.float64
 
 
 # Laws of every noise.
@@ -113,7 +97,10 @@ def test_numbers_of_any_kind_share_a_trace_and_can_be_a_batch():
 # Statistics.
 
 
-def test_white_noise_is_white():
+def test_white_noise_is_white_with_the_sizes_of_the_sensors():
+    sizes = {"x y z": 0.005, "vx vy vz": 0.02, "phi theta psi": 0.005, "p q r": 0.01}
+    sizes = {name: size for names, size in sizes.items() for name in names.split()}
+    assert SENSOR_SIGMA.tolist() == [sizes[name] for name in STATE_NAMES]
     n = 10_000
     z = errors(WhiteNoise(SENSOR_SIGMA), n) / SENSOR_SIGMA
     assert_within(z.mean(axis=0), 0, 1 / np.sqrt(n))
@@ -155,13 +142,9 @@ def test_coloured_noise_is_stationary_from_the_first_sample_and_its_innovations_
     white = errors(WhiteNoise(SENSOR_SIGMA), 61, trials=2000) / SENSOR_SIGMA
     for wrong in (coloured_errors(white, CORRELATION_TIME), coloured_errors(z, 1.05 * CORRELATION_TIME)):
         assert np.abs(list(wrong)).max(axis=0).min() > 4
-
-
-def test_limits_of_coloured_noise():
-    """An infinite correlation time is a constant; one far below the sample time is white."""
-    constant = errors(GaussMarkov(SENSOR_SIGMA, correlation_time=np.inf), 50)
+    # An infinite correlation time is a constant; one far below the sample time is white.
+    constant, white = (errors(GaussMarkov(SENSOR_SIGMA, correlation_time=time), 50) for time in (np.inf, 1e-6))
     np.testing.assert_array_equal(constant, np.broadcast_to(constant[0], (50, 12)))
-    white = errors(GaussMarkov(SENSOR_SIGMA, correlation_time=1e-6), 50)
     np.testing.assert_array_equal(white, errors(WhiteNoise(SENSOR_SIGMA), 50))
 
 
@@ -176,15 +159,13 @@ def test_quantised_states_are_the_nearest_multiples():
 
 
 def test_dropouts_come_at_their_rate():
-    n = 10_000
-    probability = np.linspace(0.05, 0.6, 12)
+    n, probability = 10_000, np.linspace(0.05, 0.6, 12)
     flight = make_flight(n)
     noisy = np.asarray(Dropouts(probability)(flight, key=jax.random.key(0)).states)
     lost = np.isnan(noisy)
     assert_within(lost.mean(axis=0), probability, np.sqrt(probability * (1 - probability) / n))
-    both = (lost[:, 0] & lost[:, 11]).mean()
     together = probability[0] * probability[11]
-    assert_within(both, together, np.sqrt(together * (1 - together) / n))
+    assert_within((lost[:, 0] & lost[:, 11]).mean(), together, np.sqrt(together * (1 - together) / n))
     np.testing.assert_array_equal(noisy[~lost], np.asarray(flight.states)[~lost])
     assert np.isnan(errors(Dropouts(1), 5)).all()
 

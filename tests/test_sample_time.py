@@ -32,28 +32,27 @@ def table(*rows):
 
 
 A, B, C = (10.0, 20.0), (13.0, 20.0), (10.0, 25.0)
+PLATEAUS = {
+    "one": ([(A, 0.0)], 0),
+    "plateau": ([(A, 0.1), (A, 0.0), (A, 0.0)], 0),
+    "later plateau": ([(A, 0.1), (B, 0.0), (B, 0.0)], 1),
+    "plateau of Iy": ([(A, 0.1), (C, 0.0), (C, -0.1)], 1),
+    "beyond chance": ([(A, 0.12), (A, 0.1), (A, 0.1)], 1),
+    "negative": ([(A, -0.5), (A, 0.1), (A, 0.1)], 1),
+    "none white": ([(A, 0.9), (A, 0.8), (A, 0.7)], 2),
+    "last alone": ([(A, 0.9), (A, 0.8), (A, 0.1)], 2),
+    "no plateau": ([(A, 0.1), (B, 0.1), (A, 0.1)], 0),
+    "no answer": ([((), 0.1), (A, 0.1), (A, 0.1)], 1),
+}
 
 
-@pytest.mark.parametrize(
-    ("answers", "place"),
-    [
-        (table((A, 0.0)), 0),
-        (table((A, 0.1), (A, 0.0), (A, 0.0)), 0),
-        (table((A, 0.1), (B, 0.0), (B, 0.0)), 1),
-        (table((A, 0.1), (C, 0.0), (C, -0.1)), 1),
-        (table((A, 0.12), (A, 0.1), (A, 0.1)), 1),
-        (table((A, 0.5), (A, 0.1), (A, 0.1)), 1),
-        (table((A, -0.5), (A, 0.1), (A, 0.1)), 1),
-        (table((A, 0.9), (A, 0.8), (A, 0.7)), 2),
-        (table((A, 0.9), (A, 0.8), (A, 0.1)), 2),
-        (table((A, 0.1), (B, 0.1), (A, 0.1)), 0),
-        (table(((), 0.1), (A, 0.1), (A, 0.1)), 1),
-    ],
-    ids=["one", "plateau", "later plateau", "plateau of Iy", "beyond chance", "white later", "negative", "none white",
-         "last alone", "no plateau", "no answer"],
-)  # fmt: skip
-def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(answers, place):
-    assert shortest(answers) == place
+@pytest.mark.parametrize(("rows", "place"), PLATEAUS.values(), ids=PLATEAUS)
+def test_the_shortest_white_sample_time_of_a_plateau_is_chosen(rows, place):
+    """Answers agree within two standard deviations and three percent."""
+    assert shortest(table(*rows)) == place
+    own, near, far = (table((values, 0.0))[0] for values in (A, (12.2, 20.0), (12.4, 20.0)))
+    assert moved(own, near) == []
+    assert moved(own, far) == moved(far, own) == ["Ix"]
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0, 10.0])
@@ -75,13 +74,6 @@ def test_noise_of_measured_speeds_is_its_share_of_their_changes(noise):
         share = np.max(changes(wrong) / changes(noisy))
         assert noise_of_speeds(flight, finest, CRAZYFLIE) == pytest.approx(share, rel=0.3, abs=0.02)
     assert noise_of_speeds(dataclasses.replace(flight, commanded=True), finest, CRAZYFLIE) == 0
-
-
-def test_answers_agree_within_two_standard_deviations_and_three_percent():
-    near, far = table(((12.2, 20.0), 0.0))[0], table(((12.4, 20.0), 0.0))[0]
-    own = table((A, 0.0))[0]
-    assert moved(own, near) == []
-    assert moved(own, far) == moved(far, own) == ["Ix"]
 
 
 def test_four_sample_times_need_one_program():
