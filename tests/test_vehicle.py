@@ -182,3 +182,24 @@ def test_a_flight_that_the_model_cannot_follow_has_no_answer():
     found = jaxos4.FilterError()(problem, jaxos4.Bracket(bracket.upper, bracket.lower))
     assert names(found) == "bracket_invalid"
     assert not np.isfinite(np.asarray(found.covariance)).any()
+
+
+@pytest.mark.parametrize("braking", [1.0, 0.2])
+def test_motors_brake_as_they_drive_unless_the_flight_says_otherwise(braking):
+    """Near its plain value the cost has kinks, so that the parameter looks known better than it is."""
+    loop = jaxos4.ClosedLoop(
+        CRAZYFLIE, gust=1.0, rotor_lag=LAG, rotor_delay=DELAY, thrust_curve=0.85, motor_braking=braking
+    )
+    references = 3 * jaxos4.random_references(duration=SECONDS, dt=PERIOD, key=jax.random.key(1))
+    flight = jaxos4.fly_closed_loop(loop, references, dt=PERIOD, key=jax.random.key(2))
+    terms = tuple("motor" if term == "lag" else term for term in TERMS)
+    problem = InnovationsProblem(shooting_problem(flight, CRAZYFLIE, terms))
+    fit = fit_innovations(jaxos4.FilterError(), problem, np.zeros(flight.time.size, int))
+    place = fit.problem.unknowns.names.index("motor_braking")
+    value = float(fit.estimate.parameters[place])
+    if braking == 1.0:
+        assert fit.held["motor_braking"].value == value == 1.0
+        assert "do not clearly contradict" in fit.held["motor_braking"].note
+    else:
+        assert "motor_braking" not in fit.held
+        assert abs(value - braking) < 3 * float(fit.estimate.std[place])

@@ -18,6 +18,7 @@ from ..analysis.diagnostics import Diagnostics, diagnostics_of
 from ..analysis.evaluation import Evaluation, evaluate
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
+from ..models.abstract import Parameter
 from ..results import RESULTS
 from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
 from ..shooting.gains import LogNoise
@@ -31,12 +32,16 @@ _PASSES = 3
 _SETTLED = 0.2
 # A parameter that must not be negative, and is so by this many standard deviations, is held at 0.
 _NEGATIVE = 2.0
+# A parameter is held at its plain value unless that raises the cost by more than the first number: near it, a cost with
+# kinks is not quadratic, and standard deviations are too small. They are never wrong by the second number.
+_CLEARLY, _SURELY = 5.0, 12.0
 _PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
 # The most parts of a flight that are compared, and the fewest that can show a disagreement.
 _MOST, _FEWEST = 20, 4
 # The chance that parts of a flight that the model explains are taken to disagree.
 _CHANCE = 0.05
 _NEGATIVE_NOTE = "came out negative, which is impossible"
+_PLAIN_NOTE = "the flights do not clearly contradict this value"
 Progress = Callable[[str], None]
 
 
@@ -144,8 +149,8 @@ def fit_innovations(
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
 
     The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket is not
-    estimated. A parameter that came out negative, though physics forbids it, is held at 0. Intervals widen if parts of
-    the flights disagree.
+    estimated. A parameter that came out negative, though physics forbids it, is held at 0. One that is not
+    clearly other than its plain value is held there. Intervals widen if parts of the flights disagree.
 
     **Arguments:**
 
@@ -154,28 +159,22 @@ def fit_innovations(
     """
     own, names = problem.problem.unknowns, problem.model.parameter_names
     unknowns = own.count + 3 * len(problem.channels)
-    progress("compiling, and fitting parameters and disturbances")
-    found = jax.block_until_ready(estimator(problem))
-    rollouts, std = int(found.rollouts), _std(found)
-    values, nonnegative = np.asarray(found.parameters), [each.nonnegative for each in problem.model.parameters]
-    at_zero = nonnegative & (values[: own.count] < -_NEGATIVE * std[: own.count])
-    negative = {names[i]: (float(values[i]), float(std[i])) for i in np.flatnonzero(at_zero)}
-    if at_zero.any() and has_answer(found):
-        progress("fitting again without what came out negative")
-        zero = {name: np.zeros(()) for name, negative in zip(names, at_zero, strict=True) if negative}
-        problem = problem.hold(zero).starting_from(values)
-        found = jax.block_until_ready(estimator(problem))
-        rollouts += int(found.rollouts)
+    half_width = np.asarray(own.half_width)
+    problem, found, rollouts, fixed, negative = _searched(estimator, problem, progress)
     progress("computing errors")
     values, std = np.asarray(found.parameters)[: own.count], _std(found)[: own.count]
-    half_width, factor = np.asarray(own.half_width), np.ones(own.count)
+    factor, free = np.ones(own.count), ~np.isin(names, list(fixed))
     if has_answer(found):
-        factor[~at_zero] = _widening(problem, found, ~at_zero, recording)
+        factor[free] = _widening(problem, found, free, recording)
     identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
     if not has_answer(found) or not identifiable.any():
         identifiable[:] = True
-    notes = {i: _NEGATIVE_NOTE if at_zero[i] else _PRIOR_NOTE for i in np.flatnonzero(~identifiable | at_zero)}
-    held = {names[i]: HeldParameter(float(values[i]), own.units[i], note) for i, note in notes.items()}
+    notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~identifiable)} | fixed
+    held = {
+        name: HeldParameter(float(values[i]), own.units[i], notes[name])
+        for i, name in enumerate(names)
+        if name in notes
+    }
     scale = np.ones(unknowns)
     scale[: own.count] = factor
     spread = np.asarray(found.covariance) * scale[:, None] * scale
@@ -191,6 +190,52 @@ def fit_innovations(
         disturbances=_disturbances(problem, found, noise),
         noise=noise,
     )
+
+
+def _searched(
+    estimator: AbstractEstimator, problem: InnovationsProblem, progress: Progress
+) -> tuple[InnovationsProblem, Estimate, int, dict[str, str], dict[str, tuple[float, float]]]:
+    """The problem with some parameters held at values that the flights do not contradict, and its estimate.
+
+    **Returns:** also the rollouts of all searches, why each of these parameters is held, and the value and standard
+    deviation of those that came out negative.
+    """
+    table, rollouts = problem.model.parameters, 0
+
+    def search(other: InnovationsProblem) -> Estimate:
+        nonlocal rollouts
+        estimate = jax.block_until_ready(estimator(other))
+        rollouts += int(estimate.rollouts)
+        return estimate
+
+    def holding(values: dict[str, float]) -> InnovationsProblem:
+        return problem.hold({name: np.asarray(value) for name, value in values.items()}).starting_from(found.parameters)
+
+    progress("compiling, and fitting parameters and disturbances")
+    found, fixed, negative = search(problem), {}, {}
+    if has_answer(found):
+        rows = zip(table, np.asarray(found.parameters).tolist(), _std(found).tolist(), strict=False)
+        negative = {row.name: (x, std) for row, x, std in rows if row.nonnegative and x < -_NEGATIVE * std}
+    if negative:
+        progress("fitting again without what came out negative")
+        problem, fixed = holding(dict.fromkeys(negative, 0.0)), dict.fromkeys(negative, _NEGATIVE_NOTE)
+        found = search(problem)
+    if has_answer(found) and (plain := _nearly_plain(table, found)):
+        progress("fitting again without what the flights hardly show")
+        simpler = holding(plain)
+        other = search(simpler)
+        if has_answer(other) and float(other.cost) < float(found.cost) + _CLEARLY:
+            problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
+    return problem, found, rollouts, fixed, negative
+
+
+def _nearly_plain(table: tuple[Parameter, ...], found: Estimate) -> dict[str, float]:
+    """The plain values of the parameters that were found near them."""
+    near = {}
+    for row, value, std in zip(table, np.asarray(found.parameters).tolist(), _std(found).tolist(), strict=False):
+        if row.plain is not None and std > 0 and abs(value - row.plain) < _SURELY * std:
+            near[row.name] = row.plain
+    return near
 
 
 def _parts(found: Estimate) -> Parts:

@@ -55,7 +55,7 @@ class TermParameter(NamedTuple):
     - `half_width`, `center`: of the default bracket: a number, or a function of the airframe.
     - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
     - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
-    - `nonnegative`, `scales_torque`, `contradiction`: see `jaxos4.models.abstract.Parameter`.
+    - `nonnegative`, `scales_torque`, `plain`, `contradiction`: see `jaxos4.models.abstract.Parameter`.
     """
 
     name: str
@@ -66,6 +66,7 @@ class TermParameter(NamedTuple):
     force_axis: int | None = None
     nonnegative: bool = False
     scales_torque: bool = False
+    plain: float | None = None
     contradiction: Contradiction | None = None
 
 
@@ -265,7 +266,7 @@ TERMS: dict[str, Term] = {
             TermParameter(
                 "thrust_curve", "1", 0.25, center=0.85, contradiction=_limits((0.0, STEEPEST, _BENT, _CLIMB))
             ),
-            TermParameter("motor_braking", "1", 0.6, center=0.5, nonnegative=True),
+            TermParameter("motor_braking", "1", 0.6, center=0.5, nonnegative=True, plain=1.0),
         ),
         # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),

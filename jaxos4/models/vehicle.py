@@ -295,6 +295,6 @@ def _table(terms: tuple[Term, ...], force_axes: tuple[int, ...], recordings: int
         named = [(source, "") for source in sources if not source.each_recording]
         named += [(source, number) for number in numbers for source in sources if source.each_recording]
         for source, number in named:
-            copied = (source.nonnegative, source.scales_torque, source.contradiction)
+            copied = (source.nonnegative, source.scales_torque, source.plain, source.contradiction)
             rows.append((term, source, Parameter(source.name + number, source.unit, term.in_forcing, *copied)))
     return tuple(rows)
