@@ -15,7 +15,7 @@ from ..bracket import NO_PRIOR, Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
 from ..results import RESULTS
-from ..shooting import AbstractProblem, InnovationsProblem, in_blocks
+from ..shooting import AbstractProblem, InnovationsProblem, ShootingProblem, in_blocks
 from .ibss import IBSS
 
 _LEVEL = 0.999  # the share of flights in which the seed's intervals hold all parameters at once
@@ -38,6 +38,8 @@ class Hybrid(AbstractEstimator):
 
     - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
     - `ibss`: how to search.
+    - `seen`: the part of the flight that the network looks at; by default the shooting problem that is searched, or
+      that of the innovations. It must be the problem of training, but for the measured values.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -48,15 +50,13 @@ class Hybrid(AbstractEstimator):
 
     network: TrainedNetwork
     ibss: IBSS = eqx.field(default_factory=IBSS)
+    seen: ShootingProblem | None = None
 
     def __call__(self, problem: AbstractProblem, bracket: Bracket | None = None) -> Estimate:
-        """Identifies one flight. Raises as the network does.
-
-        The network looks at the shooting problem of a problem of innovations.
-        """
+        """Identifies one flight. Raises as the network does."""
         problem = problem.within(bracket)
-        shooting: Any = problem.problem if isinstance(problem, InnovationsProblem) else problem
-        return search_from_seed(self.ibss, problem, self.network(shooting))
+        whole: Any = problem.problem if isinstance(problem, InnovationsProblem) else problem
+        return search_from_seed(self.ibss, problem, self.network(whole if self.seen is None else self.seen))
 
 
 class Seed(NamedTuple):
@@ -107,12 +107,13 @@ def _search_near(ibss: IBSS, problem: AbstractProblem, seed: Seed) -> Estimate:
     # The network's channels come first; a problem whose initial state is no unknown needs none of them.
     estimated = seed.initial_state.reshape(problem.windows, -1)[:, : first.shape[1]]
     seeded = first.at[:, : estimated.shape[1]].set(estimated)
-    rest = jnp.full(unknowns.count - count, jnp.nan)
+    seed_start = jnp.where(unknowns.free[:count], seed.parameters, unknowns.center[:count])
+    begin = jnp.full(unknowns.count, jnp.nan).at[:count].set(seed_start)
 
     def search(hit: Bool[Array, ""], near: Bool[Array, ""]) -> tuple[Bool[Array, ""], Estimate]:
         found = ibss.search(
             problem,
-            start=jnp.concatenate([jnp.where(near, seed.parameters, unknowns.center[:count]), rest]),
+            start=jnp.where(near, begin, jnp.nan),
             spread=jnp.where(near, seed.covariance, wide_spread),
             initial_state=jnp.where(near, seeded, first).ravel(),
             cascade=~near,

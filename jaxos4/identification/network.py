@@ -21,8 +21,9 @@ GivenNetwork = TrainedNetwork | str | os.PathLike[str] | None
 
 # Steps of training for a network that only gives a search its start.
 _SEED_STEPS = 2000
-# The same for a vehicle's flights in windows.
-_VEHICLE_TRAINING = NetworkEstimator(steps=500, batch=64, noise=(1.0, 1.0), held_out=1000)
+# A vehicle's network sees so many windows of the flight, however long it is.
+_VEHICLE_WINDOWS, _VEHICLE_TRAINING = 24, NetworkEstimator(steps=250, batch=64, noise=(1.0, 1.0), held_out=2000)
+_FLYABLE = 0.5  # the share of a vehicle's bracket in which nearly all simulated flights can be flown
 
 
 def train_network(
@@ -52,9 +53,22 @@ def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots
     return _train(NetworkEstimator(channels=_seen_channels(problem), steps=steps), problem, bracket, name, seed)
 
 
+def liveliest(problem: ShootingProblem) -> ShootingProblem:
+    """The part of a vehicle's flight that a network sees: the windows in a row with the largest rates."""
+    windows = min(_VEHICLE_WINDOWS, problem.windows)
+    samples = problem.flight.time.shape[0] // problem.windows
+    motion = np.nansum(np.square(problem.recorded()), axis=1).reshape(problem.windows, samples).sum(axis=1)
+    first = samples * int(np.convolve(motion, np.ones(windows), "valid").argmax())
+    part = slice(first, first + samples * windows)
+    flight = jax.tree.map(lambda leaf: leaf[part] if leaf.ndim else leaf, problem.flight)
+    return dataclasses.replace(problem, flight=flight, windows=windows)
+
+
 def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> TrainedNetwork:
-    """Train a network for a vehicle's flights in windows, at the noise levels of the problem."""
-    return _train(_VEHICLE_TRAINING, problem, problem.unknowns.bracket, name, seed)
+    """Train a network for a part of a vehicle's flight in windows, at the noise levels of the problem."""
+    unknowns = problem.unknowns
+    bracket = Bracket.around(unknowns.center, _FLYABLE * unknowns.half_width)
+    return _train(_VEHICLE_TRAINING, problem, bracket, name, seed)
 
 
 def loaded(network: GivenNetwork) -> TrainedNetwork | None:

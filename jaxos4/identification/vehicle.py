@@ -1,6 +1,7 @@
 """From recordings of a vehicle to the problem that an estimator solves, and the measurements that test the answer."""
 
 import dataclasses
+import time
 from collections.abc import Sequence
 
 import msgspec
@@ -11,7 +12,7 @@ from ..analysis.prediction import HORIZONS, starts
 from ..bracket import Bracket
 from ..errors import InputError, TrainingError
 from ..estimate import AbstractEstimator
-from ..estimators import ESTIMATORS, IBSS, FilterError, make_estimator
+from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
 from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, default_terms
 from ..models.vehicle import FlightModel
@@ -19,7 +20,7 @@ from ..recording import preparation
 from ..recording.preparation import Prepared
 from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from .network import GivenNetwork, vehicle_network_for
+from .network import GivenNetwork, liveliest, vehicle_network_for
 from .prepare import Case, HeldOut, Progress
 from .problem import Intervals, bracket_of
 from .results import Provenance
@@ -53,8 +54,8 @@ def prepare_vehicle(
             f"`estimator` {name}: is biased by a controller that answers gusts, as every vehicle has; use one of "
             f"{fitting}."
         )
-    if network is not None:
-        raise InputError("`network`: a vehicle's network is trained for its own flights; leave it out.")
+    if network is not None or isinstance(estimator, Hybrid):
+        raise InputError("`network`: a vehicle's network is trained for its own flights; use `estimator` hybrid.")
     holdout = settings.share(validated=validate is not None)
     prepared = preparation.prepare(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
@@ -113,14 +114,15 @@ def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int,
     if not ESTIMATORS[estimator].needs_network:
         return case._replace(estimator=make_estimator(estimator))
     progress("training a network for these flights")
+    begin, seen = time.perf_counter(), liveliest(case.shooting)
+    name, method = str((case.provenance.flights or ["flight"])[0]), IBSS()
     try:
-        name = str((case.provenance.flights or ["flight"])[0])
-        trained = vehicle_network_for(case.shooting, name, seed=seed)
+        method = Hybrid(vehicle_network_for(seen, name, seed=seed), seen=seen)
+        what = f"its network was trained for these flights in {time.perf_counter() - begin:.0f} s"
     except TrainingError as error:
-        note = f"no network for these flights ({error}); IBSS searched the whole bracket"
-        provenance = msgspec.structs.replace(case.provenance, notes=[*case.provenance.notes, note])
-        return case._replace(estimator=IBSS(), provenance=provenance)
-    return case._replace(problem=_unpadded(case), estimator=make_estimator(estimator, trained))
+        what = f"no network for these flights ({error}); IBSS searched the whole bracket"
+    notes = [*case.provenance.notes, f"{estimator}: {what}"]
+    return case._replace(estimator=method, provenance=msgspec.structs.replace(case.provenance, notes=notes))
 
 
 def _levelled(bracket: Intervals, prepared: Prepared, model: FlightModel) -> Intervals:
@@ -129,11 +131,6 @@ def _levelled(bracket: Intervals, prepared: Prepared, model: FlightModel) -> Int
         return bracket
     value, error = prepared.level
     return {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
-
-
-def _unpadded(case: Case) -> InnovationsProblem:
-    """The likelihood without padding: a network answers flights of the length that it was trained for."""
-    return dataclasses.replace(case.innovations, problem=case.shooting)
 
 
 def _vehicle_shooting(model: FlightModel, prepared: Prepared, bracket: Bracket, name: str) -> ShootingProblem:

@@ -103,7 +103,7 @@ class AbstractProblem(eqx.Module):
 
     @abc.abstractmethod
     def explains(self, cost: Scalar) -> Bool[Array, ""]:
-        """Whether a cost is no larger than noise makes it."""
+        """Whether a cost is no larger than noise makes it; false if the noise is an unknown."""
 
     def curvatures(self, parameters: Parameters, initial_state: InitialStates) -> Curvature:
         """The curvature of each window, in the shared unknowns and the window's own initial state."""
