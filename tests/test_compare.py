@@ -9,9 +9,7 @@ from helpers import compiled_programs, refused
 from small_study import finish, start
 
 from jaxos4.cli import studies
-from jaxos4.estimators import ESTIMATORS
 from jaxos4.report import write_report
-from jaxos4.report.style import styles
 from jaxos4.study import OUTCOMES, Training
 
 SMALL = {"durations": (0.5,), "flights": 16, "batch": 16, "channels": ("rates",)}
@@ -132,13 +130,3 @@ def test_a_new_estimator_is_offered_everywhere(tmp_path, monkeypatch):
     found = json.loads((tmp_path / "toy.json").read_text())
     assert (found["estimator"], found["result"]) == ("toy", "successful")
     assert "toy" in (tmp_path / "study/report.html").read_text()
-
-
-def test_every_estimator_has_a_style_of_its_own_and_the_known_ones_keep_theirs():
-    known = styles(list(ESTIMATORS))
-    assert styles(["svsf"])["svsf"] == known["svsf"]
-    toys = [f"toy {i}" for i in range(12)]
-    for names in (["new", "newest"], ["new", "newer", "newest"], [*ESTIMATORS, "newest"], [*ESTIMATORS, *toys]):
-        found = styles(names)
-        assert len(set(found.values())) == len(found)
-        assert all(found[name] == known[name] for name in names if name in known)

@@ -54,9 +54,16 @@ def test_what_is_exported_of_a_vehicle(write):
     assert vehicle.rotor_inertia == pytest.approx(7e-4 * 1.1 / 3.5e4)
     np.testing.assert_allclose(vehicle.drag, 0.027 * np.array([0.3, 0.4, 0.6]))
     np.testing.assert_allclose(vehicle.flapping, vehicle.inertia[:2] * [0.2, -0.1])
+    # What was not identified is the airframe's.
+    result = vehicle_result({"alpha3": 6.1e4, "alpha6": 5.9e4, "rotor_reaction": 7e-4})
+    result["parameters"]["rotor_reaction"]["std"] = 1e-3
+    found = read_result(write(result))
+    assert (found.vehicle.inertia[2], found.vehicle.rotor_inertia) == (pytest.approx(2.9e-5), pytest.approx(2e-8))
+    assert (found.vehicle.lag, found.vehicle.thrust_curve) == (0, 1)
+    assert any(note.startswith("Iz: not identified") for note in found.notes)
 
 
-def test_what_a_simulator_lacks_is_noted_with_its_size(write):
+def test_what_a_simulator_lacks_and_what_is_replaced_or_does_not_vary_is_noted(write):
     found = read_result(write(vehicle_result()))
     notes = {target: "\n".join(export_vehicle(found, target).notes) for target in TARGETS}
     assert "z_drag: not carried: SDF has no force against the velocity along z: 0.0162 N s/m" in notes["sdf"]
@@ -65,6 +72,14 @@ def test_what_a_simulator_lacks_is_noted_with_its_size(write):
     for target in ("sdf", "mujoco"):
         assert f"{found.vehicle.flapping[0]:.3g} N m about x for each m/s along y" in notes[target]
     assert f"{found.vehicle.rotor_inertia:.3g} kg m^2" in notes["mujoco"]
+    values = VALUES | {"alpha2": 1e-3, "alpha5": 1e-3, "alpha4": 0.5}
+    del values["alpha8"], values["yaw_damping"]
+    held = {"alpha1": {"value": -0.7}, "alpha8": {"value": 3.5e4}, "yaw_damping": {"value": 0.0}}
+    notes = export_vehicle(read_result(write(vehicle_result(values, held=held))), "mujoco").notes
+    assert "alpha4: replaced by the values that follow from Ix, Iy, Iz" in notes
+    assert "do not vary in samples, because the flights do not identify them: alpha8, yaw_damping" in notes
+    (of_rotors,) = [note for note in notes if "alpha2" in note]
+    assert of_rotors.startswith("rotor inertia: not carried")
 
 
 def test_recordings_share_the_mean_offset_and_negative_damping_is_0(write):
@@ -76,16 +91,6 @@ def test_recordings_share_the_mean_offset_and_negative_damping_is_0(write):
     assert "roll_damping" not in found.drawn
     for note in ("mean of the recordings", "roll_damping: came out negative"):
         assert any(note in line for line in found.notes), note
-
-
-def test_what_was_not_identified_is_the_airframes(write):
-    result = vehicle_result({"alpha3": 6.1e4, "alpha6": 5.9e4, "rotor_reaction": 7e-4})
-    result["parameters"]["rotor_reaction"]["std"] = 1e-3
-    found = read_result(write(result))
-    assert found.vehicle.inertia[2] == pytest.approx(2.9e-5)
-    assert found.vehicle.rotor_inertia == pytest.approx(2e-8)
-    assert (found.vehicle.lag, found.vehicle.thrust_curve) == (0, 1)
-    assert any(note.startswith("Iz: not identified") for note in found.notes)
 
 
 CURVES = {
@@ -108,17 +113,6 @@ def test_the_thrust_curve_is_noted_in_the_words_of_the_file(write):
         assert "thrust_curve" not in " ".join(export_vehicle(found, target).notes)
     assert found.vehicle.thrust_curve == 1
     assert "thrust_curve" not in found.drawn
-
-
-def test_what_is_replaced_and_what_does_not_vary_is_noted(write):
-    values = VALUES | {"alpha2": 1e-3, "alpha5": 1e-3, "alpha4": 0.5}
-    del values["alpha8"], values["yaw_damping"]
-    held = {"alpha1": {"value": -0.7}, "alpha8": {"value": 3.5e4}, "yaw_damping": {"value": 0.0}}
-    notes = export_vehicle(read_result(write(vehicle_result(values, held=held))), "mujoco").notes
-    assert "alpha4: replaced by the values that follow from Ix, Iy, Iz" in notes
-    assert "do not vary in samples, because the flights do not identify them: alpha8, yaw_damping" in notes
-    (of_rotors,) = [note for note in notes if "alpha2" in note]
-    assert of_rotors.startswith("rotor inertia: not carried")
 
 
 def test_an_sdf_is_valid_and_has_the_inertia(write):
@@ -172,21 +166,19 @@ def inertial(link):
 
 
 def test_samples_have_the_covariance_of_the_estimate(write):
-    names = ("alpha3", "alpha6", "alpha8")
-    result = vehicle_result({name: VALUES[name] for name in names})
+    names, count = ("alpha3", "alpha6", "alpha8"), 2000
+    values = {name: VALUES[name] for name in names}
+    result = vehicle_result(values)
     std = np.array([row["std"] for row in result["parameters"].values()])
     result["covariance"] = (np.outer(std, std) * (0.5 + 0.5 * np.eye(3))).tolist()
     found = read_result(write(result))
     assert found.drawn == names
-    count = 2000
     draws = [found.draw(number, seed=3)[0] for number in range(count)]
     drawn = np.array([1 / vehicle.inertia for vehicle in draws])
-    np.testing.assert_array_less(
-        np.abs(drawn.mean(axis=0) - [VALUES[name] for name in names]), 4 * std / np.sqrt(count)
-    )
+    assert (np.abs(drawn.mean(axis=0) - list(values.values())) < 4 * std / np.sqrt(count)).all()
     deviation = (drawn - drawn.mean(axis=0)) / std
     wanted = found.covariance / np.outer(std, std)
-    np.testing.assert_array_less(np.abs(deviation.T @ deviation / count - wanted), 4 * np.sqrt(2 / count))
+    assert (np.abs(deviation.T @ deviation / count - wanted) < 4 * np.sqrt(2 / count)).all()
     assert all(vehicle.mass == AIRFRAME["mass"] for vehicle in draws)
 
 
@@ -201,23 +193,16 @@ def test_a_sample_depends_on_its_number_and_on_the_seed_alone_and_has_its_own_no
     assert late not in few.text
 
 
-# The chance to be more than one standard deviation below the mean.
-BELOW = 0.1587
-
-
-def test_negative_draws_are_0(write):
-    result = vehicle_result()
-    place = list(VALUES).index("yaw_damping")
+def test_negative_draws_are_0_and_impossible_ones_are_repeated_and_counted(write):
+    result, below = vehicle_result(), 0.1587  # the chance to be more than one standard deviation below the mean
+    place, draws = list(VALUES).index("yaw_damping"), 1000
     # The damping is 0 at one standard deviation.
     result["covariance"][place][place] = VALUES["yaw_damping"] ** 2
     found = read_result(write(result))
-    draws = [found.draw(number, seed=0) for number in range(1000)]
-    damping = np.array([vehicle.damping[2] for vehicle, _ in draws])
-    assert damping.min() == sum(repeated for _, repeated in draws) == 0
-    assert abs(np.sum(damping == 0) - 1000 * BELOW) < 4 * np.sqrt(1000 * BELOW * (1 - BELOW))
-
-
-def test_impossible_draws_are_repeated_and_counted(write):
+    vehicles, repeated = zip(*(found.draw(number, seed=0) for number in range(draws)), strict=True)
+    damping = np.array([vehicle.damping[2] for vehicle in vehicles])
+    assert damping.min() == sum(repeated) == 0
+    assert abs(np.sum(damping == 0) - draws * below) < 4 * np.sqrt(draws * below * (1 - below))
     result = vehicle_result()
     for alpha, place in (("alpha3", 0), ("alpha6", 1)):
         result["parameters"][alpha]["std"] = result["covariance"][place][place] = 0.0
@@ -225,11 +210,10 @@ def test_impossible_draws_are_repeated_and_counted(write):
     least = 1 / (1 / VALUES["alpha3"] + 1 / VALUES["alpha6"])
     result["covariance"][2][2] = (VALUES["alpha8"] - least) ** 2
     found = read_result(write(result))
-    draws = [found.draw(number, seed=0) for number in range(1000)]
-    assert all(not vehicle.impossible for vehicle, _ in draws)
-    repeated = sum(count for _, count in draws)
+    vehicles, repeated = zip(*(found.draw(number, seed=0) for number in range(draws)), strict=True)
+    assert all(not vehicle.impossible for vehicle in vehicles)
     # The number of failures before 1,000 successes is negative binomial.
-    assert abs(repeated - 1000 * BELOW / (1 - BELOW)) < 4 * np.sqrt(1000 * BELOW) / (1 - BELOW)
+    assert abs(sum(repeated) - draws * below / (1 - below)) < 4 * np.sqrt(draws * below) / (1 - below)
     result["covariance"][0][0] = 1e20  # alpha3
     with pytest.raises(jaxos4.InputError, match="too uncertain"):
         export_vehicle(read_result(write(result)), "mujoco", samples=1)
@@ -240,14 +224,13 @@ def test_an_estimate_that_is_not_to_be_trusted_is_written_with_a_warning(run, tm
     write(vehicle_result(result="no_skill", doubts=[doubt]))
     code, out, err = run("export", "found.json", "--to", "rotorpy", "--out", "vehicle.py")
     assert (code, out) == (1, "vehicle.py: parameters for RotorPy\n")
-    assert err.splitlines()[0] == "not to be trusted because yaw is not predicted; fly more yaw"
-    assert err.splitlines()[-1].startswith("jaxos4: no_skill: the fit predicts")
+    first, *_, last = err.splitlines()
+    assert first == "not to be trusted because yaw is not predicted; fly more yaw"
+    assert last.startswith("jaxos4: no_skill: the fit predicts")
     # Each sentence once.
     assert err.count("not to be trusted") == err.count("the fit predicts") == 1
     text = (tmp_path / "vehicle.py").read_text(encoding="utf-8")
-    assert "# NOT TO BE TRUSTED: no_skill: " in text
-    assert f"\n# {err.splitlines()[0]}\n" in text
-    assert '"mass": 0.027,' in text
+    assert all(words in text for words in ("# NOT TO BE TRUSTED: no_skill: ", f"\n# {first}\n", '"mass": 0.027,'))
 
 
 @pytest.mark.parametrize(

@@ -187,20 +187,13 @@ def assert_held(found, values):
     assert not np.asarray(found.covariance)[places].any()
 
 
-@pytest.mark.parametrize(
-    ("estimator", "terms", "channels"),
-    [
-        (jaxos4.OutputError(), ("offset", "lag", "delay"), "rates"),
-        (jaxos4.IBSS(), ("offset", "gyro_bias"), "attitude"),
-    ],
-)
-def test_the_truth_is_found_without_noise(estimator, terms, channels):
+def test_the_truth_is_found_without_noise():
     """The offsets of two recordings differ, and each is found. The attitude tells them from biases of the gyro."""
-    model = jaxos4.FlightModel(FULL, terms=terms, recordings=(0, 1))
-    whole = truth(model)
-    problem, half_width = held_rigid(two_flights(model, channels=channels), whole), model.half_width
+    model = jaxos4.FlightModel(FULL, terms=("offset", "gyro_bias"), recordings=(0, 1))
+    whole, half_width = truth(model), model.half_width
+    problem = held_rigid(two_flights(model, channels="attitude"), whole)
     off = 0.4 * jnp.cos(jnp.arange(whole.size)) * half_width
-    found = estimator(problem, jaxos4.Bracket.around(whole + off, half_width))
+    found = jaxos4.IBSS()(problem, jaxos4.Bracket.around(whole + off, half_width))
     np.testing.assert_array_less(np.abs(found.parameters - whole) / half_width, 1e-4)
     assert_held(found, whole)
 

@@ -60,25 +60,19 @@ def test_no_window_reaches_from_one_stretch_into_the_next(lengths, length, force
 
 @pytest.mark.parametrize("field", ["body_velocity", "voltage"])
 @pytest.mark.parametrize("second", [True, False])
-def test_velocity_and_voltage_are_kept_if_every_stretch_has_them(field, second):
+def test_velocity_and_voltage_are_kept_if_every_stretch_has_them_and_averaged_and_cut(field, second):
     flights = [stretch(30, i, **{field.removeprefix("body_"): each}) for i, each in enumerate((True, second))]
     joined = getattr(jaxos4.join(flights, length=10), field)
     if second:
         np.testing.assert_array_equal(joined, np.concatenate([getattr(flight, field) for flight in flights]))
     else:
         assert joined is None
-
-
-def test_voltage_is_averaged_and_cut_with_the_samples():
     flight = Recording.of(stretch(401, 0, voltage=True, dt=0.001))
     coarse = averaged(flight, 0.004)
-    assert coarse.voltage is not None
-    assert coarse.voltage.shape == coarse.time.shape
     expected = averaged_slowly(flight.time, flight.voltage[:, None], np.asarray(coarse.time), 0.004)[:, 0]
     np.testing.assert_allclose(coarse.voltage, expected, rtol=1e-9)
     assert averaged(flight._replace(voltage=None), 0.004).voltage is None
-    part = cut(flight, Stretch(0.1, 0.2))
-    np.testing.assert_array_equal(part.voltage, flight.voltage[100:201])
+    np.testing.assert_array_equal(cut(flight, Stretch(0.1, 0.2)).voltage, flight.voltage[100:201])
 
 
 def test_the_cost_of_joined_flights_is_the_sum_of_theirs():

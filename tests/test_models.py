@@ -98,17 +98,12 @@ def test_each_model_fails_the_reference_of_the_other():
 @pytest.mark.parametrize("wrong", [*range(8), *OS4])
 def test_an_error_of_a_millionth_fails(model_class, wrong):
     """In a parameter, or in a constant."""
-    model, (state, omega, alpha) = model_class(), random_points(2000)
-    off, constants, truth = alpha.copy(), dict(OS4), np.asarray(model.alpha).copy()
+    (state, omega, alpha), constants = random_points(2000), dict(OS4)
+    off = alpha * (1 + 1e-6 * (np.arange(8) == wrong))
     if wrong in constants:
         constants[wrong] *= 1 + 1e-6
-    else:
-        off[:, wrong] *= 1 + 1e-6
-        truth[wrong] += 1e-6 * max(abs(truth[wrong]), 1.0)
-        flight = standard_flight(model_class)
-        expected = euler_trajectory(REFERENCES[model_class], truth, flight.omega)
-        assert (np.abs(flight.states - expected) / np.abs(expected).max(axis=0)).max() > 1e-12
-    assert differs(derivatives(model, state, omega, off), REFERENCES[model_class](state, omega, alpha, constants))
+    expected = REFERENCES[model_class](state, omega, alpha, constants)
+    assert differs(derivatives(model_class(), state, omega, off), expected)
 
 
 # The corrected model is a rigid body: textbook mechanics, with vectors and matrices.

@@ -21,15 +21,16 @@ from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 from jaxos4.estimators import ESTIMATORS as REGISTRY
 from jaxos4.report import error_table, read_results, study_figures, study_page, write_report
 from jaxos4.report.study_data import scenarios
-from jaxos4.report.style import drawing, grid, log_axis, styles
+from jaxos4.report.style import drawing, log_axis, styles
 from jaxos4.report.text import percent, plain
 from jaxos4.study import metrics
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
 
 
-def few(study):
-    return study.isel(parameter=[0, 1, 6])
+def few(**options):
+    """A study with three of the parameters: each has a panel, and panels take time."""
+    return synthetic_study(**options).isel(parameter=[0, 1, 6])
 
 
 def tables(text):
@@ -65,14 +66,12 @@ def stands_alone(text):
 
 @pytest.fixture(scope="module")
 def study():
-    """With three of the parameters and four of the states: each has a panel, and panels take time."""
-    return few(synthetic_study(flights=24, estimators=("ibss", "network", "hybrid", "svsf")))
+    return few(flights=24, estimators=("ibss", "network", "hybrid", "svsf"))
 
 
 @pytest.fixture(scope="module")
 def report(study, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("report")
-    return write_report(study, folder)
+    return write_report(study, tmp_path_factory.mktemp("report"))
 
 
 @pytest.fixture(scope="module")
@@ -165,17 +164,18 @@ def test_the_terminal_has_the_same_errors_in_80_columns():
     first = {name: 0 for name in SCENARIO} | {"scale": 1, "parameter": 0}
     error = float(metrics.estimator_error(study)["percent"].isel(first))
     rows = re.split(r"noise x 1 *\n", text)[1].splitlines()
-    row = next(line for line in rows if line.startswith("ibss"))
-    assert row.split()[1] == plain(error, 2)
-    assert row.split()[2].endswith("‡")
+    _, first, second, *_ = next(line for line in rows if line.startswith("ibss")).split()
+    assert (first, second[-1]) == (plain(error, 2), "‡")
     assert ("…" in text, "below the noise floor" in text) == (False, True)
     assert max(map(len, text.splitlines())) <= 80
 
 
+SMALL = {"estimators": ("ibss", "svsf"), "spoiled": False}
+
+
 def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(study_page, "MOST_DRAWN", 1)
-    options = {"flights": 4, "estimators": ("ibss", "svsf"), "scales": (1.0,), "spoiled": False}
-    study = few(synthetic_study(models=("published", "corrected"), **options))
+    study = few(models=("published", "corrected"), flights=4, scales=(1.0,), **SMALL)
     written = write_report(study, tmp_path, with_pdf=False)
     assert {path.stem for path in written[1:]} == {f"{name}-1" for name in OF_SCENARIO}
     text = written[0].read_text(encoding="utf-8")
@@ -186,13 +186,9 @@ def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypa
 
 def test_names_cannot_break_out_of_the_page(tmp_path):
     evil = "</script><script>alert(1)</script>"
-    options = {"flights": 3, "estimators": ("ibss", "svsf"), "scales": (0.0, 1.0), "spoiled": False}
-    study = few(synthetic_study(**options))
-    study = study.assign_coords(
-        estimator=["ibss", evil],
-        model=[f"{evil} {{{{ 1 }}}}"],
-        parameter=["$\\frac{<b>}$", *study["parameter"].values[1:]],
-    )
+    study = few(flights=3, scales=(0.0, 1.0), **SMALL)
+    parameters = ["$\\frac{<b>}$", *study["parameter"].values[1:]]
+    study = study.assign_coords(estimator=["ibss", evil], model=[f"{evil} {{{{ 1 }}}}"], parameter=parameters)
     failures = json.dumps([{"cell": 0, "scale": 1.0, "estimator": evil, "message": evil}])
     study.attrs |= {"title": evil, "specification": f"</pre>{evil}", "command": evil, "failures": failures}
     text = write_report(study, tmp_path, with_pdf=False)[0].read_text(encoding="utf-8")
@@ -252,7 +248,8 @@ def cielab(linear):
 
 @pytest.mark.parametrize("vision", VISIONS.values(), ids=VISIONS)
 def test_estimators_differ_in_colour_mark_and_line_for_every_reader(vision):
-    looks = styles(list(REGISTRY)).values()
+    known = styles(list(REGISTRY))
+    looks = known.values()
     for kind in zip(*looks, strict=True):
         assert len(set(kind)) == len(REGISTRY)
     linear = np.array([matplotlib.colors.to_rgb(look.color) for look in looks])
@@ -261,10 +258,15 @@ def test_estimators_differ_in_colour_mark_and_line_for_every_reader(vision):
     assert (1.05 / (luminance + 0.05)).min() > 3  # on white paper
     assert ((luminance + 0.05) / (0.0097 + 0.05)).min() > 3  # on dark paper
     assert pdist(cielab(np.clip(linear @ np.transpose(vision), 0, 1))).min() > 17
+    # Others have styles of their own, and the known ones keep theirs.
+    for names in (["svsf"], ["new", "newer", "newest"], [*REGISTRY, *(f"toy {i}" for i in range(12))]):
+        found = styles(names)
+        assert len(set(found.values())) == len(found)
+        assert all(found[name] == known[name] for name in names if name in known)
 
 
-@pytest.mark.parametrize("low", [0.04, 0.3, 0.62, 0.84, 0.95, 0.99])
-@pytest.mark.parametrize("high", [1.01, 1.2, 1.6, 2.03, 3.4, 4.7, 12.0, 29.0, 5e3])
+@pytest.mark.parametrize("low", [0.04, 0.62, 0.84, 0.99])
+@pytest.mark.parametrize("high", [1.01, 1.6, 3.4, 12.0, 29.0, 5e3])
 def test_a_logarithmic_axis_has_a_tick_at_1_where_that_is_in_sight(low, high):
     with drawing():
         panel = matplotlib.figure.Figure(figsize=(2.2, 2.2)).add_subplot()
@@ -274,14 +276,3 @@ def test_a_logarithmic_axis_has_a_tick_at_1_where_that_is_in_sight(low, high):
     seen = ticks[(ticks >= low) & (ticks <= high)]
     assert np.isclose(seen, 1).any()
     assert 1 < len(seen) < 10
-
-
-def test_a_title_stays_clear_of_the_power_of_ten_of_an_axis():
-    with drawing():
-        figure, (panel,) = grid(1, columns=1)
-        panel.plot([0, 1], [1e-7, 3e-6])
-        title = panel.set_title("p [rad/s]")
-        figure.draw_without_rendering()
-    power = panel.yaxis.get_offset_text()
-    assert power.get_text()
-    assert title.get_window_extent().y0 > power.get_window_extent().y1
