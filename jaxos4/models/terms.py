@@ -286,7 +286,11 @@ TERMS: dict[str, Term] = {
     ),
     "reaction": Term(
         "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
-        (TermParameter("rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction),),
+        (
+            TermParameter(
+                "rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction, nonnegative=True
+            ),
+        ),
         angular_acceleration=_add_reaction,
     ),
     "accelerometer": Term(
