@@ -1,14 +1,14 @@
 """An airframe's file with everything that a log knows of its vehicle, and with marks at what must be measured."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jinja2
 import numpy as np
 
 from ..airframe import GRAVITY, GUESS
-from .motion import RotorSigns, rotor_signs
+from .motion import rotor_signs
 from .pieces import cut
 from .reading import Recording
 from .usable import stretches
@@ -33,51 +33,26 @@ def airframe_draft(recording: Recording) -> AirframeDraft:
 
     **Arguments:** `recording`: read without an airframe, and with `full_scale=1.0`.
     """
-    facts, lines, missing = recording.facts, [], ["mass"]
-
-    def say(*texts: str) -> None:
-        lines.extend(f"# {text}" for text in texts)
-
-    def add(key: str, value: Any, comment: str) -> None:
-        lines.append(f"{key} = {json.dumps(value)} # {comment}")
-
+    facts, full = recording.facts, FULL_SCALE if recording.commanded else 1.0
     parts = [cut(recording, part) for part in stretches(recording) if not part.reason]
     signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
     spins = facts.rotor_spins or (None if signs is None else signs.spins)
-    say(f"The airframe of {Path(recording.name).name}. SI units.")
-    lines.extend(["", "# Weigh and measure: write the numbers, and remove the # in front."])
-    say("mass =   # kg, with battery: all inertias are proportional to it")
-    if facts.rotor_positions is None:
-        missing.append("rotor_positions")
-        say(*_positions_to_measure(signs))
-    lines.extend(["", "# From the log."])
-    if facts.rotor_positions is not None:
-        add("rotor_positions", _short(facts.rotor_positions), "m, x forward and y left: check")
-        say("(settings of the autopilot, which needs only their ratios; inertias need the true distances)")
-    if spins is None:
-        missing.append("rotor_spins")
-        add("rotor_spins", [], "fill in, such as [1, -1, 1, -1]; 1: counter-clockwise seen from above")
-    else:
-        how = "settings of the autopilot" if facts.rotor_spins else "as the vehicle yaws in this flight"
-        add("rotor_spins", [int(spin) for spin in spins], f"1: counter-clockwise seen from above; {how}")
-    full = FULL_SCALE if recording.commanded else 1.0
-    if hover is None:
-        missing.append("hover_speed")
-        say("hover_speed =   # rad/s of each rotor: nothing in this log flies, so fill it in")
-    else:
-        speed, felt = hover
-        seconds = sum(float(np.ptp(part.time)) for part in parts)
-        how = f"{'by the accelerometer' if felt else 'the median'} in {seconds:.1f} s of flight"
-        add("hover_speed", _short(speed * full), f"rad/s of each rotor; {how}")
-        if not felt:
-            say("Without an accelerometer this must be right: 1 % is an error of 2 % in every inertia.")
-    if recording.commanded:
-        add("max_rotor_speed", full, "rad/s at command 1: a convention. If you change it, scale hover_speed")
-    lines.extend(["", "# Guesses from mass and positions, where the search begins. Numbers are better."])
-    add("inertia", GUESS, "kg m^2, as [Ix, Iy, Iz]")
-    add("drag_coefficient", GUESS, "N m s^2/rad^2: Iz is proportional to it")
-    add("rotor_inertia", GUESS, "kg m^2, of a propeller with its motor's bell")
-    return AirframeDraft("\n".join(lines) + "\n", tuple(missing))
+    template = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True)
+    template.loader = jinja2.PackageLoader("jaxos4.recording", ".")
+    text = template.get_template("airframe.toml.j2").render(
+        name=Path(recording.name).name,
+        facts=facts,
+        corners=[] if signs is None else [_corner(*each) for each in zip(signs.forward, signs.left, strict=True)],
+        spins=None if spins is None else [int(spin) for spin in spins],
+        hover=hover,
+        full=full,
+        seconds=sum(float(np.ptp(part.time)) for part in parts),
+        commanded=recording.commanded,
+        guess=GUESS,
+        short=_short,
+    )
+    known = {"rotor_positions": facts.rotor_positions, "rotor_spins": spins, "hover_speed": hover}
+    return AirframeDraft(text, ("mass", *(key for key, value in known.items() if value is None)))
 
 
 def _hover(parts: Sequence[Recording]) -> tuple[float, bool] | None:
@@ -95,19 +70,10 @@ def _hover(parts: Sequence[Recording]) -> tuple[float, bool] | None:
     return float(np.sqrt(np.median(squares) / (share if felt else 1.0))), felt
 
 
-def _positions_to_measure(signs: RotorSigns | None) -> tuple[str, str]:
-    if signs is None:
-        return (
-            "rotor_positions = [[x1, y1], [x2, y2], [x3, y3], [x4, y4]]  # m, x forward and y left, in the log's order",
-            "(this flight does not show which rotor is where)",
-        )
-    signed = [("x" if x > 0 else "-x", "y" if y > 0 else "-y") for x, y in zip(signs.forward, signs.left, strict=True)]
-    words = {"x": "front", "-x": "rear", "y": "left", "-y": "right"}
-    names = ", ".join(f"{i + 1} {words[x]} {words[y]}" for i, (x, y) in enumerate(signed))
-    return (
-        f"rotor_positions = [{', '.join(f'[{x}, {y}]' for x, y in signed)}]  # m: numbers for x (forward) and y (left)",
-        f"(as the vehicle turns in this flight: {names})",
-    )
+def _corner(forward: float, left: float) -> tuple[str, str, str]:
+    """The signed x and y of a rotor, and its place in words."""
+    x, y = "x" if forward > 0 else "-x", "y" if left > 0 else "-y"
+    return x, y, f"{'front' if forward > 0 else 'rear'} {'left' if left > 0 else 'right'}"
 
 
 def _short(value: Any) -> Any:
