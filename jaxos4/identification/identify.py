@@ -22,7 +22,7 @@ from .prepare import Case, prepare_flight
 from .problem import Intervals
 from .results import Identification, SampleTime, finite_or_none
 from .sample_time import fit_at_sample_times
-from .settings import FlightSettings, VehicleSettings, flight_settings, vehicle_settings
+from .settings import FlightSettings, VehicleSettings, own_settings
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
 
 Flights = Flight | Recording | Sequence[Flight | Recording]
@@ -75,10 +75,10 @@ def identify(
     common = {"estimator": estimator, "bracket": bracket, "network": network, "validate": other}
     sample_times: tuple[SampleTime, ...] = ()
     if isinstance(subject, Airframe):
-        cases = prepare_vehicle(recordings, subject, vehicle_settings(settings), **common)
+        cases = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **common)
         case, fit, sample_times = _fit_vehicle(cases, estimator or DEFAULT, seed=seed, progress=progress)
     else:
-        own = flight_settings(subject, settings)
+        own = own_settings(FlightSettings, settings)
         case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
         fit = fit_case(case, progress=progress)
     verdict = judge(case, fit, sample_times, progress=progress)

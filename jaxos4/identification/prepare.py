@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, Hybrid, make_estimator
 from ..models import MODELS
-from ..models.abstract import AbstractModel
+from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..recording.reading import Recording
@@ -96,6 +96,8 @@ def prepare_flight(
     progress: Progress,
 ) -> Case:
     """A flight of an OS4. Arguments as of `identify`."""
+    if getattr(model, "parameter_names", None) != PARAMETER_NAMES:
+        raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(model).__name__}.")
     recording, *others = recordings
     subject = class_name(model, MODELS)
     if others:

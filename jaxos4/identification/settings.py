@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 
@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS
 from ..models import MODELS
-from ..models.abstract import PARAMETER_NAMES, AbstractModel
+from ..models.abstract import AbstractModel
 from ..recording.preparation import HOLDOUT
 from ..shooting import ShootingProblem
 
@@ -53,6 +53,7 @@ class VehicleSettings:
 
 
 Settings = FlightSettings | VehicleSettings
+S = TypeVar("S", FlightSettings, VehicleSettings)
 
 
 def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> Settings:
@@ -76,20 +77,12 @@ def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> 
     return kind(**{name: value for name, value in given.items() if name in own})
 
 
-def flight_settings(model: AbstractModel, settings: Settings | None) -> FlightSettings:
-    """The settings for a model, or the default ones. Raises `InputError` for a model or settings of another kind."""
-    if getattr(model, "parameter_names", None) != PARAMETER_NAMES:
-        raise InputError(f"`subject`: must be a model in alpha_1..8 or an airframe, got {type(model).__name__}.")
-    if isinstance(settings, VehicleSettings):
-        raise InputError("`settings`: must be FlightSettings for a model as `subject`, got VehicleSettings.")
-    return FlightSettings() if settings is None else settings
-
-
-def vehicle_settings(settings: Settings | None) -> VehicleSettings:
-    """The settings for a vehicle, or the default ones. Raises `InputError` for settings of another kind."""
-    if isinstance(settings, FlightSettings):
-        raise InputError("`settings`: must be VehicleSettings for an airframe as `subject`, got FlightSettings.")
-    return VehicleSettings() if settings is None else settings
+def own_settings(kind: type[S], settings: Settings | None) -> S:
+    """The settings, or the default ones. Raises `InputError` if they are of another kind."""
+    if settings is not None and not isinstance(settings, kind):
+        what, got = "an airframe" if kind is VehicleSettings else "a model", type(settings).__name__
+        raise InputError(f"`settings`: must be {kind.__name__} for {what} as `subject`, got {got}.")
+    return kind() if settings is None else settings
 
 
 def versions(problem: ShootingProblem) -> dict[str, Any]:

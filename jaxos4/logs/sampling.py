@@ -208,14 +208,9 @@ def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Res
 
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:
     """Remove the jumps of 2 pi from an angle [rad], and count them. Values before the first jump do not change."""
-    measured = np.flatnonzero(np.isfinite(angle))
-    step = np.diff(angle[measured])
-    turns = np.where(np.abs(step) > math.pi, np.rint(step / (2 * math.pi)), 0.0)
-    if not turns.any():
-        return angle, 0
-    angle = angle.copy()
-    angle[measured[1:]] -= 2 * math.pi * np.cumsum(turns)
-    return angle, int(np.count_nonzero(turns))
+    measured, unwrapped = np.isfinite(angle), angle.copy()
+    unwrapped[measured] = np.unwrap(angle[measured])
+    return unwrapped, int(np.count_nonzero(np.abs(np.diff(angle[measured])) > math.pi))
 
 
 def unwrapped(t: Times, angles: Float[np.ndarray, "samples 3"]) -> Series:
