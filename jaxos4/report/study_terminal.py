@@ -4,16 +4,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-import rich.box
 import xarray as xr
 from rich.console import Console, Group, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 from rich.text import Text
 
 from ..study import OUTCOMES, Step, Store, Study, carry_out, device_name, run_here
 from . import study_tables
 from .study_data import scenarios
+from .text import Listing
 
 
 def run_with_bar(
@@ -49,23 +48,13 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
     parts: list[RenderableType] = []
     notes: dict[str, None] = {}
     for scenario in scenarios(dataset):
-        table = study_tables.error_table(scenario.data, digits=2)
-        parts += [Text(f"RMS error [%], {scenario.label}"), _rich(table)]
+        table, rows = study_tables.error_table(scenario.data, digits=2), []
+        headings = [heading for heading, _ in table.headings]
+        blank = [""] * len(headings)
+        for label, group in table.groups:
+            rows += [["", *blank]] * bool(rows) + [[label, *blank]]
+            rows += [[row.label, *(cell.text + cell.mark for cell in row.cells)] for row in group]
+        listing = Listing(["", *headings], rows, headings, apart=1)  # 80 columns must do
+        parts += [Text(f"RMS error [%], {scenario.label}"), listing.table()]
         notes |= dict.fromkeys(table.notes)
     return Group(*parts, *(Text(note) for note in notes))
-
-
-def _rich(table: study_tables.Table) -> Table:
-    made = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=0)  # 80 columns must do
-    rows = [row for _, rows in table.groups for row in rows]
-    labels = [*(row.label for row in rows), *(label for label, _ in table.groups)]
-    made.add_column("", no_wrap=True, min_width=max(map(len, labels), default=0))
-    for i, (heading, _) in enumerate(table.headings):
-        widest = max(len(heading), *(len(row.cells[i].text) + len(row.cells[i].mark) for row in rows))
-        made.add_column(Text(heading), justify="right", no_wrap=True, min_width=widest)
-    for label, group in table.groups:
-        made.add_row(Text(label, style="bold"))
-        for row in group:
-            made.add_row(Text(row.label), *(Text(f"{cell.text}{cell.mark}") for cell in row.cells))
-        made.add_section()
-    return made

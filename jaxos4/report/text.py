@@ -8,6 +8,7 @@ import rich.box
 from rich.console import Console, ConsoleDimensions, RenderableType
 from rich.measure import Measurement
 from rich.table import Table
+from rich.text import Text
 
 MISSING = "–"
 _WIDEST = 10_000
@@ -38,6 +39,7 @@ class Listing(NamedTuple):
     - `right`: the headings of the columns that are aligned to the right.
     - `notes`: a note for each row, about the item in its first cell; an empty string if there is none.
     - `wraps`: the headings of the columns of words. Their cells can have several lines.
+    - `apart`: the number of blanks between columns.
     """
 
     headings: Sequence[str]
@@ -45,30 +47,33 @@ class Listing(NamedTuple):
     right: Sequence[str] = ()
     notes: Sequence[str] = ()
     wraps: Sequence[str] = ()
+    apart: int = 2
 
     def print_on(self, console: Console) -> None:
         """Prints the table. Notes are its last column, or lines below it if the terminal is too narrow."""
         if any(self.notes):
             rows = [[*row, note] for row, note in zip(self.rows, self.notes, strict=True)]
-            with_notes = Listing([*self.headings, "note"], rows, self.right, wraps=[*self.wraps, "note"])._table()
+            with_notes = Listing([*self.headings, "note"], rows, self.right, wraps=[*self.wraps, "note"]).table()
             if _needed_width(with_notes) <= console.width:
                 print_whole(console, with_notes)
                 return
-        print_whole(console, self._table())
+        print_whole(console, self.table())
         names: dict[str, list[str]] = {}
         for row, note in zip(self.rows, self.notes, strict=False):
             names.setdefault(note, []).append(row[0])
         for note in filter(None, names):
             console.print(f"{', '.join(names[note])}: {note}", markup=False, highlight=False)
 
-    def _table(self) -> Table:
-        table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    def table(self) -> Table:
+        """The table without its notes."""
+        padding = (0, self.apart - 1, 0, 0)
+        table = Table(box=rich.box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=padding)
         for i, heading in enumerate(self.headings):
             widest, wraps = max(len(row[i]) for row in (self.headings, *self.rows)), heading in self.wraps
             width, justify = min(widest, _WORDS) if wraps else widest, "right" if heading in self.right else "left"
             table.add_column(heading, justify=justify, no_wrap=not wraps, min_width=width)
         for row in self.rows:
-            table.add_row(*row)
+            table.add_row(*map(Text, row))
         return table
 
 
