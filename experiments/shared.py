@@ -20,7 +20,7 @@ from jaxos4.estimate import AbstractEstimator, Estimate
 from jaxos4.flight import Flight
 from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import AbstractNoise
-from jaxos4.report.study_terminal import run_with_bar
+from jaxos4.report.study_tables import run_with_bar
 from jaxos4.report.style import Style, drawing, pdf, svg
 from jaxos4.shooting import ShootingProblem
 from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset

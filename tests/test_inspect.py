@@ -16,7 +16,7 @@ from test_signs import flown, turned
 
 import jaxos4
 from jaxos4.logs import LogFacts
-from jaxos4.recording.drafting import FULL_SCALE, airframe_draft
+from jaxos4.recording.inspection import FULL_SCALE, airframe_draft
 from jaxos4.recording.motion import RotorSigns, rotor_signs
 
 LOGS = {

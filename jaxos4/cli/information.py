@@ -45,8 +45,7 @@ def inspect(
         from ..airframe import load_airframe
         from ..logs import log_format
         from ..recording import read_recording
-        from ..recording.drafting import airframe_draft
-        from ..recording.inspection import inspect_log
+        from ..recording.inspection import airframe_draft, inspect_log
 
         progress("reading")
         vehicle = None if airframe is None else load_airframe(airframe)

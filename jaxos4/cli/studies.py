@@ -30,7 +30,7 @@ def study(
     if dry_run:
         _print_plan(wanted, out)
         return
-    from ..report.study_terminal import count_outcomes, run_with_bar
+    from ..report.study_tables import count_outcomes, run_with_bar
 
     if scheduler is None:
         dataset = run_with_bar(wanted, out)
@@ -94,7 +94,7 @@ def compare(
         from rich.console import Console
 
         from ..report import error_table, write_report
-        from ..report.study_terminal import count_outcomes, run_with_bar
+        from ..report.study_tables import count_outcomes, run_with_bar
         from ..report.text import print_whole
 
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out

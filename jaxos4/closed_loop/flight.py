@@ -13,8 +13,7 @@ from .._custom_types import Key, Numeric, Scalar, as_float, setting
 from .._xla import quick_jit
 from ..airframe import alpha_scalars
 from ..flight import Flight
-from ..models.rotation import attitude_rates
-from ..models.state import Attitude, Rates, Vector
+from ..models.state import Attitude, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos

@@ -9,8 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Key, Scalar
 from ..flight import STATE_NAMES, Flight
-from ..models.rotation import to_earth
-from ..models.state import CASCADE_ORDER, Attitude, Rates, Vector
+from ..models.state import CASCADE_ORDER, Attitude, Rates, Vector, to_earth
 from ..simulation import until_failure
 from ..trigonometry import sincos
 from .settings import ClosedLoop, PerAxis, Sensors

@@ -17,8 +17,7 @@ from ..closed_loop import ClosedLoop, References, fly_closed_loop
 from ..errors import InputError
 from ..flight import Flight
 from ..models.abstract import PARAMETER_NAMES
-from ..models.rotation import to_earth
-from ..models.state import Attitude
+from ..models.state import Attitude, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
 from ..models.vehicle import FlightModel
 from ..shooting import InnovationsProblem, ShootingProblem

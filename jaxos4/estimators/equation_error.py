@@ -1,22 +1,229 @@
 """Equation error: the parameters for which the measured rates satisfy the rate equations best, by least squares.
 
 `EquationError` uses all samples in one step, `RecursiveLeastSquares` one sample after the other, with forgetting.
+
+Between two samples the rates change by the integral of the rate equations, which are linear in the parameters. The
+noise of measured rates makes their differences coloured. Integrating again whitens them exactly:
+y_k = w_0 + sum_{j<k} T Phi_j alpha + e_k, with white noise e and an unknown w_0. `Regression.rows` eliminates w_0
+recursively (it subtracts the mean of all rows before each row, the Helmert transform). Every row then has white noise,
+unit variance, and no unknown but the parameters.
 """
 
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar, as_float, integer, setting
 from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket
-from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, in_one_program
+from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, best_start, in_one_program
+from ..linalg import gram, invert
+from ..models.state import CASCADE_ORDER, Rates
 from ..shooting import ShootingProblem
-from .regression import Regression, normal_equations, solve
+
+Rows = Float[Array, "samples 3 columns"]
+Matrix = Float[Array, "parameters parameters"]
+
+# Standard deviation of the diffuse prior around the bracket's center, in half-widths of the bracket. It matters only
+# for parameters that are not excited.
+DIFFUSE = 1e6
+
+
+class Regression(NamedTuple):
+    """A flight as a regression for the parameters, in half-widths from the bracket's center.
+
+    - `center`, `half_width`: of the bracket; a half-width of 0 holds a parameter.
+    - `rates`: NaN if not measured, and at the first sample if the initial state is known.
+    - `anchor`: the known initial rates; NaN if they are free. `anchored`: whether they are known.
+    - `memory`, `bridge`, `forgetting`: see `RecursiveLeastSquares`.
+    """
+
+    problem: ShootingProblem
+    center: Parameters
+    half_width: Parameters
+    rates: Float[Array, "samples 3"]
+    anchor: Float[Array, "3"]
+    anchored: bool
+    memory: Scalar
+    bridge: Count
+    forgetting: Scalar
+
+    @classmethod
+    def of(cls, problem: ShootingProblem, memory: Scalar, bridge: Count, forgetting: Scalar) -> "Regression":
+        """The regression of a flight's body rates. Parameters in which it is not linear stay at their center."""
+        unknowns, rates = problem.unknowns.usable, problem.restrict("rates")
+        linear = np.array([not each.in_forcing for each in problem.model.parameters])
+        anchored = problem.initial_state is not None
+        anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
+        half_width, measured = jnp.where(linear, unknowns.width, 0.0), rates.measured()[:, :3]
+        return cls(problem, unknowns.center, half_width, measured, anchor, anchored, memory, bridge, forgetting)
+
+    @property
+    def sigma(self) -> Float[Array, "3"]:
+        """The noise of the rates [rad/s]."""
+        return self.problem.sigma[CASCADE_ORDER[:3]]
+
+    def rows(self) -> tuple[Rows, Callable[[Rows], Float[Array, "samples 3"]]]:
+        """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.
+
+        Missing samples get rows of zeros. The function turns the slope of a number in the rows into its slope in the
+        measured rates.
+        """
+        rows, back = jax.vjp(self._rows, jnp.where(jnp.isnan(self.rates), 0.0, self.rates))
+        return rows, lambda slope: back(slope)[0]
+
+    def _rows(self, rates: Float[Array, "samples 3"]) -> Rows:
+        """The rows with other values of the measured rates; the same samples are missing."""
+        measured, (filled, known) = ~jnp.isnan(self.rates), self._fill(rates)
+        increments = self._increments(filled)
+        usable = ~jnp.isnan(self._increments(jnp.where(known, filled, jnp.nan))).any(axis=-1)
+        if self.problem.flight.stretch is not None:
+            usable &= (jnp.diff(self.problem.flight.stretch, append=-1) == 0)[:, None]
+        increments = jnp.where(usable[..., None], increments, 0.0)
+        output = filled / self.sigma
+        decay = self.memory * self.forgetting
+
+        def step(carry, sample):
+            integral, mean, count = carry
+            increment, usable, output, measured = sample
+            row = integral.at[:, -1].add(output)
+            deviation, weight = row - mean, self.forgetting * count
+            scale = jnp.sqrt(1 / (1 + 1 / weight))
+            mean = jnp.where(measured[:, None], mean + deviation / (1 + decay * count)[:, None], mean)
+            count = jnp.where(usable, decay * count + measured, 0.0)
+            integral = jnp.where(usable[:, None], integral + increment, 0.0)
+            return (integral, mean, count), jnp.where(measured[:, None], scale[:, None] * deviation, 0.0)
+
+        exact = jnp.where(decay < 1, 1.0, jnp.inf)
+        first = jnp.where(jnp.isnan(self.anchor), 0.0, self.anchor) / self.sigma
+        zero = jnp.zeros_like(increments[0])
+        start = (zero, zero.at[:, -1].set(first), jnp.where(self.anchored, exact, 0.0) * jnp.ones(3))
+        return jax.lax.scan(step, start, (increments, usable, output, measured))[1]
+
+    def _fill(self, rates) -> tuple[Float[Array, "samples 3"], Bool[Array, "samples 3"]]:
+        """Rates with short gaps bridged by straight lines and other gaps set to 0, and which of them are known."""
+        samples = jnp.arange(rates.shape[0])[:, None]
+        first = (samples == 0) & self.anchored
+        rates = jnp.where(first, self.anchor, rates)
+        given = ~jnp.isnan(self.rates) | first
+        last = jax.lax.cummax(jnp.where(given, samples, -1), axis=0)
+        following = jax.lax.cummin(jnp.where(given, samples, rates.shape[0]), axis=0, reverse=True)
+        known = given | ((last >= 0) & (following < rates.shape[0]) & (following - last - 1 <= self.bridge))
+        finite = jnp.where(given, rates, 0.0)
+        before = jnp.take_along_axis(finite, jnp.maximum(last, 0), axis=0)
+        after = jnp.take_along_axis(finite, jnp.minimum(following, rates.shape[0] - 1), axis=0)
+        share = (samples - last) / jnp.maximum(following - last, 1)
+        return jnp.where(known, before + share * (after - before), 0.0), known
+
+    def _increments(self, rates: Float[Array, "samples 3"]) -> Float[Array, "samples 3 columns"]:
+        """The step of each integral from t_k to t_{k+1}: of the regressors, and of minus the center's acceleration.
+
+        The input of row k acts from t_k to t_{k+1}. Forward Euler uses the rates at t_k; any other method uses the mean
+        of both ends (the trapezoidal rule), with an error of the order T^2.
+        """
+        model, sigma, dt = self.problem.model, self.sigma, self.problem.flight.dt
+        center, half_width = self.center, self.half_width
+
+        def acceleration(steps, rates, forcing):
+            return jnp.stack(model.angular_acceleration(Rates(*rates), forcing, center + half_width * steps)) * dt
+
+        def at(rates, forcing):
+            zero = jnp.zeros_like(center)
+            regressors = jax.jacfwd(acceleration)(zero, rates, forcing)
+            return jnp.concatenate([regressors, -acceleration(zero, rates, forcing)[:, None]], axis=-1) / sigma[:, None]
+
+        forcing = jax.tree.map(lambda leaf: leaf[:-1], self.problem.forcing(center))
+        increments = jax.vmap(at)(rates[:-1], forcing)
+        if self.problem.method != "euler":
+            increments = (increments + jax.vmap(at)(rates[1:], forcing)) / 2
+        return jnp.concatenate([increments, jnp.zeros_like(increments[:1])])
+
+    def covariance(
+        self, rows: Rows, back: Callable[[Rows], Float[Array, "samples 3"]], steps: Parameters, inverse: Matrix
+    ) -> Matrix:
+        """The covariance of the solution `steps` from white noise in the measured rates, to first order.
+
+        The solution satisfies g(Y) = X(Y)^T (y(Y) - X(Y) steps) = 0. The derivative of g with respect to each measured
+        rate carries the noise through both the regressors and the outputs. So errors in variables are included, and the
+        result holds for coloured differences and any weights. The bias, a second-order effect of the noise, is not
+        included.
+        """
+        age = jnp.arange(rows.shape[0])[::-1]
+        weight = (self.forgetting**age)[:, None, None]
+        regressors, output = rows[..., :-1], rows[..., -1]
+        residuals = output - (regressors * steps).sum(axis=-1)
+
+        def sensitivity_of(one: Parameters) -> Float[Array, "samples 3"]:
+            """The derivative of one element of g; `one` is 1 at the element."""
+            regressor = (regressors * one).sum(axis=-1)[..., None]
+            by_regressors = residuals[..., None] * one - regressor * steps
+            return back(weight * jnp.concatenate([by_regressors, regressor], axis=-1))
+
+        count = steps.shape[0]
+        sensitivity = (jax.vmap(sensitivity_of)(jnp.eye(count, dtype=float)) * self.sigma).reshape(count, -1)
+        spread = gram(sensitivity) + _prior(count)
+        half = (inverse[:, :, None] * spread[None, :, :]).sum(axis=1)
+        covariance = (half[:, :, None] * inverse[None, :, :]).sum(axis=1)
+        return (covariance + covariance.T) / 2
+
+    def answer(
+        self, steps: Parameters, covariance: Matrix, history: Float[Array, "samples parameters"] | None = None
+    ) -> Estimate:
+        """A solution as an estimate, with the initial state and the cost of a simulation.
+
+        A parameter that is not identifiable can have any value. If the flight cannot be simulated with it, the estimate
+        is the bracket's center. `history`: the solution after each sample, in half-widths from the center.
+        """
+        problem, center, half_width = self.problem, self.center, self.half_width
+        history = None if history is None else center + half_width * history
+        parameters = center + half_width * steps if history is None else history[-1]
+        covariance = half_width[:, None] * covariance * half_width[None, :]
+        identifiable = problem.unknowns.usable.identifiable(jnp.sqrt(jnp.diagonal(covariance))).all()
+        initial_state, rollouts = best_start(problem, parameters)
+        choices = (parameters, initial_state), (center, problem.first_state()[0])
+        choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
+        # One after the other, so that the simulation is compiled once.
+        shots = jax.lax.map(lambda choice: problem.shots(*choice), choices)
+        flies = shots.sound[0] & jnp.isfinite(shots.cost[0])
+        (parameters, initial_state), shot = jax.tree.map(
+            lambda both: jnp.where(identifiable | flies, *both), (choices, shots)
+        )
+        return as_estimate(
+            problem,
+            parameters=parameters,
+            covariance=covariance,
+            initial_state=initial_state,
+            cost=shot.cost,
+            rollouts=rollouts + 2,
+            sweeps=1,
+            sound=shot.sound,
+            done=jnp.ones((), dtype=bool),
+            history=history,
+        )
+
+
+def normal_equations(rows: Float[Array, "*rows columns"]) -> tuple[Matrix, Float[Array, " parameters"]]:
+    """X^T X and X^T y of rows [X, y]. Plain sums give the same digits alone and in a batch."""
+    rows = rows.reshape(-1, rows.shape[-1])
+    regressors, output = rows[:, :-1], rows[:, -1]
+    information = (regressors[:, :, None] * regressors[:, None, :]).sum(axis=0)
+    return information, (regressors * output[:, None]).sum(axis=0)
+
+
+def solve(information: Matrix, moment: Float[Array, " parameters"]) -> tuple[Float[Array, " parameters"], Matrix]:
+    """The least-squares solution under the diffuse prior, and the inverse of the normal matrix."""
+    inverse = invert(information + _prior(moment.shape[0]))
+    return (inverse * moment).sum(axis=-1), inverse
+
+
+def _prior(count: int) -> Matrix:
+    return jnp.eye(count, dtype=float) / DIFFUSE**2
 
 
 class EquationError(AbstractEstimator):

@@ -1,7 +1,6 @@
 """From recorded flights to an identification: prepare, fit, judge, describe."""
 
-from .identify import identify as identify
-from .information import assess as assess
+from .identify import assess as assess, identify as identify
 from .results import FlightInformation as FlightInformation, Identification as Identification
 from .settings import (
     FlightSettings as FlightSettings,

@@ -1,4 +1,4 @@
-"""`jaxos4.identify`: from recorded flights to parameters with intervals, in one call."""
+"""`jaxos4.identify`: from recorded flights to parameters with intervals. `jaxos4.assess`: what flights can identify."""
 
 import os
 import time
@@ -8,19 +8,22 @@ import msgspec
 import numpy as np
 
 from ..airframe import Airframe
+from ..analysis.evaluation import evaluate
+from ..analysis.identifiability import identifiability_of
 from ..errors import InputError
 from ..estimate import AbstractEstimator
-from ..flight import CHANNEL_NAMES, Flight
+from ..estimators import IBSS
+from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
 from ..recording.reading import Recording, as_recordings
 from ..results import result_names
 from .answers import channel_fits
-from .fit import Fit, fit_case
+from .fit import Fit, fit_case, fit_flight
 from .judge import Judgement, judge
 from .prepare import Case, prepare_flight
-from .problem import Intervals
-from .results import Identification, SampleTime, finite_or_none
+from .problem import Intervals, bracket_of, flight_problem
+from .results import FlightInformation, Identification, ParameterInformation, SampleTime, finite_or_none, has_answer
 from .sample_time import fit_at_sample_times
 from .settings import FlightSettings, VehicleSettings, own_settings
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
@@ -129,4 +132,48 @@ def describe(
         skill=verdict.skill,
         predictions=verdict.predictions,
         response=verdict.response,
+    )
+
+
+def assess(
+    flight: Flight | Recording,
+    model: AbstractModel,
+    *,
+    bracket: Intervals = None,
+    channels: str | None = None,
+    initial_state: str = "free",
+    window: float | None = None,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> FlightInformation:
+    """Find the noise levels of a flight, and which parameters it can identify at these. Arguments as of `identify`.
+
+    **Raises:** `InputError`, one line, for arguments and flights that cannot be used.
+    """
+    (recording,) = as_recordings(flight)
+    where = bracket_of(bracket, model)
+    settings = {"channels": channels, "initial_state": initial_state, "window": window}
+    problem = flight_problem(recording, model, where, **settings)
+    fit = fit_flight(IBSS(), problem, progress=progress)
+    known = identifiability_of(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
+    names, notes = model.parameter_names, known.notes(model.parameter_names)
+    std, alone, half_width, limit = map(np.asarray, (known.std, known.std_alone, known.half_width, known.noise_limit))
+    finite = bool(np.isfinite(std).all())
+    return FlightInformation(
+        flight=recording.name,
+        fitted=has_answer(fit.estimate),
+        sigma=dict(zip(STATE_NAMES, fit.problem.sigma.tolist(), strict=True)),
+        parameters={
+            name: ParameterInformation(
+                bound=finite_or_none(std[i]),
+                others_known=finite_or_none(alone[i]),
+                half_width=float(half_width[i]),
+                noise_limit=finite_or_none(limit[i]) if np.isfinite(std[i]) else None,
+                unit=model.parameter_units[i],
+                note=notes.get(name, ""),
+            )
+            for i, name in enumerate(names)
+        },
+        eigenvalues=known.eigenvalues.tolist() if finite else None,
+        directions=known.directions.T.tolist() if finite else None,
+        identifiability=known,
     )

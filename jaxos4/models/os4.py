@@ -3,7 +3,7 @@
 The paper's equations are here:
 
 - Eqs. (1)-(3), (7)-(9): `PublishedOS4`, rates and translation.
-- Eqs. (4)-(6): attitude, `rotation.attitude_rates`.
+- Eqs. (4)-(6): attitude, `state.attitude_rates`.
 - Eqs. (10)-(13): torques and thrust, `Airframe.mixer`; the definitions of alpha below them, `alpha_from_inertia`.
 - Eq. (14): the order of the state, `STATE_NAMES`.
 """
@@ -20,8 +20,7 @@ from .._custom_types import Scalar, as_float
 from ..airframe import OS4, Airframe, alpha_from_inertia
 from ..flight import Inputs
 from .abstract import DEFAULT_HALF_WIDTH, PARAMETER_NAMES, AbstractModel, Parameter
-from .rotation import attitude_rates, sines_and_cosines
-from .state import Attitude, Forcing, Rates, State, Translation
+from .state import Attitude, Forcing, Rates, State, Translation, attitude_rates, sines_and_cosines
 
 
 class AbstractOS4(AbstractModel):

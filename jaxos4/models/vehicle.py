@@ -13,9 +13,8 @@ from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
 from .os4 import CorrectedOS4
-from .rotation import attitude_rates, to_body, to_earth
 from .rotors import Grid, Part, measured_speeds, squared
-from .state import Forcing, Rates, Samples, State, Translation, Vector
+from .state import Forcing, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
 from .terms import (
     COMMANDS,
     FULL_SCALE,

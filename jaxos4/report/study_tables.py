@@ -1,15 +1,19 @@
-"""The tables of a study as rows of text, for the page and for the terminal."""
+"""The tables of a study as rows of text, for the page and for the terminal; and a progress bar while it runs."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from rich.console import Console, Group, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
-from ..study import metrics
-from .study_data import bounds, names, scale_labels
-from .text import MISSING, percent, plain
+from ..study import OUTCOMES, Step, Store, Study, carry_out, device_name, metrics, run_here
+from .study_data import bounds, names, scale_labels, scenarios
+from .text import MISSING, Listing, percent, plain
 
 # The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
 _MARKS = ("", "†", "‡")
@@ -55,7 +59,7 @@ def scenario_tables(data: xr.Dataset) -> dict[str, Table]:
 
     parameters, levels = names(data, "parameter"), [f"{100 * x:g} %" for x in data["level"].values]
     return {
-        "error": error_table(data),
+        "error": _error_table(data),
         "efficiency": table(metrics.efficiency(data), "efficiency", plain, parameters),
         "coverage": table(metrics.coverage(data).sel(level=shown_level(data)), "coverage", percent, parameters),
         "levels": table(metrics.mean_coverage(data), "coverage", percent, levels),
@@ -68,7 +72,7 @@ def shown_level(data: xr.Dataset) -> float:
     return min(data["level"].values.tolist(), key=lambda level: abs(level - _LEVEL))
 
 
-def error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
+def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
     """RMS errors in percent of the truth, with rows for the bounds and for the centre of the bracket."""
     found, best, middle = metrics.estimator_error(data), metrics.bound_error(data), metrics.center_error(data)
 
@@ -151,3 +155,48 @@ def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[s
 def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
     rows = (map(text, row) for row in zip(*(one[part].values for part in (measure, "low", "high")), strict=True))
     return tuple(Cell(value, "" if MISSING in (low, high) else f"{low} to {high}") for value, low, high in rows)
+
+
+def run_with_bar(
+    study: Study, out: Path, *, device: str | None = None, run: Callable[[Store], Iterator[Step]] = run_here
+) -> xr.Dataset:
+    """`jaxos4.study.carry_out` with a progress bar on stderr. `device`: by default the devices of this process."""
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (SpinnerColumn(), "{task.description}", *columns)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("compiling", total=study.count)
+
+        def show(step: Step) -> None:
+            bar.update(task, completed=step.done, description=step.label)
+
+        try:
+            return carry_out(study, out, device or device_name(), run=run, progress=show)
+        except KeyboardInterrupt:
+            text = f"jaxos4: {out}: interrupted; run the same command again to continue."
+            console.print(text, soft_wrap=True, markup=False, highlight=False)
+            raise
+
+
+def count_outcomes(dataset: xr.Dataset) -> str:
+    """The number of estimates in a study's Dataset, and how they ended, in words."""
+    codes, counts = np.unique(dataset["result"].to_numpy(), return_counts=True)
+    outcomes = ", ".join(f"{count} {OUTCOMES[code]}" for code, count in zip(codes, counts, strict=True))
+    return f"{dataset['result'].size} estimates: {outcomes}"
+
+
+def error_table(dataset: xr.Dataset) -> RenderableType:
+    """The table of errors of each scenario, then the notes that explain the marks."""
+    parts: list[RenderableType] = []
+    notes: dict[str, None] = {}
+    for scenario in scenarios(dataset):
+        table, rows = _error_table(scenario.data, digits=2), []
+        headings = [heading for heading, _ in table.headings]
+        blank = [""] * len(headings)
+        for label, group in table.groups:
+            rows += [["", *blank]] * bool(rows) + [[label, *blank]]
+            rows += [[row.label, *(cell.text + cell.mark for cell in row.cells)] for row in group]
+        listing = Listing(["", *headings], rows, headings, apart=1)  # 80 columns must do
+        parts += [Text(f"RMS error [%], {scenario.label}"), listing.table()]
+        notes |= dict.fromkeys(table.notes)
+    return Group(*parts, *(Text(note) for note in notes))

@@ -1,6 +1,6 @@
 """The mismatch between a flight and a simulation of it: cost, residuals, gradient and information."""
 
-from .abstract import AbstractProblem as AbstractProblem, Stages as Stages
+from .abstract import AbstractProblem as AbstractProblem, Stages as Stages, Unknowns as Unknowns
 from .batching import cores as cores, in_blocks as in_blocks, on_all_cores as on_all_cores
 from .innovations import InnovationsProblem as InnovationsProblem
 from .padding import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded, with_room as with_room
@@ -15,4 +15,3 @@ from .scans import (
     each_window as each_window,
 )
 from .stages import ROUNDING as ROUNDING
-from .unknowns import Unknowns as Unknowns

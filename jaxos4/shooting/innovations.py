@@ -24,13 +24,12 @@ from ..bracket import PROPER_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..models.state import Forcing
-from .abstract import AbstractProblem, Stages, WindowUnknowns
+from .abstract import AbstractProblem, Stages, Unknowns, Values, WindowUnknowns
 from .filters import Innovations, innovate
 from .gains import LogNoise, Observed, first_noise, is_rate
 from .problem import ShootingProblem
 from .scans import Curvature, Parts, Rows, Shot, windowed
 from .segments import Segments, observe_in_segments
-from .unknowns import Unknowns, Values
 
 # The number of samples in a segment, and of those that settle its filter.
 SEGMENT, SETTLING = 384, 128

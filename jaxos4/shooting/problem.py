@@ -19,10 +19,9 @@ from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS, Forcing, State
 from ..noise import FORCE_SIGMA
 from ..simulation import STEPPERS
-from .abstract import AbstractProblem, Stages
+from .abstract import AbstractProblem, Stages, Unknowns
 from .scans import Curvature, Length, Rows, Shot, each_window, predict_window, shoot, shoot_with_derivatives, windowed
 from .stages import ROUNDING, shooting_stages
-from .unknowns import Unknowns
 
 # A cost this many standard deviations above that of pure noise is not explained.
 _UNEXPLAINED = 5.0

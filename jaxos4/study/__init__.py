@@ -1,7 +1,15 @@
 """Noise studies: a specification, its cells, the folder that keeps them, and the Dataset of their results."""
 
 from .cell import OUTCOMES as OUTCOMES
-from .dataset import assemble as assemble, provenance as provenance, save_dataset as save_dataset
+from .dataset import (
+    RESULTS_FILE as RESULTS_FILE,
+    Store as Store,
+    assemble as assemble,
+    open_store as open_store,
+    provenance as provenance,
+    read_store as read_store,
+    save_dataset as save_dataset,
+)
 from .run import (
     Step as Step,
     carry_out as carry_out,
@@ -11,4 +19,3 @@ from .run import (
     run_on_cluster as run_on_cluster,
 )
 from .specification import Study as Study, Training as Training, load_study as load_study
-from .store import RESULTS_FILE as RESULTS_FILE, Store as Store, open_store as open_store, read_store as read_store

@@ -24,9 +24,8 @@ from ..errors import InputError, TrainingError
 from ..networks import TrainedNetwork, encode_network, load_network
 from ..shooting import cores
 from .cell import blank_problem, fleet_of, key_of, program_of, run_cell
-from .dataset import assemble, save_dataset
+from .dataset import Store, assemble, check_store, open_store, save_dataset
 from .specification import Cell, Job, Study
-from .store import Store, check_store, open_store
 
 if TYPE_CHECKING:
     from distributed import Client
