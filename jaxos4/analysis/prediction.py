@@ -6,11 +6,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._custom_types import Parameters, Scalar, as_float
 from .._xla import quick_jit
-from ..flight import STATE_NAMES, Flight
+from ..flight import Flight
 from ..models.state import CASCADE_ORDER, State, unstack
 from ..shooting import FASTEST, ShootingProblem
 from ..shooting.gains import LogNoise, Observed, gains_of, is_rate, transition
@@ -25,16 +25,14 @@ _PARTS = 10
 
 
 class Disturbances(NamedTuple):
-    """What acts on each channel besides the model. The channels are the body rates, then specific forces.
+    """What acts on each body rate besides the model.
 
-    - `value`: at each sample, from the measurements until then [rad/s^2; m/s^2].
+    - `value`: at each sample, from the measurements until then [rad/s^2].
     - `time_constant`: with which they fade [s].
-    - `rates`: the body rates that the measurements until then imply [rad/s]. `None`: not computed.
     """
 
-    value: Float[np.ndarray, "samples channels"]
-    time_constant: Float[np.ndarray, " channels"]
-    rates: Float[np.ndarray, "samples 3"] | None = None
+    value: Float[np.ndarray, "samples 3"]
+    time_constant: Float[np.ndarray, "3"]
 
 
 class Predictions(NamedTuple):
@@ -168,88 +166,54 @@ def skill(predicted: Predictions) -> Skill:
         return Skill(rmse, persistence, 1 - total[0] / total[1], spread, errors.shape[0])
 
 
-def disturbances(
-    problem: ShootingProblem,
-    parameters: Parameters,
-    noise: LogNoise,
-    *,
-    offset: Float[np.ndarray, "samples 3"] | None = None,
-    memory: float = np.inf,
-) -> Disturbances:
-    """The disturbance of each channel by Kalman filters, for the noise that `FilterError` found.
+def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Disturbances:
+    """The disturbance of each body rate by Kalman filters, for the noise that `FilterError` found.
 
-    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r. `offset`: what to
-    add to the model [rad/s^2]; with it, the specific forces along `model.force_axes` are channels too, each without its
-    mean over the last `memory` [s], which an accelerometer's bias may be.
+    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r.
     """
-    flight, channels = problem.flight, len(RATES) if offset is None else len(noise.strength)
-    rates, stretch = np.asarray(flight.states)[:, RATES], flight.stretch
-    measured, modelled = rates, np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
-    if offset is not None:
-        modelled = modelled + offset
-        known = np.where(np.isnan(rates).any(axis=1, keepdims=True), 0.0, rates)
-        expected = np.stack(_observed(problem, parameters, as_float(known))[len(RATES) :], axis=1)
-        axes = np.asarray(problem.model.force_axes, dtype=int)
-        force = flight.recorded[:, len(STATE_NAMES) + axes] - expected
-        force -= past_means(force, float(np.exp(-float(flight.dt) / memory)))[0]
-        measured = np.concatenate([rates, force], axis=1)
-        modelled = np.pad(modelled, ((0, 0), (0, force.shape[1])))
-    own = LogNoise(*(as_float(np.asarray(leaf)[:channels]) for leaf in noise))
-    begins = np.diff(np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch), prepend=-1) != 0
-    rate, value = _filtered(own, as_float(measured), as_float(modelled), jnp.asarray(begins), flight.dt)
-    time_constant = np.exp(np.asarray(own.time_constant))
-    return Disturbances(np.asarray(value), time_constant, np.asarray(rate)[:, : len(RATES)])
+    rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
+    modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
+    own = LogNoise(*(as_float(np.asarray(leaf)[: len(RATES)]) for leaf in noise))
+    number = np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch)
+    known = _known_by(own, as_float(rates), as_float(modelled), jnp.asarray(number), problem.flight.dt)
+    return Disturbances(np.asarray(known.disturbance), np.exp(np.asarray(own.time_constant)))
 
 
-def past_means(
-    values: Float[np.ndarray, "samples columns"], kept: float
-) -> tuple[Float[np.ndarray, "samples columns"], ...]:
-    """The mean of what was measured before each sample; 0 if nothing was. NaN: not measured.
+class Filtered(NamedTuple):
+    """What the measurements until each sample tell: the rate of each channel, and its disturbance."""
 
-    **Arguments:** `kept`: the share of a value's weight that remains one sample later.
-
-    **Returns:** the means, the sums of the weights, and those of the squared weights.
-    """
-    known, sums = np.isfinite(values), []
-    total = weight = square = np.zeros(values.shape[1])
-    for value, is_known in zip(np.where(known, values, 0.0), known, strict=True):
-        sums.append((total, weight, square))
-        total, weight, square = kept * total + value, kept * weight + is_known, kept**2 * square + is_known
-    total, weight, square = np.moveaxis(np.array(sums), 1, 0)
-    return total / np.maximum(weight, 1.0), weight, square
+    rate: Float[Array, "samples channels"]
+    disturbance: Float[Array, "samples channels"]
 
 
-@quick_jit
-def _observed(
-    problem: ShootingProblem, parameters: Parameters, rates: Float[Array, "samples 3"]
-) -> tuple[Float[Array, " samples"], ...]:
-    """The outputs of the model's sensors at these body rates: rates, then specific forces."""
-    scalars = tuple(parameters)
-    observe = jax.vmap(lambda rates, row: problem.model.observe(unstack(rates), row, scalars))
-    return observe(rates, problem.forcing(parameters))
-
-
-@quick_jit
-def _filtered(
+def filtered(
     noise: LogNoise,
     measured: Float[Array, "samples channels"],
     modelled: Float[Array, "samples channels"],
-    begins: Bool[Array, " samples"],
+    stretch: Int[Array, " samples"],
     dt: Scalar,
-) -> tuple[Float[Array, "samples channels"], Float[Array, "samples channels"]]:
-    """Rates and disturbances. A specific force is measured less its model; its rate is the disturbance's mean."""
+) -> Filtered:
+    """What is known at each sample. Filters begin anew in each stretch.
+
+    `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model. The
+    rate of a specific force is the mean of its disturbance over a sample.
+    """
+    begins = jnp.diff(stretch, prepend=-1) != 0
     is_known, memory = ~jnp.isnan(measured), is_rate(measured.shape[1])
-    observed = Observed(measured[:, :, None], begins[:, None], begins[:, None])
-    gains = gains_of(observed, noise, dt)
+    gains = gains_of(Observed(measured[:, :, None], begins[:, None], begins[:, None]), noise, dt)
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
 
-    def step(known: tuple[Array, Array], row) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        (rate, disturbance), (y, is_known, added, begins, by_rate, by_disturbance) = known, row
-        rate, disturbance = (jnp.where(begins, 0.0, x) for x in (rate, disturbance))
+    def step(known: Filtered, row) -> tuple[Filtered, Filtered]:
+        y, is_known, added, begins, by_rate, by_disturbance = row
+        rate, disturbance = (jnp.where(begins, 0.0, x) for x in known)
         error = jnp.where(is_known, y - rate, 0.0)
         rate, disturbance = rate + by_rate * error, disturbance + by_disturbance * error
-        return (memory * rate + added * dt + reach * disturbance, kept * disturbance), (rate, disturbance)
+        later = Filtered(memory * rate + added * dt + reach * disturbance, kept * disturbance)
+        return later, Filtered(rate, disturbance)
 
     zero = jnp.zeros(measured.shape[1], dtype=float)
     rows = measured, is_known, modelled, begins, gains.rate[:, :, 0], gains.disturbance[:, :, 0]
-    return jax.lax.scan(step, (zero, zero), rows)[1]
+    return jax.lax.scan(step, Filtered(zero, zero), rows)[1]
+
+
+_known_by = quick_jit(filtered)

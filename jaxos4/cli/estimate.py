@@ -1,9 +1,7 @@
 """`jaxos4 estimate`: the parameters of a quadrotor from recorded flights, with 95 % intervals."""
 
-import importlib
 import shlex
 import sys
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +10,7 @@ from typer import Argument, Option
 
 from ..errors import InputError
 from . import _options as options
-from ._output import check_outputs, in_options, option_names, stages, write_json
+from ._output import DRAWING, check_outputs, import_beside, in_options, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from ..airframe import Airframe
@@ -21,8 +19,6 @@ if TYPE_CHECKING:
     from ..recording import Recording
 
 _OS4, _PUBLISHED = "os4", "published"
-# What draws a report: slow to import.
-_DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg", "matplotlib.figure", "jinja2")
 
 
 def estimate(
@@ -74,7 +70,7 @@ def estimate(
             sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
             raise InputError(f"--report: is for real vehicles, {sign}; leave it out.")
         if report is not None:  # while the first program runs
-            threading.Thread(target=lambda: [*map(importlib.import_module, _DRAWING)], daemon=True).start()
+            import_beside("jinja2", *DRAWING)
         found = identify(
             recordings,
             subject,

@@ -7,7 +7,7 @@ import typer
 from typer import Argument, Option
 
 from . import _options as options
-from ._output import check_outputs, in_options, option_names, stages, write_json
+from ._output import DRAWING, check_outputs, import_beside, in_options, option_names, stages, write_json
 
 
 def predict(
@@ -38,6 +38,7 @@ def predict(
         vehicle = vehicle_of(result)
         recording = read_recording(flight, vehicle.model.airframe)
         progress("predicting")
+        import_beside(*DRAWING * (figure is not None), netcdf=out is not None and out.suffix == ".nc")
         found = predict_flight(vehicle, recording, horizon=horizon, sample_time=sample_time, spacing=spacing, seed=seed)
         progress("writing")
         if out is not None:

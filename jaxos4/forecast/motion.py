@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Numeric, Scalar
 from .._xla import quick_jit
-from ..flight import Flight
+from ..analysis.prediction import filtered
+from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER, Forcing, Rates, State
 from ..models.vehicle import FlightModel
 from ..shooting import FASTEST
@@ -39,15 +40,13 @@ class Motion(NamedTuple):
 
 
 class Known(NamedTuple):
-    """The knowledge at a start; with a leading axis, at many.
+    """The knowledge at a sample; with a leading axis, at many.
 
-    - `first`: the sample.
     - `state`: as measured, as in `PARTS`.
     - `rates`, `disturbance`: by the filters [rad/s], [rad/s^2; m/s^2].
     - `unsure`: the standard deviation of the offsets.
     """
 
-    first: Int[Numeric, "*starts"]
     state: Float[Numeric, "*starts 13"]
     rates: Float[Numeric, "*starts 3"]
     disturbance: Float[Numeric, "*starts channels"]
@@ -146,19 +145,21 @@ def _sum(a, b) -> tuple[Scalar, Scalar, Scalar]:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-def _fly(model: FlightModel, lane: Lanes, start: Known, noise: LogNoise, dt: Scalar) -> Float[Array, "steps 13"]:
+def _fly(
+    model: FlightModel, lane: Lanes, first: Int[Array, ""], start: Known, noise: LogNoise, dt: Scalar
+) -> Float[Array, "steps 13"]:
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
     scalars, axes = tuple(lane.parameters), model.force_axes
     p, v, q, w = (start.state[places] for places in PARTS.values())
     # A gyro bias is part of the measurement, not of the state.
     steps = lane.gusts.shape[0]
-    rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start.first, steps), lane.forcing)
+    rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), lane.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
     biased = jnp.stack(model.observe(State(Rates(*w)), still, scalars)[:3])
     w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin[9:]
     error, absorbed = start.unsure * lane.off
-    offset = lane.offset[start.first] + error
+    offset = lane.offset[first] + error
     tilt = (jnp.ones(()), *(lane.begin[6:9] / 2))
     begin = Motion(tuple(p + lane.begin[:3]), tuple(v + lane.begin[3:6]), _unit(product(tuple(q), tilt)), Rates(*w))
 
@@ -198,50 +199,101 @@ def departures(states: Any, others: Any) -> Any:
 
 @quick_jit
 def fly_chunk(
-    model: FlightModel, lanes: Lanes, starts: Known, noise: LogNoise, dt: Scalar
+    model: FlightModel, lanes: Lanes, known: Known, first: Int[Array, " starts"], noise: LogNoise, dt: Scalar
 ) -> tuple[Float[Array, "starts 2 steps 13"], Float[Array, "starts steps 12"]]:
-    """The first two lanes of each start, and the root mean square `departures` of the other lanes from the first."""
+    """The first two lanes from each sample `first`, and the root mean square `departures` of the others from them."""
 
-    def every(start: Known) -> tuple[Array, Array]:
-        states = jax.vmap(lambda lane: _fly(model, lane, start, noise, dt))(lanes)
+    def every(first: Int[Array, ""]) -> tuple[Array, Array]:
+        start = jax.tree.map(lambda leaf: leaf[first], known)
+        states = jax.vmap(lambda lane: _fly(model, lane, first, start, noise, dt))(lanes)
         off = departures(jnp.broadcast_to(states[0], states[2:].shape), states[2:])
         return states[:2], jnp.sqrt(jnp.square(off).mean(axis=0))
 
-    return jax.vmap(every)(starts)
+    return jax.vmap(every)(first)
+
+
+class Evidence(NamedTuple):
+    """What a flight measured, and what is known of its offsets.
+
+    - `states`: as in `PARTS`. `accelerations`: see `jaxos4.forecast.measured.Measured`.
+    - `noise`: of the filters. `velocity_noise`: the standard deviation of the white noise of velocity [m/s].
+    - `prior`: the standard deviation of each offset before the flight.
+    - `lacking`: the standard deviation of the force that a model lacks [m/s^2], and its correlation time [s].
+    - `memory`: the time constant with which a recording's offsets are forgotten [s].
+    """
+
+    states: Float[Array, "samples 13"]
+    accelerations: Float[Array, "samples 6"]
+    noise: LogNoise
+    velocity_noise: Float[Array, "3"]
+    prior: Float[Array, "6"]
+    lacking: Float[Array, "2"]
+    memory: Scalar
 
 
 @quick_jit
-def forcing_and_offsets(
-    model: FlightModel,
-    flight: Flight,
-    length: Count,
-    parameters: Float[Array, "lanes parameters"],
-    measured: Float[Array, "samples 6"],
-    weight: Float[Array, "samples 6"],
-    kept: Scalar,
-) -> tuple[Forcing, Float[Array, "lanes samples 6"]]:
-    """The forcing and the offsets of `Lanes` for each row of parameters.
+def known_at_samples(
+    model: FlightModel, flight: Flight, length: Count, parameters: Float[Array, "lanes parameters"], evidence: Evidence
+) -> tuple[Known, Forcing, Float[Array, "lanes samples 6"]]:
+    """What is known at each sample, by the first row of `parameters`; and forcing and offsets of each row: see `Lanes`.
 
-    An offset is a weighted sum of what the `measured` accelerations before a sample exceed the model's by: each sample
-    earlier has less weight by the factor `kept`, and `weight` multiplies the sum. The velocity is left out of the
-    forcing: it will be that of the prediction. `length`: the samples of the flight that are no padding.
+    The velocity is left out of the forcing: it will be that of the prediction. `length`: the samples of the flight that
+    are no padding.
     """
     rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
+    kept = jnp.exp(-flight.dt / evidence.memory)
+    weight, unsure = _offset_weights(model, evidence, kept, flight.dt)
 
-    def of_lane(values: Array) -> tuple[Forcing, Array]:
+    def of_lane(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
-        turning = model.angular_acceleration(Rates(*middle.T), forcing, scalars)
-        pushing = model.specific_force(forcing.thrust, forcing, scalars)
-        residual = measured - jnp.stack([*turning, *pushing], axis=1)
+        turning = jnp.stack(model.angular_acceleration(Rates(*middle.T), forcing, scalars), axis=1)
+        pushing = jnp.stack(model.specific_force(forcing.thrust, forcing, scalars), axis=1)
+        residual = evidence.accelerations - jnp.concatenate([turning, pushing], axis=1)
+        offset = weight * _past(jnp.nan_to_num(residual), kept)
+        observe = jax.vmap(lambda rates, row: model.observe(State(Rates(*rates)), row, scalars))
+        seen = observe(jnp.nan_to_num(rates), forcing)
+        return forcing._replace(velocity=None, recording=()), offset, turning, jnp.stack(seen[3:], axis=1)
 
-        def gather(total: Array, row: Array) -> tuple[Array, Array]:
-            return kept * total + row, total
+    forcing, offset, turning, expected = jax.vmap(of_lane)(parameters)
+    force = flight.channels[:, len(STATE_NAMES) + np.asarray(model.force_axes, dtype=int)] - expected[0]
+    # The bias of an accelerometer is its mean over the memory.
+    force = force - _past(jnp.nan_to_num(force), kept) / jnp.maximum(_past(~jnp.isnan(force), kept), 1.0)
+    modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
+    stretch = jnp.zeros(len(rates), dtype=int) if flight.stretch is None else flight.stretch
+    found = filtered(evidence.noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
+    return Known(evidence.states, found.rate[:, :3], found.disturbance, unsure), forcing, offset
 
-        past = jax.lax.scan(gather, jnp.zeros(6), jnp.where(jnp.isnan(residual), 0.0, residual))[1]
-        return forcing._replace(velocity=None, recording=()), weight * past
 
-    return jax.vmap(of_lane)(parameters)
+def _offset_weights(
+    model: FlightModel, evidence: Evidence, kept: Scalar, dt: Scalar
+) -> tuple[Float[Array, "samples 6"], Float[Array, "samples 6"]]:
+    """What multiplies the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
+
+    Each recording has its own offsets. The mean of the residuals, of which it forgets the oldest, is drawn to 0 as far
+    as offsets are known not to differ.
+    """
+    noise, channels = evidence.noise, np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
+    strength, time_constant = (jnp.full(6, x) for x in evidence.lacking)
+    strength = strength.at[channels].set(jnp.exp(noise.strength))
+    time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant))
+    sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), evidence.velocity_noise])
+    is_known, prior = ~jnp.isnan(evidence.accelerations), jnp.square(evidence.prior)
+    total, squares = _past(is_known, kept), _past(is_known, kept**2)
+    count = jnp.maximum(total, 1.0)
+    seconds = dt * count**2 / jnp.maximum(squares, 1.0)  # a uniform mean over this time is as exact
+    variance = strength**2 * jnp.minimum(1.0, 2 * time_constant / seconds) + 2 * (sensor / (dt * count)) ** 2
+    share = prior / (prior + variance)
+    return share / count, jnp.sqrt(jnp.where(total > 0, share * variance, prior))
+
+
+def _past(values: Array, kept: Scalar) -> Float[Array, "samples columns"]:
+    """The sum of the values before each sample; each sample earlier has less weight by the factor `kept`."""
+
+    def gather(total: Array, row: Array) -> tuple[Array, Array]:
+        return kept * total + row, total
+
+    return jax.lax.scan(gather, jnp.zeros(values.shape[1:], dtype=float), values)[1]
 
 
 @quick_jit

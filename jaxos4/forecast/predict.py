@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import as_float
-from ..analysis.prediction import disturbances, past_means
 from ..errors import InputError
 from ..flight import Flight
 from ..identification import Identification
@@ -21,7 +20,7 @@ from ..recording.reading import Recording, as_recording
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .measured import Measured, Regression, constant_rates
-from .motion import CHUNK, PARTS, Known, Lanes, fly_chunk, forcing_and_offsets, settled, turned
+from .motion import CHUNK, PARTS, Evidence, Lanes, fly_chunk, known_at_samples, settled, turned
 from .prediction import FlightPrediction
 from .vehicle import Vehicle, vehicle_of
 
@@ -156,31 +155,6 @@ def _starts(
     return start
 
 
-def _offsets(
-    vehicle: Vehicle, measured: Measured, accelerations: Float[np.ndarray, "samples 6"], noise: LogNoise
-) -> tuple[float, Float[np.ndarray, "samples 6"], Float[np.ndarray, "samples 6"]]:
-    """How the offsets of p', q', r' and of the specific force follow from the past of a recording.
-
-    Each recording has its own. The mean of the residuals before a sample, of which it forgets the oldest, is drawn to 0
-    as far as offsets are known not to differ. If no velocity is measured, the specific force has no offset.
-
-    **Returns:** the share of a residual's weight that remains one sample later, what multiplies the sum of the weighted
-    residuals, and the standard deviation of the offsets.
-    """
-    dt, kept = measured.dt, math.exp(-measured.dt / _MEMORY)
-    _, total, squares = past_means(accelerations, kept)
-    strength, time_constant = np.full(6, _PUSH[0]), np.full(6, _PUSH[1])
-    channels = [0, 1, 2, *(3 + axis for axis in vehicle.model.force_axes)]
-    strength[channels], time_constant[channels] = np.exp(noise.strength), np.exp(noise.time_constant)
-    sensor = np.append(np.exp(noise.sensor[:3]), measured.noise[3:6])
-    prior = np.append(vehicle.offset, [_PUSH[0] * measured.has("velocity")] * 3) ** 2
-    count = np.maximum(total, 1.0)
-    seconds = dt * count**2 / np.maximum(squares, 1.0)  # a uniform mean over this time is as exact
-    variance = strength**2 * np.minimum(1.0, 2 * time_constant / seconds) + 2 * (sensor / (dt * count)) ** 2
-    share = prior / (prior + variance)
-    return kept, share / count, np.sqrt(np.where(total > 0, share * variance, prior))
-
-
 def _fly(
     problem: ShootingProblem,
     vehicle: Vehicle,
@@ -194,19 +168,14 @@ def _fly(
     Float[np.ndarray, "starts 13"], Float[np.ndarray, "starts 2 steps 13"], Float[np.ndarray, "starts steps 12"]
 ]:
     """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures."""
-    generator, channels, own = np.random.default_rng(seed), noise.strength.size, LogNoise(*map(as_float, noise))
+    generator, channels, dt = np.random.default_rng(seed), noise.strength.size, problem.flight.dt
     parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(_DRAWS, generator)]))
-    accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
-    kept, weight, unsure = _offsets(vehicle, measured, accelerations, noise)
-    flight, samples = problem.flight, len(weight)
-    padding = ((0, flight.time.size - samples), (0, 0))
-    above, weight = (as_float(np.pad(x, padding)) for x in (accelerations, weight))
     model = dataclasses.replace(vehicle.model, recordings=(0,) * (int(measured.stretch.max()) + 1))
-    length = jax.device_put(np.asarray(samples))
-    forcing, offset = forcing_and_offsets(model, flight, length, parameters, above, weight, as_float(kept))
-    known = _known(problem, vehicle, measured, noise, np.asarray(offset)[0], missing)._replace(unsure=unsure)
+    evidence = _evidence(problem, vehicle, measured, noise, missing)
+    length = jax.device_put(np.asarray(len(measured.stretch)))
+    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, evidence)
 
-    after, added, absorbed = jax.tree.map(np.asarray, settled(own, problem.flight.dt))
+    after, added, absorbed = jax.tree.map(np.asarray, settled(evidence.noise, dt))
     first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
     begin = np.pad(first[:, :3, 0], ((0, 0), (9, 0)))  # the rest is in `Measured.contradictions`
     gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
@@ -215,34 +184,37 @@ def _fly(
     surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
     lanes = Lanes(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
-    found = []
-    for chunk in range(0, start.size, CHUNK):
-        rows = start[np.minimum(np.arange(chunk, chunk + CHUNK), start.size - 1)]
-        some = Known(*(jnp.asarray(leaf[rows]) for leaf in known))
-        found.append(fly_chunk(vehicle.model, lanes, some, own, problem.flight.dt))
+    chunks = (np.minimum(np.arange(i, i + CHUNK), start.size - 1) for i in range(0, start.size, CHUNK))
+    found = [fly_chunk(vehicle.model, lanes, known, jnp.asarray(start[rows]), evidence.noise, dt) for rows in chunks]
     states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[: start.size] for i in range(2))
-    return np.asarray(known.state)[start], states, spread
+    return np.asarray(evidence.states)[start], states, spread
 
 
-def _known(
-    problem: ShootingProblem,
-    vehicle: Vehicle,
-    measured: Measured,
-    noise: LogNoise,
-    offset: Float[np.ndarray, "padded 6"],
-    missing: tuple[str, ...],
-) -> Known:
-    """The knowledge at each sample, in NumPy; `unsure` is missing. A position that was not measured is 0."""
-    samples = slice(len(measured.stretch))
-    filtered = disturbances(problem, as_float(vehicle.parameters), noise, offset=offset[:, :3], memory=_MEMORY)
-    state = measured.states.copy()
+def _evidence(
+    problem: ShootingProblem, vehicle: Vehicle, measured: Measured, noise: LogNoise, missing: tuple[str, ...]
+) -> Evidence:
+    """What the padded flight measured. A position that was not measured is 0, and a velocity is that of dead reckoning.
+
+    If no velocity is measured, the specific force has no offset.
+    """
+    state, samples = measured.states.copy(), len(measured.stretch)
     if "velocity" in missing:
-        reckoned = np.asarray(problem.flight.body_velocity)[samples].T
+        reckoned = np.asarray(problem.flight.body_velocity)[:samples].T
         state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
     if "position" in missing:
         state[:, PARTS["position"]] = 0.0
-    rates, value = np.asarray(filtered.rates)[samples], filtered.value[samples]
-    return Known(np.arange(len(state)), state, rates, value, np.zeros((len(state), 6)))
+    padding = ((0, problem.flight.time.size - samples), (0, 0))
+    accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
+    state, accelerations = (as_float(np.pad(x, padding, constant_values=np.nan)) for x in (state, accelerations))
+    return Evidence(
+        state,
+        accelerations,
+        noise=LogNoise(*map(as_float, noise)),
+        velocity_noise=as_float(measured.noise[3:6]),
+        prior=as_float(np.append(vehicle.offset, [_PUSH[0] * ("velocity" not in missing)] * 3)),
+        lacking=as_float(np.array(_PUSH)),
+        memory=as_float(_MEMORY),
+    )
 
 
 def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:

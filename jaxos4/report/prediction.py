@@ -95,7 +95,10 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
         for panel in panels[-3:]:
             panel.set_xlabel("time [s]")
         labels = ("measured", f"predicted up to {found.horizons[-1]:.3g} s ahead", "95 % band")
-        figure.legend(handles, labels, loc="outside lower left", ncols=3)
+        figure.set_layout_engine(None)  # to fit all labels exactly would take half of the time
+        below, width, height = 0.5, *figure.get_size_inches()
+        figure.subplots_adjust(0.5 / width, (below + 0.4) / height, 1 - 0.1 / width, 1 - 0.3 / height, hspace=0.35)
+        figure.legend(handles, labels, loc="lower left", ncols=3)
         drawn = (pdf if Path(path).suffix == ".pdf" else svg)(figure)
     write_file(path, drawn)
 
