@@ -46,10 +46,10 @@ hypothesis.settings.load_profile("ci")
 
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("experiments", "vehicle", "experiments_vehicle", "estimators", "design", "study_resume", "errors", "network"),
-    *("cli", "multiple_shooting", "study", "startup", "predict", "filter_error", "closed_loop", "shooting", "hybrid"),
-    *("compare", "closed_loop_effects", "vehicle_likelihood", "programs", "recursive", "searches"),
-    *("diagnostics", "identify", "flight_model", "report_browser", "report", "identifiability", "flight_model_fits"),
+    *("experiments", "design", "vehicle", "estimators", "network", "experiments_vehicle", "study_resume", "startup"),
+    *("hybrid", "errors", "filter_error", "multiple_shooting", "report_browser", "recursive", "study", "cli"),
+    *("predict", "vehicle_likelihood", "compare", "identifiability", "flight_model_fits", "closed_loop"),
+    *("flight_model", "searches", "identify", "sample_time", "study_cluster", "diagnostics", "simulate", "shooting"),
 )
 
 

@@ -1,97 +1,67 @@
 """Designs of rotor speeds and of references: what they tell, the limits that they keep, and the command."""
 
-import contextlib
 import dataclasses
-import io
-import shutil
-import sys
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import (
-    CRAZYFLIE,
-    CRAZYFLIE_TOML,
-    DT,
-    euler_trajectory,
-    published_derivative,
-    refused,
-    standard_flight,
-)
+from helpers import CRAZYFLIE, CRAZYFLIE_TOML, DT, euler_trajectory, published_derivative, refused, standard_flight
 
 import jaxos4
 from jaxos4 import design
-from jaxos4.cli import main
 from jaxos4.cli.design import Criterion
 from jaxos4.design import Envelope
 from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
 from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely
 from jaxos4.design.task import CRITERIA, bounds_of, criterion_of
+from jaxos4.study import load_study
+from jaxos4.study.cell import fleet_of
 
 MODEL = jaxos4.PublishedOS4()
 BRACKET = jaxos4.Bracket.default(MODEL)
 SECONDS = 2.0
 LOOP = jaxos4.ClosedLoop(CRAZYFLIE, gust=5.0)
 LOOP_BRACKET = jaxos4.Bracket.default(design.model_of(LOOP))
-LOOP_DT, LOOP_SECONDS = 0.004, 10.0
+LOOP_DT, LOOP_SECONDS = 0.004, 6.0
 CLOSED = ("--closed-loop", "--airframe", "mine.toml")
 
 
-class Commanded(NamedTuple):
-    """A run of the command: its folder, what it prints, what it asks of the library, and what the library finds."""
-
-    folder: Any
-    printed: str
-    subject: Any
-    asked: dict[str, Any]
-    found: design.Design
-
-
-def command(folder, function, *options) -> Commanded:
-    """Runs `jaxos4 design` once for a module."""
-    printed, failed, calls, original = io.StringIO(), io.StringIO(), [], getattr(design, function)
-    (folder / "mine.toml").write_text(CRAZYFLIE_TOML)
-
-    def seen(subject, **asked):
-        calls.append((subject, asked, original(subject, **asked)))
-        return calls[0][-1]
-
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        contextlib.redirect_stdout(printed),
-        contextlib.redirect_stderr(failed),
-    ):
-        patch.chdir(folder)
-        patch.setattr(design, function, seen)
-        patch.setattr(sys, "argv", ["jaxos4", "design", *options, "--out", "new.csv", "--figure", "new.svg"])
-        with pytest.raises(SystemExit) as stop:
-            main()
-    assert (stop.value.code or 0, failed.getvalue()) == (0, "")
-    assert (folder / "new.svg").read_text().count("<svg") == 1
-    return Commanded(folder, printed.getvalue(), *calls[0])
+OPEN_SETTINGS = {"duration": SECONDS, "dt": 0.01, "channels": "all", "criterion": "D", "start_is_known": True}
+LOOP_SETTINGS = {"duration": LOOP_SECONDS, "dt": LOOP_DT, "criterion": "D"}
 
 
 @pytest.fixture(scope="module")
-def speeds(tmp_path_factory):
+def speeds():
     """Rotor speeds of 2 s."""
-    return command(tmp_path_factory.mktemp("a"), "design_input", "--initial-state", "known", "--duration", "2")
+    return design.design_input(MODEL, bracket=BRACKET, **OPEN_SETTINGS, compare=True, key=0)
 
 
 @pytest.fixture(scope="module")
-def references(tmp_path_factory):
-    """References of 10 s."""
-    return command(tmp_path_factory.mktemp("b"), "design_references", *CLOSED, "--duration", "10")
+def references():
+    """References of 6 s."""
+    return design.design_references(LOOP, bracket=LOOP_BRACKET, **LOOP_SETTINGS, compare=True, key=0)
 
 
-def asked_for(commanded, bracket, **settings):
-    """Whether the command asks the library for these settings, and no others."""
-    assert set(commanded.asked) == {*settings, "bracket", "progress", "compare", "key"}
-    assert {name: commanded.asked[name] for name in settings} == settings
-    assert (commanded.asked["compare"], commanded.asked["key"]) == (True, 0)
-    np.testing.assert_array_equal(commanded.asked["bracket"].lower, bracket.lower)
-    np.testing.assert_array_equal(commanded.asked["bracket"].upper, bracket.upper)
+@pytest.fixture
+def command(run, tmp_path, monkeypatch):
+    """Runs `jaxos4 design`: it asks the library for these settings and no others. Returns what it prints and asks."""
+
+    def call(function, found, bracket, settings, *options):
+        asked = []
+        monkeypatch.setattr(design, function, lambda subject, **given: asked.append((subject, given)) or found)
+        (tmp_path / "mine.toml").write_text(CRAZYFLIE_TOML)
+        code, out, err = run("design", *options, "--out", "new.csv", "--figure", "new.svg")
+        assert (code, err) == (0, "")
+        assert (tmp_path / "new.svg").read_text().count("<svg") == 1
+        ((subject, given),) = asked
+        given.pop("progress")
+        for end in ("lower", "upper"):
+            np.testing.assert_array_equal(getattr(given["bracket"], end), getattr(bracket, end))
+        assert given == settings | {"limits": {}, "bracket": given["bracket"], "compare": True, "key": 0}
+        return out, subject
+
+    return call
 
 
 # Rotor speeds.
@@ -115,52 +85,46 @@ def geometric_mean(bounds):
 
 
 def test_the_bounds_are_those_of_an_independent_fisher_information(speeds):
-    for one in (speeds.found.designed, speeds.found.standard["multisine"]):
+    for one in (speeds.designed, speeds.standard["multisine"]):
         np.testing.assert_allclose(one.bounds, numpy_bounds(one.inputs), rtol=1e-3)
         np.testing.assert_array_equal(one.bounds, one.history[-1])
+    # The shortest flight is the first sample at which the bounds are small enough.
+    designed = speeds.designed
+    np.testing.assert_allclose(designed.shortest(designed.history[120, :3]), 1.2, rtol=1e-9)
+    np.testing.assert_allclose(designed.shortest(designed.bounds / 3), 9 * SECONDS, rtol=1e-9)
 
 
 def test_a_designed_input_tells_more_than_the_standard_inputs(speeds):
-    own = geometric_mean(numpy_bounds(speeds.found.designed.inputs))
+    own = geometric_mean(numpy_bounds(speeds.designed.inputs))
     standard = np.asarray(standard_flight(duration=SECONDS).omega)  # its own envelope, at its full amplitude
     assert own < 0.5 * geometric_mean(numpy_bounds(standard))
-    assert own < 0.5 * min(geometric_mean(one.bounds) for one in speeds.found.standard.values())
+    assert own < 0.5 * min(geometric_mean(one.bounds) for one in speeds.standard.values())
 
 
 def test_other_vehicles_of_the_bracket_keep_the_limits_between_samples_too(speeds):
-    others, designed, limits = drawn(BRACKET, jax.random.key(77), VEHICLES), speeds.found.designed, speeds.found.task
+    others, designed, limits = drawn(BRACKET, jax.random.key(77), VEHICLES), speeds.designed, speeds.task
     states = fly_finely(MODEL, others, jnp.asarray(designed.inputs), jnp.asarray(DT, float))
     shares = limits.envelope.shares(designed.inputs, states, float(DT))
     assert max(shares.values()) <= 1
     assert 0.9 < max(designed.uses.values()) <= 1
 
 
-def test_the_shortest_flight_is_the_first_sample_at_which_the_bounds_are_small_enough(speeds):
-    designed = speeds.found.designed
-    np.testing.assert_allclose(designed.shortest(designed.history[120, :3]), 1.2, rtol=1e-9)
-    np.testing.assert_allclose(designed.shortest(designed.bounds / 3), 9 * SECONDS, rtol=1e-9)
-
-
-def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, run):
-    settings = {"limits": {}, "duration": SECONDS, "dt": 0.01, "channels": "all", "criterion": "D"}
-    asked_for(speeds, BRACKET, start_is_known=True, **settings)
-    folder, omega, path = speeds.folder, speeds.found.designed.inputs, speeds.folder / "new.csv"
-    np.testing.assert_allclose(design.read_input(path, 0.01), omega, rtol=1e-9)
+def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, command, run, tmp_path):
+    out, _ = command("design_input", speeds, BRACKET, OPEN_SETTINGS, "--initial-state", "known", "--duration", "2")
     for words in ("x multisine", "x chirp", "of 200 vehicles", "fly it"):
-        assert words in speeds.printed
-    assert run("simulate", "--speeds", str(path), "--out", "flight.csv")[0] == 0
-    refused(run("simulate", "--speeds", str(path), "--out", "x.csv", "--duration", "5"), "--duration: ")
+        assert words in out
+    omega = speeds.designed.inputs
+    np.testing.assert_allclose(design.read_input(tmp_path / "new.csv", 0.01), omega, rtol=1e-9)
+    assert run("simulate", "--speeds", "new.csv", "--out", "flight.csv")[0] == 0
+    refused(run("simulate", "--speeds", "new.csv", "--out", "x.csv", "--duration", "5"), "--duration: ")
     np.testing.assert_allclose(np.asarray(jaxos4.read_flight("flight.csv").omega), omega, rtol=1e-6)
-    from jaxos4.study import load_study
-    from jaxos4.study.cell import fleet_of
-
     study = 'excitations = ["best"]\ndurations = [{}]\n[input]\nbest = "new.csv"\n'
-    (folder / "study.toml").write_text(study.format(2))
-    loaded = load_study(folder / "study.toml")
+    (tmp_path / "study.toml").write_text(study.format(2))
+    loaded = load_study(tmp_path / "study.toml")
     np.testing.assert_allclose(fleet_of(loaded, loaded.cell(0).scenario).omega, omega, rtol=1e-9)
-    (folder / "study.toml").write_text(study.format(3))
+    (tmp_path / "study.toml").write_text(study.format(3))
     with pytest.raises(jaxos4.InputError, match="its file lasts 2 s; correct `durations`"):
-        load_study(folder / "study.toml")
+        load_study(tmp_path / "study.toml")
 
 
 # References.
@@ -168,21 +132,21 @@ def test_the_command_writes_an_input_that_simulate_and_a_study_fly(speeds, run):
 
 def test_designed_references_tell_twice_as_much_as_3211(references):
     """With the same length and no larger values; the bounds are standard deviations."""
-    found = references.found
+    found = references
     assert found.gain("3211")[0] < 0.5
     assert max(found.gain(name)[0] for name in found.standard) < 0.6
     for one in (found.designed, found.standard["3211"]):
         assert (np.abs(one.inputs).max(axis=0) <= np.array([0.3, 0.3, 0.3, 1.5]) * (1 + 1e-9)).all()
-        assert one.inputs.shape == (2501, 4)
+        assert one.inputs.shape == (1501, 4)
     period = round(found.designed.period / LOOP_DT)
     np.testing.assert_allclose(found.designed.inputs[period:], found.designed.inputs[:-period], atol=1e-9)
 
 
 def test_other_vehicles_in_other_gusts_keep_the_limits(references):
     """The limits of rates and angles are mostly used by gusts, whose largest value is random."""
-    assert max(references.found.designed.uses.values()) <= 1
+    assert max(references.designed.uses.values()) <= 1
     others = Fleet.of(LOOP, LOOP_BRACKET, LOOP_DT, jax.random.key(77))
-    uses = others.uses(references.found.designed.inputs, references.found.task.envelope)
+    uses = others.uses(references.designed.inputs, references.task.envelope)
     assert max(uses[name] for name in ("fastest", "slowest", "velocity", "distance")) <= 1
     assert max(uses[name] for name in ("angle", "rate")) < 1.15
 
@@ -190,7 +154,7 @@ def test_other_vehicles_in_other_gusts_keep_the_limits(references):
 @pytest.mark.usefixtures("quickly_compiled")
 def test_the_bounds_are_those_of_filter_error(references):
     """The bounds of an identified flight, whose filters know neither the noise nor the parameters."""
-    designed = references.found.designed
+    designed = references.designed
     flight = jaxos4.fly_closed_loop(LOOP, jnp.asarray(designed.inputs), dt=LOOP_DT, key=jax.random.key(5))
     settings = jaxos4.VehicleSettings(holdout=0.0, begin=0.0, end=LOOP_SECONDS)
     estimate = jaxos4.identify(flight, CRAZYFLIE, settings=settings)
@@ -205,7 +169,7 @@ def test_the_bounds_are_those_of_filter_error(references):
 
 def test_repeated_references_add_the_same_information(references):
     """Half of the flight without references leaves half of what they add: bounds fall with the root of the duration."""
-    fleet, designed = references.found.task.fleet, references.found.designed
+    fleet, designed = references.task.fleet, references.designed
     quiet = dataclasses.replace(LOOP, gust=0.0, gyro_noise=0.0, attitude_noise=0.0, force_noise=0.0)
     period = round(designed.period / LOOP_DT)
     some = np.zeros((BATCH, *designed.inputs.shape))
@@ -220,20 +184,19 @@ def test_repeated_references_add_the_same_information(references):
     np.testing.assert_allclose(designed.shortest(designed.bounds[:3] / 2), 4 * LOOP_SECONDS, rtol=1e-9)
 
 
-def test_the_command_writes_references_that_simulate_flies(references, run, tmp_path):
-    asked_for(references, LOOP_BRACKET, limits={}, duration=LOOP_SECONDS, dt=LOOP_DT, criterion="D")
-    assert jax.tree.structure(references.subject) == jax.tree.structure(LOOP)
-    for one, other in zip(jax.tree.leaves(references.subject), jax.tree.leaves(LOOP), strict=True):
+def test_the_command_writes_references_that_simulate_flies(references, command, run, tmp_path):
+    out, loop = command("design_references", references, LOOP_BRACKET, LOOP_SETTINGS, *CLOSED, "--duration", "6")
+    for words in ("x 3211", "of 64 vehicles", "known to 5 %: Ix after"):
+        assert words in out
+    assert jax.tree.structure(loop) == jax.tree.structure(LOOP)
+    for one, other in zip(jax.tree.leaves(loop), jax.tree.leaves(LOOP), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)
-    shutil.copytree(references.folder, tmp_path, dirs_exist_ok=True)
     written, dt = design.read_references(tmp_path / "new.csv")
     assert dt == pytest.approx(LOOP_DT)
-    np.testing.assert_allclose(written, references.found.designed.inputs, atol=1e-6)
-    for words in ("x 3211", "of 64 vehicles", "known to 5 %: Ix after"):
-        assert words in references.printed
+    np.testing.assert_allclose(written, references.designed.inputs, atol=1e-6)
     code, out, err = run("simulate", *CLOSED, "--references", "new.csv", "--out", "flight.csv")
     assert (code, err) == (0, "")
-    assert "2501 samples of 0.004 s" in out
+    assert "1501 samples of 0.004 s" in out
 
 
 @pytest.mark.parametrize(

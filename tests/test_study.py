@@ -78,19 +78,14 @@ def test_a_dry_run_writes_nothing_and_counts(run, tmp_path, monkeypatch):
 
 
 @settings(max_examples=50)
-@given(st.lists(st.integers(1, 3), min_size=6, max_size=6), st.integers(1, 40), st.integers(1, 12))
+@given(st.lists(st.integers(1, 3), min_size=5, max_size=5), st.integers(1, 40), st.integers(1, 12))
 def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
-    few = iter(lengths)
-    study = Study(
-        models=("published", "corrected")[: next(few)],
-        durations=(1.0, 2.0, 3.0)[: next(few)],
-        noises=("white", "lossy", "biased")[: next(few)],
-        scales=(0.0, 1.0, 2.0)[: next(few)],
-        channels=("rates", "attitude", "all")[: next(few)],
-        estimators=("ibss", "network", "kalman")[: next(few)],
-        flights=flights,
-        batch=batch,
-    )
+    all_values = {
+        **{"durations": (1.0, 2.0, 3.0), "noises": ("white", "lossy", "biased"), "scales": (0.0, 1.0, 2.0)},
+        **{"channels": ("rates", "attitude", "all"), "estimators": ("ibss", "network", "kalman")},
+    }
+    some = {name: values[:n] for (name, values), n in zip(all_values.items(), lengths, strict=True)}
+    study = Study(flights=flights, batch=batch, models=("published", "corrected"), **some)
     cells = list(study.cells())
     assert [cell.number for cell in cells] == list(range(study.count))
     axes = [getattr(study, axis) for axis in AXES]
@@ -252,18 +247,18 @@ def test_a_diverging_cell_is_counted_and_the_study_ends(run, tmp_path, dataset):
 
 def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path, monkeypatch, dataset):
     specification(tmp_path, SPECIFICATION)
+    study, broken = ("study", "spec.toml", "--out", "out"), (1, 7, 10)
 
     def raises(study, cell, network):
-        if cell.number in (1, 7, 10):
+        if cell.number in broken:
             raise ValueError("the moon was in\nthe way")
         return run_cell(study, cell, network)
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "run_cell", raises)
-        code, out, err = run("study", "spec.toml", "--out", "out")
-    assert (code, err) == (0, "")
-    assert "12 failed" in out
-    assert "12 failed" in run("study", "spec.toml", "--out", "out")[1]  # it is not tried again
+        code, out, err = run(*study)
+    assert (code, err, "12 failed" in out) == (0, "", True)
+    assert "12 failed" in run(*study)[1]  # it is not tried again
     with xr.open_dataset("out/results.nc") as found:
         failures = json.loads(found.attrs["failures"])
         lost = found["result"].to_numpy() == OUTCOMES.index("failed")
@@ -274,9 +269,9 @@ def test_a_cell_that_raises_is_kept_as_failed_until_it_is_deleted(run, tmp_path,
     where = [(1, 4, "ibss", 1.0), (7, 4, "equation-error", 1.0), (10, 4, "equation-error", 0.1)]
     assert [(f["cell"], f["first"], f["estimator"], f["scale"]) for f in failures] == where
     assert {f["message"] for f in failures} == {"the moon was in the way"}
-    for index in (1, 7, 10):
+    for index in broken:
         (tmp_path / "out" / "cells" / f"{index:08d}.npz").unlink()
-    code, out, _ = run("study", "spec.toml", "--out", "out")
+    code, out, _ = run(*study)
     assert (code, "failed" in out) == (0, False)
     with xr.open_dataset("out/results.nc") as found:
         assert found.drop_attrs(deep=False).identical(dataset.drop_attrs(deep=False))
