@@ -27,7 +27,8 @@ from jaxos4.results import RESULTS
 
 AIRFRAME = Path(__file__).parents[1] / "experiments" / "real_flight" / "crazyflie.toml"
 VEHICLE = jaxos4.FlightModel(
-    eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(400.0)), terms=("motor", "delay", "accelerometer")
+    eqx.tree_at(lambda a: a.max_rotor_speed, OS4, np.asarray(400.0)),
+    terms=("damping", "motor", "delay", "accelerometer"),
 )
 IMPLAUSIBLE = "implausible"
 
@@ -84,6 +85,7 @@ def test_nothing_speaks_against_a_good_estimate():
             {"thrust_curve": (1.5, 0.03)},
             ("thrust_curve = 1.5 is not between 0 (thrust linear", "climbs"),
         ),
+        ({"pitch_damping": (6.0, 0.6)}, ("pitch_damping = 6 1/s is more than rotors give", "too rarely", "on board")),
         ({"az_bias": (1.2, 0.02)}, ("az_bias = 1.2 m/s^2", "levelled accelerometer", "mass")),
         ({"thrust_gain": (0.02, 0.01)}, ("accelerometer", "does not follow")),
         ({"thrust_gain": (-1.0, 0.05)}, ("z axis points down",)),
@@ -98,6 +100,11 @@ def test_a_parameter_that_contradicts_physics_is_named_with_its_cause(changed, w
     (doubt,) = doubts(changed)
     assert doubt.result == IMPLAUSIBLE
     assert [word for word in words if word not in str(doubt)] == []
+
+
+def test_the_damping_of_rotors_is_believed():
+    """A Crazyflie has 0.7 to 1.3 1/s, RotorPy's Hummingbird 1.7; a poor log knows it poorly."""
+    assert doubts({"roll_damping": (1.8, 0.1), "pitch_damping": (5.0, 1.0)}) == ()
 
 
 def test_an_answer_without_roll_and_pitch_is_none():

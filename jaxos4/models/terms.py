@@ -28,18 +28,16 @@ VOLTAGE = "battery voltage"
 
 # Brackets reach this share of the hover torque of one pair of rotors: as an offset, or at a velocity of 2 m/s.
 _AUTHORITY, _FAST = 0.2, 2.0
-# A time constant or delay this far below 0 is neither chance nor rounding [s].
-_EARLY = 0.002
-# A thrust gain beyond this factor, or its reciprocal, is no error of a scale or of a propeller's table. An
-# accelerometer that follows less than the second number does not measure the thrust.
+_EARLY = 0.002  # a time constant this far below 0 is neither chance nor rounding [s]
+# A thrust gain beyond this factor, or its reciprocal, is no error of a scale; below the second, no thrust is measured.
 _FAR_GAIN, _DEAD = 2.0, 0.2
 STEEPEST = 1.2
 """A thrust curve beyond this is no propeller's."""
 _BIAS = 0.3  # no levelled accelerometer has twice this bias [m/s^2]
 _SCALES = "correct `mass`, `thrust_coefficient` or `max_rotor_speed`"
 _YAW = 0.2  # the yaw torque of the rotors as a share of their roll torque
-# The half-width of the damping [1/s]: rotors resist roll and pitch by their thrust, and yaw by their drag only.
-_DAMPING = (5.0, 5.0, 2.0)
+# The half-width of the damping [1/s]: by thrust about roll and pitch, drag about yaw. No rotors give the last number.
+_DAMPING, _MOST_DAMPING = (5.0, 5.0, 2.0), 2.5
 _FORCE_BIASES = ("ax_bias", "ay_bias", "az_bias")
 VERTICAL_BIAS = _FORCE_BIASES[2]
 """The parameter that is the constant error of the accelerometer along z."""
@@ -128,8 +126,7 @@ def _authority(axis: int, per: float = 1.0) -> Callable[[Airframe], Scalar]:
     def share(airframe: Airframe) -> Scalar:
         arm = jnp.abs(jnp.asarray(airframe.rotor_positions)).mean()
         torque = 2 * arm * airframe.mass * airframe.gravity / 4
-        limit = _AUTHORITY * torque * jnp.array([1.0, 1.0, _YAW]) / jnp.asarray(airframe.inertia)
-        return limit[axis] / per
+        return (_AUTHORITY * torque * jnp.array([1.0, 1.0, _YAW]) / jnp.asarray(airframe.inertia))[axis] / per
 
     return share
 
@@ -160,6 +157,8 @@ _BENT = f"is not between 0 (thrust linear in the command) and {STEEPEST:g}: no m
 _CLIMB = "check that the commands are shares of full speed, and fly climbs and descents, or leave out the term `motor`"
 _GROWS = "is negative: no inflow makes thrust grow with the velocity along z"
 _CLIMBS = _limits((0.0, _INF, _GROWS, "check the z axes of the log and `mass`, and fly climbs and descents"))
+_SPARSE = "1/s is more than rotors give (1): motors were logged too rarely", "log on board, faster, or rotor speeds"
+_DAMPED = _limits((-_INF, _MOST_DAMPING, *_SPARSE))
 _OFF = f"m/s^2: a levelled accelerometer is off by less than {2 * _BIAS:g}, so that the thrust is not the weight"
 _LEVEL = _limits((-2 * _BIAS, 2 * _BIAS, _OFF, "correct `mass` or `gravity`, or calibrate the accelerometer"))
 
@@ -236,7 +235,10 @@ TERMS: dict[str, Term] = {
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
-        tuple(TermParameter(f"{x}_damping", "1/s", y, nonnegative=True) for x, y in zip(AXES, _DAMPING, strict=True)),
+        tuple(
+            TermParameter(f"{x}_damping", "1/s", y, nonnegative=True, contradiction=_DAMPED)
+            for x, y in zip(AXES, _DAMPING, strict=True)
+        ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
     ),
     "velocity": Term(
