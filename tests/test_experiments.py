@@ -287,7 +287,7 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
 def test_public_flights(report_of, shared_flights):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
-    report = report_of("public_flights", flights=shared_flights, end=15.0, epochs=20, compared=[], **names)
+    report = report_of("public_flights", flights=shared_flights, end=15.0, batches=20, compared=[], **names)
     assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))

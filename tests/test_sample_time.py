@@ -110,5 +110,5 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
         assert row.std > 0.4 * row.estimate
     assert not answer_of(case, weak, case.shooting.flight).constants
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
-    unclear = fit._replace(bound=np.asarray(fit.problem.unknowns.half_width))
+    unclear = fit._replace(held=dict.fromkeys(fit.problem.unknowns.names, held["thrust_gain"]))
     assert not answer_of(case, unclear, case.shooting.flight).constants

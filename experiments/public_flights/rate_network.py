@@ -42,8 +42,8 @@ def _data(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     return recording.states[:, COLUMNS], 5 * (commands - 1.0)
 
 
-def trained(recordings: list[Recording], *, epochs: int, seed: int) -> RateNetwork:
-    """A network of the recordings; samples with missing rates are left out. An epoch is one batch of starts."""
+def trained(recordings: list[Recording], *, batches: int, seed: int) -> RateNetwork:
+    """A network of the recordings; samples with missing rates are left out."""
     data, places = [_data(recording) for recording in recordings], []
     for i, (rates, _) in enumerate(data):
         known = np.asarray(np.isfinite(rates).all(axis=1))
@@ -66,7 +66,7 @@ def trained(recordings: list[Recording], *, epochs: int, seed: int) -> RateNetwo
         change, state = optimiser.update(slope, state)
         return eqx.tree_at(lambda n: n.layers, network, eqx.apply_updates(network.layers, change)), state
 
-    for _ in range(epochs):
+    for _ in range(batches):
         some = generator.integers(len(places), size=BATCH)
         chosen = [(*data[places[k][0]], places[k][1]) for k in some]
         rates = np.stack([r[k] for r, _, k in chosen])

@@ -109,7 +109,7 @@ def main(
     predicted: Annotated[list[str], typer.Option(help="The flights to predict.")] = PREDICTED,
     compared: Annotated[list[str], typer.Option(help="The flights to identify alone.")] = (*FITTED, *PREDICTED),
     end: Annotated[float | None, typer.Option(help="Identify with the flights up to this time [s].")] = None,
-    epochs: Annotated[int, typer.Option(help="Epochs of the network's training.")] = 300,
+    batches: Annotated[int, typer.Option(help="Batches of the network's training.")] = 300,
 ) -> None:
     """Identify each flight and all together; identify some together, and predict the others."""
     names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
@@ -119,7 +119,7 @@ def main(
     found = jaxos4.identify([recordings[name] for name in fitted], AIRFRAME, settings=settings)
     print(f"{', '.join(fitted)}: {found.result}, {found.seconds:.0f} s", flush=True)
     vehicle = jaxos4.forecast.vehicle_of(found)
-    networks = [trained([recordings[name] for name in fitted], epochs=epochs, seed=seed) for seed in range(SEEDS)]
+    networks = [trained([recordings[name] for name in fitted], batches=batches, seed=seed) for seed in range(SEEDS)]
     report: dict[str, Any] = {"version": jaxos4.__version__, "identification": found.to_dict(), "flights": {}}
     for name in predicted:
         prediction = jaxos4.predict(vehicle, recordings[name], sample_time=STEP)

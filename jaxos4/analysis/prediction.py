@@ -25,7 +25,7 @@ _PARTS = 10
 
 
 class Disturbances(NamedTuple):
-    """What acts on each body rate besides the model.
+    """The disturbance of each body rate.
 
     - `value`: at each sample, from the measurements until then [rad/s^2].
     - `time_constant`: with which they fade [s].

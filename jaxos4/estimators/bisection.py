@@ -66,8 +66,8 @@ class Stage(NamedTuple):
         return (jnp.abs(steps) * jnp.roll(weight, -self.problem.unknowns.count)).max()
 
 
-class View(NamedTuple):
-    """The view from where a sweep begins: its directions, and the room along them.
+class Directions(NamedTuple):
+    """The directions of a sweep, and the room along them from where it begins.
 
     - `factor`, `basis`: see `JointFactor`. A direction is a column of `basis`.
     - `moves`: the unknowns that move: not those at a limit, beyond which the cost falls.
@@ -81,19 +81,20 @@ class View(NamedTuple):
     above: PerDirection
 
 
-class Lines(NamedTuple):
+class Brackets(NamedTuple):
     """The bracket along each direction, as steps from where the sweep began.
 
     - `predicted`: the predicted step to the minimum.
-    - `lower`, `upper`: the bracket around it. `low`, `high`: the part of it that may hold the minimum.
+    - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: those of the part that may still
+      hold the minimum.
     - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope there, and its change.
     """
 
     predicted: PerDirection
+    lowest: PerDirection
+    highest: PerDirection
     lower: PerDirection
     upper: PerDirection
-    low: PerDirection
-    high: PerDirection
     trial: PerDirection
     last: PerDirection
     slope: PerDirection
@@ -103,25 +104,25 @@ class Lines(NamedTuple):
     def around(cls, predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection):
         """Brackets around predicted steps. The first trials are their middles, the rates those of unit information."""
         predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
-        lower = jnp.maximum(predicted - half_width, -below)
-        upper = jnp.minimum(predicted + half_width, above)
-        middle, zero = (lower + upper) / 2, jnp.zeros_like(lower)
-        return cls(predicted, lower, upper, lower, upper, middle, middle, zero, jnp.ones_like(lower))
+        lowest = jnp.maximum(predicted - half_width, -below)
+        highest = jnp.minimum(predicted + half_width, above)
+        middle, zero = (lowest + highest) / 2, jnp.zeros_like(lowest)
+        return cls(predicted, lowest, highest, lowest, highest, middle, middle, zero, jnp.ones_like(lowest))
 
-    def halved(self, slope: PerDirection) -> "Lines":
-        """The lines after a shot at their trials: **the sign of the slope decides**, the secant proposes.
+    def halved(self, slope: PerDirection) -> "Brackets":
+        """The brackets after a shot at their trials: **the sign of the slope decides**, the secant proposes.
 
         The next trial is the zero of a line through the last two slopes, or the middle if that is outside.
         """
-        low = jnp.where(slope <= 0, self.trial, self.low)
-        high = jnp.where(slope >= 0, self.trial, self.high)
+        lower = jnp.where(slope <= 0, self.trial, self.lower)
+        upper = jnp.where(slope >= 0, self.trial, self.upper)
         secant = (slope - self.slope) / (self.trial - self.last)
         rate = jnp.where((secant > 0) & jnp.isfinite(secant), secant, self.rate)
         zero = self.trial - slope / rate
         # An end that no shot has moved yet may be tried itself.
-        outside = ((zero <= low) & (low > self.lower)) | ((zero >= high) & (high < self.upper))
-        following = jnp.where(outside, (low + high) / 2, jnp.clip(zero, low, high))
-        return self._replace(low=low, high=high, trial=following, last=self.trial, slope=slope, rate=rate)
+        outside = ((zero <= lower) & (lower > self.lowest)) | ((zero >= upper) & (upper < self.highest))
+        following = jnp.where(outside, (lower + upper) / 2, jnp.clip(zero, lower, upper))
+        return self._replace(lower=lower, upper=upper, trial=following, last=self.trial, slope=slope, rate=rate)
 
 
 def prior_std(problem: AbstractProblem) -> WindowUnknowns:

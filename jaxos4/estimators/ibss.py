@@ -1,7 +1,7 @@
 """Iterative Bi-Section Shooting (IBSS): halve brackets on the slope of the trajectory mismatch.
 
 The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md). They are
-the five lines of `IBSS.sweep`.
+the five brackets of `IBSS.sweep`.
 """
 
 import functools
@@ -20,9 +20,9 @@ from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at, from_sta
 from ..linalg import coordinate_directions, gram, joint_factor, movable, room_to_limits, slopes_along
 from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
 from ..shooting.abstract import WindowUnknowns
-from .bisection import Flag, Lines, PerDirection, Stage, View, prior_std
+from .bisection import Brackets, Directions, Flag, PerDirection, Stage, prior_std
 
-DIRECTIONS = {"whitened": joint_factor, "coordinate": coordinate_directions}
+FACTORS = {"whitened": joint_factor, "coordinate": coordinate_directions}
 
 _COARSE = 0.5  # a stage that is not the last ends once no direction has more than this many standard deviations to go
 # The first brackets reach this many of the start's standard deviations, in brackets of this share of them.
@@ -61,7 +61,8 @@ class State(NamedTuple):
     record: Float[Array, "record 2 parameters"]
 
 
-Bisected = tuple[Lines, WindowUnknowns, Curvature, Count]  # what is left of the brackets, the last shot, their number
+# The narrowed brackets, the unknowns of the last shot and its curvature, and how many shots were made.
+Bisected = tuple[Brackets, WindowUnknowns, Curvature, Count]
 
 
 class IBSS(AbstractEstimator):
@@ -99,8 +100,8 @@ class IBSS(AbstractEstimator):
     record: int = eqx.field(static=True, converter=integer("record", 0, static=True), default=0)
 
     def __check_init__(self):
-        if self.directions not in DIRECTIONS:
-            raise ValueError(f"`directions` must be one of {', '.join(DIRECTIONS)}, got {self.directions!r}.")
+        if self.directions not in FACTORS:
+            raise ValueError(f"`directions` must be one of {', '.join(FACTORS)}, got {self.directions!r}.")
 
     @quick_jit
     def __call__(
@@ -169,7 +170,7 @@ class IBSS(AbstractEstimator):
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem)))
         if spread is not None:
             known = np.s_[:, : spread.shape[0], : spread.shape[0]]
-            # What is skipped may have no finite spread.
+            # A search that is skipped may have no finite spread.
             covariance = covariance.at[known].set(jnp.where(skip, covariance[known], spread))
         none = jnp.zeros((), dtype=int)
         shapes = jax.eval_shape(stages.evaluate, none, unknowns)
@@ -189,50 +190,52 @@ class IBSS(AbstractEstimator):
 
     def sweep(self, stage: Stage, state: State) -> State:
         """One iteration, in the five steps of docs/method/ibss.md."""
-        view = self._look_around(stage, state)
-        predicted, near = self._predict(stage, state, view)
-        lines = self._open(stage, state, view, predicted)
-        found = self._bisect(stage, state, view, near, lines)
-        return self._judge(stage, state, view, near, found)
+        directions = self._look_around(stage, state)
+        predicted, near = self._predict(stage, state, directions)
+        brackets = self._open(stage, state, directions, predicted)
+        found = self._bisect(stage, state, directions, near, brackets)
+        return self._judge(stage, state, directions, near, found)
 
     def terminate(self, stage: Stage, state: State) -> Flag:
         """Whether the stage has ended. After its last sweep it looks once more whether the minimum is near."""
         return state.done | (state.sweep > self._most_sweeps(stage))
 
-    def _look_around(self, stage: Stage, state: State) -> View:
+    def _look_around(self, stage: Stage, state: State) -> Directions:
         """1. Choose directions in which the cost is nearly separable, from its curvature where the sweep begins."""
         unknowns, curvature, count = state.unknowns, state.curvature, stage.problem.unknowns.count
         moves = movable(unknowns, curvature.gradient, stage.limits, count)
         information = jnp.where(moves[:, :, None] & moves[:, None, :], curvature.information, 0.0)
-        factor, basis = DIRECTIONS[self.directions](information + stage.prior, count)
+        factor, basis = FACTORS[self.directions](information + stage.prior, count)
         lower, upper = (jnp.where(moves, limit, unknowns) for limit in stage.limits)
-        return View(factor, basis, moves, *room_to_limits(unknowns, basis, (lower, upper)))
+        return Directions(factor, basis, moves, *room_to_limits(unknowns, basis, (lower, upper)))
 
-    def _predict(self, stage: Stage, state: State, view: View) -> tuple[PerDirection, Flag]:
+    def _predict(self, stage: Stage, state: State, directions: Directions) -> tuple[PerDirection, Flag]:
         """2. The step to the minimum of the quadratic model, and whether all steps are so short that the stage ends.
 
         The information along each direction is 1, so the step is minus the slope.
         """
-        steps = jnp.clip(-self._slopes(stage, view, state.curvature), -view.below, view.above)
+        steps = jnp.clip(-self._slopes(stage, directions, state.curvature), -directions.below, directions.above)
         return steps, (state.sweep >= 0) & self._is_near(stage, state.curvature, steps)
 
-    def _open(self, stage: Stage, state: State, view: View, predicted: PerDirection) -> Lines:
+    def _open(self, stage: Stage, state: State, directions: Directions, predicted: PerDirection) -> Brackets:
         """3. Open a bracket around the predicted step in each direction."""
-        opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", view.factor, state.spread, view.factor))
+        opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", directions.factor, state.spread, directions.factor))
         longest, is_first = jnp.abs(predicted).max(), state.sweep == 0
         later = jnp.maximum(state.error * longest, stage.smallest_step) * state.growth
         half_width = jnp.where(is_first, _FIRST * opening, later)
-        # How far this sweep may go; before the first shot, which is at the start, nowhere.
-        reach = jnp.where(is_first, opening, jnp.inf)
-        reach = jnp.where(state.trust < 1, state.trust * longest, reach)
-        reach = jnp.where(state.sweep < 0, 0.0, reach)
+        # How far this sweep may go. Before the first shot, which is at the start: nowhere.
+        furthest = jnp.where(is_first, opening, jnp.inf)
+        furthest = jnp.where(state.trust < 1, state.trust * longest, furthest)
+        furthest = jnp.where(state.sweep < 0, 0.0, furthest)
         if self.directions == "coordinate":  # each searched unknown has its turn
             rank, searched = jnp.cumsum(stage.searched) - 1, stage.searched
             turn = searched & (rank == state.sweep % jnp.maximum(searched.sum(), 1))
-            reach = jnp.where(jnp.roll(turn, -stage.problem.unknowns.count), reach, 0.0)
-        return Lines.around(predicted, half_width, jnp.minimum(view.below, reach), jnp.minimum(view.above, reach))
+            furthest = jnp.where(jnp.roll(turn, -stage.problem.unknowns.count), furthest, 0.0)
+        return Brackets.around(
+            predicted, half_width, jnp.minimum(directions.below, furthest), jnp.minimum(directions.above, furthest)
+        )
 
-    def _bisect(self, stage: Stage, state: State, view: View, near: Flag, lines: Lines) -> Bisected:
+    def _bisect(self, stage: Stage, state: State, directions: Directions, near: Flag, brackets: Brackets) -> Bisected:
         """4. Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
 
         The last shot is at what the others found. There is none if the minimum is near, or after the last sweep.
@@ -241,38 +244,40 @@ class IBSS(AbstractEstimator):
         shots = jnp.where(state.sweep < 0, 1, jnp.where(over, 0, self.halvings + 1))
 
         def shoot(carry):
-            lines, _, _, taken, _ = carry
-            unknowns = jnp.clip(state.unknowns + jnp.einsum("wud,wd->wu", view.basis, lines.trial), *stage.limits)
+            brackets, _, _, taken, _ = carry
+            unknowns = jnp.clip(
+                state.unknowns + jnp.einsum("wud,wd->wu", directions.basis, brackets.trial), *stage.limits
+            )
             curvature = stage.evaluate(unknowns)
-            slope = self._slopes(stage, view, curvature)
+            slope = self._slopes(stage, directions, curvature)
             close = curvature.shot.sound.all() & self._is_near(stage, curvature, slope)
             # A failed shot points back to the beginning.
-            lines = lines.halved(jnp.where(jnp.isfinite(slope), slope, lines.trial))
-            return lines, unknowns, curvature, taken + 1, close
+            brackets = brackets.halved(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
+            return brackets, unknowns, curvature, taken + 1, close
 
-        first = lines, state.unknowns, state.curvature, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
+        first = brackets, state.unknowns, state.curvature, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
         return jax.lax.while_loop(lambda carry: (carry[3] < shots) & ~carry[4], shoot, first)[:4]
 
-    def _judge(self, stage: Stage, state: State, view: View, near: Flag, found: Bisected) -> State:
+    def _judge(self, stage: Stage, state: State, directions: Directions, near: Flag, found: Bisected) -> State:
         """5. Keep the new point, or go back and stay closer if the sweep made things worse."""
-        (lines, unknowns, curvature, shots), first = found, state.sweep < 0
+        (brackets, unknowns, curvature, shots), first = found, state.sweep < 0
         shot, before = curvature.shot, state.curvature.shot
         finite = jnp.isfinite(unknowns).all() & jnp.isfinite(shot.cost).all()
         # The cost of a flight that fails means nothing.
         lower = shot.sound.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
         failed = ~first & ~(finite & (~before.sound.all() | lower))
-        kept, there = jax.tree.map(
+        unknowns, curvature = jax.tree.map(
             lambda new, old: jnp.where(failed, old, new), (unknowns, curvature), (state.unknowns, state.curvature)
         )
-        steps, bisected = lines.last, lines.upper > lines.lower
-        off = _SAFETY * jnp.abs(steps - lines.predicted).max()
-        at_end = (steps == lines.lower) | (steps == lines.upper)
+        steps, bisected = brackets.last, brackets.highest > brackets.lowest
+        off = _SAFETY * jnp.abs(steps - brackets.predicted).max()
+        at_end = (steps == brackets.lowest) | (steps == brackets.highest)
         growth = jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0)
-        covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(view.basis)
+        covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(directions.basis)
         searched, counts = stage.searched & stage.searched[:, None] & ~first, ~first & (shots > 0)
         return State(
-            unknowns=kept,
-            curvature=there,
+            unknowns=unknowns,
+            curvature=curvature,
             spread=jnp.where(searched, covariance, state.spread),
             error=jnp.clip(off / jnp.maximum(jnp.abs(steps).max(), stage.smallest_step), _LEAST, 1.0),
             growth=jnp.where(bisected, growth, state.growth),
@@ -281,13 +286,13 @@ class IBSS(AbstractEstimator):
             sweeps=state.sweeps + counts,
             rollouts=state.rollouts + shots * stage.searched.sum(),
             done=near | (first & ~finite),
-            record=_recorded(state, view, lines, counts) if self.record else state.record,
+            record=_recorded(state, directions, brackets, counts) if self.record else state.record,
         )
 
-    def _slopes(self, stage: Stage, view: View, curvature: Curvature) -> PerDirection:
+    def _slopes(self, stage: Stage, directions: Directions, curvature: Curvature) -> PerDirection:
         """The slope of the cost along each direction, of the unknowns that move."""
-        gradient = jnp.where(view.moves, curvature.gradient, 0.0)
-        return slopes_along(view.basis, gradient, stage.problem.unknowns.count)
+        gradient = jnp.where(directions.moves, curvature.gradient, 0.0)
+        return slopes_along(directions.basis, gradient, stage.problem.unknowns.count)
 
     def _is_near(self, stage: Stage, curvature: Curvature, steps: PerDirection) -> Flag:
         """Whether so short steps to the minimum end a stage: the last stage is searched finely, the others coarsely."""
@@ -299,9 +304,11 @@ class IBSS(AbstractEstimator):
         return self.max_sweeps * (1 if self.directions == "whitened" else stage.searched.sum())
 
 
-def _recorded(state: State, view: View, lines: Lines, counts: Flag) -> Float[Array, "record 2 parameters"]:
+def _recorded(
+    state: State, directions: Directions, brackets: Brackets, counts: Flag
+) -> Float[Array, "record 2 parameters"]:
     """The record with the bracket of each parameter in one more sweep; sweeps beyond its length are dropped."""
     length, _, count = state.record.shape
-    widest = jnp.abs(view.basis * ((lines.upper - lines.lower) / 2)[:, None, :]).max(axis=(0, 2))[:count]
+    widest = jnp.abs(directions.basis * ((brackets.highest - brackets.lowest) / 2)[:, None, :]).max(axis=(0, 2))[:count]
     bracket = state.unknowns[0, :count] + jnp.stack([-widest, widest])
     return state.record.at[jnp.where(counts, state.sweeps, length)].set(bracket, mode="drop")

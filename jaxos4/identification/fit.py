@@ -167,7 +167,7 @@ def fit_innovations(
     if has_answer(found):
         factor[free] = _widening(problem, found, free, recording)
     identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
-    if not has_answer(found) or not identifiable.any():
+    if not has_answer(found):
         identifiable[:] = True
     notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~identifiable)} | fixed
     held = {

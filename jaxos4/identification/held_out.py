@@ -66,7 +66,7 @@ def compile_ahead(case: Case) -> None:
 def _disturbances(
     fitted: ShootingProblem, held_out: HeldOut, room: int, parameters: np.ndarray, noise: LogNoise
 ) -> Disturbances:
-    """What acts on the vehicle besides the model, from all measurements."""
+    """The disturbances of the vehicle, from all measurements."""
     whole = _joined(fitted, held_out.problem) if held_out.fitted_vehicle else held_out.problem
     samples = whole.flight.time.shape[0]
     found = disturbances(with_room(whole, max(samples, room)), as_float(parameters), noise)

@@ -1,4 +1,4 @@
-"""What an identification returns: typed results, and the same as JSON."""
+"""The result of an identification: typed, and as JSON."""
 
 import math
 from typing import Any, SupportsFloat
@@ -123,7 +123,7 @@ class RateSkill(msgspec.Struct, frozen=True):
 
 
 class Disturbance(msgspec.Struct, frozen=True):
-    """What acts on a channel besides the model, by filter error.
+    """The disturbance of a channel: all that acts on it besides the model.
 
     - `strength`: standard deviation, in `unit`. `time_constant`: of its correlation [s].
     - `sensor`: standard deviation of the sensor's white noise, in the unit of the channel.

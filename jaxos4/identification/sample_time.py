@@ -15,7 +15,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from ..airframe import Airframe
-from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import REACH
 from ..flight import Flight
 from ..shooting import InnovationsProblem
@@ -112,11 +111,10 @@ def moved(answer: SampleTime, other: SampleTime) -> list[str]:
 def answer_of(case: Case, fit: Fit, finest: Flight) -> SampleTime:
     """The answer of one sample time. `finest`: the flight with the shortest samples.
 
-    Without a thrust there is no scale of torques, and so no answer. Nor if the flight says nothing of any parameter.
+    Without a thrust there is no scale of torques, and so no answer.
     """
     scales = [each.name for each in fit.problem.model.parameters if each.scales_torque]
-    says = is_identifiable(fit.bound, np.asarray(fit.problem.unknowns.half_width), GAUSSIAN_PRIOR)
-    answered = fit.answered and bool(np.any(says)) and not any(name in fit.held for name in scales)
+    answered = fit.answered and not any(name in fit.held for name in scales)
     constants = vehicle_constants(fit).constants if answered else {}
     if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}

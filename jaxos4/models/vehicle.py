@@ -149,7 +149,7 @@ class FlightModel(AbstractModel):
         )
 
     def _driven(self, inputs: Inputs, grid: Grid, part: Part, parameters) -> tuple[Forcing, Array]:
-        """What the rotors do over some samples, and their speeds at the end of the last."""
+        """The forcing by the rotors over some samples, and the rotor speeds at the end of the last."""
         airframe = self.airframe
 
         def omega(rows: Int[Array, " rows"]) -> RotorSpeeds:

@@ -82,7 +82,7 @@ class _Row(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """What the filters know before a measurement: the rates, and the disturbances.
+    """The estimates of the filters before a measurement: rates and disturbances.
 
     That of a specific force is its value at the end of the sample, whose mean is measured.
     """
@@ -92,7 +92,7 @@ class _Known(NamedTuple):
 
 
 class _Feedback(NamedTuple):
-    """What the noise changes in a filter: its gains, and the disturbance over one sample. Each is a channel's."""
+    """The parts of a filter that depend on the noise, by channel: its gains, and the disturbance over one sample."""
 
     rate: tuple[Segments, ...]
     disturbance: tuple[Segments, ...]
@@ -103,7 +103,7 @@ class _Feedback(NamedTuple):
 def _advance(
     move: Move, observe: Observe, known: _Known, forcing: Forcing, scalars: Scalars, feedback: _Feedback, row: _Row
 ) -> tuple[_Known, tuple[Segments, ...]]:
-    """What is known one sample later, and the innovations of this sample."""
+    """The estimates one sample later, and the innovations of this sample."""
     outputs = observe(State(known.rates), forcing, scalars)
     means = zip(feedback.reach, feedback.kept, known.disturbance, strict=True)  # of the disturbance over this sample
     least = np.finfo(known.rates[0].dtype).tiny  # a disturbance that fades within the sample is 0 at its end

@@ -44,7 +44,7 @@ class LogNoise(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """What was measured, in segments.
+    """The measurements, in segments.
 
     - `measured`: body rates, then specific force. NaN: not measured.
     - `restart`: whether a segment forgets what it knew before this sample.
@@ -59,7 +59,7 @@ class Observed(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """What a unit of innovation adds to rate and disturbance, and the variance of the innovation."""
+    """The gains of rate and disturbance for a unit of innovation, and the variance of the innovation."""
 
     rate: Series
     disturbance: Series
@@ -67,7 +67,7 @@ class Gains(NamedTuple):
 
 
 class Covariance(NamedTuple):
-    """Of the rate, of rate and disturbance, and of the disturbance."""
+    """Variance of the rate, covariance of rate and disturbance, variance of the disturbance."""
 
     rate: Channels
     cross: Channels
@@ -104,7 +104,7 @@ def transition(time_constant: Float[Array, "channels *segments"], dt: Float[Arra
 
 
 def step_of(noise: LogNoise, dt: Float[Array, "..."]) -> Step:
-    """What one sample of this length adds, exact for an Ornstein-Uhlenbeck process."""
+    """The step over one sample of this length, exact for an Ornstein-Uhlenbeck process."""
     strength, time_constant, sensor = (leaf.reshape(leaf.shape[0], -1) for leaf in noise)
     variance, tau = jnp.exp(2 * strength), jnp.exp(time_constant)
     share, (kept, reach) = dt / tau, transition(tau, dt)

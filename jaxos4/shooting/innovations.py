@@ -92,12 +92,12 @@ class InnovationsProblem(AbstractProblem):
 
     @property
     def model(self) -> AbstractModel:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Of the shooting problem."""
+        """The model of the shooting problem."""
         return self.problem.model
 
     @property
     def flight(self) -> Flight:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Of the shooting problem."""
+        """The flight of the shooting problem."""
         return self.problem.flight
 
     @property

@@ -89,7 +89,7 @@ def run_here(store: Store) -> Iterator[Step]:
     pool = concurrent.futures.ThreadPoolExecutor(len(free))
 
     def next_cell(device: Any) -> Cell | None:
-        """Of a program that is not compiled yet, else of one that waits for no compiler, else of any."""
+        """The next cell: of a program that is not compiled yet, else of one that waits for no compiler, else of any."""
         ready = [p for p, cells in waiting.items() if cells and study.job(cells[0].scenario) in networks]
         ready = [p for p in ready if compiled.get((p, device), True)]
         started = {program for program, _ in compiled}
