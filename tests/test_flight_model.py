@@ -252,7 +252,7 @@ def test_a_new_term_is_one_object(monkeypatch):
     found = jaxos4.OutputError()(problem)
     np.testing.assert_allclose(found.parameters[-3:], [0.5, 0.3, 0.8], atol=1e-4)
     with pytest.raises(ValueError, match="acts on the forcing"):
-        Term("", (TermParameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda speeds, *other: speeds)
+        Term("", (TermParameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda omega, *other: omega)
 
 
 def test_an_estimate_uses_the_terms_that_the_logs_allow():

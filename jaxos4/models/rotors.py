@@ -5,13 +5,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import RotorSpeeds, Scalar
 from ..flight import Inputs
 
 Speed = Float[Array, "*samples"]
-Commands = Callable[[Int[Array, " rows"]], RotorSpeeds]
+Commands = Callable[[Int[Array, "*rows"]], Float[Array, "*rows 4"]]
 """The commands [rad/s] at the samples with these numbers."""
 
 # The lag that acts is at least this share of a sample, so that a step stays finite wherever a search looks.
@@ -118,18 +119,19 @@ def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:
     count, samples = grid.first.shape[0], delay / grid.dt
     floor = jnp.floor(jax.lax.stop_gradient(samples))
     f = samples - floor
-    weights = (
-        f * (-0.5 + f - f * f / 2),
-        1 + f * f * (1.5 * f - 2.5),
-        f * (0.5 + 2 * f - 1.5 * f * f),
-        f * f * (f - 1) / 2,
+    weights = jnp.stack(
+        [
+            f * (-0.5 + f - f * f / 2),
+            1 + f * f * (1.5 * f - 2.5),
+            f * (0.5 + 2 * f - 1.5 * f * f),
+            f * f * (f - 1) / 2,
+        ]
     )
     shift = jnp.clip(floor, -count, count).astype(int)
 
-    def at(rows: Int[Array, " rows"]) -> RotorSpeeds:
-        first, last = grid.first[rows], grid.last[rows]
-        near = (omega(jnp.clip(rows - shift + ahead, first, last)) for ahead in (1, 0, -1, -2))
-        return sum((weight * value for weight, value in zip(weights, near, strict=True)), jnp.zeros(()))
+    def at(rows: Int[Array, "*rows"]) -> Float[Array, "*rows 4"]:
+        near = rows - shift + np.array([1, 0, -1, -2])[:, None]
+        return jnp.tensordot(weights, omega(jnp.clip(near, grid.first[rows], grid.last[rows])), 1)
 
     return at
 

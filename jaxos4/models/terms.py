@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Scalar
+from .._custom_types import RotorSpeeds, Scalar
 from ..airframe import GRAVITY, Airframe
 from ..excitation import AXES
 from .abstract import Contradiction
@@ -83,7 +83,8 @@ class Term:
     with the term. The contributions act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s], a function of the numbers of the samples.
-    - `speed(speeds, values, part, airframe)`: the rotor speeds that follow from the commands, over some samples.
+    - `speed(omega, values, part, airframe)`: the rotor speeds that follow the commands over some samples. Only one term
+      may have it.
     - `angular_acceleration(total, values, rates, forcing)`: p', q', r' [rad/s^2].
     - `specific_force(force, values, forcing)`: along the body's axes [m/s^2].
     - `gyro(rates, values)`: the measured body rates [rad/s].
@@ -99,7 +100,7 @@ class Term:
     by_default: Callable[[frozenset[str]], bool] = lambda available: True
     force_axes: tuple[int, ...] = ()
     command: Callable[[Commands, Values, Grid], Commands] | None = None
-    speed: Callable[[Speeds, Values, Part, Airframe], Speeds] | None = None
+    speed: Callable[[RotorSpeeds, Values, Part, Airframe], Speeds] | None = None
     angular_acceleration: Callable[[Rates, Values, Rates, Forcing], Rates] | None = None
     specific_force: Callable[[Vector, Values, Forcing], Vector] | None = None
     gyro: Callable[[Rates, Values], Rates] | None = None
@@ -191,15 +192,15 @@ def _scaled(
 
     def command(omega: Commands, values: Values, grid: Grid) -> Commands:
         shares = share(values, grid)
-        return lambda rows: omega(rows) * shares[rows][:, None]
+        return lambda rows: omega(rows) * shares[rows][..., None]
 
     return command
 
 
-def _drive(speeds: Speeds, values: Values, part: Part, airframe: Airframe) -> Speeds:
+def _drive(omega: RotorSpeeds, values: Values, part: Part, airframe: Airframe) -> Speeds:
     full = jnp.asarray(airframe.max_rotor_speed)
     motor = Motor(values["rotor_lag"], values["thrust_curve"], values["motor_braking"], full)
-    return driven(speeds.begin, motor, part)
+    return driven(omega, motor, part)
 
 
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
@@ -278,7 +279,7 @@ TERMS: dict[str, Term] = {
         "rotors follow their commands as first-order systems: rotor_lag [s]; if no load can be found",
         (_LAG,),
         by_default=lambda available: COMMANDS in available and not {FULL_SCALE, VERTICAL_FORCE} <= available,
-        speed=lambda speeds, values, part, airframe: driven(speeds.begin, Motor(values["rotor_lag"]), part),
+        speed=lambda omega, values, part, airframe: driven(omega, Motor(values["rotor_lag"]), part),
     ),
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from .._custom_types import Count, Parameters, RotorSpeeds, Scalar, as_float
+from .._custom_types import Count, Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
 from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
@@ -152,14 +152,13 @@ class FlightModel(AbstractModel):
         """The forcing by the rotors over some samples, and the rotor speeds at the end of the last."""
         airframe = self.airframe
 
-        def omega(rows: Int[Array, " rows"]) -> RotorSpeeds:
+        def omega(rows: Int[Array, "*rows"]) -> Float[Array, "*rows 4"]:
             return inputs.omega[rows]
 
         for change, values in self._contributions("command", parameters):
             omega = change(omega, values, grid)
-        speeds = measured_speeds(omega, part)
-        for change, values in self._contributions("speed", parameters):
-            speeds = change(speeds, values, part, airframe)
+        drive, values = next(iter(self._contributions("speed", parameters)), (None, {}))
+        speeds = drive(omega(part.rows), values, part, airframe) if drive else measured_speeds(omega, part)
         squares = squared(speeds, part)
         roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
@@ -178,20 +177,16 @@ class FlightModel(AbstractModel):
         """`_driven` of the samples that count, block by block, so that padding takes no time."""
         samples = inputs.omega.shape[0]
 
-        def of_block(i: Count | int, before: Array) -> tuple[Forcing, Array]:
-            rows = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1)
-            return self._driven(inputs, grid, grid.part(rows, before), parameters)
-
         def fill(i: Count, carry: tuple[Forcing, Array]) -> tuple[Forcing, Array]:
             filled, before = carry
-            found, before = of_block(i, before)
+            rows = jnp.minimum(i * _BLOCK + jnp.arange(_BLOCK), samples - 1)
+            found, before = self._driven(inputs, grid, grid.part(rows, before), parameters)
             place = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=i * _BLOCK, axis=0)
             return jax.tree.map(place, filled, found), before
 
         before = jnp.zeros(inputs.omega.shape[1], inputs.omega.dtype)
-        shapes, _ = jax.eval_shape(of_block, 0, before)
-        room = -(-samples // _BLOCK) * _BLOCK
-        nothing = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape[1:]), leaf.dtype), shapes)
+        zeros = jnp.zeros(-(-samples // _BLOCK) * _BLOCK, before.dtype)
+        nothing = Forcing(zeros, zeros, zeros, zeros, zeros, zeros, zeros)
         filled, _ = jax.lax.fori_loop(0, -(-length // _BLOCK), fill, (nothing, before))
         return jax.tree.map(lambda leaf: leaf[:samples], filled)
 

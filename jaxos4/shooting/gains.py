@@ -176,7 +176,8 @@ def basis(noise: LogNoise) -> LogNoise:
     return LogNoise(*np.eye(3).reshape(3, 3, *(1 for _ in shape)) * np.ones(shape))
 
 
-def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_constant: float) -> LogNoise:
+@jax.jit  # traced once, although many ask for it
+def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_constant: Scalar) -> LogNoise:
     """Rough noise levels from differences of the measurements. `time_constant`: of all disturbances [s]."""
 
     def power(values: Float[Array, "rows channels"]) -> Float[Array, " channels"]:
@@ -192,4 +193,4 @@ def first_noise(measured: Float[Array, "samples channels"], dt: Scalar, time_con
     mean = jnp.nansum(measured, axis=0) / jnp.maximum((~jnp.isnan(measured)).sum(axis=0), 1)
     spread = jnp.sqrt(power(measured - mean)) / 2
     strength = jnp.where(is_rate(measured.shape[1]), change, spread)
-    return LogNoise(logarithm(strength), jnp.full(strength.shape, np.log(time_constant)), logarithm(sensor))
+    return LogNoise(logarithm(strength), jnp.full(strength.shape, jnp.log(time_constant)), logarithm(sensor))

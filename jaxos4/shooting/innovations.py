@@ -28,7 +28,7 @@ from .abstract import AbstractProblem, Stages, Unknowns, Values, WindowUnknowns
 from .filters import Innovations, innovate
 from .gains import LogNoise, Observed, first_noise, is_rate
 from .problem import ShootingProblem
-from .scans import Curvature, Parts, Rows, Shot, windowed
+from .scans import Curvature, Parts, Shot, windowed
 from .segments import Segments, observe_in_segments
 
 # The number of samples in a segment, and of those that settle its filter.
@@ -263,11 +263,17 @@ class InnovationsProblem(AbstractProblem):
         """The forcing of all segments and its tangents, as functions of the parameters; segments are the last axis."""
         problem, inputs = self.problem, self.flight.inputs._replace(length=self.problem.length)
         samples = jnp.minimum(jnp.asarray(self.cut.place), self.flight.time.shape[0] - 1)
-        rows = Rows(windowed(self.model.forcing(inputs, self.model.alpha), samples), ())
+
+        def segments_last(forcing: Forcing) -> Forcing:
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), forcing)
+
+        if not self.model.forcing_parameters:
+            known = segments_last(windowed(self.model.forcing(inputs, self.model.alpha), samples))
+            return lambda parameters: (known, None)
 
         def forced(parameters: Parameters) -> tuple[Forcing, Forcing | None]:
-            found = problem.with_forcing(rows, parameters, inputs=inputs, index=samples)
-            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (found.forcing, found.forcing_tangents))
+            forcing, tangents = problem.forcing_and_tangents(parameters, inputs, samples)
+            return segments_last(forcing), segments_last(tangents)
 
         return forced
 

@@ -169,36 +169,30 @@ class ShootingProblem(AbstractProblem):
         """The forcing of the whole flight, one row for each sample."""
         return self.model.forcing(self.flight.inputs, parameters)
 
-    def with_forcing(
-        self,
-        rows: Rows,
-        parameters: Parameters,
-        *,
-        inputs: Inputs | None = None,
-        index: Int[Numeric, "windows length"] | None = None,
-    ) -> Rows:
+    def with_forcing(self, rows: Rows, parameters: Parameters, *, inputs: Inputs | None = None) -> Rows:
         """Recompute the forcing for these parameters, with its derivatives.
 
         Does nothing if the forcing depends on no parameter. `inputs`: `flight.inputs`, prepared outside of a loop.
-        `index`: the samples of each window, by default those of `cut`.
         """
-        positions = np.asarray(self.model.forcing_parameters, dtype=int)
-        if not positions.size:
+        if not self.model.forcing_parameters:
             return rows
         inputs = self.flight.inputs if inputs is None else inputs
-        index = self.cut()[0] if index is None else index
+        forcing, tangents = self.forcing_and_tangents(parameters, inputs, self.cut()[0])
+        return rows._replace(forcing=forcing, forcing_tangents=tangents)
 
-        def forcing(values: Float[Array, " positions"]) -> Forcing:
-            new = self.model.forcing(inputs, parameters.at[positions].set(values))
-            return windowed(new._replace(recording=(), velocity=None), index)
+    def forcing_and_tangents(
+        self, parameters: Parameters, inputs: Inputs, index: Int[Numeric, "windows length"]
+    ) -> tuple[Forcing, Forcing]:
+        """The forcing of each window, and its derivatives. `index`: the samples of each window."""
+        positions = np.asarray(self.model.forcing_parameters, dtype=int)
 
-        def completed(forcing: Forcing, source: Forcing) -> Forcing:
-            # No parameter changes these fields: they are copied instead of computed again.
-            return forcing._replace(recording=source.recording, velocity=source.velocity)
+        def forcing(values: Float[Array, " positions"]) -> tuple[Forcing, Forcing]:
+            new = windowed(self.model.forcing(inputs, parameters.at[positions].set(values)), index)
+            return new._replace(recording=(), velocity=None), new  # no parameter changes these fields
 
-        slopes, new = jax.jacfwd(lambda x: (forcing(x),) * 2, has_aux=True)(parameters[positions])
-        zeros = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), rows.forcing)
-        return rows._replace(forcing=completed(new, rows.forcing), forcing_tangents=completed(slopes, zeros))
+        slopes, new = jax.jacfwd(forcing, has_aux=True)(parameters[positions])
+        zeros: Forcing = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, positions.size), leaf.dtype), new)
+        return new, slopes._replace(recording=zeros.recording, velocity=zeros.velocity)
 
     def split(self, initial_state: InitialStates) -> Float[Array, "windows size"]:
         """The initial state of each window."""
