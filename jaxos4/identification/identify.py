@@ -107,6 +107,8 @@ def describe(
     """Everything about an answer, in the fields that pages and files show."""
     result, free = str(result_names(fit.estimate.result)), fit.free
     covariance, sigma = np.asarray(fit.estimate.covariance)[np.ix_(free, free)], np.asarray(fit.problem.sigma)
+    judged = verdict._asdict()
+    notes = [*case.provenance.notes, *judged.pop("notes")]
     return Identification(
         estimator=case.name,
         model=case.model,
@@ -114,24 +116,18 @@ def describe(
         rollouts=fit.rollouts,
         cost=finite_or_none(fit.estimate.cost),
         seconds=seconds,
-        parameters=verdict.parameters,
-        rigid_body=verdict.rigid_body,
-        provenance=msgspec.structs.replace(case.provenance, notes=[*case.provenance.notes, *verdict.notes]),
+        provenance=msgspec.structs.replace(case.provenance, notes=notes),
         covariance=covariance.tolist() if np.isfinite(covariance).all() else None,
         estimate=fit.estimate,
         problem=fit.problem,
         is_vehicle=case.is_vehicle,
         fit={} if fit.diagnostics is None else channel_fits(fit.problem, fit.diagnostics),
-        validation=verdict.validation,
         held=fit.held,
         noise={CHANNEL_NAMES[i]: float(sigma[i]) for i in fit.problem.columns},
-        doubts=verdict.doubts,
         disturbances=fit.disturbances,
         widened=fit.widened,
         sample_times=sample_times if len(sample_times) > 1 else (),
-        skill=verdict.skill,
-        predictions=verdict.predictions,
-        response=verdict.response,
+        **judged,
     )
 
 
