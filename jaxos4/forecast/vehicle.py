@@ -13,7 +13,7 @@ from jaxtyping import Float
 from .._custom_types import Parameters
 from .._xla import quick_jit
 from ..airframe import airframe_from_table
-from ..errors import InputError
+from ..errors import InputError, named
 from ..export.result import ResultFile, checked, read_file
 from ..flight import FORCE_NAMES
 from ..identification import Identification
@@ -61,10 +61,8 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     """
     if not isinstance(found, Identification):
         file = read_file(found)
-        try:
+        with named(found):
             return _vehicle(file, Path(found).name)
-        except InputError as error:
-            raise InputError(f"{found}: {error}") from None
     return _vehicle(checked(msgspec.convert(found.to_dict(), ResultFile)), f"{found.estimator}, {found.model} model")
 
 
