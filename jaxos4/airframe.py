@@ -107,16 +107,7 @@ def alpha_from_inertia(inertia: Float[ArrayLike, "3"], gyroscopic: Float[ArrayLi
 
 def alpha_scalars(ix: Scalar, iy: Scalar, iz: Scalar, gyroscopic: Scalar) -> tuple[Scalar, ...]:
     """`alpha_from_inertia` with scalars in and out, for use inside a scan."""
-    return (
-        (iy - iz) / ix,
-        gyroscopic / ix,
-        1 / ix,
-        (iz - ix) / iy,
-        gyroscopic / iy,
-        1 / iy,
-        (ix - iy) / iz,
-        1 / iz,
-    )
+    return ((iy - iz) / ix, gyroscopic / ix, 1 / ix, (iz - ix) / iy, gyroscopic / iy, 1 / iy, (ix - iy) / iz, 1 / iz)
 
 
 def load_airframe(source: str | PathLike[str]) -> Airframe:

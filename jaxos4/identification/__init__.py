@@ -2,8 +2,4 @@
 
 from .identify import assess as assess, identify as identify
 from .results import FlightInformation as FlightInformation, Identification as Identification
-from .settings import (
-    FlightSettings as FlightSettings,
-    VehicleSettings as VehicleSettings,
-    settings_for as settings_for,
-)
+from .settings import FlightSettings as FlightSettings, VehicleSettings as VehicleSettings, settings_for as settings_for

@@ -19,16 +19,7 @@ from .answers import AXES, overwhelmed, parameter_table, rigid_body
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
-from .results import (
-    Constant,
-    Disturbance,
-    Doubt,
-    ParameterEstimate,
-    PredictionSkill,
-    RigidBody,
-    SampleTime,
-    Validation,
-)
+from .results import Constant, Disturbance, Doubt, ParameterEstimate, PredictionSkill, RigidBody, SampleTime, Validation
 from .sample_time import NOISY, moved, noise_of_speeds
 
 # Doubts need this many standard deviations.

@@ -293,10 +293,7 @@ def _is_sound(state: State) -> Bool[Array, " *lanes"]:
 
 
 def _errors(
-    row: Rows,
-    predicted: tuple[Lanes, ...],
-    weights: tuple[Lanes, ...],
-    sound: Bool[Array, "*#lanes"],
+    row: Rows, predicted: tuple[Lanes, ...], weights: tuple[Lanes, ...], sound: Bool[Array, "*#lanes"]
 ) -> list[Lanes]:
     return [
         jnp.where(jnp.isnan(y) | ~sound, 0.0, w * (y - x))
