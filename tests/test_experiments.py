@@ -120,10 +120,10 @@ def test_noise_study(study):
 
 def test_noise_kinds(study):
     covered = metrics.mean_coverage(study("noise_kinds")).sel(level=0.95)
-    assert float(covered["low"].sel(noise="white")) < 0.95 < float(covered["high"].sel(noise="white"))
-    assert (covered["coverage"].sel(noise=["coloured", "biased"]) < covered["low"].sel(noise="white")).all()
+    low, high = covered["low"].sel(noise="white"), covered["high"]
     # Without 10 % of the samples the errors are about 5 % larger, and the intervals too.
-    assert float(covered["high"].sel(noise="lossy")) > 0.95
+    assert float(low) < 0.95 < min(float(high.sel(noise=noise)) for noise in ("white", "lossy"))
+    assert (covered["coverage"].sel(noise=["coloured", "biased"]) < low).all()
 
 
 def test_scale(study):
@@ -137,24 +137,23 @@ def test_scale(study):
 def test_frontier(run):
     frontier = shared.load_results(run("frontier"))["frontier"].squeeze()
     # The published gyroscopic terms are far below any sensor's noise, the corrected ones are not.
-    gyroscopic = frontier.sel(parameter="alpha2", excitation="multisine")
-    assert float(gyroscopic.sel(model="published")) < 1e-4 < 1 < float(gyroscopic.sel(model="corrected"))
+    published, corrected = (
+        float(frontier.sel(parameter="alpha2", excitation="multisine", model=name)) for name in frontier["model"].values
+    )
+    assert published < 1e-4 < 1 < corrected
     # A doublet moves one axis at a time, so products of rates are not excited. alpha7 is 0.
     assert frontier.sel(excitation="doublet", parameter="alpha1").isnull().all()
     assert (frontier.sel(parameter="alpha7") == 0).all()
 
 
 def test_rollout_budget(run):
-    data = shared.load_results(
-        run("rollout_budget", limits=[1, 10], names=["IBSS, whitened", "output error"])
-    ).squeeze()
+    limits = {"limits": [1, 10], "names": ["IBSS, whitened", "output error"]}
+    data = shared.load_results(run("rollout_budget", **limits)).squeeze()
     reached, (few, enough) = load("rollout_budget", "plot").accuracy(data), data["rollouts"].mean("flight").T
-    assert (enough >= few).all()
     # One sweep, or one step, of each stage is nearly as good as the complete search: the rates are nearly linear.
     assert (reached.isel(limit=0) < 1.2).all()
     assert (few < 0.7 * enough).all()
-    # Both minimise the same cost.
-    np.testing.assert_allclose(reached.isel(limit=1), 1, atol=0.2)
+    assert near(reached.isel(limit=1), 1, 0.2)  # both minimise the same cost
 
 
 def test_published_corrected(run):
@@ -163,17 +162,15 @@ def test_published_corrected(run):
     # Each model is at the bound on its own flights, and the residuals are noise.
     for which in ({"flown": model, "fitted": model} for model in ("published", "corrected")):
         assert data["answered"].sel(which).all()
-        np.testing.assert_allclose(rms.sel(which), 1, atol=0.6)
+        assert near(rms.sel(which), 1, 0.6)
         assert float(rejected.sel(which)) < 0.2
     # The published model lacks a term of the corrected one, and its residuals show it.
     alien = {"flown": "corrected", "fitted": "published"}
-    assert float(rms.sel(alien).min()) > 2
-    assert float(rejected.sel(alien)) == 1
+    assert (float(rms.sel(alien).min()) > 2, float(rejected.sel(alien))) == (True, 1)
     # With alpha2 = alpha5 = 0 the corrected model equals the published one: only these two estimates are wrong.
-    alien = {"flown": "published", "fitted": "corrected"}
+    alien, wrong = {"flown": "published", "fitted": "corrected"}, ["alpha2", "alpha5"]
     assert float(rejected.sel(alien)) < 0.2
-    assert (rms.sel(alien).sel(parameter=["alpha2", "alpha5"]) > 10).all()
-    assert (rms.sel(alien).drop_sel(parameter=["alpha2", "alpha5"]) < 2).all()
+    assert rms.sel(alien).sel(parameter=wrong).min() > 10 > 2 > rms.sel(alien).drop_sel(parameter=wrong).max()
 
 
 def test_inverse_crime(run):
@@ -186,12 +183,12 @@ def test_inverse_crime(run):
 def test_bracket_and_seeds(run):
     data = read_results(run("bracket_and_seeds", seeds=[0]) / "seed 0").squeeze()
     rollouts, accuracy = metrics.mean_rollouts(data), metrics.accuracy(data)
-    assert float(rollouts.sel(estimator="ibss", width=2.0)) > float(rollouts.sel(estimator="ibss", width=0.5))
-    assert (rollouts.sel(estimator="hybrid") < rollouts.sel(estimator="ibss")).all()
-    np.testing.assert_allclose(accuracy.sel(estimator="hybrid"), accuracy.sel(estimator="ibss"), rtol=0.05)
+    ibss, hybrid, network = ({"estimator": name} for name in ("ibss", "hybrid", "network"))
+    assert float(rollouts.sel(ibss | {"width": 2.0})) > float(rollouts.sel(ibss | {"width": 0.5}))
+    assert (rollouts.sel(hybrid) < rollouts.sel(ibss)).all()
+    np.testing.assert_allclose(accuracy.sel(hybrid), accuracy.sel(ibss), rtol=0.05)
     # The rates are nearly linear in the parameters: the network loses little, and less in a narrower bracket.
-    network = accuracy.sel(estimator="network")
-    assert float(network.sel(width=0.5)) < min(1.5, float(network.sel(width=2.0)))
+    assert float(accuracy.sel(network | {"width": 0.5})) < min(1.5, float(accuracy.sel(network | {"width": 2.0})))
 
 
 # Experiments that are scripts.
@@ -216,9 +213,9 @@ def test_speed(report_of):
 
 def test_networks(report_of):
     cases = {"cases": ["standard"], "networks": ["score, mlp"], "noises": [1.0], "channels": "rates", "separate": False}
-    report = report_of("networks", flights=100, seed=7, steps=100, many=100, **cases)
+    report = report_of("networks", flights=64, seed=7, steps=100, many=64, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
-    assert report["one_call"]["flights"] == 100
+    assert report["one_call"]["flights"] == 64
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
     # Each of eight parameters within five Monte-Carlo errors of the bound.
     assert all(near(rows[n]["efficiency"], 1, 5 * rows[n]["monte_carlo_error"]) for n in ("hybrid", "ibss"))
@@ -228,9 +225,9 @@ def test_networks(report_of):
 
 def test_baselines(report_of):
     cases = {"estimators": ["equation-error", "output-error"], "noises": ["white"], "scales": [0.0, 1.0]}
-    rows = report_of("baselines", flights=100, seed=5, channels="rates", **cases)["rows"]
+    rows = report_of("baselines", flights=48, seed=5, channels="rates", **cases)["rows"]
     exact, noisy = rows[:2], rows[2:]
-    assert all(row["answers"] == 100 for row in rows)
+    assert all(row["answers"] == 48 for row in rows)
     assert all(max(row["efficiency"]) < 1e-6 for row in exact)
     # Known start: integrated equation error loses most in alpha2, 1.6 times the bound.
     assert max(noisy[1]["efficiency"]) < 1 + 5 * noisy[1]["monte_carlo_error"]
@@ -239,12 +236,12 @@ def test_baselines(report_of):
 
 def test_coverage(report_of):
     cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
-    rows = report_of("coverage", flights=100, seed=11, scales=[1.0], steps=100, **cases)["rows"]
+    rows = report_of("coverage", flights=64, seed=11, scales=[1.0], steps=100, **cases)["rows"]
     assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
-        assert row["results"] == {"successful": 100}
+        assert row["results"] == {"successful": 64}
         assert near(row["std"], 1, 0.05)  # the intervals are not too wide
-        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 100))
+        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 64))
 
 
 def test_dirty_flights(report_of, plot):
@@ -262,14 +259,12 @@ def test_dirty_flights(report_of, plot):
 
 
 def test_long_flight(report_of):
-    """Windows follow a drift that one shot cannot."""
+    """Windows follow a drift that one shot cannot. One shot ends at the bounds, and its result says so."""
     cases = {"duration": 20.0, "drifts": [1e-3], "windows": [1, 20], "estimators": ["ibss"]}
     one, many = report_of("long_flight", flights=2, seed=3, steps=100, **cases)["rows"]
-    assert many["results"] == {"successful": 2}
+    assert (one["results"], many["results"]) == ({"at_bound": 2}, {"successful": 2})
     assert max(many["percent"]) < 5
     assert max(many["percent"][place] for place in (1, 3, 4)) < 2  # the gains of the torques
-    # One shot ends at the bounds, and its result says so.
-    assert one["results"] == {"at_bound": 2}
 
 
 def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interval():
@@ -291,6 +286,5 @@ def test_public_flights(report_of, shared_flights):
     assert report["pairs"]["not refused"]["pairs"] == 0
     found = report["flights"]["B8_star_fast_rep2"]["quantities"]
     assert all(found[name]["sum"]["error"] < 0.7 * found[name]["sum"]["constant"] for name in ("position", "velocity"))
-    for rate in "pq":
-        assert found[rate]["error"][9] < found[rate]["constant"][9]
-        assert len(found[rate]["network"]) == 50
+    assert all(found[rate]["error"][9] < found[rate]["constant"][9] for rate in "pq")
+    assert all(len(found[rate]["network"]) == 50 for rate in "pq")

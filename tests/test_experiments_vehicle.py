@@ -9,8 +9,9 @@ import jaxos4
 
 
 def test_real_flight(shared_flights, report_of, plot):  # noqa: F811
-    cases = {"names": ["rollpitch"], "estimators": ["filter-error"], "end": 12.0}
-    report = report_of("real_flight", flights=shared_flights, **cases)
+    report = report_of(
+        "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
+    )
     plot("real_flight")
     (row,) = report["estimators"]["filter-error"]["flights"].values()
     assert all(0.8e-5 < row["constants"][name]["estimate"] < 2.2e-5 for name in ("Ix", "Iy"))
@@ -47,8 +48,7 @@ def test_closed_loop(report_of, plot, monkeypatch):  # noqa: F811
     assert [len(case["flights"]) for case in report["cases"]] == [3, 3]
     # A controller that answers gusts makes both biased by tens of percent, and their intervals do not know it.
     for row in (row for case in report["cases"] for row in case["summary"].values()):
-        assert row["bias"] > 0.2
-        assert row["covered"] == 0
+        assert (row["bias"] > 0.2, row["covered"]) == (True, 0)
     # An interrupted study is continued: the flights that are there are not identified again.
     assert report_of("closed_loop", **cases) == report
     with pytest.raises(SystemExit, match="other settings"):
@@ -57,23 +57,11 @@ def test_closed_loop(report_of, plot, monkeypatch):  # noqa: F811
 
 def test_effects(report_of, plot):  # noqa: F811
     """The effects of real flights are flown, identified and drawn."""
-    report = report_of("closed_loop", "effects", flights=1, duration=10.0, effects=["gusts", "clock"])
+    report = report_of("closed_loop", "effects", flights=1, duration=10.0, effects=["clock"])
     plot("closed_loop", "plot_effects")
     for case in report["cases"]:
         assert [row["result"] for row in case["flights"]] == ["successful"]
         assert abs(case["summary"]["thrust"]["mean"]) < 0.05
-
-
-def test_all_effects_are_drawn_at_random():
-    effects = load("closed_loop", "effects")
-    first, same, other = (effects.effect_of(effects.ALL, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    assert first == same != other
-    every = [effect._asdict() for effect in effects.EFFECTS.values()]
-    for part in ("air", "sensors", "loop"):
-        sizes = {name: size for effect in every for name, size in effect[part].items()}
-        drawn = getattr(first, part)
-        assert drawn.keys() == sizes.keys()
-        assert all(value is None or abs(value) <= max(sizes[name], 0.02) for name, value in drawn.items())
 
 
 def test_rotorpy(report_of, tmp_path):  # noqa: F811

@@ -235,16 +235,13 @@ def test_the_text_of_a_vehicle(tmp_path):
     assert "late" not in printed(identified_vehicle(parameters=small))
 
 
-def test_a_figure_with_an_image_has_the_same_bytes_again():
+def test_small_numbers_keep_their_digits_and_a_figure_its_bytes():
+    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: MISSING}
+    assert {x: plain(x) for x in known | {1.234e300: ""}} == known | {1.234e300: "1.23e300"}
     with drawing():
         figure = Figure()
         figure.add_subplot().imshow(np.arange(16.0).reshape(4, 4))
         assert [svg(figure), pdf(figure)] == [svg(figure), pdf(figure)]
-
-
-def test_small_numbers_keep_their_digits():
-    known = {1.2e-5: "1.20e-5", 0.99999: "1.00", 123456.0: "123000", 0.0: "0", -3.14159: "-3.14", math.nan: MISSING}
-    assert {x: plain(x) for x in known | {1.234e300: ""}} == known | {1.234e300: "1.23e300"}
 
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: f"{x:.5g}")
@@ -259,7 +256,7 @@ def listed(listing, width):
 
 
 @given(rows=st.lists(st.tuples(NUMBERS, NUMBERS, NOTES), min_size=1, max_size=4), width=st.integers(20, 120))
-def test_no_cell_is_cut(rows, width):
+def test_no_cell_is_cut_and_a_wide_table_stays_as_wide_as_the_terminal_if_it_fits(rows, width):
     names = [f"thrust_gain_{i}" for i in range(len(rows))]
     cells = [(name, low, f"[{low}, {high}]") for name, (low, high, _) in zip(names, rows, strict=True)]
     notes = [note for *_, note in rows]
@@ -267,9 +264,6 @@ def test_no_cell_is_cut(rows, width):
     assert "…" not in text
     assert all(cell in text for row in cells for cell in row)
     assert all(word in text for note in notes for word in note.split())
-
-
-def test_a_wide_table_stays_as_wide_as_the_terminal_if_it_fits():
     use = "rotor 1, 2, 3, 4 at rest or idle, for a long time, in the air"
     lines = listed(Listing(("name", "use"), [("a", use)], wraps=("use",)), 40).splitlines()
     assert max(map(len, lines)) <= 40

@@ -122,17 +122,6 @@ def bound_of(model_class, channels="all"):
     return jaxos4.cramer_rao_bound(standard_problem(model_class, channels), model_class(jaxos4.OS4).alpha)
 
 
-@pytest.mark.parametrize(
-    ("model_class", "airframe"), [(jaxos4.PublishedOS4, jaxos4.OS4_SIMULATOR), (jaxos4.CorrectedOS4, jaxos4.VOOS)]
-)
-def test_exact_alphas_give_exact_constants(model_class, airframe):
-    model = model_class(airframe)
-    fit = jaxos4.fit_inertia(model, model.alpha, bound_of(model_class))
-    np.testing.assert_allclose(fit.constants[:3], airframe.inertia, rtol=1e-9)
-    assert np.all(np.abs(fit.constants - constants(airframe)) < 1e-6 * fit.std)
-    assert (fit.mismatch < 1e-9, fit.is_rigid_body) == (True, True)
-
-
 @pytest.mark.parametrize("model_class", MODELS)
 def test_it_is_the_weighted_least_squares_that_another_minimiser_finds(model_class):
     model, covariance = model_class(jaxos4.OS4), np.asarray(bound_of(model_class))

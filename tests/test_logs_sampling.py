@@ -9,12 +9,7 @@ from test_logs_ulog import grid
 
 from jaxos4.flight import STATE_NAMES
 from jaxos4.logs import Table
-from jaxos4.logs.sampling import (
-    Series,
-    gyro_rows,
-    resample,
-    root_mean_square,
-)
+from jaxos4.logs.sampling import Series, gyro_rows, resample, root_mean_square
 
 # Uneven times
 

@@ -6,20 +6,7 @@ import struct
 import numpy as np
 import pytest
 from helpers import CRAZYFLIE
-from recorded_logs import (
-    FRD,
-    RPM,
-    attitude,
-    check,
-    force,
-    message,
-    outcome,
-    position,
-    rates,
-    speeds,
-    ulog,
-    velocity,
-)
+from recorded_logs import FRD, RPM, attitude, check, force, message, outcome, position, rates, speeds, ulog, velocity
 from scipy.spatial.transform import Rotation
 
 from jaxos4.errors import InputError

@@ -89,7 +89,6 @@ MISUSE = [
     ("omega", lambda: simulate(omega=np.ones((1, 5, 4)))),
     ("initial_state", lambda: simulate(initial_state=np.zeros(6))),
     ("dt", lambda: simulate(dt=0.0)),
-    ("dt", lambda: simulate(dt=float("nan"))),
     ("dt", lambda: simulate(dt=np.ones(2))),
     ("`method` must be one of euler, rk4, diffrax, got 'heun'", lambda: simulate(method="heun")),
     ("`time`, `omega` and `states`", lambda: flat_flight(3, rows=4)),
@@ -100,7 +99,6 @@ MISUSE = [
     ),
     ("`flights` must hold at least `length` = 40 samples", lambda: jaxos4.join([], length=40)),
     # Noise.
-    ("`sigma`", lambda: WhiteNoise(np.ones(3))),
     ("`sigma`", lambda: WhiteNoise(-0.1)),
     ("`sigma`", lambda: WhiteNoise(np.nan)),
     ("`mean`", lambda: ConstantBias(1.0, mean=np.ones((2, 12)))),
@@ -115,7 +113,6 @@ MISUSE = [
     ("`length` must be `None`", lambda: shoot(windows=5, length=jnp.asarray(7))),
     ("`values`: wind is no unknown; the unknowns are alpha1, ", lambda: hold(alpha1=0.0, wind=1.0)),
     ("`values` holds every unknown", lambda: hold(**dict.fromkeys(MODEL.parameter_names, 0.0))),
-    ("`lags` must lie in 1 to 500", lambda: diagnose(lags=0)),
     ("`lags` must lie in 1 to 500", lambda: diagnose(lags=501)),
     (r"`initial_state` must be of shape \(6,\)", lambda: diagnose(windows=2)),
     (r"`parameters` must be of shape \(8,\)", lambda: diagnose(parameters=MODEL.alpha[:7])),
@@ -126,7 +123,6 @@ MISUSE = [
     ("leave out lag", lambda: vehicle(terms=("motor", "lag"))),
     ("`battery_voltage` must be given for the term voltage", lambda: vehicle(terms=("voltage",))),
     ("`terms` must be some of offset, center_of_mass, damping", lambda: vehicle(terms=("wind",))),
-    ("`terms` must be some of", lambda: vehicle(terms=("lag", "lag"))),
     ("`terms` must be some of", lambda: vehicle(terms=("lag", "Lag"))),
     *(("`recordings` must count from 0", lambda r=r: vehicle(recordings=r)) for r in ((), (1,), (0, 2), (-1, 0))),
     ("velocity, inflow need `Flight.body_vel", lambda: vehicle(terms=("velocity",))),
@@ -140,7 +136,6 @@ MISUSE = [
     *(("`bracket` must hold 8 parameters, got 7", lambda n=n: estimate(n, SEVEN)) for n in NAMES),
     *(("`problem.windows` must be 1", lambda n=n: estimate(n, windows=2)) for n in ("rls", "svsf", "kalman")),
     ("linear in its parameters|no rotor lag", lambda: estimate("equation-error", None, LAGGING)),
-    ("linear in its parameters|no rotor lag", lambda: estimate("rls", None, LAGGING)),
     *(("`network` must be a trained network", lambda n=n: make_estimator(n)) for n in ("network", "hybrid")),
     ("`name` must be one of ibss, .*, got 'newton'", lambda: make_estimator("newton")),
     (r"`start` must hold 8 unknowns, got shape \(7,\)", lambda: jaxos4.IBSS()(shoot(), BRACKET, start=jnp.zeros(7))),
@@ -164,7 +159,6 @@ MISUSE = [
     ("`sag`", lambda: loop(sag=2.0)),
     ("`log_every`", lambda: loop(log_every=0)),
     ("`references`", lambda: fly(samples=1)),
-    ("`dt`", lambda: fly(dt=0.0)),
     ("`substeps`", lambda: fly(substeps=0)),
     ("`substeps`.*multiple of `log_every` = 3, got 4", lambda: fly(every=3)),
     ("`duration`", lambda: references(duration=0.0)),
@@ -210,15 +204,12 @@ def test_arguments_of_excitations_out_of_range_are_named(excitations, name, valu
 SETTINGS = [
     (jaxos4.IBSS, "directions", ["steepest"], "must be one of whitened, coordinate"),
     (jaxos4.IBSS, "halvings", [1], "must be an integer of at least 2"),
-    (jaxos4.IBSS, "max_sweeps", [0], "must be an integer of at least 1"),
     (jaxos4.IBSS, "tolerance", [0.0, np.nan], "must be positive"),
     (jaxos4.IBSS, "reach", [-1.0], "must be positive"),
     (jaxos4.OutputError, "tolerance", [0.0, -1.0], "must be positive"),
     (jaxos4.OutputError, "max_steps", [0, 2.5, "x", True, None], "must be an integer of at least 1"),
     (jaxos4.IBSS, "max_sweeps", [2**70], "must be at most 2147483647"),
-    (jaxos4.AntColony, "max_sweeps", [0], "must be an integer of at least 1"),
     (jaxos4.FilterError, "tolerance", [0.0, np.nan], "must be positive"),
-    (jaxos4.FilterError, "max_steps", [0], "must be an integer of at least 1"),
     (jaxos4.EquationError, "memory", [-0.1, 1.5, np.nan], "must be finite and at least 0 and at most 1"),
     (jaxos4.EquationError, "bridge", [-1], "must be an integer of at least 0"),
     (jaxos4.RecursiveLeastSquares, "forgetting", [0.0, 1.1], "must be positive and finite and at most 1"),
@@ -228,7 +219,6 @@ SETTINGS = [
     (jaxos4.SVSF, "parameter_layer", [-1.0], "must be positive and finite"),
     (jaxos4.SVSF, "damping", [np.inf], "must be positive and finite"),
     (jaxos4.SVSF, "equilibration", [0.5], "must be finite and at least 1"),
-    (jaxos4.SVSF, "passes", [0], "must be an integer of at least 1"),
     (jaxos4.JointEKF, "passes", [0, -1], "must be an integer of at least 1"),
     (jaxos4.AntColony, "archive", [1], "must be an integer of at least 2"),
     (jaxos4.AntColony, "ants", [0], "must be an integer of at least 1"),
@@ -244,16 +234,10 @@ def test_settings_out_of_range_are_named(make, setting, values, message):
             make(**{setting: value})
 
 
-def test_a_setting_may_be_an_integer_of_numpy():
+def test_settings_out_of_range_are_named_while_a_function_is_traced_and_may_be_integers_of_numpy():
     assert jaxos4.IBSS(max_sweeps=np.int64(5)).max_sweeps == 5
-
-
-def test_settings_out_of_range_are_named_while_a_function_is_traced():
-    for make, setting, value in (
-        (jaxos4.IBSS, "max_sweeps", 0),
-        (jaxos4.OutputError, "tolerance", -1.0),
-        (jaxos4.EquationError, "bridge", -1),
-    ):
+    bad = (jaxos4.IBSS, "max_sweeps", 0), (jaxos4.OutputError, "tolerance", -1.0), (jaxos4.EquationError, "bridge", -1)
+    for make, setting, value in bad:
         with pytest.raises(ValueError, match=f"`{setting}` must be .*, got {value}"):
             eqx.filter_eval_shape(make, **{setting: value})
     with pytest.raises(ValueError, match="`passes` must be an integer of at least 1"):

@@ -8,15 +8,7 @@ import pytest
 from helpers import folded, measured, same
 
 from jaxos4.flight import STATE_NAMES, Flight
-from jaxos4.noise import (
-    SENSOR_SIGMA,
-    Chain,
-    ConstantBias,
-    Dropouts,
-    GaussMarkov,
-    Quantisation,
-    WhiteNoise,
-)
+from jaxos4.noise import SENSOR_SIGMA, Chain, ConstantBias, Dropouts, GaussMarkov, Quantisation, WhiteNoise
 
 DT = 0.02
 NOISES = {

@@ -124,20 +124,6 @@ def batch(method, *arguments):
     return eqx.filter_vmap(fly)(*map(jnp.asarray, arguments))
 
 
-def test_vmaps_over_flights_models_and_sample_times_and_runs_without_jit():
-    omega = standard_flight().omega[:4]
-
-    def fly(mass, dt, scale):
-        model = eqx.tree_at(lambda m: m.airframe.mass, jaxos4.CorrectedOS4(), mass)
-        return jaxos4.simulate(model, model.alpha, scale * omega, dt=dt).states
-
-    settings = jnp.array([0.5, 0.7]), jnp.array([0.01, 0.02]), jnp.array([1.0, 0.9])
-    batched = eqx.filter_vmap(fly)(*settings)
-    with jax.disable_jit():
-        alone = [fly(*one) for one in zip(*settings, strict=True)]
-    np.testing.assert_allclose(batched, alone, rtol=1e-12, atol=1e-14)
-
-
 # Nose up without roll: pitch passes 90 degrees after 0.025 s. With any roll, Euler angles turn sharply before that.
 OVER = np.zeros(12)
 OVER[THETA], OVER[Q] = np.pi / 2 - 0.05, 2.0

@@ -29,6 +29,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 # Libraries that only some commands need, and that are slow to import.
 HEAVY = set("diffrax lineax optax optimistix xarray h5netcdf h5py matplotlib jinja2 pandas dask".split())
 CORE = {"jax", "equinox", "jaxtyping", "numpy", "msgspec"}
+SIMULATE = ("simulate", "--duration", "0.1", "--out", "flight.csv")
 COMMAND = "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import main; main()"
 # Prints the loaded packages when the process ends, however it ends.
 LIST = "import atexit, sys; atexit.register(lambda: print('\\nloaded', *{name.split('.')[0] for name in sys.modules}));"
@@ -144,7 +145,7 @@ import diffrax
     assert process.returncode == 0, process.stderr
 
 
-def test_the_choices_of_the_command_line_are_the_names_in_the_tables():
+def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_command_keeps_settings(run):
     tables = {"Estimator": ESTIMATORS, "Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
     tables |= {"Channels": CHANNELS, "Features": FEATURES}
     for name, table in tables.items():
@@ -152,9 +153,9 @@ def test_the_choices_of_the_command_line_are_the_names_in_the_tables():
     defaults = {name: argument.default for name, argument in inspect.signature(train.train).parameters.items()}
     for name in ("noise", "steps", "features"):
         assert defaults[name] == getattr(NetworkEstimator, name)
-
-
-SIMULATE = ("simulate", "--duration", "0.1", "--out", "flight.csv")
+    before = json.dumps(jax.config.values, default=str, sort_keys=True)
+    assert run(*SIMULATE)[0] == 0
+    assert json.dumps(jax.config.values, default=str, sort_keys=True) == before
 
 
 def programs(*arguments: str, cwd: pathlib.Path, **environment: str) -> tuple[int, int]:
@@ -179,26 +180,15 @@ def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwis
     home, count = filled
     assert programs(*SIMULATE, cwd=tmp_path, **home) == (count, 0)
     assert programs(*SIMULATE, cwd=tmp_path, JAXOS4_NO_CACHE="1", **home) == (0, 0)
+    # Another folder is chosen. A program that was cut off is compiled again, in silence.
     chosen = tmp_path / "chosen"
-    assert programs(*SIMULATE, cwd=tmp_path, JAX_COMPILATION_CACHE_DIR=str(chosen), **home) == (0, count)
-    assert len(list(chosen.iterdir())) >= count
-    # A program that was cut off is compiled again, in silence.
-    shutil.copytree(home["XDG_CACHE_HOME"], tmp_path / "cache")
-    for path in (tmp_path / "cache").rglob("*"):
-        if path.is_file():
-            path.write_bytes(path.read_bytes()[:100])
-    cut = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    assert programs(*SIMULATE, cwd=tmp_path, **cut)[0] == 0
+    shutil.copytree(pathlib.Path(home["XDG_CACHE_HOME"]) / "jaxos4" / "programs", chosen)
+    for path in chosen.iterdir():
+        path.write_bytes(path.read_bytes()[:100])
+    assert programs(*SIMULATE, cwd=tmp_path, JAX_COMPILATION_CACHE_DIR=str(chosen), **home)[0] == 0
 
 
-def test_a_cache_folder_that_cannot_be_used_is_no_error(tmp_path):
-    (tmp_path / "file").write_text("not a folder")
-    home = dict.fromkeys(("HOME", "XDG_CACHE_HOME"), str(tmp_path / "file"))
-    process = start(*SIMULATE, cwd=tmp_path, **home)
-    assert (process.returncode, process.stderr) == (0, "")
-
-
-def test_the_cache_is_limited_and_keeps_what_was_used_last(tmp_path):
+def test_the_cache_is_limited_and_keeps_what_was_used_last_and_a_folder_may_be_unusable(tmp_path, monkeypatch):
     for age, name in enumerate("abcd"):
         (tmp_path / name).write_bytes(b"0" * 10)
         os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
@@ -206,12 +196,9 @@ def test_the_cache_is_limited_and_keeps_what_was_used_last(tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
     _jax._remove_oldest(tmp_path, 39)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a"]
-
-
-def test_a_command_keeps_the_settings_of_its_process(run):
-    before = json.dumps(jax.config.values, default=str, sort_keys=True)
-    assert run(*SIMULATE)[0] == 0
-    assert json.dumps(jax.config.values, default=str, sort_keys=True) == before
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / "a"))  # not a folder
+    assert _jax._usable_folder() is None
 
 
 def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path):
@@ -265,15 +252,14 @@ def test_only_a_program_that_is_called_alone_is_compiled_quickly(off, monkeypatc
     monkeypatch.setenv(NO_OPTIONS, "1" if off else "")
     twice, x, before = quick_jit(lambda x, *, scale: 2 * x * scale), np.ones(3), os.environ.get("XLA_FLAGS")
     uses = {
-        "alone": lambda: twice(x, scale=1.0),
-        "jit": lambda: jax.jit(lambda x: twice(x, scale=1.0))(x),
-        "constant": lambda: jax.jit(lambda: twice(x, scale=1.0))(),
-        "vmap": lambda: jax.vmap(lambda x: twice(x, scale=1.0))(np.ones((2, 3))),
-        "grad": lambda: jax.grad(lambda x: twice(x, scale=1.0).sum())(x),
-        "loop": lambda: jax.lax.scan(lambda c, _: (twice(c, scale=1.0), None), x, None, 1)[0],
+        "alone": lambda x, scale: twice(x, scale=scale),
+        "jit": jax.jit(lambda x, scale: twice(x, scale=scale)),
+        "vmap": jax.vmap(lambda x, scale: twice(x, scale=scale), in_axes=(0, None)),
+        "grad": jax.grad(lambda x, scale: twice(x, scale=scale).sum()),
+        "loop": lambda x, scale: jax.lax.scan(lambda c, _: (twice(c, scale=scale), None), x, None, 1)[0],
     }
     for name, use in uses.items():
         quickly.clear()
-        np.testing.assert_array_equal(use(), np.full_like(use(), 2))
+        np.testing.assert_array_equal(use(x, 1.0), np.full(3, 2.0))
         assert any(quickly) == (name == "alone" and not off), name
     assert os.environ.get("XLA_FLAGS") == before

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import CRAZYFLIE
+from helpers import CRAZYFLIE, forcing_of
 from scipy.spatial.transform import Rotation
 
 import jaxos4
@@ -18,7 +18,6 @@ from jaxos4.recording.reading import as_recordings
 from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.gains import LogNoise
 from jaxos4.shooting.innovations import SEGMENT, SETTLING
-from jaxos4.shooting.padding import pad_flight
 
 DT, SAMPLES = 0.004, SETTLING + 8 * SEGMENT
 ANGLES_AND_RATES = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "p", "q", "r")]
@@ -36,11 +35,6 @@ def problem_of(flight):
     model = jaxos4.FlightModel(CRAZYFLIE, terms=TERMS)
     shooting = jaxos4.ShootingProblem(model, flight, sigma=np.full(12, 0.02), channels="rates", method="rk4")
     return InnovationsProblem(shooting)
-
-
-@eqx.filter_jit
-def curvature(problem, values):
-    return problem.evaluator()(values, jnp.zeros(0))
 
 
 @eqx.filter_jit
@@ -72,7 +66,7 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples():
     of_all, of_rates = (each.innovations(jnp.asarray(parameters), noise).cost.sum() for each in (problem, silent))
 
     named = dict(zip(problem.unknowns.names, parameters.tolist(), strict=False))
-    forcing = problem.model.forcing(flight.inputs, jnp.asarray(parameters))
+    forcing = forcing_of(problem.model, flight.inputs, jnp.asarray(parameters))
     expected = named["thrust_gain"] * np.asarray(forcing.specific_thrust)[:samples] + named["az_bias"]
     share, apart = DT / tau, np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
     lost = 1 - np.exp(-share)
@@ -146,21 +140,6 @@ def test_a_wrong_accelerometer_is_doubted():
     found = jaxos4.identify(flight, CRAZYFLIE, settings=jaxos4.VehicleSettings(terms=TERMS, sample_time=0.008))
     assert "az_bias" in found.held
     assert [d.cause for d in found.doubts if "levelled accelerometer" in d.cause] != []
-
-
-def test_padding_changes_the_likelihood_by_rounding_only():
-    flight, values = flown(), None
-    found = []
-    for capacity in (SAMPLES, SAMPLES + 2 * SEGMENT):
-        problem = problem_of(pad_flight(flight, capacity))
-        values = np.asarray(problem.starts[0]) if values is None else values
-        found.append(curvature(problem, jnp.asarray(values)))
-    own, padded = found
-    np.testing.assert_allclose(padded.shot.cost, own.shot.cost, rtol=1e-10)
-    for name in ("gradient", "information"):
-        one, other = (np.asarray(getattr(each, name)) for each in (own, padded))
-        # The prior of the noise has its center where the differences of measurements are counted.
-        np.testing.assert_allclose(other / np.abs(one).max(), one / np.abs(one).max(), atol=1e-10)
 
 
 def test_shifted_clocks_give_the_same_inertias():
