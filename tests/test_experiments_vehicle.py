@@ -88,6 +88,24 @@ def test_rotorpy(report_of, tmp_path):  # noqa: F811
     assert path.stat().st_mtime_ns == recorded
 
 
+def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
+    clocks, random = load("public_flights", "clocks"), np.random.default_rng(0)
+    time = 0.01 * np.arange(2000)
+    angle, rate = (
+        (lambda t: 0.3 * np.sin(7 * t) + 0.2 * np.sin(11 * t)),
+        2.1 * np.cos(7 * time) + 2.2 * np.cos(11 * time),
+    )
+    states = np.zeros((len(time), 12))
+    states[:, 6], states[:, 7] = angle(time - 0.013), rate
+    states[:, 6:8] += random.normal(0, [0.003, 0.1], (len(time), 2))
+    states[::50, 6] += 1.0  # markers that were taken for others
+    recording = jaxos4.recording.Recording(time, np.ones((len(time), 4)), states)
+    assert clocks.capture_lag(recording) == pytest.approx(0.013, abs=0.002)
+    moved = clocks.aligned(recording)
+    assert np.median(np.abs(moved.states[:-5, 6] - angle(time[:-5]))) < 0.005
+    np.testing.assert_array_equal(moved.states[:, 7], states[:, 7])
+
+
 def test_an_interrupted_report_of_predictions_is_continued(tmp_path):
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     rotorpy, out, settings = load("rotorpy"), tmp_path / "out.json", {"flights": 1, "duration": 1.0, "seed": 2}

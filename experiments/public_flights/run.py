@@ -4,6 +4,8 @@ Each flight is identified alone, and all together; what is refused has its cause
 should differ by chance alone: `pairs` has the share of pairs of flights whose difference is inside its 95 %, with an
 interval from a bootstrap of the flights.
 
+The motion capture is moved to the clock of the gyro first (`clocks.py`).
+
 Three flights are identified together, and all others are predicted: position, velocity, attitude and body rates, 50
 steps of 10 ms ahead, open loop, with the recorded commands. The errors stand beside those of constant velocity and
 rates, of a regression that is fitted to the first half of the flight that it predicts, and of a small network for the
@@ -27,6 +29,7 @@ from jaxos4.results import NINETY_FIVE
 
 sys.path[:0] = map(str, Path(__file__).resolve().parents[:2])
 
+from clocks import aligned
 from rate_network import errors_of, trained
 from shared import flight_files, table_of
 
@@ -114,7 +117,7 @@ def main(
     """Identify each flight and all together; identify some together, and predict the others."""
     names = tuple(dict.fromkeys((*fitted, *predicted, *compared)))
     paths = flight_files(flights, [f"nanobench/{name}.csv" for name in names])
-    recordings = {name: read_recording(path, AIRFRAME) for name, path in zip(names, paths, strict=True)}
+    recordings = {name: aligned(read_recording(path, AIRFRAME)) for name, path in zip(names, paths, strict=True)}
     settings = jaxos4.VehicleSettings(sample_time=STEP, end=end)
     found = jaxos4.identify([recordings[name] for name in fitted], AIRFRAME, settings=settings)
     print(f"{', '.join(fitted)}: {found.result}, {found.seconds:.0f} s", flush=True)
