@@ -127,10 +127,6 @@ BAD = {
     "empty t": (csv(rows=["," + row.split(",", 1)[1] for row in ROWS]), ["column t", "no time"]),
     "empty cell of t": (edited(4, "t", ""), ["row 4, column t", "is empty"]),
     "no rotors": (csv(HEADER.replace("omega", "w")), ["column omega1", "command1..4"]),
-    "three commands": (
-        csv("t,command1,command2,w,command4,p,q,psi", [row.replace(",10", ",0.10") for row in ROWS]),
-        ["column command3"],
-    ),
     "all-empty rotor": (csv(rows=[row.replace(",102,", ",,") for row in ROWS]), ["column omega3"]),
     "rotor without a first value": (edited(2, "omega2", ""), ["row 2, column omega2", "no earlier value to hold"]),
     "nothing in the states": (csv(rows=[row.rsplit(",", 3)[0] + ",,," for row in ROWS]), ["no state was measured"]),
