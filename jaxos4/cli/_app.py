@@ -12,9 +12,8 @@ from ..errors import InputError, TrainingError
 from ._jax import NO_CACHE, prepare
 from .design import design
 from .estimate import estimate
-from .export import export
+from .identified import export, predict
 from .information import identifiability, inspect
-from .predict import predict
 from .simulate import simulate
 from .studies import compare, report, study
 from .train import train
