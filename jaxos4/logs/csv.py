@@ -3,11 +3,11 @@
 import array
 import contextlib
 import csv
+import functools
 import itertools
 import math
 import re
-from collections.abc import Collection, Iterator
-from typing import IO
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, quoted, re
 _LONGEST_LINE = 1 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)  # float() also reads "nan", "1_0" and the digits of other scripts
+_IN_NUMBERS = dict.fromkeys(map(ord, "-+.0123456789eE,\n"))
+_BLOCK = 10_000  # lines that are read at once
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
 
@@ -45,14 +47,22 @@ def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Co
         header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
         wanted = [name for name in header if name in known]
         places = [header.index(name) for name in wanted]
-        count = 0
-        for count, cells in enumerate(_rows(path, file, len(header), first_row), start=1):
+        lines, count = iter(functools.partial(file.readline, _LONGEST_LINE), ""), 0
+        while block := list(itertools.islice(lines, _BLOCK)):
+            numbers = None if missing else _plain_numbers(block, len(header))
+            if numbers is None:
+                lines = itertools.chain(block, lines)
+                break
+            values.frombytes(numbers[:, places].tobytes())
+            count += len(block)
+            _check_rows(path, count)
+        for cells in _rows(path, lines, len(header), first_row + count):
+            count += 1
             given = [cells[place] for place in places]
             if missing:
                 given = ["" if cell.strip() in missing else cell for cell in given]
             values.extend(_numbers(path, wanted, given, first_row + count - 1))
-            if count > MAX_ROWS:
-                refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
+            _check_rows(path, count)
     if count < 2:
         refuse(path, f"has a header and {['no data', 'one row of data'][count]}; a flight needs two rows")
     columns = np.asarray(values).reshape(count, len(wanted)).T.copy()
@@ -119,13 +129,32 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
     return names
 
 
-def _rows(path: Path, file: IO[str], width: int, first_row: int) -> Iterator[list[str]]:
+def _check_rows(path: Path, count: int) -> None:
+    if count > MAX_ROWS:
+        refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
+
+
+def _plain_numbers(lines: list[str], width: int) -> np.ndarray | None:
+    """The numbers in lines without an empty cell, a blank or a fault, all at once; `None` for any other lines."""
+    text = "".join(lines)
+    if (
+        text.translate(_IN_NUMBERS)
+        or "\n\n" in text
+        or text[0] == "\n"
+        or len(max(lines, key=len)) >= _LONGEST_LINE - 1
+    ):
+        return None
+    try:
+        numbers = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return numbers if numbers.shape == (len(lines), width) and np.isfinite(numbers).all() else None
+
+
+def _rows(path: Path, lines: Iterable[str], width: int, first_row: int) -> Iterator[list[str]]:
     """The cells of each line, without the blank lines at the end of the file."""
     blank = None
-    for row in itertools.count(first_row):
-        line = file.readline(_LONGEST_LINE)
-        if not line:
-            return
+    for row, line in enumerate(lines, first_row):
         if line.isspace():
             blank = blank or row
             continue

@@ -49,10 +49,10 @@ class Grid(NamedTuple):
         voltage = None if voltage is None or battery_voltage is None else voltage / battery_voltage
         zeros = jnp.zeros(samples, dtype=int)
         stretches = inputs.stretches or (zeros, zeros, zeros + samples - 1)
-        recording = zeros if recordings is None else jnp.asarray(recordings)[stretches[0]]
-        row = jnp.arange(samples)
-        begins = jnp.full(max(recordings or (0,)) + 1, samples).at[recording].min(row)
-        elapsed = inputs.dt * (row - begins[recording])
+        elapsed = inputs.dt * jnp.arange(samples)
+        if recordings is not None and max(recordings) > 0:
+            recording = jnp.asarray(recordings)[stretches[0]]
+            elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
         return cls(inputs.dt, *stretches, elapsed, voltage)
 
     def part(self, rows: Int[Array, " rows"], before: Float[Array, "4"] | None = None) -> "Part":
