@@ -88,6 +88,12 @@ def test_rotorpy(report_of, tmp_path):  # noqa: F811
     assert path.stat().st_mtime_ns == recorded
 
 
+def test_commands_that_are_too_rare_are_named(shared_flights, report_of):  # noqa: F811
+    (row,) = report_of("public_flights", "radio", flights=shared_flights, every=[40]).values()
+    assert row["result"] != "successful"
+    assert any("damping" in doubt["cause"] and "too rarely" in doubt["cause"] for doubt in row["doubts"])
+
+
 def test_a_motion_capture_is_moved_to_the_clock_of_the_gyro():
     clocks, random = load("public_flights", "clocks"), np.random.default_rng(0)
     time = 0.01 * np.arange(2000)
