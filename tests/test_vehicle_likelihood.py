@@ -38,6 +38,11 @@ def problem_of(flight):
 
 
 @eqx.filter_jit
+def cost_of(problem, parameters, noise):
+    return problem.innovations(parameters, noise).cost.sum()
+
+
+@eqx.filter_jit
 def searched(problem):
     return jaxos4.FilterError()(problem)
 
@@ -63,7 +68,7 @@ def test_the_likelihood_of_a_specific_force_is_that_of_means_over_samples():
     values, noise = np.asarray(problem.starts[0]), np.log([[1.0, 1.0, 1.0]] * 3 + [[strength, tau, sensor]])
     parameters = values[: problem.problem.unknowns.count]
     noise = LogNoise(*map(jnp.asarray, noise.T))
-    of_all, of_rates = (each.innovations(jnp.asarray(parameters), noise).cost.sum() for each in (problem, silent))
+    of_all, of_rates = (cost_of(each, jnp.asarray(parameters), noise) for each in (problem, silent))
 
     named = dict(zip(problem.unknowns.names, parameters.tolist(), strict=False))
     forcing = forcing_of(problem.model, flight.inputs, jnp.asarray(parameters))
