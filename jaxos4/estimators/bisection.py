@@ -19,9 +19,7 @@ from ..shooting.abstract import WindowUnknowns
 Flag = Bool[Array, ""]
 PerDirection = Float[Array, "windows n"]
 
-# An unknown with a stride, such as a level of noise, has an approximate gradient (see `Unknowns`).
-_ROUGH = 0.2  # the share of a step along it that counts
-_STRIDE = 0.1  # the information that keeps predicted steps along it short
+_STRIDE = 0.1  # the information that keeps predicted steps along an unknown with a stride short, see `Unknowns`
 
 
 class Stage(NamedTuple):
@@ -58,12 +56,6 @@ class Stage(NamedTuple):
             prior=prior.at[:, : unknowns.count].set(shared)[:, :, None] * np.eye(prior.shape[1]),
             limits=problem.limits(reach),
         )
-
-    def distance(self, steps: PerDirection) -> Scalar:
-        """The longest of some steps to the minimum; those along an unknown with a stride count less."""
-        strides = self.problem.each_window(self.problem.unknowns.stride, jnp.inf)[0]
-        weight = jnp.where(jnp.isfinite(strides), _ROUGH, 1.0)
-        return (jnp.abs(steps) * jnp.roll(weight, -self.problem.unknowns.count)).max()
 
 
 class Directions(NamedTuple):

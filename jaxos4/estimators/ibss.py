@@ -31,6 +31,9 @@ _OPENING, _FIRST = 4.0, 0.05
 _SAFETY, _LEAST = 2.0, 0.01
 _GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose search ended at one of its ends, and of all together
 _CHANCE = 1.0  # a sweep that raises the cost by no more may have done so by chance
+# A vehicle's cost has kinks, at which no slope is small. A sweep of at most so many standard deviations that lowers the
+# cost by no more than the second number has found the minimum.
+_SHORT, _GAIN = 0.3, 1e-4
 # After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far.
 _RETREAT, _ADVANCE = 0.25, 1.4
 
@@ -265,7 +268,10 @@ class IBSS(AbstractEstimator):
         finite = jnp.isfinite(unknowns).all() & jnp.isfinite(shot.cost).all()
         # The cost of a flight that fails means nothing.
         lower = shot.sound.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
-        failed = ~first & ~(finite & (~before.sound.all() | lower))
+        gain, has_kinks = before.cost.sum() - shot.cost.sum(), jnp.isfinite(stage.problem.unknowns.stride).any()
+        short = shot.sound.all() & before.sound.all() & (jnp.abs(brackets.predicted).max() <= _SHORT)
+        stalled = has_kinks & ~first & (shots > 0) & short & (gain <= _GAIN)
+        failed = ~first & ~(finite & (~before.sound.all() | lower)) | (stalled & (gain < 0))
         unknowns, curvature = jax.tree.map(
             lambda new, old: jnp.where(failed, old, new), (unknowns, curvature), (state.unknowns, state.curvature)
         )
@@ -285,7 +291,7 @@ class IBSS(AbstractEstimator):
             sweep=state.sweep + 1,
             sweeps=state.sweeps + counts,
             rollouts=state.rollouts + shots * stage.searched.sum(),
-            done=near | (first & ~finite),
+            done=near | stalled | (first & ~finite),
             record=_recorded(state, directions, brackets, counts) if self.record else state.record,
         )
 
@@ -298,7 +304,7 @@ class IBSS(AbstractEstimator):
         """Whether so short steps to the minimum end a stage: the last stage is searched finely, the others coarsely."""
         noise = stage.misfit(curvature.shot.cost.sum())
         fine = jnp.maximum(self.tolerance * noise, stage.smallest_step)
-        return stage.distance(steps) <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(noise, 1.0))
+        return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(noise, 1.0))
 
     def _most_sweeps(self, stage: Stage) -> Count:
         return self.max_sweeps * (1 if self.directions == "whitened" else stage.searched.sum())
