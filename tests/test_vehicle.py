@@ -13,7 +13,7 @@ from lanes import names
 import jaxos4
 from jaxos4.identification import network
 from jaxos4.identification.fit import fit_innovations
-from jaxos4.identification.network import liveliest
+from jaxos4.identification.problem import liveliest
 from jaxos4.shooting import InnovationsProblem
 
 FLIGHTS, PERIOD, SECONDS = 8, 0.004, 10.0

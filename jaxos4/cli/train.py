@@ -40,7 +40,7 @@ def train(
     options.check_seed(seed)
     with stages("loading the library") as progress:
         from ..airframe import load_airframe
-        from ..identification.network import train_network
+        from ..identification.problem import train_network
         from ..models import MODELS
         from ..networks import NetworkEstimator, save_network
         from ..recording import read_recording

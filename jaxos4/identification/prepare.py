@@ -15,8 +15,7 @@ from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem
-from .network import GivenNetwork, loaded, network_for, network_provenance
-from .problem import Intervals, bracket_of, flight_problem
+from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, loaded, network_for, network_provenance
 from .results import Provenance
 from .settings import FlightSettings, airframe_name, class_name, name_and_class, versions
 

@@ -20,9 +20,8 @@ from ..recording import preparation
 from ..recording.preparation import Prepared
 from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from .network import GivenNetwork, liveliest, vehicle_network_for
 from .prepare import Case, HeldOut, Progress
-from .problem import Intervals, bracket_of
+from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
 from .results import Provenance
 from .settings import VehicleSettings, airframe_name, name_and_class, versions
 
