@@ -11,7 +11,7 @@ from helpers import CRAZYFLIE
 from lanes import names
 
 import jaxos4
-from jaxos4.identification import network
+from jaxos4.identification import problem as problems
 from jaxos4.identification.fit import fit_innovations
 from jaxos4.identification.problem import liveliest
 from jaxos4.shooting import InnovationsProblem
@@ -138,7 +138,7 @@ def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
     small = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=2000)
-    monkeypatch.setattr(network, "_VEHICLE_TRAINING", small)
+    monkeypatch.setattr(problems, "_VEHICLE_TRAINING", small)
     flight, airframe = (lane(part, 0) for part in flown())
     shorter = jax.tree.map(lambda leaf: leaf[:1001] if leaf.ndim else leaf, flight)
     settings = jaxos4.VehicleSettings(terms=("offset", "lag"), sample_time=0.016, holdout=0.0)

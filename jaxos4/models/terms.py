@@ -185,9 +185,7 @@ def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) 
     return total._replace(r=total.r - values["rotor_reaction"] * spin_up)
 
 
-def _scaled(
-    share: Callable[[Values, Grid], Float[Array, " samples"]],
-) -> Callable[[Commands, Values, Grid], Commands]:
+def _scaled(share: Callable[[Values, Grid], Float[Array, " samples"]]) -> Callable[[Commands, Values, Grid], Commands]:
     """The commands times a share, which is given for each sample of the flight."""
 
     def command(omega: Commands, values: Values, grid: Grid) -> Commands:
