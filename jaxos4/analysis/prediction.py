@@ -74,7 +74,7 @@ def predictions(
     horizons: tuple[float, ...] = HORIZONS,
     disturbance: Disturbances | None = None,
 ) -> Predictions:
-    """Predict the body rates from many starts, with the recorded rotor speeds. The velocity stays that of the start.
+    """Predict the body rates from many starts, with the recorded rotor speeds. The velocity keeps its value at the start.
 
     Starts are 0.05 s apart. The initial rates are the mean of the rates measured within 0.01 s of the start. A start is
     omitted if one of these rates is missing, or if the longest horizon reaches beyond the stretch.
@@ -180,7 +180,7 @@ def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoi
 
 
 class Filtered(NamedTuple):
-    """What the measurements until each sample tell: the rate of each channel, and its disturbance."""
+    """The rate of each channel, and its disturbance, at each sample from all measurements until then."""
 
     rate: Float[Array, "samples channels"]
     disturbance: Float[Array, "samples channels"]

@@ -39,7 +39,7 @@ class Hybrid(AbstractEstimator):
     - `network`: a trained network. A network that looks at all of the problem's channels makes the search shortest.
     - `ibss`: how to search.
     - `seen`: the part of the flight that the network looks at; by default the shooting problem that is searched, or
-      that of the innovations. It must be the problem of training, but for the measured values.
+      that of the innovations. It may differ from the training problem only in the measured values.
     """
 
     looks_at: ClassVar[str] = "all"

@@ -12,6 +12,8 @@ from jaxtyping import Float
 from ..airframe import Airframe, airframe_from_table
 from ..errors import InputError, named
 from ..linalg import covariance_root
+from ..models.abstract import PARAMETER_NAMES
+from ..models.terms import TERMS
 from ..results import NAMES, meaning
 from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
 
@@ -231,6 +233,11 @@ def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], 
         some = [name for name in found if name.startswith(names)]
         if some:
             notes.append(f"{', '.join(some)}: {why}")
+    known = {parameter.name for term in TERMS.values() for parameter in term.parameters} | {*PARAMETER_NAMES}
+    if strangers := [name for name in rows if name not in known and name.rpartition("_")[0] not in known]:
+        notes.append(
+            f"{', '.join(strangers)}: not carried: no term of this version has them; run `jaxos4 estimate` again"
+        )
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
     apart = tuple(itertools.chain(("alpha2", "alpha5"), *_NOT_EXPORTED))

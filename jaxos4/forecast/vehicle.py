@@ -18,6 +18,7 @@ from ..export.result import ResultFile, checked, read_file
 from ..flight import FORCE_NAMES
 from ..identification import Identification
 from ..linalg import covariance_root
+from ..models.terms import TERMS
 from ..models.vehicle import FlightModel
 from ..shooting.gains import LogNoise
 
@@ -35,7 +36,7 @@ class Vehicle(NamedTuple):
     - `noise`: of the body rates, then of the specific forces along `model.force_axes`.
     - `sample_time`: of the fit [s].
     - `result`: the name of the result code.
-    - `notes`: why the estimate cannot be trusted, and what it does not know; one line each.
+    - `notes`: why the estimate cannot be trusted, and which parameters were not identified; one line each.
     """
 
     name: str
@@ -74,9 +75,11 @@ def _vehicle(file: ResultFile, name: str) -> Vehicle:
     try:
         model = FlightModel(airframe, terms=tuple(used.terms), battery_voltage=used.battery_voltage)
     except ValueError:
-        raise InputError(
-            f"a vehicle cannot have its terms, {', '.join(used.terms)}; run `jaxos4 estimate` again."
-        ) from None
+        strangers = [term for term in used.terms if term not in TERMS]
+        which = (
+            f"the term {strangers[0][:40]} is not one of this version" if strangers else "its terms exclude each other"
+        )
+        raise InputError(f"{which}; run `jaxos4 estimate` again.") from None
     known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
     known |= {row: each.value for row, each in file.held.items()}
     alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))

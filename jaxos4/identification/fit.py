@@ -33,7 +33,8 @@ _SETTLED = 0.2
 # A parameter that must not be negative, and is so by this many standard deviations, is held at 0.
 _NEGATIVE = 2.0
 # A parameter is held at its plain value unless that raises the cost by more than the first number: near it, a cost with
-# kinks is not quadratic, and standard deviations are too small. They are never wrong by the second number.
+# kinks is not quadratic, and standard deviations are too small. A value further off than the second number of standard
+# deviations is never tried.
 _CLEARLY, _SURELY = 5.0, 12.0
 _PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
 # The most parts of a flight that are compared, and the fewest that can show a disagreement.
@@ -41,7 +42,7 @@ _MOST, _FEWEST = 20, 4
 # The chance that parts of a flight that the model explains are taken to disagree.
 _CHANCE = 0.05
 _NEGATIVE_NOTE = "came out negative, which is impossible"
-_PLAIN_NOTE = "the flights do not clearly contradict this value"
+_PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 Progress = Callable[[str], None]
 
 
@@ -149,8 +150,8 @@ def fit_innovations(
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
 
     The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket is not
-    estimated. A parameter that came out negative, though physics forbids it, is held at 0. One that is not
-    clearly other than its plain value is held there. Intervals widen if parts of the flights disagree.
+    estimated. A parameter that came out negative, though physics forbids it, is held at 0. A parameter
+    near its plain value is held there. Intervals widen if parts of the flights disagree.
 
     **Arguments:**
 
@@ -224,9 +225,17 @@ def _searched(
         progress("fitting again without what the flights hardly show")
         simpler = holding(plain)
         other = search(simpler)
-        if has_answer(other) and float(other.cost) < float(found.cost) + _CLEARLY:
+        if has_answer(other) and float(other.cost) + _against(problem, plain) < float(found.cost) + _CLEARLY:
             problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
     return problem, found, rollouts, fixed, negative
+
+
+def _against(problem: InnovationsProblem, values: dict[str, float]) -> float:
+    """What the brackets add to the cost at these values, as Gaussian priors. Held parameters have none."""
+    own = problem.problem.unknowns
+    places = [own.names.index(name) for name in values]
+    off = (np.array(list(values.values())) - np.asarray(own.center)[places]) / np.asarray(own.half_width)[places]
+    return float(np.square(off).sum()) / 2
 
 
 def _nearly_plain(table: tuple[Parameter, ...], found: Estimate) -> dict[str, float]:

@@ -29,7 +29,7 @@ class Parameter(NamedTuple):
     - `in_forcing`: whether the forcing depends on the parameter. If not, the rate equations are linear in it.
     - `nonnegative`: whether physics forbids a negative value.
     - `scales_torque`: whether torque exceeds that of the airframe by this factor.
-    - `plain`: the value at which the effect is absent. `None`: any value is as plain as another.
+    - `plain`: the usual value, at which the parameter is held unless the flights clearly contradict it. `None`: none.
     - `contradiction`: from a value and its error, why physics or the airframe forbids it, and what to do; `None` if
       they do not.
     """

@@ -91,7 +91,7 @@ class Term:
     - `accelerometer(force, values)`: the measured specific force [m/s^2]. It makes specific force a measurement.
 
     If each recording has its own value of a parameter, `values` holds that of the sample's recording. This is not
-    possible in the first two contributions, which act before the recordings are told apart: `ValueError`.
+    possible in the first two contributions, which act before recordings are distinguished: `ValueError`.
     """
 
     description: str
@@ -319,7 +319,7 @@ TERMS: dict[str, Term] = {
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
         (TermParameter("x_drag", "1/s", 1.0), TermParameter("y_drag", "1/s", 1.0)),
-        needs=frozenset({MEASURED_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
+        needs=frozenset({VELOCITY, MEASURED_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
         force_axes=(0, 1),
         specific_force=_add_drag,
     ),
