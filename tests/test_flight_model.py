@@ -169,6 +169,7 @@ TOLERANCES = {
     ("motor", "accelerometer"): 3e-3,
     ("fade", "accelerometer"): 1e-7,
     ("accelerometer", "drag", "inflow"): 1e-7,
+    ("accelerometer", "drag"): 1e-7,
     ("lag", "delay", "reaction"): 2e-3,
     ALL: 2e-3,
 }

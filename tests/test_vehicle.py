@@ -196,8 +196,8 @@ def test_a_flight_that_the_model_cannot_follow_has_no_answer():
     assert not np.isfinite(np.asarray(found.covariance)).any()
 
 
-@pytest.mark.parametrize("braking", [1.0, 0.2])
-def test_motors_brake_as_they_drive_unless_the_flight_says_otherwise(braking):
+@pytest.mark.parametrize(("braking", "bracket"), [(1.0, None), (1.0, (0.8, 0.05)), (0.2, None)])
+def test_motors_brake_as_they_drive_unless_flight_or_bracket_say_otherwise(braking, bracket):
     """Near its plain value the cost has kinks, so that the parameter looks known better than it is."""
     loop = jaxos4.ClosedLoop(
         CRAZYFLIE, gust=1.0, rotor_lag=LAG, rotor_delay=DELAY, thrust_curve=0.85, motor_braking=braking
@@ -206,12 +206,18 @@ def test_motors_brake_as_they_drive_unless_the_flight_says_otherwise(braking):
     flight = jaxos4.fly_closed_loop(loop, references, dt=PERIOD, key=jax.random.key(2))
     terms = tuple("motor" if term == "lag" else term for term in TERMS)
     problem = InnovationsProblem(shooting_problem(flight, CRAZYFLIE, terms))
+    if bracket is not None:
+        own = problem.problem.unknowns
+        place = own.names.index("motor_braking")
+        center, half_width = (np.asarray(x).copy() for x in (own.center, own.half_width))
+        center[place], half_width[place] = bracket
+        problem = problem.within(jaxos4.Bracket.around(center, half_width))
     fit = fit_innovations(jaxos4.FilterError(), problem, np.zeros(flight.time.size, int))
     place = fit.problem.unknowns.names.index("motor_braking")
     value = float(fit.estimate.parameters[place])
-    if braking == 1.0:
+    if braking == 1.0 and bracket is None:
         assert fit.held["motor_braking"].value == value == 1.0
         assert "do not contradict" in fit.held["motor_braking"].note
     else:
         assert "motor_braking" not in fit.held
-        assert abs(value - braking) < 3 * float(fit.estimate.std[place])
+        assert abs(value - (braking if bracket is None else bracket[0])) < 3 * float(fit.estimate.std[place])
