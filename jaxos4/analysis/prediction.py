@@ -76,8 +76,9 @@ def predictions(
 ) -> Predictions:
     """Predict the body rates from many starts, with the recorded rotor speeds.
 
-    The velocity keeps its value at the start. Starts are 0.05 s apart. The initial rates are the mean of the rates measured within 0.01 s of the start. A start is
-    omitted if one of these rates is missing, or if the longest horizon reaches beyond the stretch.
+    The velocity keeps its value at the start. Starts are 0.05 s apart. The initial rates are the mean of the rates
+    measured within 0.01 s of the start. A start is omitted if one of these rates is missing, or if the longest horizon
+    reaches beyond the stretch.
 
     **Arguments:** `problem` gives model, flight and method; its windows and channels have no effect. `horizons` [s] are
     positive. `disturbance`: fades from its value at the start, as the past lets expect; by default there is none.
