@@ -125,7 +125,7 @@ MISUSE = [
     ("`terms` must be some of offset, center_of_mass, damping", lambda: vehicle(terms=("wind",))),
     ("`terms` must be some of", lambda: vehicle(terms=("lag", "Lag"))),
     *(("`recordings` must count from 0", lambda r=r: vehicle(recordings=r)) for r in ((), (1,), (0, 2), (-1, 0))),
-    ("velocity, inflow need `Flight.body_vel", lambda: vehicle(terms=("velocity",))),
+    ("velocity, inflow, drag need `Flight.body_vel", lambda: vehicle(terms=("velocity",))),
     ("voltage need `Flight.voltage`", lambda: vehicle(terms=("voltage",), battery_voltage=11.1)),
     # Brackets, results and estimators.
     *(
