@@ -109,6 +109,12 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
         assert row.estimate == pytest.approx(vehicle_constants(fit).constants[name].estimate)
         assert row.std > 0.4 * row.estimate
     assert not answer_of(case, weak, case.shooting.flight).constants
+    # Noise of rotor speeds widens the intervals by 2.5 times its share, up to the limit of the doubt.
+    for share, added in ((0.02, 0.05), (0.5, 0.125)):
+        for name, row in vehicle_constants(fit, share).constants.items():
+            clear = vehicle_constants(fit).constants[name]
+            assert row.std == pytest.approx(np.hypot(clear.std, added * clear.estimate), rel=0.02)
+            assert row.estimate == clear.estimate
     # Nor is a fit that says no more than the bracket, as when all samples settle the filters.
     unclear = fit._replace(held=dict.fromkeys(fit.problem.unknowns.names, held["thrust_gain"]))
     assert not answer_of(case, unclear, case.shooting.flight).constants

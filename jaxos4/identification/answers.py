@@ -25,6 +25,9 @@ INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
 AXES = {"p": "roll", "q": "pitch", "r": "yaw"}
 # The scale of an accelerometer, with what forward flight adds to the lift of rotors, is known to 1 %.
 _SCALE = 0.01
+# Noise of measured rotor speeds may be this share of the changes of the rotors' torque in a sample. It makes moments of
+# inertia too large, by two to three times the share in simulated flights.
+NOISY, _TOO_LARGE = 0.05, 2.5
 # The standard deviation of an alpha that was not estimated, in half-widths of its bracket: as good as unknown.
 _UNKNOWN = 1e3
 # A channel with fewer measurements has no diagnostics.
@@ -95,10 +98,10 @@ def overwhelmed(fit: Fit) -> dict[str, str]:
     return weak
 
 
-def rigid_body(case: Case, fit: Fit) -> RigidBody:
+def rigid_body(case: Case, fit: Fit, speed_noise: float = 0.0) -> RigidBody:
     """The moments of inertia that explain the estimate best; none of a flight if they are not identifiable."""
     if case.is_vehicle:
-        return vehicle_constants(fit)
+        return vehicle_constants(fit, speed_noise)
     model, estimate = fit.problem.model, fit.estimate
     if model.parameter_names != PARAMETER_NAMES:
         return RigidBody()
@@ -111,8 +114,11 @@ def rigid_body(case: Case, fit: Fit) -> RigidBody:
     return RigidBody(constants, consistency_p=float(rigid.p_value), is_rigid_body=bool(rigid.is_rigid_body))
 
 
-def vehicle_constants(fit: Fit) -> RigidBody:
-    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated."""
+def vehicle_constants(fit: Fit, speed_noise: float = 0.0) -> RigidBody:
+    """Ix, Iy and Iz of a vehicle, from those of alpha3, alpha6 and alpha8 that were estimated.
+
+    `speed_noise`: see `SampleTime`; up to `NOISY` it widens the intervals.
+    """
     model, free, values = fit.problem.model, fit.free, np.asarray(fit.estimate.parameters)
     known, bracket = np.isin(PARAMETER_NAMES, [model.parameter_names[i] for i in free]), fit.problem.unknowns
     alpha, slopes = np.where(known, values[:8], np.asarray(bracket.center)[:8]), np.eye(8, values.size)
@@ -125,10 +131,10 @@ def vehicle_constants(fit: Fit) -> RigidBody:
     slopes[~known] = 0.0
     unknown = np.where(known, 0.0, (_UNKNOWN * np.asarray(bracket.half_width)[:8]) ** 2)
     covariance = slopes @ np.asarray(fit.estimate.covariance) @ slopes.T + np.diag(unknown)
-    if gains:
-        # What no likelihood sees makes all moments of inertia wrong by one factor.
-        shared = _SCALE * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
-        covariance += shared[:, None] * shared
+    # What no likelihood sees makes all moments of inertia wrong by one factor.
+    scale = np.hypot(_SCALE * bool(gains), _TOO_LARGE * min(speed_noise, NOISY))
+    shared = scale * np.where(np.isin(np.arange(8), list(INVERSE.values())), alpha, 0.0)
+    covariance += shared[:, None] * shared
     constants, thrust = {}, "mass" if gains else "thrust_coefficient"
     notes = dict.fromkeys(("Ix", "Iy"), f"if arms and {thrust} are right") | {"Iz": f"if {thrust} and drag are right"}
     for name, row in INVERSE.items():

@@ -15,12 +15,12 @@ from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
 from ..shooting import with_room
-from .answers import AXES, overwhelmed, parameter_table, rigid_body
+from .answers import AXES, NOISY, overwhelmed, parameter_table, rigid_body
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
 from .results import Constant, Disturbance, Doubt, ParameterEstimate, PredictionSkill, RigidBody, SampleTime, Validation
-from .sample_time import NOISY, moved, noise_of_speeds
+from .sample_time import moved, noise_of_speeds
 
 # Doubts need this many standard deviations.
 _SURE = 3.0
@@ -292,15 +292,18 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     """Compare an answer with the airframe, with other sample times, and with measurements that were not fitted."""
     if not fit.answered:
         return Judgement(parameters={} if case.is_vehicle else parameter_table(case, fit))
-    table, body, held_out = parameter_table(case, fit), rigid_body(case, fit), case.held_out
+    table, held_out = parameter_table(case, fit), case.held_out
     if not case.is_vehicle:
         other = None if held_out is None else validate_on(fit, held_out)
-        return Judgement(table, body, validation=other)
+        return Judgement(table, rigid_body(case, fit), validation=other)
+    step = float(fit.problem.flight.dt)
+    known = [each.speed_noise for each in sample_times if each.sample_time == step]
+    noise = known[0] if known else noise_of_speeds(fit.problem.flight, fit.problem.flight, fit.problem.model.airframe)
+    body = rigid_body(case, fit, noise)
     predicted = skill = None
     if held_out is not None:
         progress("predicting what was not fitted")
         predicted, skill = predict_held_out(fit, held_out, case.room)
-    airframe = fit.problem.model.airframe
     still = () if predicted is None else _still_axes(fit, predicted)
     notes = [
         f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`"
@@ -323,9 +326,6 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         *_held(fit),
         *doubts_of(fit.problem.model, trusted, body.constants, skill, still, case.log_step),
     )
-    step = float(fit.problem.flight.dt)
-    known = [each.speed_noise for each in sample_times if each.sample_time == step]
-    noise = known[0] if known else noise_of_speeds(fit.problem.flight, fit.problem.flight, airframe)
     doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(noise), *_moved(sample_times, step, body))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
     return Judgement(

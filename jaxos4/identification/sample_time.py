@@ -18,7 +18,7 @@ from ..airframe import Airframe
 from ..estimate import REACH
 from ..flight import Flight
 from ..shooting import InnovationsProblem
-from .answers import AXES, overwhelmed, vehicle_constants
+from .answers import AXES, NOISY, overwhelmed, vehicle_constants
 from .fit import Fit, fit_innovations
 from .held_out import compile_ahead
 from .prepare import Case, Progress
@@ -29,8 +29,6 @@ from .results import Constant, SampleTime
 WHITE, _CHANCE = 0.06, 3.0
 # Two answers agree within so many standard deviations and this share, which allows for errors of discretisation.
 AGREE, _DISCRETE = 2.0, 0.03
-# Noise may be this share of the changes of the rotors' torque in a sample; inertias are too large by about this share.
-NOISY = 0.05
 # The share of the way to its limit at which an unknown counts as being there.
 _NEAR = 0.95
 
@@ -115,13 +113,13 @@ def answer_of(case: Case, fit: Fit, finest: Flight) -> SampleTime:
     """
     scales = [each.name for each in fit.problem.model.parameters if each.scales_torque]
     answered = fit.answered and not any(name in fit.held for name in scales)
-    constants = vehicle_constants(fit).constants if answered else {}
+    flight = case.shooting.flight
+    noise = noise_of_speeds(flight, finest, fit.problem.model.airframe)
+    constants = vehicle_constants(fit, noise).constants if answered else {}
     if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
     largest = max(correlations, key=abs, default=1.0)
-    flight = case.shooting.flight
-    noise = noise_of_speeds(flight, finest, fit.problem.model.airframe)
     return SampleTime(float(flight.dt), constants, largest, _samples(fit), noise)
 
 
