@@ -194,7 +194,7 @@ def filtered(
     stretch: Int[Array, " samples"],
     dt: Scalar,
 ) -> Filtered:
-    """What is known at each sample. Filters begin anew in each stretch.
+    """The rates and disturbances at each sample. Filters begin anew in each stretch.
 
     `modelled`: the model's angular acceleration, and 0 for a specific force, which is measured less its model. The
     rate of a specific force is the mean of its disturbance over a sample.

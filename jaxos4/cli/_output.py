@@ -18,7 +18,7 @@ from .._files import check_writable, load_netcdf, write_file
 from ..errors import InputError
 
 DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg", "matplotlib.figure")
-"""What draws a figure: slow to import."""
+"""The modules that draw a figure: slow to import."""
 
 _PHRASES = {
     "an `Airframe` as `subject`": "--model flight",

@@ -213,7 +213,7 @@ def fly_chunk(
 
 
 class Evidence(NamedTuple):
-    """What a flight measured, and what is known of its offsets.
+    """The measurements of a flight, and the knowledge of its offsets.
 
     - `states`: as in `PARTS`. `accelerations`: see `jaxos4.forecast.measured.Measured`.
     - `noise`: of the filters. `velocity_noise`: the standard deviation of the white noise of velocity [m/s].
@@ -235,7 +235,7 @@ class Evidence(NamedTuple):
 def known_at_samples(
     model: FlightModel, flight: Flight, length: Count, parameters: Float[Array, "lanes parameters"], evidence: Evidence
 ) -> tuple[Known, Forcing, Float[Array, "lanes samples 6"]]:
-    """What is known at each sample, by the first row of `parameters`; and forcing and offsets of each row: see `Lanes`.
+    """The knowledge at each sample, by the first row of `parameters`; and forcing and offsets of each row: see `Lanes`.
 
     The velocity is left out of the forcing: it will be that of the prediction. `length`: the samples of the flight that
     are no padding.
@@ -268,7 +268,7 @@ def known_at_samples(
 def _offset_weights(
     model: FlightModel, evidence: Evidence, kept: Scalar, dt: Scalar
 ) -> tuple[Float[Array, "samples 6"], Float[Array, "samples 6"]]:
-    """What multiplies the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
+    """The factor of the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
 
     Each recording has its own offsets. The mean of the residuals, of which it forgets the oldest, is drawn to 0 as far
     as offsets are known not to differ.

@@ -193,9 +193,9 @@ def _fly(
 def _evidence(
     problem: ShootingProblem, vehicle: Vehicle, measured: Measured, noise: LogNoise, missing: tuple[str, ...]
 ) -> Evidence:
-    """What the padded flight measured. A position that was not measured is 0, and a velocity is that of dead reckoning.
+    """The measurements of the padded flight. A position that was not measured is 0.
 
-    If no velocity is measured, the specific force has no offset.
+    If no velocity is measured, it is that of dead reckoning, and the specific force has no offset.
     """
     state, samples = measured.states.copy(), len(measured.stretch)
     if "velocity" in missing:

@@ -4,7 +4,7 @@ The noise of a simulated likelihood is that of the sensors; it follows from the 
 it. A likelihood of innovations has its noise among its unknowns, and is fitted once.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -150,8 +150,8 @@ def fit_innovations(
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
 
     The bracket is a prior of all parameters. A parameter about which the flights say less than the bracket is not
-    estimated. A parameter that came out negative, though physics forbids it, is held at 0. A parameter
-    near its plain value is held there. Intervals widen if parts of the flights disagree.
+    estimated. A parameter that came out negative, though physics forbids it, is held at 0. One that came
+    out near its plain value is held there. Intervals widen if parts of the flights disagree.
 
     **Arguments:**
 
@@ -160,14 +160,13 @@ def fit_innovations(
     """
     own, names = problem.problem.unknowns, problem.model.parameter_names
     unknowns = own.count + 3 * len(problem.channels)
-    half_width = np.asarray(own.half_width)
     problem, found, rollouts, fixed, negative = _searched(estimator, problem, progress)
     progress("computing errors")
     values, std = np.asarray(found.parameters)[: own.count], _std(found)[: own.count]
     factor, free = np.ones(own.count), ~np.isin(names, list(fixed))
     if has_answer(found):
         factor[free] = _widening(problem, found, free, recording)
-    identifiable = np.asarray(is_identifiable(factor * std, half_width, GAUSSIAN_PRIOR))
+    identifiable = np.asarray(is_identifiable(factor * std, np.asarray(own.half_width), GAUSSIAN_PRIOR))
     if not has_answer(found):
         identifiable[:] = True
     notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~identifiable)} | fixed
@@ -215,7 +214,7 @@ def _searched(
     progress("compiling, and fitting parameters and disturbances")
     found, fixed, negative = search(problem), {}, {}
     if has_answer(found):
-        rows = zip(table, np.asarray(found.parameters).tolist(), _std(found).tolist(), strict=False)
+        rows = _with_values(table, found)
         negative = {row.name: (x, std) for row, x, std in rows if row.nonnegative and x < -_NEGATIVE * std}
     if negative:
         progress("fitting again without what came out negative")
@@ -231,7 +230,7 @@ def _searched(
 
 
 def _against(problem: InnovationsProblem, values: dict[str, float]) -> float:
-    """What the brackets add to the cost at these values, as Gaussian priors. Held parameters have none."""
+    """The cost that the brackets add at these values, as Gaussian priors. Held parameters have none."""
     own = problem.problem.unknowns
     places = [own.names.index(name) for name in values]
     off = (np.array(list(values.values())) - np.asarray(own.center)[places]) / np.asarray(own.half_width)[places]
@@ -240,11 +239,16 @@ def _against(problem: InnovationsProblem, values: dict[str, float]) -> float:
 
 def _nearly_plain(table: tuple[Parameter, ...], found: Estimate) -> dict[str, float]:
     """The plain values of the parameters that were found near them."""
-    near = {}
-    for row, value, std in zip(table, np.asarray(found.parameters).tolist(), _std(found).tolist(), strict=False):
-        if row.plain is not None and std > 0 and abs(value - row.plain) < _SURELY * std:
-            near[row.name] = row.plain
-    return near
+    return {
+        row.name: row.plain
+        for row, value, std in _with_values(table, found)
+        if row.plain is not None and std > 0 and abs(value - row.plain) < _SURELY * std
+    }
+
+
+def _with_values(table: tuple[Parameter, ...], found: Estimate) -> Iterator[tuple[Parameter, float, float]]:
+    """Each parameter with its value and its standard deviation; the noise levels that follow are left out."""
+    return zip(table, np.asarray(found.parameters).tolist(), _std(found).tolist(), strict=False)
 
 
 def _parts(found: Estimate) -> Parts:

@@ -135,7 +135,7 @@ class FlightModel(AbstractModel):
     def forcing(self, inputs: Inputs, parameters) -> Forcing:
         """The chain from commands to torque and thrust: each term acts at its place.
 
-        Of a padded flight (`Inputs.length`), only blocks with samples that count are computed; the others are 0.
+        If the flight is padded (`Inputs.length`), blocks that are padding alone are not computed: they are 0.
         """
         grid, samples = Grid.of(inputs, self.battery_voltage, self.recordings), inputs.omega.shape[0]
         if inputs.length is None:

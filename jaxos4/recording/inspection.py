@@ -1,4 +1,4 @@
-"""What a log contains: its stretches in flight, their excitation, and the airframe's file that it begins."""
+"""The contents of a log: its stretches in flight, their excitation, and the airframe's file that it begins."""
 
 from collections.abc import Sequence
 from pathlib import Path
