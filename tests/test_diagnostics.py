@@ -28,7 +28,7 @@ def judged(states):
         answers = zip(some, found.parameters, found.initial_state, strict=True)
         for flown, parameters, start in itertools.islice(answers, len(states) - first):
             flight = eqx.tree_at(lambda p: p.flight.states, problem, flown)
-            each.append(jaxos4.residual_diagnostics(flight, parameters, start))
+            each.append(jaxos4.residual_diagnostics(jaxos4.evaluate(flight, parameters, start)))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
 
 
@@ -40,7 +40,7 @@ def test_figures_are_those_of_plain_numpy():
     states = noisy_states(1)[0]
     problem = standard_problem(states=states, channels="attitude")
     alpha = problem.model.alpha * 1.01
-    found = jaxos4.residual_diagnostics(problem, alpha, fitted=False)
+    found = jaxos4.residual_diagnostics(jaxos4.evaluate(problem, alpha), fitted=False)
     order = [7, 9, 11, 6, 8, 10]
     y = np.asarray(states)[1:, order]
     x = np.asarray(problem.predict(alpha, problem.first_state()[0]))[1:]
@@ -105,7 +105,7 @@ def test_an_effect_of_the_input_that_the_model_lacks_is_detected_in_its_channel(
     noise = jaxos4.SENSOR_SIGMA * jax.random.normal(jax.random.key(1), states.shape)
     problem = standard_problem(states=states + noise, channels="rates")
     found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(model))
-    judgement = jaxos4.residual_diagnostics(problem, found.parameters, found.initial_state)
+    judgement = jaxos4.residual_diagnostics(jaxos4.evaluate(problem, found.parameters, found.initial_state))
     assert judgement.input_p[0] < 1e-6
     assert jnp.abs(judgement.input_correlation[0]).argmax() == 0
     assert judgement.input_p[2] > 1e-3
@@ -114,13 +114,13 @@ def test_an_effect_of_the_input_that_the_model_lacks_is_detected_in_its_channel(
 def test_no_alarm_without_measurements_or_motion_or_with_rounding_errors_or_after_divergence():
     problem = standard_problem(channels="attitude")
     alpha = problem.model.alpha
-    exact = jaxos4.residual_diagnostics(problem, alpha)
+    exact = jaxos4.residual_diagnostics(jaxos4.evaluate(problem, alpha))
     assert (exact.white_p == 1).all()
     assert (exact.input_p == 1).all()
     unmeasured = eqx.tree_at(lambda p: p.flight.states, problem, problem.flight.states.at[:, 6].set(jnp.nan))
-    found = jaxos4.residual_diagnostics(unmeasured, alpha)
+    found = jaxos4.residual_diagnostics(jaxos4.evaluate(unmeasured, alpha))
     assert found.count.tolist() == [500, 500, 500, 0, 500, 500]
-    diverged = jaxos4.residual_diagnostics(problem, alpha.at[2].set(1e9))
+    diverged = jaxos4.residual_diagnostics(jaxos4.evaluate(problem, alpha.at[2].set(1e9)))
     assert (bool(exact.sound), bool(diverged.sound)) == (True, False)
     assert (diverged.count == 0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((found, diverged)))
@@ -130,7 +130,7 @@ def test_no_alarm_without_measurements_or_motion_or_with_rounding_errors_or_afte
     noise = 0.2 * jaxos4.SENSOR_SIGMA * jax.random.normal(jax.random.key(2), flight.states.shape)
     still = eqx.tree_at(lambda f: f.states, flight, (flight.states + noise).at[:, 11].set(0.1))
     known = {"sigma": jaxos4.SENSOR_SIGMA, "initial_state": flight.states[0], "channels": "rates"}
-    found = jaxos4.residual_diagnostics(jaxos4.ShootingProblem(problem.model, still, **known), alpha)
+    found = jaxos4.residual_diagnostics(jaxos4.evaluate(jaxos4.ShootingProblem(problem.model, still, **known), alpha))
     assert (found.input_correlation == 0).all()
     assert (found.input_p == 1).all()
     assert found.percent[2] == 0
@@ -139,6 +139,6 @@ def test_no_alarm_without_measurements_or_motion_or_with_rounding_errors_or_afte
     noisy = eqx.tree_at(lambda f: f.states, problem.flight, noisy_states(1)[0])
     windowed = jaxos4.ShootingProblem(problem.model, noisy, **known)
     found = jaxos4.OutputError()(windowed, jaxos4.Bracket.default(problem.model))
-    judgement = jaxos4.residual_diagnostics(windowed, found.parameters, found.initial_state)
+    judgement = jaxos4.residual_diagnostics(jaxos4.evaluate(windowed, found.parameters, found.initial_state))
     assert (judgement.white_p == 1).all()
     np.testing.assert_allclose(judgement.level, 1, atol=5 * np.sqrt(2 / 430))

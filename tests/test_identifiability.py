@@ -23,7 +23,7 @@ def problem_of(omega, model_class=jaxos4.PublishedOS4, channels="rates", scale=1
 
 
 def analysed(problem):
-    return jaxos4.identifiability(problem, jaxos4.Bracket.default(problem.model), problem.model.alpha)
+    return jaxos4.identifiability(jaxos4.evaluate(problem, problem.model.alpha), jaxos4.Bracket.default(problem.model))
 
 
 def test_a_hover_excites_nothing():
@@ -120,7 +120,8 @@ def residual_noise(flights, correlation_time):
         error = np.asarray(found.parameters - problem.model.alpha)
         for lane in range(LANES):
             noisy = eqx.tree_at(lambda p: p.flight.states, problem, states[lane])
-            covariance = jaxos4.robust_covariance(noisy, found.parameters[lane], found.initial_state[lane])
+            fitted = jaxos4.evaluate(noisy, found.parameters[lane], found.initial_state[lane])
+            covariance = jaxos4.robust_covariance(fitted)
             robust.append(error[lane] / np.sqrt(np.diagonal(covariance)))
         naive.extend(error / found.std)
     return np.array(naive), np.array(robust)
@@ -141,7 +142,8 @@ def test_robust_is_the_bound_under_white_noise():
     found = jaxos4.IBSS()(problem, jaxos4.Bracket.default(problem.model))
     # The robust covariance does not depend on sigma: here it is wrong by a factor of three.
     wrong = eqx.tree_at(lambda p: p.sigma, problem, problem.sigma / 3)
-    robust, again = (jaxos4.robust_covariance(p, found.parameters, found.initial_state) for p in (problem, wrong))
+    fits = (jaxos4.evaluate(p, found.parameters, found.initial_state) for p in (problem, wrong))
+    robust, again = map(jaxos4.robust_covariance, fits)
     assert np.all(np.abs(np.sqrt(np.diagonal(robust)) / found.std - 1) < 0.3)
     np.testing.assert_allclose(again, robust, rtol=1e-6)
 
@@ -152,9 +154,9 @@ def test_nothing_is_identifiable_without_measurements_a_trajectory_or_a_bracket(
     alpha, runaway = problem.model.alpha, problem.model.alpha.at[2].set(1e9)
     blank = eqx.tree_at(lambda p: p.flight.states, problem, jnp.full((501, 12), jnp.nan))
     for broken, at in ((blank, alpha), (problem, runaway)):
-        assert np.isposinf(jaxos4.robust_covariance(broken, at)).all()
+        assert np.isposinf(jaxos4.robust_covariance(jaxos4.evaluate(broken, at))).all()
     for where, at in ((bracket, runaway), (jaxos4.Bracket(bracket.upper, bracket.lower), alpha)):
-        found = jaxos4.identifiability(problem, where, at)
+        found = jaxos4.identifiability(jaxos4.evaluate(problem, at), where)
         assert np.isposinf(found.std).all()
         reason = "the trajectory is not finite, or the bracket is not valid"
         assert found.reasons(names) == dict.fromkeys(names, reason)

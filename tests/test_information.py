@@ -46,7 +46,7 @@ def test_information_is_the_jacobians_square(model_class, channels):
         joint = slopes.T @ slopes
         information = np.linalg.inv(np.linalg.inv(joint)[:8, :8]) if free else joint[:8, :8]
         scale = np.sqrt(np.diagonal(information))
-        actual = jaxos4.fisher_information(problem, alpha)
+        actual = jaxos4.evaluate(problem, alpha).fisher_information
         np.testing.assert_allclose(actual / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-6)
         bound = jaxos4.cramer_rao_bound(problem, alpha)
         np.testing.assert_allclose(np.diagonal(bound), np.diagonal(np.linalg.inv(information)), rtol=1e-4)

@@ -51,13 +51,8 @@ def fit(bracket=BRACKET, **settings):
     return network.fit(shoot(**start()), bracket, key=jax.random.key(0))
 
 
-def diagnose(windows=1, parameters=MODEL.alpha, **settings):
-    problem = shoot(flight=standard_flight(), windows=windows)
-    return jaxos4.residual_diagnostics(problem, parameters, jnp.zeros(3), **settings)
-
-
-def identify(bracket=BRACKET, parameters=MODEL.alpha):
-    return jaxos4.identifiability(shoot(**start()), bracket, parameters)
+def evaluate(windows=1, parameters=MODEL.alpha):
+    return jaxos4.evaluate(shoot(flight=standard_flight(), windows=windows), parameters, jnp.zeros(3))
 
 
 def estimate(name, bracket=BRACKET, model=MODEL, **arguments):
@@ -113,11 +108,9 @@ MISUSE = [
     ("`length` must be `None`", lambda: shoot(windows=5, length=jnp.asarray(7))),
     ("`values`: wind is no unknown; the unknowns are alpha1, ", lambda: hold(alpha1=0.0, wind=1.0)),
     ("`values` holds every unknown", lambda: hold(**dict.fromkeys(MODEL.parameter_names, 0.0))),
-    ("`lags` must lie in 1 to 500", lambda: diagnose(lags=501)),
-    (r"`initial_state` must be of shape \(6,\)", lambda: diagnose(windows=2)),
-    (r"`parameters` must be of shape \(8,\)", lambda: diagnose(parameters=MODEL.alpha[:7])),
-    ("`parameters` must hold 8", lambda: identify(parameters=MODEL.alpha[:4])),
-    ("`bracket` must hold 8", lambda: identify(bracket=SEVEN)),
+    (r"`initial_state` must be of shape \(6,\)", lambda: evaluate(windows=2)),
+    (r"`parameters` must be of shape \(8,\)", lambda: evaluate(parameters=MODEL.alpha[:7])),
+    ("`bracket` must hold 8", lambda: jaxos4.identifiability(evaluate(), SEVEN)),
     # Vehicles.
     ("max_rotor_speed", lambda: vehicle(terms=("motor",))),
     ("leave out lag", lambda: vehicle(terms=("motor", "lag"))),

@@ -14,7 +14,6 @@ import pytest
 from helpers import compiled_programs, curvatures, first_state, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.analysis.evaluation import evaluate
 from jaxos4.shooting import padded
 from jaxos4.simulation import METHODS
 
@@ -104,7 +103,7 @@ def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
     problem = jaxos4.ShootingProblem(
         problem.model, problem.flight, sigma=problem.sigma, channels="attitude", windows=windows
     )
-    found, start = evaluate(problem, problem.model.alpha), first_state(problem)
+    found, start = jaxos4.evaluate(problem, problem.model.alpha), first_state(problem)
     expected = curvatures(problem, problem.model.alpha, start)
     assert found.sound
     np.testing.assert_allclose(found.cost, expected.shot.cost.sum(), rtol=1e-12)
@@ -113,7 +112,7 @@ def test_an_evaluation_has_the_cost_and_the_information_of_the_problem(windows):
     bound = np.asarray(jaxos4.cramer_rao_bound(problem, problem.model.alpha))
     unit = np.sqrt(np.diagonal(bound))
     np.testing.assert_allclose(found.covariance / np.outer(unit, unit), bound / np.outer(unit, unit), atol=1e-9)
-    diverged = evaluate(problem, jnp.asarray(np.where(np.arange(8) == 2, 1e9, problem.model.alpha)))
+    diverged = jaxos4.evaluate(problem, jnp.asarray(np.where(np.arange(8) == 2, 1e9, problem.model.alpha)))
     assert not diverged.sound
     assert diverged.cost == float("inf")
 

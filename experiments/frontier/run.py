@@ -37,7 +37,7 @@ def limits(study: Study, model_name: str, excitation: str, duration: float, chan
     problem = jaxos4.ShootingProblem(
         model, flight, sigma=jaxos4.SENSOR_SIGMA, initial_state=jnp.zeros(12), channels=channels
     )
-    found = jaxos4.identifiability(problem, jaxos4.Bracket.default(model), model.alpha)
+    found = jaxos4.identifiability(jaxos4.evaluate(problem, model.alpha), jaxos4.Bracket.default(model))
     return np.where(found.excited | (model.alpha == 0), found.noise_limit, np.nan)
 
 

@@ -61,7 +61,7 @@ def judge(exact: jaxos4.ShootingProblem, found: jaxos4.Estimate, states: jax.Arr
     least = []
     for flight, parameters, start in zip(states, found.parameters, found.initial_state, strict=True):
         problem = eqx.tree_at(lambda p: p.flight.states, exact, flight)
-        tests = jaxos4.residual_diagnostics(problem, parameters, start)
+        tests = jaxos4.residual_diagnostics(jaxos4.evaluate(problem, parameters, start))
         least.append([min(p.size * p.min(), 1.0) for p in (tests.white_p, tests.input_p, tests.level_p)])
     names, half_width = jaxos4.result_names(found.result), np.asarray(found.half_width(0.95))
     return Fits(np.asarray(found.parameters), half_width, names, *np.array(least).T)

@@ -3,17 +3,14 @@
 The sandwich covariance is that of a fit whose residuals are coloured, or not as large as sigma says.
 """
 
-import functools
-
-import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from .._custom_types import Covariance, InitialStates, Parameters, as_float
 from .._xla import quick_jit
-from ..linalg import covariance_of_shared, gram, joint_factor
+from ..linalg import covariance_of_shared
 from ..shooting import ShootingProblem
-from .evaluation import Evaluation, evaluate, inverse, shared_information
+from .evaluation import Evaluation, inverse
 
 # Residuals are taken as correlated over lags up to this share of the flight.
 _LAGS = 0.1
@@ -23,70 +20,38 @@ _MANY_WINDOWS, _LARGEST_WINDOW = 20, 4000
 Spread = Float[np.ndarray, "parameters parameters"]
 
 
-def fisher_information(
-    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
-) -> Covariance:
-    """J^T W^2 J in the parameters, with the Jacobian J at `parameters` and the weights W = 1 / sigma.
-
-    A free initial state is unknown too and is eliminated (Schur complement). `initial_state` is where J is computed, by
-    default the measured one.
-    """
-    return _information_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
-
-
+@quick_jit
 def cramer_rao_bound(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Covariance:
-    """The smallest covariance that an unbiased estimate can have: the inverse of `fisher_information`.
+    """The smallest covariance that an unbiased estimate can have: the inverse of the Fisher information J^T W^2 J.
 
-    A parameter that is not excited has a huge variance, but not an infinite one.
+    J is the Jacobian at `parameters`, W the weights 1 / sigma. A free initial state is unknown too. `initial_state` is
+    where J is computed, by default the measured one. A parameter that is not excited has a huge variance, but not an
+    infinite one.
     """
-    return _covariance_of_shared(_information(problem, parameters, initial_state), parameters.shape[0])
-
-
-# A program of its own: information and bound share it, and the simulation is what takes long to compile.
-@quick_jit
-def _information(
-    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None
-) -> Float[Array, "windows unknowns unknowns"]:
     start = problem.first_state()[0] if initial_state is None else as_float(initial_state)
-    return problem.curvatures(as_float(parameters), start).information
+    information = problem.curvatures(as_float(parameters), start).information
+    return covariance_of_shared(information, parameters.shape[0])
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def _information_of_shared(information: Float[Array, "windows unknowns unknowns"], count: int) -> Covariance:
-    return gram(joint_factor(information, count).factor[0, :count, -count:])
-
-
-_covariance_of_shared = jax.jit(covariance_of_shared, static_argnums=1)
-
-
-def robust_covariance(
-    problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
-) -> Spread:
+def robust_covariance(evaluation: Evaluation) -> Spread:
     """The covariance of fitted parameters, F^-1 (sum_t sum_s J_t^T R(t, s) J_s) F^-1, from the residuals of the fit.
 
     F is the Fisher information, J the Jacobian of the weighted residuals, and R their autocovariance, between channels
     too. The residuals are taken as the noise. They lack slow noise that the fit explained as motion. A flight must
-    therefore be many times longer than the correlation time of the noise. NumPy computes it, for one flight.
+    therefore be many times longer than the correlation time of the noise.
 
-    **Arguments:** as for `cramer_rao_bound`, at the answer of a fit.
+    **Arguments:** the flight, evaluated at the answer of a fit.
 
     **Returns:** the covariance; infinite if the trajectory diverges or nothing was measured.
 
     Reference: Klein and Morelli, Aircraft System Identification, chapter 6. Coverage: `docs/measured.md`.
     """
-    return robust_covariance_of(evaluate(problem, parameters, initial_state))
-
-
-def robust_covariance_of(evaluation: Evaluation) -> Spread:
-    """`robust_covariance` of a flight that was simulated already."""
     count, measured = evaluation.parameters.size, ~np.isnan(evaluation.measured)
     if not (evaluation.sound and measured.any()):
         return np.full((count, count), np.inf)
-    jacobian = evaluation.jacobian
-    information = jacobian @ np.swapaxes(jacobian, 1, 2)
-    shared = inverse(shared_information(information, count))
+    jacobian, information, shared = evaluation.jacobian, evaluation.information, evaluation.covariance
     cross, own = information[:, count:, :count], information[:, count:, count:]
     sensitivity = np.concatenate(
         [np.broadcast_to(shared, (len(cross), count, count)), -inverse(own) @ cross @ shared], 1

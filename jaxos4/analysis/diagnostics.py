@@ -4,11 +4,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._custom_types import InitialStates, Parameters
-from ..shooting import ROUNDING, ShootingProblem
-from .evaluation import Evaluation, evaluate
+from ..shooting import ROUNDING
+from .evaluation import Evaluation
 
-# Correlations of residuals are computed up to this many samples apart.
+# Correlations of residuals are computed up to this many samples apart, and in a short flight up to half of it.
 _LAGS = 25
 # Residuals below this share of a channel's largest value are rounding errors, in double precision.
 _ROUNDING = 1e-9
@@ -52,41 +51,14 @@ class Diagnostics(eqx.Module):
     input_p: Float[np.ndarray, " size"]
 
 
-def residual_diagnostics(
-    problem: ShootingProblem,
-    parameters: Parameters,
-    initial_state: InitialStates | None = None,
-    *,
-    fitted: bool = True,
-    lags: int = _LAGS,
-) -> Diagnostics:
-    """Diagnostics of the residuals at `parameters`, computed by NumPy for one flight.
+def residual_diagnostics(evaluation: Evaluation, *, fitted: bool = True) -> Diagnostics:
+    """Diagnostics of the residuals of one flight, evaluated at the answer of a fit.
 
-    **Arguments:**
-
-    - `parameters`, `initial_state`: of a fit. The initial state is by default the measured one.
-    - `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom.
-    - `lags`: the largest lag of the correlations, in samples.
-
-    **Raises:** `ValueError` for wrong shapes, or a flight with too few samples for `lags`.
+    `fitted`: whether the parameters were fitted to this flight, which uses degrees of freedom.
     """
-    for name, value, length in (
-        ("parameters", parameters, len(problem.model.parameter_names)),
-        ("initial_state", initial_state, problem.windows * problem.size),
-    ):
-        if value is not None and np.shape(value) != (length,):
-            raise ValueError(f"`{name}` must be of shape ({length},), got {np.shape(value)}.")
-    samples = problem.flight.states.shape[-2]
-    if not 1 <= lags < samples:
-        raise ValueError(f"`lags` must lie in 1 to {samples - 1} for {samples} samples, got {lags}.")
-    return diagnostics_of(evaluate(problem, parameters, initial_state), fitted=fitted, lags=lags)
-
-
-def diagnostics_of(evaluation: Evaluation, *, fitted: bool, lags: int | None = None) -> Diagnostics:
-    """`residual_diagnostics` of a flight that was simulated already. `lags`: fewer in a short flight by default."""
     from scipy.special import gammainc, gammaincc  # slow to import, and few need it
 
-    lags = min(_LAGS, evaluation.measured.shape[0] // 2) if lags is None else lags
+    lags = min(_LAGS, evaluation.measured.shape[0] // 2)
     problem, sound = evaluation.problem, evaluation.sound
     # A diverged trajectory counts as nothing measured.
     measured = ~np.isnan(evaluation.measured) & sound

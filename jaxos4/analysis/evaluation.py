@@ -20,7 +20,7 @@ _THETA = 4  # the place of the pitch angle in cascade order
 
 
 class Evaluation(NamedTuple):
-    """A flight simulated at `parameters`, on the host.
+    """A flight simulated at `parameters`, as NumPy arrays. Made by `jaxos4.evaluate`.
 
     - `problem`: its sigma gives the weights.
     - `measured`, `predicted`: what sensors measured (NaN: missing), and what noise-free sensors measure.
@@ -75,18 +75,32 @@ class Evaluation(NamedTuple):
         return jacobian @ np.swapaxes(jacobian, 1, 2)
 
     @property
+    def fisher_information(self) -> Float[np.ndarray, "parameters parameters"]:
+        """J^T W^2 J in the parameters, which all windows share; free initial states are eliminated."""
+        information, count = self.information, self.parameters.size
+        cross, own = information[:, count:, :count], information[:, count:, count:]
+        return (information[:, :count, :count] - np.swapaxes(cross, 1, 2) @ inverse(own) @ cross).sum(axis=0)
+
+    @property
     def covariance(self) -> Float[np.ndarray, "parameters parameters"]:
         """The Cramer-Rao bound of the parameters; infinite if the trajectory is not sound."""
         count = self.parameters.size
-        if not self.sound:
-            return np.full((count, count), np.inf)
-        return inverse(shared_information(self.information, count))
+        return inverse(self.fisher_information) if self.sound else np.full((count, count), np.inf)
 
 
 def evaluate(
     problem: ShootingProblem, parameters: Parameters, initial_state: InitialStates | None = None
 ) -> Evaluation:
-    """Simulate a flight with all first derivatives. `initial_state` defaults to the measured one."""
+    """Simulate a flight with all first derivatives. `initial_state` defaults to the measured one.
+
+    **Raises:** `ValueError` for wrong shapes.
+    """
+    for name, value, length in (
+        ("parameters", parameters, len(problem.model.parameter_names)),
+        ("initial_state", initial_state, problem.windows * problem.size),
+    ):
+        if value is not None and np.shape(value) != (length,):
+            raise ValueError(f"`{name}` must be of shape ({length},), got {np.shape(value)}.")
     parameters, samples = as_float(parameters), problem.flight.time.shape[0]
     flown = _fly(padded(problem), parameters, initial_state)
     # In double precision from here on: a difference of information matrices would lose the digits of single precision.
@@ -123,14 +137,6 @@ def _fly(
     # One unknown after another, with a loop: one simulation is compiled, and the memory holds no copies of the flight.
     predicted, slopes = jax.lax.scan(along, jnp.zeros_like(problem.measured()), jnp.eye(count + free, dtype=here.dtype))
     return predicted, slopes, jnp.stack(problem.forcing(parameters)[:3], axis=1), problem.model.alpha
-
-
-def shared_information(
-    information: Float[np.ndarray, "windows unknowns unknowns"], count: int
-) -> Float[np.ndarray, "count count"]:
-    """The information in the first `count` unknowns, which all windows share: the sum of the Schur complements."""
-    shared, cross, own = information[:, :count, :count], information[:, count:, :count], information[:, count:, count:]
-    return (shared - np.swapaxes(cross, 1, 2) @ inverse(own) @ cross).sum(axis=0)
 
 
 def inverse(information: Float[np.ndarray, "*batch n n"]) -> Float[np.ndarray, "*batch n n"]:

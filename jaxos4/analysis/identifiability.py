@@ -4,11 +4,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._custom_types import InitialStates, Parameters, as_float
+from .._custom_types import as_float
 from ..bracket import Bracket, is_identifiable
 from ..results import NINETY_FIVE
-from ..shooting import ShootingProblem
-from .evaluation import Evaluation, evaluate, inverse, shared_information
+from .evaluation import Evaluation, evaluate, inverse
 
 Values = Float[np.ndarray, " parameters"]
 
@@ -78,35 +77,24 @@ class Identifiability(eqx.Module):
         return [j for j in range(len(share)) if j != i and share[j] > _PARTNER] or [int(np.argsort(share)[-2])]
 
 
-def identifiability(
-    problem: ShootingProblem, bracket: Bracket, parameters: Parameters, initial_state: InitialStates | None = None
-) -> Identifiability:
+def identifiability(evaluation: Evaluation, bracket: Bracket) -> Identifiability:
     """Analyse which parameters of the problem's model its flight can identify, at the problem's sigma.
 
-    **Arguments:**
+    **Arguments:** the flight, evaluated where the information is computed, and a bracket, whose half-widths say how
+    well each parameter is known without the flight. A free initial state is estimated too. If the trajectory diverges,
+    or the bracket is not valid, the standard deviations are infinite.
 
-    - `bracket`: its half-widths say how well each parameter is known without the flight.
-    - `parameters`, `initial_state`: where the information is computed. A free initial state is estimated too. If the
-      trajectory diverges there, or the bracket is not valid, the standard deviations are infinite.
-
-    **Raises:** `ValueError` for a wrong number of parameters.
+    **Raises:** `ValueError` for a bracket of another length.
     """
-    names = problem.model.parameter_names
-    for name, shape in (("parameters", np.shape(parameters)), ("bracket", bracket.lower.shape)):
-        if shape != (len(names),):
-            raise ValueError(f"`{name}` must hold {len(names)} parameters, got shape {shape}.")
-    return identifiability_of(evaluate(problem, parameters, initial_state), bracket)
-
-
-def identifiability_of(evaluation: Evaluation, bracket: Bracket) -> Identifiability:
-    """`identifiability` where a flight was simulated already."""
+    if bracket.lower.shape != evaluation.nominal.shape:
+        raise ValueError(f"`bracket` must hold {evaluation.nominal.size} parameters, got {bracket.lower.shape[0]}.")
     nominal, half_width = evaluation.nominal, np.asarray(bracket.half_width)
     valid = bool(((half_width > 0) & np.isfinite(half_width)).all())
     sound = valid and evaluation.sound
     if not evaluation.sound:
         evaluation = evaluate(evaluation.problem, as_float(nominal))
     half_width = half_width if valid else np.ones_like(nominal)
-    information = shared_information(evaluation.information, nominal.size)
+    information = evaluation.fisher_information
     scaled = np.nan_to_num(information * half_width[:, None] * half_width, posinf=0.0, neginf=0.0)
     eigenvalues, directions = np.linalg.eigh(scaled)
     diagonal = np.diagonal(information)

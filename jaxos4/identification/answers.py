@@ -6,7 +6,7 @@ import numpy as np
 from .._custom_types import Parameters
 from .._xla import quick_jit
 from ..analysis.diagnostics import Diagnostics
-from ..analysis.identifiability import identifiability_of
+from ..analysis.identifiability import identifiability
 from ..analysis.inertia import fit_inertia
 from ..bracket import is_identifiable
 from ..estimate import Estimate
@@ -48,7 +48,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
     if not case.is_vehicle:
         limits = dict.fromkeys(unknowns.names)
     if fit.evaluation is not None:
-        information = identifiability_of(fit.evaluation, unknowns.bracket)
+        information = identifiability(fit.evaluation, unknowns.bracket)
         notes, known = information.notes(unknowns.names), information.identifiable & information.excited
         reasons |= {name: notes[name] for i, name in enumerate(unknowns.names) if not known[i] and name in notes}
         limits = {name: finite_or_none(x) for name, x in zip(unknowns.names, information.noise_limit, strict=True)}

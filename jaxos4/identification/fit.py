@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import as_float
-from ..analysis.covariance import robust_covariance_of
-from ..analysis.diagnostics import Diagnostics, diagnostics_of
+from ..analysis.covariance import robust_covariance
+from ..analysis.diagnostics import Diagnostics, residual_diagnostics
 from ..analysis.evaluation import Evaluation, evaluate
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
@@ -129,10 +129,10 @@ def fit_flight(
         return Fit(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
     evaluation = evaluated()
     bound, covariance = evaluation.covariance, estimate.covariance
-    diagnostics = diagnostics_of(evaluation, fitted=True)
+    diagnostics = residual_diagnostics(evaluation)
     if estimator.shoots:
         coloured = (diagnostics.colour > COLOURED).any()
-        covariance = robust_covariance_of(evaluation) if coloured else bound
+        covariance = robust_covariance(evaluation) if coloured else bound
     estimate = eqx.tree_at(
         lambda e: (e.covariance, e.cost), estimate, (as_float(covariance), as_float(evaluation.cost))
     )

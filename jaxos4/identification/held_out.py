@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._custom_types import as_float
 from .._xla import quick_jit
-from ..analysis.diagnostics import diagnostics_of
+from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate
 from ..analysis.frequency_response import frequency_response
 from ..analysis.prediction import Disturbances, Predictions, Skill, disturbances, predictions, skill
@@ -106,5 +106,5 @@ def validate_on(fit: Fit, held_out: HeldOut) -> Validation:
     start, cost, sound, _ = quick_jit(fit_start)(padded(other), parameters)
     if not bool(sound):
         return Validation(held_out.name, None, None)
-    diagnostics = diagnostics_of(evaluate(other, parameters, start), fitted=False)
+    diagnostics = residual_diagnostics(evaluate(other, parameters, start), fitted=False)
     return Validation(held_out.name, finite_or_none(cost), channel_fits(other, diagnostics))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..airframe import Airframe
 from ..analysis.evaluation import evaluate
-from ..analysis.identifiability import identifiability_of
+from ..analysis.identifiability import identifiability
 from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..estimators import IBSS
@@ -150,7 +150,7 @@ def assess(
     settings = {"channels": channels, "initial_state": initial_state, "window": window}
     problem = flight_problem(recording, model, where, **settings)
     fit = fit_flight(IBSS(), problem, progress=progress)
-    known = identifiability_of(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
+    known = identifiability(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
     names, notes = model.parameter_names, known.notes(model.parameter_names)
     std, alone, half_width, limit = map(np.asarray, (known.std, known.std_alone, known.half_width, known.noise_limit))
     finite = bool(np.isfinite(std).all())
