@@ -1,8 +1,9 @@
 """Options of XLA for a CPU: loops become native functions, and the program of one flight compiles quickly.
 
 By default, XLA calls one compiled function for every few operations of a loop, in each step. A step of a flight is so
-short that the calls take ten times as long as the operations. The option that changes this cannot be set for a program,
-only for the process, in `XLA_FLAGS`, which JAX reads when it starts to compute. All other options are set for programs.
+short that the calls take ten times as long as the operations. XLA also uses half the width of a processor's vectors.
+The options that change this are set for the process, in `XLA_FLAGS`, which JAX reads when it starts to compute: the
+first cannot be set for a program, and the second concerns programs that users compile. All others are set for programs.
 """
 
 import functools
@@ -18,10 +19,17 @@ R = TypeVar("R")
 NO_OPTIONS = "JAXOS4_NO_XLA_OPTIONS"
 """The environment variable that switches off all options of this file."""
 
-_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+LOOP_FLAGS = {
+    "xla_cpu_small_while_loop_byte_threshold": (
+        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+    ),
+    "xla_cpu_prefer_vector_width": "--xla_cpu_prefer_vector_width=512",
+}
+"""The flags of the process, by the names of their options.
 
-NATIVE_LOOPS = f"--xla_backend_extra_options={_OPTION}=1000000000"
-"""Loops whose step moves less than a gigabyte become native functions. Larger ones keep XLA's threads."""
+- Loops whose step moves less than a gigabyte become native functions. Larger ones keep XLA's threads.
+- Vectors are as wide as the processor's. Results are the same.
+"""
 
 QUICK = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 """XLA's older way to write loops, and fewer optimisations: three quarters of the time to compile a program.
@@ -33,15 +41,16 @@ KNOWN_TO = ("0.10.",)
 """The versions of jaxlib that know the options in `QUICK`: an unknown option is an error."""
 
 
-def make_loops_native() -> None:
-    """Adds `NATIVE_LOOPS` to `XLA_FLAGS`, unless the user has set this option, or the name of a file with flags.
+def make_loops_fast() -> None:
+    """Adds `LOOP_FLAGS` to `XLA_FLAGS`: each whose option the user has not set; none to the name of a file with flags.
 
-    Warns if JAX has computed before: the option is then without effect.
+    Warns if JAX has computed before: the flags are then without effect.
     """
     flags = os.environ.get("XLA_FLAGS", "").strip()
-    if os.environ.get(NO_OPTIONS) or _OPTION in flags or (flags and not flags.startswith("--")):
+    added = [flag for option, flag in LOOP_FLAGS.items() if option not in flags]
+    if os.environ.get(NO_OPTIONS) or not added or (flags and not flags.startswith("--")):
         return
-    os.environ["XLA_FLAGS"] = f"{flags} {NATIVE_LOOPS}".strip()
+    os.environ["XLA_FLAGS"] = " ".join([flags, *added]).strip()
     if _computes_on_cpu():
         warnings.warn(
             "JAX has computed before `import jaxos4`, so that XLA does not make loops native functions: simulations "

@@ -33,10 +33,10 @@ rarely_collect_garbage()
 # Before JAX starts to compute: all programs compile as the program of one flight does, because tests compile for longer
 # than they compute. The other cores have workers: a program compiled in parts takes a tenth more time of all cores.
 OURS = " ".join(
-    [_xla.NATIVE_LOOPS, *(f"--{name}={value}".lower() for name, value in _xla.QUICK.items())]
+    [*_xla.LOOP_FLAGS.values(), *(f"--{name}={value}".lower() for name, value in _xla.QUICK.items())]
     + ["--xla_cpu_parallel_codegen_split_count=1"]
 )
-if os.environ.get("XLA_FLAGS") == _xla.NATIVE_LOOPS and jax.__version__.startswith(_xla.KNOWN_TO):
+if os.environ.get("XLA_FLAGS") == " ".join(_xla.LOOP_FLAGS.values()) and jax.__version__.startswith(_xla.KNOWN_TO):
     os.environ |= {"XLA_FLAGS": OURS, _xla.NO_OPTIONS: "1"}
 # In a worker, the controller has set them.
 FLAGS_ARE_OURS = os.environ.get("XLA_FLAGS") == OURS

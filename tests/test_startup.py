@@ -15,7 +15,7 @@ import pytest
 from jax._src import compiler
 
 import jaxos4
-from jaxos4._xla import NATIVE_LOOPS, NO_OPTIONS, make_loops_native, quick_jit
+from jaxos4._xla import LOOP_FLAGS, NO_OPTIONS, make_loops_fast, quick_jit
 from jaxos4.cli import _jax, _options, train
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
@@ -214,25 +214,30 @@ def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path)
     assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52
 
 
+NATIVE, WIDE = LOOP_FLAGS.values()
+
+
 @pytest.mark.parametrize(
     ("variables", "flags"),
     [
-        ({}, NATIVE_LOOPS),
-        ({"XLA_FLAGS": "--own=1"}, f"--own=1 {NATIVE_LOOPS}"),
-        ({"XLA_FLAGS": "--xla_backend_extra_options=own=1"}, f"--xla_backend_extra_options=own=1 {NATIVE_LOOPS}"),
-        ({"XLA_FLAGS": NATIVE_LOOPS.replace("1000000000", "1000")}, NATIVE_LOOPS.replace("1000000000", "1000")),
+        ({}, f"{NATIVE} {WIDE}"),
+        ({"XLA_FLAGS": "--own=1"}, f"--own=1 {NATIVE} {WIDE}"),
+        ({"XLA_FLAGS": "--xla_backend_extra_options=own=1"}, f"--xla_backend_extra_options=own=1 {NATIVE} {WIDE}"),
+        ({"XLA_FLAGS": NATIVE.replace("1000000000", "1000")}, f"{NATIVE.replace('1000000000', '1000')} {WIDE}"),
+        ({"XLA_FLAGS": WIDE.replace("512", "128")}, f"{WIDE.replace('512', '128')} {NATIVE}"),
+        ({"XLA_FLAGS": f"{WIDE} {NATIVE}"}, f"{WIDE} {NATIVE}"),
         ({"XLA_FLAGS": "flags.txt"}, "flags.txt"),
         ({"XLA_FLAGS": "--own=1", NO_OPTIONS: "1"}, "--own=1"),
         ({NO_OPTIONS: "1"}, None),
     ],
 )
-def test_the_import_makes_loops_native_and_replaces_no_flag(variables, flags, monkeypatch, recwarn):
+def test_the_import_makes_loops_fast_and_replaces_no_flag(variables, flags, monkeypatch, recwarn):
     for name in ("XLA_FLAGS", NO_OPTIONS):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     jax.devices()
-    make_loops_native()
+    make_loops_fast()
     assert os.environ.get("XLA_FLAGS") == flags
     # JAX has computed in this process, so that a new flag comes too late.
     assert len(recwarn) == (flags != variables.get("XLA_FLAGS"))
