@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,7 +21,7 @@ from ..recording.reading import Recording, as_recordings
 from ..results import result_names
 from .answers import channel_fits
 from .fit import Fit, fit_case, fit_flight
-from .judge import Judgement, judge
+from .judge import judge
 from .prepare import Case, prepare_flight
 from .problem import Intervals, bracket_of, flight_problem
 from .results import FlightInformation, Identification, ParameterInformation, SampleTime, finite_or_none, has_answer
@@ -84,8 +85,8 @@ def identify(
         own = own_settings(FlightSettings, settings)
         case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
         fit = fit_case(case, progress=progress)
-    verdict = judge(case, fit, sample_times, progress=progress)
-    return describe(case, fit, verdict, sample_times, time.perf_counter() - begin)
+    judged = judge(case, fit, sample_times, progress=progress)
+    return describe(case, fit, judged, sample_times, time.perf_counter() - begin)
 
 
 def _fit_vehicle(
@@ -102,17 +103,16 @@ def _fit_vehicle(
 
 
 def describe(
-    case: Case, fit: Fit, verdict: Judgement, sample_times: tuple[SampleTime, ...], seconds: float
+    case: Case, fit: Fit, judged: dict[str, Any], sample_times: tuple[SampleTime, ...], seconds: float
 ) -> Identification:
-    """Everything about an answer, in the fields that pages and files show."""
+    """Everything about an answer, in the fields that pages and files show. `judged`: see `judge`."""
     result, free = str(result_names(fit.estimate.result)), fit.free
     covariance, sigma = np.asarray(fit.estimate.covariance)[np.ix_(free, free)], np.asarray(fit.problem.sigma)
-    judged = verdict._asdict()
-    notes = [*case.provenance.notes, *judged.pop("notes")]
+    notes, doubts = [*case.provenance.notes, *judged.pop("notes", ())], judged.get("doubts")
     return Identification(
         estimator=case.name,
         model=case.model,
-        result=verdict.doubts[0].result if verdict.doubts and result in _ANSWERS else result,
+        result=doubts[0].result if doubts and result in _ANSWERS else result,
         rollouts=fit.rollouts,
         cost=finite_or_none(fit.estimate.cost),
         seconds=seconds,

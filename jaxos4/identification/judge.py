@@ -1,14 +1,14 @@
 """Checks before an estimate of a vehicle is believed: each doubt has a cause and a remedy."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from .._custom_types import as_float
 from ..airframe import Airframe
-from ..analysis.frequency_response import FrequencyResponse, frequency_response
+from ..analysis.frequency_response import frequency_response
 from ..analysis.inertia import fit_inertia
 from ..analysis.prediction import Predictions
 from ..models.abstract import AbstractModel, Parameter
@@ -19,7 +19,7 @@ from .answers import AXES, NOISY, overwhelmed, parameter_table, rigid_body
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
-from .results import Constant, Disturbance, Doubt, ParameterEstimate, PredictionSkill, RigidBody, SampleTime, Validation
+from .results import Constant, Disturbance, Doubt, ParameterEstimate, PredictionSkill, RigidBody, SampleTime
 from .sample_time import moved, noise_of_speeds
 
 # Doubts need this many standard deviations.
@@ -267,35 +267,18 @@ def _implausible(cause: str, remedy: str) -> Doubt:
     return Doubt("implausible", cause, remedy)
 
 
-class Judgement(NamedTuple):
-    """Everything that speaks for and against an answer.
+def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, progress: Progress) -> dict[str, Any]:
+    """Compare an answer with the airframe, with other sample times, and with measurements that were not fitted.
 
-    - `parameters`, `rigid_body`: the answer itself; empty for a vehicle without one.
-    - `doubts`: why a vehicle's answer is not to be trusted.
-    - `notes`: what could not be checked.
-    - `validation`: how well an OS4 model explains another flight.
-    - `skill`, `predictions`: of measurements of a vehicle that were not fitted.
-    - `response`: the frequency response of a vehicle.
+    **Returns:** the fields of an `Identification` for the answer, and for what speaks for and against it. `notes`: what
+    could not be checked.
     """
-
-    parameters: dict[str, ParameterEstimate] = {}
-    rigid_body: RigidBody = RigidBody()
-    doubts: tuple[Doubt, ...] = ()
-    notes: tuple[str, ...] = ()
-    validation: Validation | None = None
-    skill: PredictionSkill | None = None
-    predictions: Predictions | None = None
-    response: FrequencyResponse | None = None
-
-
-def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, progress: Progress) -> Judgement:
-    """Compare an answer with the airframe, with other sample times, and with measurements that were not fitted."""
     if not fit.answered:
-        return Judgement(parameters={} if case.is_vehicle else parameter_table(case, fit))
+        return {"parameters": {} if case.is_vehicle else parameter_table(case, fit)}
     table, held_out = parameter_table(case, fit), case.held_out
     if not case.is_vehicle:
-        other = None if held_out is None else validate_on(fit, held_out)
-        return Judgement(table, rigid_body(case, fit), validation=other)
+        other = None if held_out is None else validate_on(fit, held_out, case.validate)
+        return {"parameters": table, "rigid_body": rigid_body(case, fit), "validation": other}
     step = float(fit.problem.flight.dt)
     known = [each.speed_noise for each in sample_times if each.sample_time == step]
     noise = known[0] if known else noise_of_speeds(fit.problem.flight, fit.problem.flight, fit.problem.model.airframe)
@@ -303,7 +286,7 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     predicted = skill = None
     if held_out is not None:
         progress("predicting what was not fitted")
-        predicted, skill = predict_held_out(fit, held_out, case.room)
+        predicted, skill = predict_held_out(case, fit, held_out)
     still = () if predicted is None else _still_axes(fit, predicted)
     notes = [
         f"the held-out part hardly turns about {' and '.join(still)}; choose another with `begin`, `end` or `validate`"
@@ -328,12 +311,12 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     )
     doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(noise), *_moved(sample_times, step, body))
     values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
-    return Judgement(
-        table,
-        body,
-        doubts,
-        tuple(notes),
-        skill=skill,
-        predictions=predicted,
-        response=frequency_response(with_room(fit.problem, case.room), values),
-    )
+    return {
+        "parameters": table,
+        "rigid_body": body,
+        "doubts": doubts,
+        "notes": notes,
+        "skill": skill,
+        "predictions": predicted,
+        "response": frequency_response(with_room(fit.problem, case.room), values),
+    }

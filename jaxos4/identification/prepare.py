@@ -22,20 +22,6 @@ from .settings import FlightSettings, airframe_name, class_name, name_and_class,
 Progress = Callable[[str], None]
 
 
-class HeldOut(NamedTuple):
-    """Measurements that are not fitted.
-
-    - `problem`: with these measurements. `name`: of the recording.
-    - `seconds`: how long they last [s].
-    - `fitted_vehicle`: whether they are a part of the fitted recordings, which have their own offsets.
-    """
-
-    problem: ShootingProblem
-    name: str
-    seconds: float = 0.0
-    fitted_vehicle: bool = False
-
-
 class Case(NamedTuple):
     """Everything that a fit needs, and the measurements that test it.
 
@@ -43,9 +29,10 @@ class Case(NamedTuple):
     - `estimator`: what searches it; `name`: of the estimator.
     - `model`: the name of the equations.
     - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`.
-    - `held_out`: the measurements that are not fitted, if there are any.
+    - `held_out`: the flight with the measurements that are not fitted, if there are any.
     - `recording`: the number of the recording of each sample.
     - `provenance`: data, settings and versions.
+    - `validate`: the name of the other recording that `held_out` is; empty: it is a part of the fitted ones.
     - `doubts`: cause and remedy of each doubt about the logs. `log_step`: the longest sample of the logs [s].
     """
 
@@ -55,9 +42,10 @@ class Case(NamedTuple):
     name: str
     model: str
     prior: float
-    held_out: HeldOut | None
+    held_out: ShootingProblem | None
     recording: np.ndarray
     provenance: Provenance
+    validate: str = ""
     doubts: tuple[tuple[str, str], ...] = ()
     log_step: float = 0.0
 
@@ -70,16 +58,6 @@ class Case(NamedTuple):
     def room(self) -> int:
         """The number of samples of a padded flight: checks at all sample times share their programs."""
         return self.problem.flight.time.shape[0]
-
-    @property
-    def innovations(self) -> InnovationsProblem:
-        """The likelihood of a vehicle.
-
-        **Raises:** `ValueError` for a flight of an OS4.
-        """
-        if not isinstance(self.problem, InnovationsProblem):
-            raise ValueError("`problem` must be one of innovations.")
-        return self.problem
 
 
 def prepare_flight(
@@ -129,9 +107,9 @@ def prepare_flight(
             )
         if not kind.shoots:
             problem = problem.restrict(trained.channels).within(trained.bracket)
-    notes, held_out = recording.notes, None
+    notes, name_of_other = recording.notes, ""
     if validate is not None and other is not None:
-        held_out, notes = HeldOut(_comparable(other, problem, validate), validate.name), notes + validate.named_notes
+        other, notes, name_of_other = _comparable(other, problem, validate), notes + validate.named_notes, validate.name
     samples = int(problem.flight.time.shape[0])
     provenance = Provenance(
         flight=recording.name,
@@ -145,7 +123,8 @@ def prepare_flight(
         notes=list(notes),
         **versions(problem),
     )
-    return Case(problem, problem, method, name, subject, kind.prior, held_out, np.zeros(samples, int), provenance)
+    one = np.zeros(samples, int)
+    return Case(problem, problem, method, name, subject, kind.prior, other, one, provenance, name_of_other)
 
 
 def _restricted(problem: ShootingProblem, channels: str, name: str, recording: Recording) -> ShootingProblem:

@@ -250,7 +250,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     cost: float | None
     seconds: float
     parameters: dict[str, ParameterEstimate]
-    rigid_body: RigidBody
+    rigid_body: RigidBody = RigidBody()
     provenance: Provenance
     covariance: list[list[float]] | None
     estimate: Estimate

@@ -19,7 +19,7 @@ from ..estimate import REACH
 from ..flight import Flight
 from ..shooting import InnovationsProblem
 from .answers import AXES, NOISY, overwhelmed, vehicle_constants
-from .fit import Fit, fit_innovations
+from .fit import Fit, fit_case
 from .held_out import compile_ahead
 from .prepare import Case, Progress
 from .results import Constant, SampleTime
@@ -41,11 +41,10 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     fits: list[Fit] = []
     with ThreadPoolExecutor(1) as beside:
         for case in reversed(cases):
-            problem = case.innovations
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            if fits and fits[0].answered:
-                problem = problem.starting_from(_start(problem, np.asarray(fits[0].estimate.parameters)))
-            fits.insert(0, fit_innovations(case.estimator, problem, case.recording, shooting=case.shooting))
+            if fits and fits[0].answered and isinstance(case.problem, InnovationsProblem):
+                case = case._replace(problem=_started(case.problem, np.asarray(fits[0].estimate.parameters)))
+            fits.insert(0, fit_case(case))
             if len(fits) == 1:
                 beside.submit(compile_ahead, case)
     finest = cases[0].shooting.flight
@@ -54,8 +53,8 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     return place, fits[place], answers
 
 
-def _start(problem: InnovationsProblem, found: np.ndarray) -> np.ndarray:
-    """Where the next fit starts: at the answer of the last one.
+def _started(problem: InnovationsProblem, found: np.ndarray) -> InnovationsProblem:
+    """The problem, with a search that starts at the answer of the last fit.
 
     If a parameter went to its limit, the answer may be another minimum. The parameters then start at their centers, and
     only the noise at that of the last answer.
@@ -63,7 +62,7 @@ def _start(problem: InnovationsProblem, found: np.ndarray) -> np.ndarray:
     own = problem.problem.unknowns
     off = np.abs(found[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
     is_inside = (off < _NEAR * REACH).all()
-    return found if is_inside else np.concatenate([np.full(own.count, np.nan), found[own.count :]])
+    return problem.starting_from(np.where(is_inside | (np.arange(found.size) >= own.count), found, np.nan))
 
 
 def shortest(answers: Sequence[SampleTime]) -> int:

@@ -20,7 +20,7 @@ from ..recording import preparation
 from ..recording.preparation import Prepared
 from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from .prepare import Case, HeldOut, Progress
+from .prepare import Case, Progress
 from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
 from .results import Provenance
 from .settings import VehicleSettings, airframe_name, name_and_class, versions
@@ -82,7 +82,7 @@ def _case(
     shooting = _vehicle_shooting(
         model, prepared, bracket_of(_levelled(bracket, prepared, model), model), recordings[0].name
     )
-    held_out, notes = _held_out(recordings, validate, prepared, shooting, model)
+    held_out, tested_seconds, notes = _held_out(recordings, validate, prepared, shooting, model)
     stretch = prepared.fitted.stretch
     number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
     powered = any(VOLTAGE in TERMS[term].needs for term in terms)
@@ -93,7 +93,7 @@ def _case(
         terms=list(terms),
         sample_time=float(prepared.fitted.dt),
         fitted_seconds=prepared.seconds[0],
-        tested_seconds=0.0 if held_out is None else held_out.seconds,
+        tested_seconds=tested_seconds,
         battery_voltage=voltage if powered and voltage is not None else msgspec.UNSET,
         notes=list(notes),
         **versions(shooting),
@@ -102,7 +102,7 @@ def _case(
     problem = _innovations(shooting, prepared, room)
     return Case(
         problem, shooting, _NEWTON, name, "flight", FilterError.prior, held_out, recording, provenance,
-        doubts=prepared.doubts, log_step=prepared.log_step,
+        validate.name if validate else "", prepared.doubts, prepared.log_step,
     )  # fmt: skip
 
 
@@ -164,34 +164,31 @@ def _held_out(
     prepared: Prepared,
     fitted: ShootingProblem,
     model: FlightModel,
-) -> tuple[HeldOut | None, tuple[str, ...]]:
-    """The data that are predicted and not fitted, if there are any; and the notes about all data."""
-    held_out, notes = None, prepared.notes
+) -> tuple[ShootingProblem | None, float, tuple[str, ...]]:
+    """The flight that is predicted and not fitted, if there is one; how long it lasts [s]; the notes about all data."""
+    name, notes, seconds = recordings[0].name, prepared.notes, prepared.seconds[1]
+    remedy = "give `holdout` 0 or `validate`"
     if validate is not None:
         other = _prepare_other(recordings, validate, prepared, model)
-        held_out, notes = (
-            HeldOut(_on(fitted, model, other.fitted), validate.name, other.seconds[0]),
-            notes + other.notes,
-        )
+        held_out, seconds = _on(fitted, other.fitted), other.seconds[0]
+        name, remedy, notes = validate.name, "give another flight", notes + other.notes
     elif prepared.tested is not None:
-        whole = dataclasses.replace(fitted, flight=prepared.tested)
-        held_out = HeldOut(whole, recordings[0].name, prepared.seconds[1], fitted_vehicle=True)
-    if held_out is None:
-        return None, (*notes, "nothing was held out, so no prediction checks the fit")
+        held_out = dataclasses.replace(fitted, flight=prepared.tested)
+    else:
+        return None, 0.0, (*notes, "nothing was held out, so no prediction checks the fit")
     try:
-        starts(held_out.problem.flight)
+        starts(held_out.flight)
     except ValueError:
-        remedy = "give `holdout` 0 or `validate`" if held_out.fitted_vehicle else "give another flight"
         raise InputError(
-            f"{held_out.name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
+            f"{name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
         ) from None
-    return held_out, notes
+    return held_out, seconds, notes
 
 
-def _on(fitted: ShootingProblem, model: FlightModel, flight: Flight) -> ShootingProblem:
+def _on(fitted: ShootingProblem, flight: Flight) -> ShootingProblem:
     """The problem of another flight, which counts as one recording."""
     stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
-    other = dataclasses.replace(model, recordings=(0,) * stretches)
+    other = dataclasses.replace(fitted.model, recordings=(0,) * stretches)
     return ShootingProblem(other, flight, sigma=fitted.sigma, channels="rates", method="rk4")
 
 
