@@ -35,17 +35,17 @@ filter_gains = eqx.filter_jit(gains_of)
 
 
 @eqx.filter_jit
-def observed_in(problem, segment=501):
+def observed_in(problem, segments=1):
     """The measurements in segments of about this many samples, by default in one."""
-    found = InnovationsProblem(problem, segment=segment)
+    found = InnovationsProblem(problem, segments=segments)
     rows, (measured, restart, counts, known) = found.cut.rows, found.observed()
     return Observed(measured[:rows], restart[:rows], counts[:rows], known)
 
 
 @eqx.filter_jit
-def likelihood(problem, parameters, noise, *, segment=501):
+def likelihood(problem, parameters, noise, *, segments=1):
     """The innovations of a problem in segments of about this many samples."""
-    return InnovationsProblem(problem, segment=segment).innovations(parameters, noise)
+    return InnovationsProblem(problem, segments=segments).innovations(parameters, noise)
 
 
 def uncoupled_rates(flight):
@@ -176,7 +176,7 @@ def test_the_information_is_the_covariance_of_the_gradient():
 
 def test_the_likelihood_does_not_depend_on_the_segments_and_no_trajectory_runs_away_in_a_long_gap():
     problem = disturbed()
-    alone, cut = likelihood(problem, MODEL.alpha, NOISE), likelihood(problem, MODEL.alpha, NOISE, segment=93)
+    alone, cut = likelihood(problem, MODEL.alpha, NOISE), likelihood(problem, MODEL.alpha, NOISE, segments=4)
     assert (alone.cost.shape, cut.cost.shape) == ((1,), (4,))
     np.testing.assert_allclose(cut.cost.sum(), alone.cost.sum(), atol=0.2)
     np.testing.assert_allclose(cut.gradient.sum(axis=(0, 2)), alone.gradient.sum(axis=(0, 2)), rtol=0.05, atol=1.0)
@@ -211,7 +211,7 @@ def test_a_known_start_is_used_in_flights_of_several_segments():
     start = np.array(long.flight.states[0])
     start[RATES] = 0.3, -0.2, 0.1
     problem = eqx.tree_at(lambda p: p.initial_state, long, jnp.asarray(start))
-    observed = observed_in(problem, 93)
+    observed = observed_in(problem, 4)
     assert observed.restart[0].tolist() == [False, True, True, True]
     assert observed.known is not None
     np.testing.assert_array_equal(observed.known[:, 0], start[RATES])
@@ -222,15 +222,12 @@ def test_a_known_start_is_used_in_flights_of_several_segments():
     np.testing.assert_allclose(gains.variance[1, 0, 0], expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("samples", "segment"), [(2, 384), (50, 384), (501, 90), (501, 384), (1500, 384), (153_601, 384)]
-)
-def test_each_sample_counts_once(samples, segment):
+@pytest.mark.parametrize(("samples", "number"), [(2, 1), (50, 1), (501, 1), (501, 4), (1500, 4), (153_601, 400)])
+def test_each_sample_counts_once(samples, number):
     """Also if the flight is padded: then its length is data."""
     room = samples + 100
-    number = Segments.of(samples, segment, SETTLING).place.shape[0]
-    padded = jax.jit(lambda length: Segments.number(number, room, length, SETTLING))(samples)
-    for index, owned, rows in (Segments.of(samples, segment, SETTLING), map(np.asarray, padded)):
+    padded = jax.jit(lambda length: Segments.of(number, room, length, SETTLING))(samples)
+    for index, owned, rows in (Segments.of(number, samples, samples, SETTLING), map(np.asarray, padded)):
         assert index.shape == owned.shape
         assert index.shape[1] % BLOCK == 0
         assert (index >= 0).all()

@@ -17,9 +17,9 @@ from jaxos4.recording.preparation import prepare
 from jaxos4.recording.reading import as_recordings
 from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.gains import LogNoise
-from jaxos4.shooting.innovations import SEGMENT, SETTLING
+from jaxos4.shooting.innovations import SETTLING
 
-DT, SAMPLES = 0.004, SETTLING + 8 * SEGMENT
+DT, SAMPLES = 0.004, SETTLING + 8 * 384
 ANGLES_AND_RATES = [STATE_NAMES.index(name) for name in ("phi", "theta", "psi", "p", "q", "r")]
 TERMS = ("offset", "lag", "delay", "accelerometer")
 

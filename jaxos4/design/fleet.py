@@ -166,7 +166,7 @@ class Fleet(eqx.Module):
             problem = ShootingProblem(self.model, flight, sigma=np.ones(12), channels="rates", method="rk4")
             sensor = jnp.append(jnp.repeat(loop.gyro_noise, 3), loop.force_noise)
             noise = LogNoise(jnp.log(strength), jnp.log(jnp.repeat(loop.gust_time, 4)), jnp.log(sensor))
-            innovations = InnovationsProblem(problem, segment=flight.time.shape[0])
+            innovations = InnovationsProblem(problem, segments=1)
             found = innovations.innovations(self.parameters, noise)
             information = found.information.sum(axis=-1)
             whole = joined(found.gradient.sum(axis=-1), information, count)[1]

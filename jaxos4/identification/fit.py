@@ -105,29 +105,23 @@ def fit_flight(
         shared = padded(weighted) if estimator.shoots and not estimator.needs_network else weighted
         return jax.block_until_ready(estimator(shared))
 
-    def evaluated() -> Evaluation:
-        return evaluate(problem, estimate.parameters, estimate.initial_state)
-
-    estimate, settled, number = search(problem, 0), False, 0
-    rollouts = int(estimate.rollouts)
-    while has_answer(estimate) and not settled and number < _PASSES:
-        before, number = problem.sigma, number + 1
-        problem = problem.reweighted(evaluated().errors)
-        change = np.abs(np.asarray(problem.sigma) / np.asarray(before) - 1)
-        failed = estimator.shoots and bool(estimate.result != RESULTS.successful)
-        settled = bool((change < _SETTLED).all()) or failed
-        if not settled:
-            estimate = search(problem, number)
-            rollouts += int(estimate.rollouts)
-    if has_answer(estimate):
-        if not settled:
-            problem = problem.reweighted(evaluated().errors)
-        if not estimator.shoots:
-            estimate = search(problem, number + 1)
-            rollouts += int(estimate.rollouts)
+    estimates = [search(problem, 0)]
+    for number in range(1, _PASSES + 2):
+        last, before = estimates[-1], np.asarray(problem.sigma)
+        if not has_answer(last):
+            break
+        problem = problem.reweighted(evaluate(problem, last.parameters, last.initial_state).errors)
+        settled = (np.abs(np.asarray(problem.sigma) / before - 1) < _SETTLED).all()
+        failed = estimator.shoots and bool(last.result != RESULTS.successful)
+        is_last = settled or failed or number > _PASSES
+        if not is_last or not estimator.shoots:
+            estimates.append(search(problem, number))
+        if is_last:
+            break
+    estimate, rollouts = estimates[-1], sum(int(each.rollouts) for each in estimates)
     if not has_answer(estimate):
         return Fit(problem, estimate, np.full(problem.unknowns.count, np.inf), rollouts)
-    evaluation = evaluated()
+    evaluation = evaluate(problem, estimate.parameters, estimate.initial_state)
     bound, covariance = evaluation.covariance, estimate.covariance
     diagnostics = residual_diagnostics(evaluation)
     if estimator.shoots:

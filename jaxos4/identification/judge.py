@@ -60,8 +60,8 @@ def doubts_of(
     return (
         *contradicted.values(),
         *(() if is_thrust_wrong else _impossible_inertias(constants, model.airframe)),
+        *_answers(found),
         *_contradictions(found, stds, model.airframe),
-        *_no_answer(found),
         *_unseen(found, log_step),
         *_skill(skill, still),
     )
@@ -157,11 +157,16 @@ def _moved(sample_times: Sequence[SampleTime], step: float, body: RigidBody) -> 
             )
 
 
-def _no_answer(found: Found) -> Iterator[Doubt]:
-    """Roll and pitch must answer the rotors: otherwise nothing was identified."""
-    for name, axis in (("alpha3", "roll"), ("alpha6", "pitch")):
-        value, std = found.get(name, (0.0, np.inf))
-        if -_SURE * std <= value <= _SURE * std:
+def _answers(found: Found) -> Iterator[Doubt]:
+    """Roll and pitch must answer the rotors, otherwise nothing was identified; and no axis with the opposite sign."""
+    for name, axis in (("alpha3", "roll"), ("alpha6", "pitch"), ("alpha8", "yaw")):
+        value, std = found.get(name, (0.0, 0.0))
+        if value + _SURE * std < 0:
+            yield _implausible(
+                f"{name} = {value:.3g} is negative: {axis} answers the rotors with the opposite sign",
+                "check `rotor_positions` and `rotor_spins`, and the axes of the log",
+            )
+        elif value <= _SURE * std and axis != "yaw":
             yield _implausible(
                 f"{axis} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
                 f"fly more {axis}, or check `rotor_positions` in the airframe, and which rotor is which",
@@ -169,16 +174,10 @@ def _no_answer(found: Found) -> Iterator[Doubt]:
 
 
 def _contradictions(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator[Doubt]:
-    negative = False
-    for name, axis in (("alpha3", "roll"), ("alpha6", "pitch"), ("alpha8", "yaw")):
-        value, std = found.get(name, (0.0, 0.0))
-        if value + _SURE * std < 0:
-            negative = True
-            yield _implausible(
-                f"{name} = {value:.3g} is negative: {axis} answers the rotors with the opposite sign",
-                "check `rotor_positions` and `rotor_spins`, and the axes of the log",
-            )
-    if negative or not all(name in found for name in ("alpha1", "alpha3", "alpha4", "alpha6", "alpha7", "alpha8")):
+    """Gyroscopic couplings that no rigid body with these inertias has."""
+    needed = ("alpha1", "alpha3", "alpha4", "alpha6", "alpha7", "alpha8")
+    opposite = [name for name in needed[1::2] if name in found and found[name][0] + _SURE * found[name][1] < 0]
+    if opposite or not all(name in found for name in needed):
         return
     model = CorrectedOS4(airframe)
     alpha, variance = np.array(model.alpha, dtype=float), np.full(8, np.inf)
@@ -219,14 +218,9 @@ def _held(fit: Fit) -> Iterator[Doubt]:
 
     One that is held at 0 came out negative. What is known of another one is its bracket.
     """
-    brackets = dict(zip(fit.problem.unknowns.names, np.asarray(fit.problem.unknowns.half_width).tolist(), strict=True))
-    for parameter in fit.problem.model.parameters:
-        if parameter.contradiction is None or parameter.name not in fit.held:
-            continue
-        known = fit.held[parameter.name].value, brackets[parameter.name]
-        value, std = fit.negative.get(parameter.name, known)
-        if verdict := parameter.contradiction(value, _SURE * std):
-            yield _implausible(f"{parameter.name} = {value:.2g} {verdict[0]}", verdict[1])
+    widths = dict(zip(fit.problem.unknowns.names, np.asarray(fit.problem.unknowns.half_width).tolist(), strict=True))
+    known = {name: fit.negative.get(name, (row.value, widths[name])) for name, row in fit.held.items()}
+    return (doubt for _, doubt in _contradicted(fit.problem.model, known))
 
 
 def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:

@@ -213,10 +213,6 @@ class AbstractProblem(eqx.Module):
         """The problem in stages; without `cascade` as a whole."""
 
     @abc.abstractmethod
-    def cascade(self) -> "tuple[AbstractProblem, ...]":
-        """The problems to be solved one after the other; the last is this one."""
-
-    @abc.abstractmethod
     def explains(self, cost: Scalar) -> Bool[Array, ""]:
         """Whether a cost is no larger than noise makes it; false if the noise is an unknown."""
 

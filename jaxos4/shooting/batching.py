@@ -57,29 +57,23 @@ def in_blocks(function: Callable, *arguments: Any) -> Any:
         function, *arguments = eqx.combine(arrays, settings)
         return function(*arguments)
 
-    blocked = custom_vmap(one)
-
-    @blocked.def_vmap
-    def batch(lanes: int, is_batched: list, arrays: Any) -> tuple[Any, Any]:
-        many, shared = eqx.partition(arrays, is_batched[0])
+    def of_batch(lanes: int, many: Any, shared: Any) -> Any:
         blocks = max(-(-lanes // _BLOCK), 1) if jax.default_backend() == "cpu" else 1
         size = -(-lanes // blocks)
 
         def block(many: Any) -> Any:
-            return jax.vmap(lambda each: one(eqx.combine(each, shared)))(many)
+            return jax.vmap(lambda each: one(*eqx.combine(each, shared)))(many)
 
         def cut(leaf: Array) -> Array:
             more = jnp.repeat(leaf[-1:], blocks * size - lanes, axis=0)
             return jnp.concatenate([leaf, more]).reshape(blocks, size, *leaf.shape[1:])
 
         if blocks == 1:
-            out = block(many)
-        else:
-            out = jax.lax.map(block, jax.tree.map(cut, many))
-            out = jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
-        return out, jax.tree.map(lambda _: True, out)
+            return block(many)
+        out = jax.lax.map(block, jax.tree.map(cut, many))
+        return jax.tree.map(lambda leaf: leaf.reshape(blocks * size, *leaf.shape[2:])[:lanes], out)
 
-    return blocked(arrays)
+    return with_batch(one, of_batch, arrays)
 
 
 def computed_once(needed: Bool[Array, " lanes"], function: Callable[[], Any]) -> Any:

@@ -63,11 +63,6 @@ class Innovations(NamedTuple):
     products: Float[Array, "channels lags segments"]
 
 
-def _start(observed: Observed, zero: Channels) -> Channels:
-    """The rates at the first sample; 0 if unknown."""
-    return zero if observed.known is None else zero.at[:RATES].set(observed.known)
-
-
 class _Row(NamedTuple):
     """One sample of all segments.
 
@@ -148,8 +143,8 @@ def innovate(
     forcing: Forcing,
     parameters: Parameters,
     noise: LogNoise,
-    dt: Scalar,
     *,
+    dt: Scalar,
     rows: Count | int,
     forcing_tangents: Forcing | None,
     forcing_parameters: tuple[int, ...],
@@ -224,9 +219,9 @@ def _filter(
     step, push = jax.linearize(lambda noise: step_of(noise, dt), noise)
     steps = step, jax.vmap(push)(basis(noise))
     covariance, push = jax.linearize(lambda step: first_covariance(step, segments), step)
-    start = _start(observed, jnp.zeros((channels, segments), dtype=float))
     zero = jnp.zeros(segments, dtype=float)
-    known = _emptied(_Known(Rates(*start[:RATES]), (zero,) * channels), observed.restart[0])
+    start = (zero,) * RATES if observed.known is None else observed.known
+    known = _emptied(_Known(Rates(*start), (zero,) * channels), observed.restart[0])
     nothing = Innovations(
         cost=zero,
         sound=jnp.ones(segments, dtype=bool),

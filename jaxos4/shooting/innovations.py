@@ -31,8 +31,8 @@ from .problem import ShootingProblem
 from .scans import Curvature, Parts, Shot, windowed
 from .segments import Segments, observe_in_segments
 
-# The number of samples in a segment, and of those that settle its filter.
-SEGMENT, SETTLING = 384, 128
+# About how many samples a segment has by default, and how many settle its filter.
+_SEGMENT, SETTLING = 384, 128
 # Time constants of the disturbance at which searches start [s]: the likelihood has several maxima.
 _TIMES = np.array([0.2, 0.03])
 _SHORTEST, _LONGEST = 0.25, 3.0  # time constants: in samples, in seconds
@@ -55,10 +55,10 @@ class InnovationsProblem(AbstractProblem):
 
     - `problem`: model, flight, known or free initial state, and the bracket of the parameters. Its windows and its
       sigma do not matter.
-    - `segment`: about how many samples are filtered in a row; segments are filtered in parallel. A short segment loses
-      information if the disturbance is weak, because its filter begins without memory.
-    - `segments`: the number of segments; replaces `segment`. Padded flights (`ShootingProblem.length`) with equal
-      numbers of segments and equal room share a program, whatever their lengths.
+    - `segments`: the number of parts of the flight that are filtered in parallel; by default one for about 384 samples.
+      A short segment loses information if the disturbance is weak, because its filter begins without memory. Padded
+      flights (`ShootingProblem.length`) with equal numbers of segments and equal room share a program, whatever their
+      lengths.
     - `settling`: after so many samples a filter has settled. The first innovations of a segment do not count.
     - `start`: where searches start; NaN, or by default: the center of the bracket, with each of several time constants
       of the disturbances.
@@ -67,25 +67,23 @@ class InnovationsProblem(AbstractProblem):
     prior: ClassVar[float] = PROPER_PRIOR
     problem: ShootingProblem
     start: Values = eqx.field(converter=as_float)
-    segment: int = eqx.field(static=True, default=SEGMENT)
-    segments: int | None = eqx.field(static=True, default=None)
+    segments: int = eqx.field(static=True)
     settling: int = eqx.field(static=True, default=SETTLING)
 
     def __init__(
         self,
         problem: ShootingProblem,
         *,
-        segment: int = SEGMENT,
         segments: int | None = None,
         settling: int = SETTLING,
         start: Float[ArrayLike, " unknowns"] | None = None,
     ):
-        number = 1 if segments is None else segments
-        for name, value, least in (("segment", segment, 1), ("segments", number, 1), ("settling", settling, 0)):
+        if segments is None:
+            segments = max(round((problem.flight.time.shape[-1] - settling) / _SEGMENT), 1)
+        for name, value, least in (("segments", segments, 1), ("settling", settling, 0)):
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}.")
-        self.problem, self.segment, self.settling = problem.restrict("rates"), segment, settling
-        self.segments = segments
+        self.problem, self.segments, self.settling = problem.restrict("rates"), segments, settling
         # An array in any case, so that all starts share one program.
         unknowns = problem.unknowns.count + 3 * self.problem.columns.size
         self.start = as_float(np.full(unknowns, np.nan) if start is None else start)
@@ -119,11 +117,9 @@ class InnovationsProblem(AbstractProblem):
     def cut(self) -> Segments:
         """The samples of each segment."""
         room, length = self.flight.time.shape[0], self.problem.length
-        if self.segments is None:
-            return Segments.of(room, self.segment, self.settling)
         # A length that is known needs no compiled program.
         samples = room if length is None else length if isinstance(length, Tracer) else int(length)
-        return Segments.number(self.segments, room, samples, self.settling)
+        return Segments.of(self.segments, room, samples, self.settling)
 
     @property
     def unknowns(self) -> Unknowns:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -186,14 +182,13 @@ class InnovationsProblem(AbstractProblem):
 
     def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
         """See `AbstractProblem`. `parts` are the segments."""
-        unknowns, innovations, forced = self.unknowns.usable, self._innovations(self.observed()), self._forced()
+        unknowns, innovations = self.unknowns.usable, self._innovations()
         count, free = self.problem.unknowns.count, unknowns.free
         both = free & free[:, None]
 
         def evaluate(values: Values, initial_state: InitialStates) -> Curvature:
             del initial_state
-            forcing, tangents = forced(values[:count])
-            found = innovations(values[:count], self.noise(values), forcing, tangents)
+            found = innovations(values[:count], self.noise(values))
             gradient, information = jax.vmap(joined, in_axes=(-1, -1, None))(found.gradient, found.information, count)
             off = values - unknowns.center
             cost = found.cost.sum() + (unknowns.precision * jnp.square(off)).sum() / 2
@@ -221,10 +216,6 @@ class InnovationsProblem(AbstractProblem):
         smallest_step = jnp.sqrt(jnp.finfo(float).eps) * jnp.ones(1)
         return Stages(1, evaluate, self.unknowns.free[None], misfit, smallest_step)
 
-    def cascade(self) -> "tuple[InnovationsProblem, ...]":
-        """The problem alone."""
-        return (self,)
-
     def explains(self, cost: Scalar) -> Bool[Array, ""]:
         """False: the noise is found with the parameters, so that no cost is too large."""
         return jnp.zeros_like(cost, dtype=bool)
@@ -235,27 +226,17 @@ class InnovationsProblem(AbstractProblem):
 
     def innovations(self, parameters: Parameters, noise: LogNoise) -> Innovations:
         """The innovations of all segments."""
-        return self._innovations(self.observed())(parameters, noise, *self._forced()(parameters))
+        return self._innovations()(parameters, noise)
 
-    def _innovations(
-        self, observed: Observed
-    ) -> Callable[[Parameters, LogNoise, Forcing, Forcing | None], Innovations]:
-        """The innovations of all segments, as a function of the parameters, the noise, and what `_forced` returns."""
-        problem, model, dt, rows = self.problem, self.model, self.flight.dt, self.cut.rows
+    def _innovations(self) -> Callable[[Parameters, LogNoise], Innovations]:
+        """`innovations` for a loop: what does not depend on parameters and noise is computed once."""
+        problem, model, observed, forced = self.problem, self.model, self.observed(), self._forced()
+        settings = {"dt": self.flight.dt, "rows": self.cut.rows, "forcing_parameters": model.forcing_parameters}
 
-        def at(parameters: Parameters, noise: LogNoise, forcing: Forcing, tangents: Forcing | None) -> Innovations:
-            return innovate(
-                problem.step,
-                model.observe,
-                observed,
-                forcing,
-                parameters,
-                noise,
-                dt,
-                rows=rows,
-                forcing_tangents=tangents,
-                forcing_parameters=model.forcing_parameters,
-            )
+        def at(parameters: Parameters, noise: LogNoise) -> Innovations:
+            forcing, tangents = forced(parameters)
+            data = observed, forcing, parameters, noise
+            return innovate(problem.step, model.observe, *data, forcing_tangents=tangents, **settings)
 
         return at
 

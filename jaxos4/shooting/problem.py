@@ -169,16 +169,15 @@ class ShootingProblem(AbstractProblem):
         """The forcing of the whole flight, one row for each sample."""
         return self.model.forcing(self.flight.inputs, parameters)
 
-    def with_forcing(self, rows: Rows, parameters: Parameters, *, inputs: Inputs | None = None) -> Rows:
-        """Recompute the forcing for these parameters, with its derivatives.
+    def forced_rows(self) -> Callable[[Parameters], Rows]:
+        """`rows` with the derivatives of the forcing, for a loop: what depends on no parameter is made once."""
+        rows, inputs, index = self.rows(), self.flight.inputs, self.cut()[0]
 
-        Does nothing if the forcing depends on no parameter. `inputs`: `flight.inputs`, prepared outside of a loop.
-        """
-        if not self.model.forcing_parameters:
-            return rows
-        inputs = self.flight.inputs if inputs is None else inputs
-        forcing, tangents = self.forcing_and_tangents(parameters, inputs, self.cut()[0])
-        return rows._replace(forcing=forcing, forcing_tangents=tangents)
+        def forced(parameters: Parameters) -> Rows:
+            forcing, tangents = self.forcing_and_tangents(parameters, inputs, index)
+            return rows._replace(forcing=forcing, forcing_tangents=tangents)
+
+        return forced if self.model.forcing_parameters else lambda parameters: rows
 
     def forcing_and_tangents(
         self, parameters: Parameters, inputs: Inputs, index: Int[Numeric, "windows length"]
@@ -250,12 +249,12 @@ class ShootingProblem(AbstractProblem):
         return Shot(each.cost.sum(), each.sound.all())
 
     def evaluator(self) -> Callable[[Parameters, InitialStates], Curvature]:
-        """`curvatures` for a loop: the rows that do not depend on the parameters are made once."""
-        rows, inputs = self.rows(), self.flight.inputs
+        """`curvatures` for a loop: what does not depend on the unknowns is made once."""
+        forced = self.forced_rows()
 
         def evaluate(parameters: Parameters, initial_state: InitialStates) -> Curvature:
-            forced, starts = self.with_forcing(rows, parameters, inputs=inputs), self.split(initial_state)
-            return each_window(lambda rows, start: self.curvature(rows, parameters, start), forced, starts)
+            rows, starts = forced(parameters), self.split(initial_state)
+            return each_window(lambda rows, start: self.curvature(rows, parameters, start), rows, starts)
 
         return evaluate
 
@@ -264,7 +263,7 @@ class ShootingProblem(AbstractProblem):
         return shooting_stages(self, cascade=cascade)
 
     def cascade(self) -> "tuple[ShootingProblem, ...]":
-        """The rates, and then all channels with them: the rates depend on nothing else."""
+        """The problems to solve one after the other: the rates, which depend on nothing else, and then all channels."""
         return (self,) if self.channels == "rates" else (self.restrict("rates"), self)
 
     def explains(self, cost: Scalar) -> Bool[Array, ""]:

@@ -129,7 +129,8 @@ def shoot(
         following, predicted = advance(state, row.forcing, scalars)
         return following, Shot(shot.cost + _half_square(_errors(row, predicted, weights, sound)), sound)
 
-    return _fold(step, (unstack(initial_state), _no_shot()), rows, length)[1]
+    nothing = Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
+    return _fold(step, (unstack(initial_state), nothing), rows, length)[1]
 
 
 def shoot_with_derivatives(
@@ -280,10 +281,6 @@ def _symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *la
     lower = jnp.concatenate(filled)
     below = np.tri(size, dtype=bool).reshape(size, size, *(1,) * lanes)
     return jnp.where(below, lower, jnp.swapaxes(lower, 0, 1))
-
-
-def _no_shot() -> Shot:
-    return Shot(jnp.zeros((), dtype=float), jnp.ones((), dtype=bool))
 
 
 def _is_sound(state: State) -> Bool[Array, " *lanes"]:

@@ -38,13 +38,7 @@ class Segments(NamedTuple):
     rows: Count | int
 
     @classmethod
-    def of(cls, samples: int, wanted: int, settling: int) -> "Segments":
-        """Segments with about `wanted` samples after those that settle the filter."""
-        number = max(round((samples - settling) / wanted), 1)
-        return cls.number(number, samples, samples, settling)
-
-    @classmethod
-    def number(cls, number: int, capacity: int, samples: Count | int, settling: int) -> "Segments":
+    def of(cls, number: int, capacity: int, samples: Count | int, settling: int) -> "Segments":
         """So many segments of a flight with room for `capacity` samples, of which some exist."""
         settling = settling if number > 1 else 0
         length, most = -(-(samples - settling) // number), -(-(capacity - settling) // number)

@@ -45,7 +45,7 @@ def shooting_stages(problem: "ShootingProblem", *, cascade: bool) -> Stages:
     squares = (within @ jnp.square(jnp.nan_to_num(measured))) / jnp.maximum(known, 1)
     largest = jnp.where(fitted, jnp.sqrt(squares) / problem.sigma[problem.columns], 0.0).max(axis=1)
     measurements = jnp.where(fitted, known, 0.0).sum(axis=1)
-    rows, inputs, starts = problem.rows(), problem.flight.inputs, problem.split(problem.first_state()[0])
+    forced, starts = problem.forced_rows(), problem.split(problem.first_state()[0])
 
     def on(part: "ShootingProblem", rows: Rows, length: Int[Array, ""] | None, unknowns: WindowUnknowns) -> Curvature:
         """The curvature on the channels of `part`, in all unknowns."""
@@ -57,9 +57,9 @@ def shooting_stages(problem: "ShootingProblem", *, cascade: bool) -> Stages:
         return Curvature(shot, jnp.pad(gradient, (none, more)), jnp.pad(information, (none, more, more)))
 
     def evaluate(stage: Int[Array, ""], unknowns: WindowUnknowns) -> Curvature:
-        forced = problem.with_forcing(rows, unknowns[0, :count], inputs=inputs)
+        rows = forced(unknowns[0, :count])
         length, free = lengths[stage] if problem.windows == 1 else None, searched[stage]
-        branches = [functools.partial(on, part, forced, length) for part in parts]
+        branches = [functools.partial(on, part, rows, length) for part in parts]
         # The stage is the same in all lanes of a batch.
         chosen = branches[0](unknowns) if len(parts) == 1 else jax.lax.switch(place_of[stage], branches, unknowns)
         shot, gradient, information, _ = chosen
