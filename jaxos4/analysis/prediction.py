@@ -24,17 +24,6 @@ _EVERY, _AROUND = 0.05, 0.02
 _PARTS = 10
 
 
-class Disturbances(NamedTuple):
-    """The disturbance of each body rate.
-
-    - `value`: at each sample, from the measurements until then [rad/s^2].
-    - `time_constant`: with which they fade [s].
-    """
-
-    value: Float[np.ndarray, "samples 3"]
-    time_constant: Float[np.ndarray, "3"]
-
-
 class Predictions(NamedTuple):
     """Predictions of the body rates p, q, r [rad/s] from many starts.
 
@@ -72,7 +61,8 @@ def predictions(
     parameters: Parameters,
     *,
     horizons: tuple[float, ...] = HORIZONS,
-    disturbance: Disturbances | None = None,
+    disturbance: Float[np.ndarray, "samples 3"] | None = None,
+    noise: LogNoise | None = None,
 ) -> Predictions:
     """Predict the body rates from many starts, with the recorded rotor speeds.
 
@@ -81,7 +71,8 @@ def predictions(
     reaches beyond the stretch.
 
     **Arguments:** `problem` gives model, flight and method; its windows and channels have no effect. `horizons` [s] are
-    positive. `disturbance`: fades from its value at the start, as the past lets expect; by default there is none.
+    positive. `disturbance` [rad/s^2]: fades from its value at the start, as the past lets expect, by the time constants
+    of `noise`; by default there is none.
 
     **Raises:** `ValueError` if the flight is shorter than the longest horizon, or has no measured rates.
     """
@@ -89,10 +80,9 @@ def predictions(
     ahead, rates = _ahead(flight, horizons), np.asarray(flight.states)[:, RATES]
     start, initial = starts(flight, horizons)
     rate_problem = dataclasses.replace(problem, channels="rates", windows=1, initial_state=None, length=None)
-    if disturbance is None:
-        disturbance = Disturbances(np.zeros(rates.shape), np.ones(3))
-    pushed, fading = as_float(disturbance.value[start]), as_float(disturbance.time_constant)
-    begin = jnp.asarray(start), jnp.asarray(initial), pushed
+    pushed = np.zeros(rates.shape) if disturbance is None else disturbance
+    fading = as_float(np.ones(3) if noise is None else np.exp(np.asarray(noise.time_constant)[:3]))
+    begin = jnp.asarray(start), jnp.asarray(initial), as_float(pushed[start])
     predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
     return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead], rates[start[:, None] + ahead])
 
@@ -167,17 +157,18 @@ def skill(predicted: Predictions) -> Skill:
         return Skill(rmse, persistence, 1 - total[0] / total[1], spread, errors.shape[0])
 
 
-def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Disturbances:
-    """The disturbance of each body rate by Kalman filters, for the noise that `FilterError` found.
+def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoise) -> Float[np.ndarray, "samples 3"]:
+    """The disturbance of each body rate [rad/s^2] at each sample, from the measurements until then.
 
-    The model is evaluated at the measured rates. `noise`: its first three channels are p, q and r.
+    Kalman filters find it, for the noise that `FilterError` found. The model is evaluated at the measured rates.
+    `noise`: its first three channels are p, q and r.
     """
     rates, stretch = np.asarray(problem.flight.states)[:, RATES], problem.flight.stretch
     modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
     own = LogNoise(*(as_float(np.asarray(leaf)[: len(RATES)]) for leaf in noise))
     number = np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch)
     known = _known_by(own, as_float(rates), as_float(modelled), jnp.asarray(number), problem.flight.dt)
-    return Disturbances(np.asarray(known.disturbance), np.exp(np.asarray(own.time_constant)))
+    return np.asarray(known.disturbance)
 
 
 class Filtered(NamedTuple):

@@ -44,9 +44,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
     values, half_width, free = np.asarray(estimate.parameters), np.asarray(unknowns.half_width), fit.free
     identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, case.prior))
     reasons = dict.fromkeys(unknowns.names, "not identifiable from this flight")
-    limits: dict[str, float | None | msgspec.UnsetType] = dict.fromkeys(unknowns.names, msgspec.UNSET)
-    if not case.is_vehicle:
-        limits = dict.fromkeys(unknowns.names)
+    limits = dict.fromkeys(unknowns.names, msgspec.UNSET if case.is_vehicle else None)
     if fit.evaluation is not None:
         information = identifiability(fit.evaluation, unknowns.bracket)
         notes, known = information.notes(unknowns.names), information.identifiable & information.excited

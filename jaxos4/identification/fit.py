@@ -153,29 +153,24 @@ def fit_innovations(
     - `shooting`: the flight and its model, if that of the problem is padded.
     """
     own, names = problem.problem.unknowns, problem.model.parameter_names
-    unknowns = own.count + 3 * len(problem.channels)
-    problem, found, rollouts, fixed, negative = _searched(estimator, problem, progress)
+    problem, found, rollouts, notes, negative = _searched(estimator, problem, progress)
     progress("computing errors")
-    values, std = np.asarray(found.parameters)[: own.count], _std(found)[: own.count]
-    factor, free = np.ones(own.count), ~np.isin(names, list(fixed))
+    values, std = np.asarray(found.parameters), _std(found)[: own.count]
+    noise = LogNoise(*values[own.count :].reshape(-1, 3).T)
+    free, factor = np.flatnonzero(~np.isin(names, list(notes))), np.ones(values.size)
     if has_answer(found):
         factor[free] = _widening(problem, found, free, recording)
-    identifiable = np.asarray(is_identifiable(factor * std, np.asarray(own.half_width), GAUSSIAN_PRIOR))
-    if not has_answer(found):
-        identifiable[:] = True
-    notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~identifiable)} | fixed
+        known = np.asarray(is_identifiable(factor[: own.count] * std, np.asarray(own.half_width), GAUSSIAN_PRIOR))
+        notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~known)} | notes
     held = {
         name: HeldParameter(float(values[i]), own.units[i], notes[name])
         for i, name in enumerate(names)
         if name in notes
     }
-    scale = np.ones(unknowns)
-    scale[: own.count] = factor
-    spread = np.asarray(found.covariance) * scale[:, None] * scale
-    noise = LogNoise(*np.asarray(found.parameters)[own.count :].reshape(-1, 3).T)
+    spread = as_float(np.asarray(found.covariance) * np.outer(factor, factor))
     return Fit(
         problem=_with_sensors(problem.problem if shooting is None else shooting, noise),
-        estimate=eqx.tree_at(lambda e: e.covariance, found, as_float(spread)),
+        estimate=eqx.tree_at(lambda e: e.covariance, found, spread),
         bound=std,
         rollouts=rollouts,
         held=held,
@@ -258,18 +253,18 @@ def _std(found: Estimate) -> np.ndarray:
 def _widening(
     problem: InnovationsProblem, found: Estimate, fitted: np.ndarray, recording: np.ndarray
 ) -> Float[np.ndarray, " fitted"]:
-    """The factor by which the interval of each fitted parameter widens. `recording`: of each sample."""
+    """The factor by which the intervals of the parameters in the places `fitted` widen. `recording`: of each sample."""
     index, owned, _ = map(np.asarray, problem.cut)
     middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
-    some, parts = np.flatnonzero(fitted), _parts(found)
+    parts = _parts(found)
     # In a segment of padding nothing was measured.
     used = np.asarray(parts.information).any(axis=(1, 2))
     number = recording[np.minimum(middle, recording.size - 1)][used]
-    gradient = np.asarray(parts.gradient)[used][:, some]
-    information = np.asarray(parts.information)[used][:, some[:, None], some]
-    prior = np.diag(1 / np.square(np.asarray(problem.problem.unknowns.half_width)[some]))
+    gradient = np.asarray(parts.gradient)[used][:, fitted]
+    information = np.asarray(parts.information)[used][:, fitted[:, None], fitted]
+    prior = np.diag(1 / np.square(np.asarray(problem.problem.unknowns.half_width)[fitted]))
     ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
-    return np.max([np.ones(some.size), *ways], axis=0)
+    return np.max([np.ones(fitted.size), *ways], axis=0)
 
 
 def _with_sensors(problem: ShootingProblem, noise: LogNoise) -> ShootingProblem:

@@ -13,7 +13,7 @@ from .._xla import quick_jit
 from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate
 from ..analysis.frequency_response import frequency_response
-from ..analysis.prediction import Disturbances, Predictions, Skill, disturbances, predictions, skill
+from ..analysis.prediction import Predictions, Skill, disturbances, predictions, skill
 from ..estimate import fit_start
 from ..estimators import EquationError
 from ..shooting import ShootingProblem, padded, with_room
@@ -37,7 +37,7 @@ def predict_held_out(case: Case, fit: Fit, held_out: ShootingProblem) -> tuple[P
     def scored(values: np.ndarray, noise: LogNoise | None) -> tuple[Predictions, Skill]:
         parameters = _of_one_recording(fit.problem, held_out, values) if case.validate else values
         known = None if noise is None else _disturbances(case, fit.problem, held_out, parameters, noise)
-        predicted = predictions(held_out, as_float(parameters), disturbance=known)
+        predicted = predictions(held_out, as_float(parameters), disturbance=known, noise=noise)
         return predicted, skill(predicted)
 
     predicted, own = scored(values, fit.noise)
@@ -64,15 +64,14 @@ def compile_ahead(case: Case) -> None:
 
 def _disturbances(
     case: Case, fitted: ShootingProblem, held_out: ShootingProblem, parameters: np.ndarray, noise: LogNoise
-) -> Disturbances:
+) -> np.ndarray:
     """The disturbances of the vehicle, from all measurements: those that were fitted and those that were not."""
     if not case.validate:
         own, others = np.asarray(held_out.flight.states), np.asarray(fitted.flight.states)
         both = as_float(np.where(np.isnan(own), others, own))
         held_out = eqx.tree_at(lambda p: p.flight.states, held_out, both)
     samples = held_out.flight.time.shape[0]
-    found = disturbances(with_room(held_out, max(samples, case.room)), as_float(parameters), noise)
-    return found._replace(value=found.value[:samples])
+    return disturbances(with_room(held_out, max(samples, case.room)), as_float(parameters), noise)[:samples]
 
 
 def _regressed(problem: ShootingProblem, room: int, values: np.ndarray, held: Sequence[bool]) -> np.ndarray:

@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -79,9 +80,13 @@ def _case(
 ) -> Case:
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
-    shooting = _vehicle_shooting(
-        model, prepared, bracket_of(_levelled(bracket, prepared, model), model), recordings[0].name
-    )
+    unknowns = Unknowns.of(model, bracket_of(_levelled(bracket, prepared, model), model))
+    shooting = _problem(model, prepared.fitted, windows=prepared.windows, unknowns=unknowns)
+    measured = np.count_nonzero(~np.isnan(shooting.recorded()))
+    if measured <= unknowns.count:
+        raise InputError(
+            f"{recordings[0].name}: {measured} measurements for {unknowns.count} unknowns; give a longer flight."
+        )
     held_out, tested_seconds, notes = _held_out(recordings, validate, prepared, shooting, model)
     stretch = prepared.fitted.stretch
     number = np.zeros(prepared.fitted.time.shape[0], int) if stretch is None else np.asarray(stretch)
@@ -132,20 +137,9 @@ def _levelled(bracket: Intervals, prepared: Prepared, model: FlightModel) -> Int
     return {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
 
 
-def _vehicle_shooting(model: FlightModel, prepared: Prepared, bracket: Bracket, name: str) -> ShootingProblem:
-    shooting = ShootingProblem(
-        model,
-        prepared.fitted,
-        sigma=np.full(12, _FIRST_SIGMA),
-        channels="rates",
-        method="rk4",
-        windows=prepared.windows,
-        unknowns=Unknowns.of(model, bracket),
-    )
-    measured, unknowns = np.count_nonzero(~np.isnan(shooting.recorded())), len(model.parameter_names)
-    if measured <= unknowns:
-        raise InputError(f"{name}: {measured} measurements for {unknowns} unknowns; give a longer flight.")
-    return shooting
+def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingProblem:
+    """The problem of a vehicle's flight: its rates, and what its model says of specific force."""
+    return ShootingProblem(model, flight, sigma=np.full(12, _FIRST_SIGMA), channels="rates", method="rk4", **settings)
 
 
 def _innovations(shooting: ShootingProblem, prepared: Prepared, room: Prepared) -> InnovationsProblem:
@@ -170,7 +164,8 @@ def _held_out(
     remedy = "give `holdout` 0 or `validate`"
     if validate is not None:
         other = _prepare_other(recordings, validate, prepared, model)
-        held_out, seconds = _on(fitted, other.fitted), other.seconds[0]
+        own = dataclasses.replace(model, recordings=other.recordings)
+        held_out, seconds = _problem(own, other.fitted), other.seconds[0]
         name, remedy, notes = validate.name, "give another flight", notes + other.notes
     elif prepared.tested is not None:
         held_out = dataclasses.replace(fitted, flight=prepared.tested)
@@ -183,13 +178,6 @@ def _held_out(
             f"{name}: nothing is long enough to be predicted {max(HORIZONS):g} s ahead; {remedy}."
         ) from None
     return held_out, seconds, notes
-
-
-def _on(fitted: ShootingProblem, flight: Flight) -> ShootingProblem:
-    """The problem of another flight, which counts as one recording."""
-    stretches = 1 if flight.stretch is None else int(flight.stretch.max()) + 1
-    other = dataclasses.replace(fitted.model, recordings=(0,) * stretches)
-    return ShootingProblem(other, flight, sigma=fitted.sigma, channels="rates", method="rk4")
 
 
 def _prepare_other(
@@ -217,7 +205,6 @@ def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tu
     for term in terms:
         if term not in TERMS:
             raise InputError(f"`terms`: knows no `{term[:40]}`; the terms are {', '.join(TERMS)}.")
-    for term in terms:
         missing = TERMS[term].needs - available
         if FULL_SCALE in missing:
             raise InputError(f"`terms`: {term} needs `max_rotor_speed` in the airframe; set it or leave it out.")
