@@ -16,11 +16,11 @@ from rich.table import Table
 from jaxos4._custom_types import Key, States
 from jaxos4._files import write_atomically
 from jaxos4.bracket import Bracket
+from jaxos4.cli.studies import run_with_bar
 from jaxos4.estimate import AbstractEstimator, Estimate
 from jaxos4.flight import Flight
 from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import AbstractNoise
-from jaxos4.report.study_tables import run_with_bar
 from jaxos4.report.style import Style, drawing, pdf, svg
 from jaxos4.shooting import ShootingProblem
 from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset

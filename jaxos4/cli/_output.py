@@ -69,16 +69,27 @@ def import_beside(*names: str, netcdf: bool = False) -> None:
 
 
 @contextlib.contextmanager
-def stages(first: str) -> Iterator[Callable[[str], None]]:
-    """Shows a stage and the time. Yields a function that changes the stage. Shows nothing if stderr is no terminal."""
+def stages(first: str, total: int | None = None) -> Iterator[Callable[..., None]]:
+    """Shows a stage and the time, and a bar if there is a `total`. Shows nothing if stderr is no terminal.
+
+    Yields a function that changes the stage, and what is done of the total.
+    """
     from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        SpinnerColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) if total else ()
+    columns = (SpinnerColumn(), "{task.description}", TimeElapsedColumn(), *columns)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(first, total=None)
-        yield lambda stage: bar.update(task, description=stage)
+        task = bar.add_task(first, total=total)
+        yield lambda stage, done=None: bar.update(task, description=stage, completed=done)
 
 
 def check_outputs(*inputs: Path | str | None, **outputs: Path | None) -> None:

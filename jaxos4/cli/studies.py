@@ -3,7 +3,7 @@
 import time
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -13,6 +13,8 @@ from ._options import Estimator
 from ._output import stages
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from ..study import Study
 
 
@@ -30,7 +32,7 @@ def study(
     if dry_run:
         _print_plan(wanted, out)
         return
-    from ..report.study_tables import count_outcomes, run_with_bar
+    from ..report.study_tables import count_outcomes
 
     if scheduler is None:
         dataset = run_with_bar(wanted, out)
@@ -38,6 +40,18 @@ def study(
         with _connected(scheduler) as client:
             dataset = run_with_bar(wanted, out, device="Dask cluster", run=partial(run_on_cluster, client=client))
     typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
+
+
+def run_with_bar(wanted: "Study", out: Path, *, device: str | None = None, **how: Any) -> "xr.Dataset":
+    """`jaxos4.study.carry_out` with a progress bar. `device`: by default the devices of this process."""
+    from ..study import carry_out, device_name
+
+    try:
+        with stages("compiling", wanted.count) as show:
+            return carry_out(wanted, out, device or device_name(), progress=show, **how)
+    except KeyboardInterrupt:
+        typer.echo(f"jaxos4: {out}: interrupted; run the same command again to continue.", err=True)
+        raise
 
 
 def _print_plan(wanted: "Study", out: Path) -> None:
@@ -94,7 +108,7 @@ def compare(
         from rich.console import Console
 
         from ..report import error_table, write_report
-        from ..report.study_tables import count_outcomes, run_with_bar
+        from ..report.study_tables import count_outcomes
         from ..report.text import print_whole
 
     directory = Path("comparison-quick" if quick else "comparison") if out is None else out

@@ -1,17 +1,15 @@
-"""The tables of a study as rows of text, for the page and for the terminal; and a progress bar while it runs."""
+"""The tables of a study as rows of text, for the page and for the terminal."""
 
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from rich.console import Console, Group, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.console import Group, RenderableType
 from rich.text import Text
 
-from ..study import OUTCOMES, Step, Store, Study, carry_out, device_name, metrics, run_here
+from ..study import OUTCOMES, metrics
 from .study_data import bounds, names, scale_labels, scenarios
 from .text import MISSING, Listing, percent, plain
 
@@ -155,27 +153,6 @@ def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[s
 def _with_intervals(one: xr.Dataset, measure: str, text: Callable[[float], str]) -> tuple[Cell, ...]:
     rows = (map(text, row) for row in zip(*(one[part].values for part in (measure, "low", "high")), strict=True))
     return tuple(Cell(value, "" if MISSING in (low, high) else f"{low} to {high}") for value, low, high in rows)
-
-
-def run_with_bar(
-    study: Study, out: Path, *, device: str | None = None, run: Callable[[Store], Iterator[Step]] = run_here
-) -> xr.Dataset:
-    """`jaxos4.study.carry_out` with a progress bar on stderr. `device`: by default the devices of this process."""
-    console = Console(stderr=True)
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    columns = (SpinnerColumn(), "{task.description}", *columns)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("compiling", total=study.count)
-
-        def show(step: Step) -> None:
-            bar.update(task, completed=step.done, description=step.label)
-
-        try:
-            return carry_out(study, out, device or device_name(), run=run, progress=show)
-        except KeyboardInterrupt:
-            text = f"jaxos4: {out}: interrupted; run the same command again to continue."
-            console.print(text, soft_wrap=True, markup=False, highlight=False)
-            raise
 
 
 def count_outcomes(dataset: xr.Dataset) -> str:

@@ -48,6 +48,8 @@ _FEW_FLIGHTS = 2000
 _LARGEST_OFFSET = 0.8
 # Programs that all estimators share are compiled once: the second thread waits for the first.
 _ONE_THREAD = threading.Lock()
+# For each program: whether its first cell has ended, so that other threads do not compile it too.
+_COMPILED: dict[tuple, threading.Event] = {}
 
 
 Lanes = Float[Array, "lanes samples 12"]
@@ -166,7 +168,14 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
             blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
             standard = blank_problem(study, fleet, 1.0, scenario.seen)
             bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
-        found = _answers(study, cell, fleet, blank, flights.measured, network)
+        own = threading.Event()
+        first = _COMPILED.setdefault(program_of(scenario), own)
+        if first is not own:
+            first.wait()
+        try:
+            found = _answers(study, cell, fleet, blank, flights.measured, network)
+        finally:
+            own.set()
         return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
 
 

@@ -10,7 +10,8 @@ import ctypes
 import functools
 import io
 import itertools
-from collections import defaultdict, deque
+import queue
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -40,7 +41,7 @@ _RETRIES = 2
 
 
 class Step(NamedTuple):
-    """`done` cells are finished; `label` names the running tasks."""
+    """`done` cells are finished; `label` names the last one."""
 
     done: int
     label: str
@@ -74,78 +75,95 @@ def run_here(store: Store) -> Iterator[Step]:
 
     A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
-    study, cells = store.study, [store.study.cell(index) for index in store.missing()]
-    done, waiting = study.count - len(cells), defaultdict[tuple, deque[Cell]](deque)
-    # Cells of IBSS first: those of the hybrid, which end with the same program, wait for a network.
-    for cell in sorted(cells, key=lambda cell: study.job(cell.scenario) is not None):
-        waiting[program_of(cell.scenario)].append(cell)
-    untrained = deque(dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None))
-    # A cell without a network never waits for one.
-    networks: dict[Job | None, Trained] = {None: None}
-    free = deque(workers())
-    # Whether each program is compiled on a device, or its first cell is still running there.
-    compiled: dict[tuple[tuple, Any], bool] = {}
-    running: dict[concurrent.futures.Future, tuple[Any, Job | Cell]] = {}
-    pool = concurrent.futures.ThreadPoolExecutor(len(free))
+    devices = workers()
+    free, pool = queue.SimpleQueue[Any](), concurrent.futures.ThreadPoolExecutor(len(devices))
+    for device in devices:
+        free.put(device)
 
-    def next_cell(device: Any) -> Cell | None:
-        """The next cell: of a program that is not compiled yet, else of one that waits for no compiler, else of any."""
-        ready = [p for p, cells in waiting.items() if cells and study.job(cells[0].scenario) in networks]
-        ready = [p for p in ready if compiled.get((p, device), True)]
-        started = {program for program, _ in compiled}
-        program = min(ready, key=lambda p: (p in started, (p, device) not in compiled), default=None)
-        if program is None:
-            return None
-        compiled.setdefault((program, device), False)
-        return waiting[program].popleft()
+    def call(function: Callable[..., Any], *arguments: Any) -> Any:
+        given = [x.result() if isinstance(x, concurrent.futures.Future) else x for x in arguments]
+        device = free.get()
+        try:
+            with jax.default_device(device):
+                return function(*given)
+        finally:
+            free.put(device)
+
+    def results(futures: list[concurrent.futures.Future]) -> Iterator[tuple[Any, Any]]:
+        return ((future, future.result()) for future in concurrent.futures.as_completed(futures))
 
     try:
-        while True:
-            for device in tuple(free):
-                if untrained:
-                    task = untrained.popleft()
-                    future = pool.submit(_train, store, task, device)
-                elif task := next_cell(device):
-                    future = pool.submit(compute, study, task, networks[study.job(task.scenario)], device)
-                else:  # all remaining cells wait for networks or programs
-                    continue
-                free.remove(device)
-                running[future] = device, task
-            yield Step(done, ", ".join(dict.fromkeys(label_of(study, task) for _, task in running.values())))
-            if not running:
-                return
-            finished, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
-            for future in finished:
-                device, task = running.pop(future)
-                free.append(device)
-                _give_memory_back()
-                if isinstance(task, Job):
-                    networks[task] = future.result()
-                else:
-                    compiled[program_of(task.scenario), device] = True
-                    write_file(store.cell_file(task.number), future.result())
-                    done += 1
+        yield from _run(store, functools.partial(pool.submit, call), results)
     finally:
         # An interrupt does not wait for running tasks, which may last minutes; their results are lost.
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
+    """Computes the remaining cells on a cluster, in the order in which they finish.
+
+    `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
+    lock of the cluster. Raises `InputError` if the cluster has no workers, or loses a task more often than it allows.
+    """
+    from distributed import as_completed
+
+    if store.missing() and not client.nthreads():
+        raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
+
+    def results(futures: list[Any]) -> Iterator[tuple[Any, Any]]:
+        for future in as_completed(futures, loop=client.loop, raise_errors=False):
+            try:
+                result = future.result()
+            except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
+                what = " ".join(str(error).split())[:300] or type(error).__name__
+                raise InputError(f"lost by the cluster ({what}); run the study again to resume.") from None
+            yield future, result
+
+    yield from _run(store, functools.partial(client.submit, retries=_RETRIES, pure=False), results)
+
+
+def _run(
+    store: Store, submit: Callable[..., Any], results: Callable[[list[Any]], Iterator[tuple[Any, Any]]]
+) -> Iterator[Step]:
+    """Trains the missing networks and computes the missing cells. Files are written by this process.
+
+    - `submit`: takes a function and its arguments, some of which may be futures; returns a future.
+    - `results`: the finished futures with their results.
+    """
+    study, numbers, begun = store.study, store.study.jobs(), Counter[tuple]()
+
+    def turn(cell: Cell) -> tuple[bool, int]:
+        """Cells without a network first, and one cell of each program first: threads compile different programs."""
+        program = program_of(cell.scenario)
+        begun[program] += 1
+        return study.job(cell.scenario) is not None, begun[program]
+
+    cells = sorted(map(study.cell, store.missing()), key=turn)
+    networks: dict[Job | None, Any] = {None: None}
+    tasks: dict[Any, Job | Cell] = {}
+    for job in dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None):
+        if store.read_network(numbers[job]) is None:
+            networks[job] = submit(train, study, job)
+            tasks[networks[job]] = job
+        else:  # as a task: a cluster keeps it once, and again if a worker is lost
+            networks[job] = submit(bytes, store.network_file(numbers[job]).read_bytes())
+    tasks |= {submit(compute, study, cell, networks[study.job(cell.scenario)]): cell for cell in cells}
+    done = study.count - len(cells)
+    for future, data in results(list(tasks)):
+        task = tasks.pop(future)
+        if isinstance(task, Cell):
+            write_file(store.cell_file(task.number), data)
+            done += 1
+            yield Step(done, label_of(study, task))
+        elif isinstance(data, bytes):
+            write_file(store.network_file(numbers[task]), data)
+        _give_memory_back()
 
 
 def _give_memory_back() -> None:
     """Returns the compiler's freed memory to the system; the C library keeps half a gigabyte of a large program."""
     with contextlib.suppress(OSError, AttributeError, TypeError):  # not every C library can
         ctypes.CDLL(None).malloc_trim(0)
-
-
-def _train(store: Store, job: Job, device: Any) -> bytes | str:
-    """`train` on a device, or the file of an earlier run."""
-    number = store.study.jobs()[job]
-    if store.read_network(number) is None:
-        with jax.default_device(device):
-            data = train(store.study, job)
-        if isinstance(data, str):
-            return data
-        write_file(store.network_file(number), data)
-    return store.network_file(number).read_bytes()
 
 
 def train(study: Study, job: Job) -> bytes | str:
@@ -163,13 +181,12 @@ def train(study: Study, job: Job) -> bytes | str:
         return str(error)
 
 
-def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> bytes:
+def compute(study: Study, cell: Cell, network: Trained) -> bytes:
     """The bytes of a cell's file. Equal results give equal bytes."""
     try:
         if isinstance(network, str):
             raise TrainingError(network)
-        with jax.default_device(device):
-            results = run_cell(study, cell, None if network is None else _loaded(network))
+        results = run_cell(study, cell, None if network is None else _loaded(network))
     except FAILURES as error:
         if "RESOURCE_EXHAUSTED" in str(error):  # the machine's failure, not the cell's
             remedy = "free some and run the study again, or start another study with a smaller `batch`"
@@ -180,54 +197,10 @@ def compute(study: Study, cell: Cell, network: Trained, device: Any = None) -> b
     return file.getvalue()
 
 
-def label_of(study: Study, task: Job | Cell) -> str:
-    """The name of a task: for a cell its estimator, and its values on the axes that have more than one."""
-    if isinstance(task, Job):
-        return f"training for {task.channels}"
-    *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in task.scenario)
+def label_of(study: Study, cell: Cell) -> str:
+    """The name of a cell: its estimator, and its values on the axes that have more than one."""
+    *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in cell.scenario)
     return " ".join([estimator, *itertools.compress(shared, (length > 1 for length in study.shape))])
-
-
-def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
-    """Computes the remaining cells on a cluster, in the order in which they finish.
-
-    `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
-    lock of the cluster. Raises `InputError` if the cluster has no workers, or loses a cell more often than it allows.
-    """
-    from distributed import as_completed
-
-    study, cells, numbers = store.study, [store.study.cell(index) for index in store.missing()], store.study.jobs()
-    if cells and not client.nthreads():
-        raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
-
-    def network_of(job: Job) -> Any:
-        if store.read_network(numbers[job]) is None:
-            return client.submit(train, study, job, retries=_RETRIES, pure=False)
-        # Read here, and not on a worker, because it may be damaged. As a task: data of a lost worker are lost with it.
-        return client.submit(bytes, store.network_file(numbers[job]).read_bytes(), pure=False)
-
-    jobs = [study.job(cell.scenario) for cell in cells]
-    networks: dict[Job | None, Any] = {job: network_of(job) for job in dict.fromkeys(jobs) if job is not None} | {
-        None: None
-    }
-    running = {
-        client.submit(compute, study, cell, networks[job], retries=_RETRIES, pure=False): (cell, job)
-        for cell, job in zip(cells, jobs, strict=True)
-    }
-    finished = as_completed(list(running), loop=client.loop, raise_errors=False)
-    for done, future in enumerate(finished, start=study.count - len(cells) + 1):
-        cell, job = running.pop(future)
-        try:
-            data = future.result()
-            trained = None if job is None or store.network_file(numbers[job]).exists() else networks[job].result()
-        except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
-            what = " ".join(str(error).split())[:300] or type(error).__name__
-            lost = f"cell {cell.number}: lost by the cluster ({what})"
-            raise InputError(f"{lost}; run the study again to resume.") from None
-        if job is not None and isinstance(trained, bytes):
-            write_file(store.network_file(numbers[job]), trained)
-        write_file(store.cell_file(cell.number), data)
-        yield Step(done, label_of(study, cell))
 
 
 @functools.lru_cache(maxsize=8)
@@ -242,19 +215,19 @@ def carry_out(
     device: str,
     *,
     run: Callable[[Store], Iterator[Step]] = run_here,
-    progress: Callable[[Step], None] = lambda step: None,
+    progress: Callable[[str, int], None] = lambda label, done: None,
 ) -> xr.Dataset:
     """Runs the missing cells of a study and writes its Dataset. Raises what `open_store` and `run` raise.
 
     - `out`: the study's folder; a new one, or one that the same study wrote.
     - `device`: what computes, in words, for the provenance.
     - `run`: `run_here`, or `run_on_cluster` with its client.
-    - `progress`: is called after each step.
+    - `progress`: is called after each step, with its label and the number of finished cells.
     """
     with open_store(out, study, device) as store:
         for step in run(store):
-            progress(step)
-        progress(Step(study.count, "writing the Dataset"))
+            progress(step.label, step.done)
+        progress("writing the Dataset", study.count)
         dataset = assemble(store)
         save_dataset(dataset, out)
     return dataset
