@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._custom_types import Numeric, RotorSpeeds, Scalar, setting
+from .._custom_types import Numeric, Scalar, setting
 from ..airframe import Airframe
 from ..errors import InputError, named
 from ..flight import STATE_NAMES
@@ -19,7 +19,7 @@ ANGLES, RATES, POSITION, VELOCITY = (
     for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
 )
 # Shares of the limits by the name of the limit, for each sample.
-Uses = dict[str, Float[Array, "..."]]
+Uses = Mapping[str, Float[Numeric, "..."]]
 
 
 class Envelope(eqx.Module):
@@ -53,7 +53,10 @@ class Envelope(eqx.Module):
         cls, omega: Float[Numeric, "*inputs samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
     ) -> "Envelope":
         """The limits that flights just keep. `dt`: of the rotor speeds; the states may be sampled more often."""
-        return cls(**_needs(omega, states, dt))
+        sizes = {name: np.abs(size) for name, size in _sizes(np.asarray(omega), np.asarray(states), dt).items()}
+        largest = {name: size.max() for name, size in sizes.items()}
+        each = {name: sizes[name].reshape(-1, 3).max(axis=0) for name in ("angle", "rate")}
+        return cls(**largest | each | {"slowest": sizes["slowest"].min()})
 
     def limited(self, limits: Mapping[str, Any]) -> "Envelope":
         """This envelope with some limits replaced. Raises `InputError` if one of them is impossible."""
@@ -64,39 +67,34 @@ class Envelope(eqx.Module):
         self, omega: Float[Numeric, "*inputs samples 4"], states: Float[Numeric, "*flights times 12"], dt: float
     ) -> dict[str, float]:
         """The largest share of each limit that flights use, see `of`: 1 is the limit. Infinite if a flight failed."""
-        shares = {
-            name: np.max(need / np.asarray(getattr(self, name))) for name, need in _needs(omega, states, dt).items()
-        }
+        limits = jax.tree.map(np.asarray, self)
         with np.errstate(divide="ignore"):  # a rotor that stands still
-            shares["slowest"] = 1 / shares["slowest"]
-        return {name: float(np.nan_to_num(share, nan=np.inf, posinf=np.inf)) for name, share in shares.items()}
+            uses = limits.uses(np.asarray(omega), np.asarray(states), dt)
+        return {name: float(np.nan_to_num(np.abs(use).max(), nan=np.inf, posinf=np.inf)) for name, use in uses.items()}
 
-    def uses(self, omega: RotorSpeeds, states: Float[Array, "times *vehicles 12"], dt: Scalar) -> Uses:
-        """The share of each limit at each sample, with derivatives. The columns are rotors, or axes of all vehicles."""
-        held = omega[:-1]
-        of_states = {
-            "angle": states[..., ANGLES] / self.angle,
-            "rate": states[..., RATES] / self.rate,
-            "velocity": _norm(states[..., VELOCITY]) / self.velocity,
-            "distance": _norm(states[..., POSITION] - states[0][..., POSITION]) / self.distance,
-        }
-        return {
-            "slowest": self.slowest / held,
-            "fastest": held / self.fastest,
-            "slew": jnp.diff(held, axis=0) / (self.slew * dt),
-        } | {name: share.reshape(share.shape[0], -1) for name, share in of_states.items()}
+    def uses(
+        self,
+        omega: Float[Numeric, "*inputs samples 4"],
+        states: Float[Numeric, "*flights times 12"],
+        dt: Scalar | float,
+    ) -> Uses:
+        """The share of each limit at each sample, with derivatives. The columns are rotors, or axes."""
+        sizes = _sizes(omega, states, dt)
+        shares = {name: size / getattr(self, name) for name, size in sizes.items()}
+        return shares | {"slowest": self.slowest / sizes["slowest"]}
 
 
-def _needs(omega: Numeric, states: Numeric, dt: float) -> dict[str, Any]:
-    held, states = np.asarray(omega)[..., :-1, :], np.asarray(states)  # the last row drives nothing
+def _sizes(omega: Numeric, states: Numeric, dt: Scalar | float) -> dict[str, Numeric]:
+    """The quantities at each sample that the limits of an envelope restrict, by the name of the limit."""
+    held, moved = omega[..., :-1, :], states - states[..., :1, :]  # the last row of rotor speeds drives nothing
     return {
-        "slowest": held.min(),
-        "fastest": held.max(),
-        "slew": np.abs(np.diff(held, axis=-2)).max() / dt,
-        "angle": np.abs(states[..., ANGLES]).reshape(-1, 3).max(axis=0),
-        "rate": np.abs(states[..., RATES]).reshape(-1, 3).max(axis=0),
-        "velocity": np.linalg.norm(states[..., VELOCITY], axis=-1).max(),
-        "distance": np.linalg.norm((states - states[..., :1, :])[..., POSITION], axis=-1).max(),
+        "slowest": held,
+        "fastest": held,
+        "slew": (held[..., 1:, :] - held[..., :-1, :]) / dt,
+        "angle": states[..., ANGLES],
+        "rate": states[..., RATES],
+        "velocity": _norm(states[..., VELOCITY]),
+        "distance": _norm(moved[..., POSITION]),
     }
 
 
@@ -113,6 +111,6 @@ def hover_squares(airframe: Airframe, envelope: Envelope) -> Float[np.ndarray, "
     return squares
 
 
-def _norm(vectors: Float[Array, "*some 3"]) -> Float[Array, "*some 1"]:
+def _norm(vectors: Float[Numeric, "*some 3"]) -> Float[Numeric, "*some 1"]:
     """The length of each vector, with a derivative at 0."""
-    return jnp.sqrt(jnp.square(vectors).sum(axis=-1, keepdims=True) + 1e-12)
+    return ((vectors**2).sum(axis=-1, keepdims=True) + 1e-12) ** 0.5

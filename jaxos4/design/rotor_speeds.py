@@ -131,9 +131,9 @@ class RotorSpeeds(task.AbstractTask):
         return jax.vmap(one)(self.draws).mean()
 
     def uses(self, coefficients: Coefficients) -> Uses:
-        """See `AbstractTask`. The columns of a limit of the states are those of all vehicles."""
+        """See `AbstractTask`."""
         omega = self.make(coefficients)
-        fly = jax.vmap(lambda a: simulate(self.model, a, omega, dt=self.dt).states, out_axes=1)
+        fly = jax.vmap(lambda a: simulate(self.model, a, omega, dt=self.dt).states)
         return self.envelope.uses(omega, fly(self.fleet[:_LIMITED]), self.dt)
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:

@@ -118,7 +118,7 @@ class AbstractTask(eqx.Module):
 
     @abc.abstractmethod
     def uses(self, coefficients: Coefficients) -> Uses:
-        """The shares of the limits at each sample, which should be at most 1."""
+        """The shares of the limits at each sample, which should be at most 1; samples are the last axis but one."""
 
     @abc.abstractmethod
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
@@ -186,7 +186,7 @@ def _minimise(
 
     def cost(scaled: Coefficients, penalty: Scalar) -> Scalar:
         uses = jax.tree.leaves(task.uses(_UNIT * scaled))
-        excess = sum(jnp.square(jnp.maximum(jnp.square(use) - 1, 0)).sum() / use.shape[0] for use in uses)
+        excess = sum(jnp.square(jnp.maximum(jnp.square(use) - 1, 0)).sum() / use.shape[-2] for use in uses)
         return task.objective(_UNIT * scaled) + penalty / 2 * excess
 
     def one(start: Coefficients) -> tuple[Coefficients, Scalar]:
