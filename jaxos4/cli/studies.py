@@ -13,8 +13,6 @@ from ._options import Estimator
 from ._output import stages
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from ..study import Study
 
 
@@ -42,8 +40,8 @@ def study(
     typer.echo(f"{out}: {count_outcomes(dataset)}; `jaxos4 report {out}` shows them.")
 
 
-def run_with_bar(wanted: "Study", out: Path, *, device: str | None = None, **how: Any) -> "xr.Dataset":
-    """`jaxos4.study.carry_out` with a progress bar. `device`: by default the devices of this process."""
+def run_with_bar(wanted: "Study", out: Path, *, device: str | None = None, **how: Any) -> Any:
+    """The Dataset of `jaxos4.study.carry_out`, with a progress bar. `device`: by default those of this process."""
     from ..study import carry_out, device_name
 
     try:
