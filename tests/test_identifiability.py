@@ -41,8 +41,10 @@ def test_a_hover_excites_nothing():
 def test_one_axis_excites_its_own_parameters_only(axis, lost):
     """Eqs. (1)-(3): alpha2 multiplies q in p', alpha5 multiplies r in q', so pitch and yaw excite those too."""
     problem = problem_of(jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=[axis]))
-    reasons = analysed(problem).reasons(problem.model.parameter_names)
-    assert {name for name, why in reasons.items() if why == "not excited"} == {f"alpha{i}" for i in lost}
+    notes = analysed(problem).notes(problem.model.parameter_names)
+    assert {name for name, why in notes.items() if why == "not identifiable: not excited"} == {
+        f"alpha{i}" for i in lost
+    }
 
 
 def test_a_parameter_that_is_identifiable_only_together_is_named_with_its_partner():
@@ -158,5 +160,5 @@ def test_nothing_is_identifiable_without_measurements_a_trajectory_or_a_bracket(
     for where, at in ((bracket, runaway), (jaxos4.Bracket(bracket.upper, bracket.lower), alpha)):
         found = jaxos4.identifiability(jaxos4.evaluate(problem, at), where)
         assert np.isposinf(found.std).all()
-        reason = "the trajectory is not finite, or the bracket is not valid"
-        assert found.reasons(names) == dict.fromkeys(names, reason)
+        reason = "not identifiable: the trajectory is not finite, or the bracket is not valid"
+        assert found.notes(names) == dict.fromkeys(names, reason)

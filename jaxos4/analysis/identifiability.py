@@ -49,25 +49,21 @@ class Identifiability(eqx.Module):
         """The largest noise, in multiples of sigma, at which the 95 % interval of the nominal value excludes 0."""
         return np.abs(self.nominal) / (NINETY_FIVE * self.std)
 
-    def reasons(self, names: tuple[str, ...]) -> dict[str, str]:
-        """For each parameter of one flight that is not identifiable, the reason."""
-
-        def reason(i: int) -> str:
-            if not np.isfinite(self.std[i]):
-                return "the trajectory is not finite, or the bracket is not valid"
-            if not self.excited[i]:
-                return "not excited"
-            return f"only together with {', '.join(names[j] for j in self._partners(i))}"
-
-        return {names[i]: reason(i) for i in np.flatnonzero(~self.identifiable).tolist()}
-
     def notes(self, names: tuple[str, ...]) -> dict[str, str]:
         """For each parameter of one flight that is not identifiable or below the noise floor, a note to the user."""
-        notes = {name: f"not identifiable: {reason}" for name, reason in self.reasons(names).items()}
-        for name, limit, nominal in zip(names, self.noise_limit, self.nominal, strict=True):
-            if name not in notes and limit < 1 and nominal != 0:
-                notes[name] = f"below the noise floor: identifiable below {limit:.2g} times this noise"
-        return notes
+
+        def note(i: int) -> str:
+            if not np.isfinite(self.std[i]):
+                return "not identifiable: the trajectory is not finite, or the bracket is not valid"
+            if not self.excited[i]:
+                return "not identifiable: not excited"
+            if not self.identifiable[i]:
+                return f"not identifiable: only together with {', '.join(names[j] for j in self._partners(i))}"
+            if self.noise_limit[i] < 1 and self.nominal[i] != 0:
+                return f"below the noise floor: identifiable below {self.noise_limit[i]:.2g} times this noise"
+            return ""
+
+        return {name: text for i, name in enumerate(names) if (text := note(i))}
 
     def _partners(self, i: int) -> list[int]:
         """The parameters that can change together with parameter `i` with the least effect on the flight."""

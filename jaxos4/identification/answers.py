@@ -8,7 +8,7 @@ from .._xla import quick_jit
 from ..analysis.diagnostics import Diagnostics
 from ..analysis.identifiability import identifiability
 from ..analysis.inertia import fit_inertia
-from ..bracket import is_identifiable
+from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import Estimate
 from ..flight import STATE_NAMES, STATE_UNITS
 from ..models.abstract import PARAMETER_NAMES
@@ -42,7 +42,8 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
     estimate, unknowns = fit.estimate, fit.problem.unknowns
     std, width = map(np.asarray, _intervals(estimate))
     values, half_width, free = np.asarray(estimate.parameters), np.asarray(unknowns.half_width), fit.free
-    identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, case.prior))
+    prior = GAUSSIAN_PRIOR if case.is_vehicle else case.estimator.prior
+    identifiable = np.asarray(is_identifiable(std[: unknowns.count], half_width, prior))
     reasons = dict.fromkeys(unknowns.names, "not identifiable from this flight")
     limits = dict.fromkeys(unknowns.names, msgspec.UNSET if case.is_vehicle else None)
     if fit.evaluation is not None:

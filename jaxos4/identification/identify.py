@@ -151,25 +151,21 @@ def assess(
     problem = flight_problem(recording, model, where, **settings)
     fit = fit_flight(IBSS(), problem, progress=progress)
     known = identifiability(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
-    names, notes = model.parameter_names, known.notes(model.parameter_names)
-    std, alone, half_width, limit = map(np.asarray, (known.std, known.std_alone, known.half_width, known.noise_limit))
-    finite = bool(np.isfinite(std).all())
+    notes = known.notes(model.parameter_names)
     return FlightInformation(
         flight=recording.name,
         fitted=has_answer(fit.estimate),
         sigma=dict(zip(STATE_NAMES, fit.problem.sigma.tolist(), strict=True)),
         parameters={
             name: ParameterInformation(
-                bound=finite_or_none(std[i]),
-                others_known=finite_or_none(alone[i]),
-                half_width=float(half_width[i]),
-                noise_limit=finite_or_none(limit[i]) if np.isfinite(std[i]) else None,
+                bound=finite_or_none(known.std[i]),
+                others_known=finite_or_none(known.std_alone[i]),
+                half_width=float(known.half_width[i]),
+                noise_limit=finite_or_none(known.noise_limit[i]) if np.isfinite(known.std[i]) else None,
                 unit=model.parameter_units[i],
                 note=notes.get(name, ""),
             )
-            for i, name in enumerate(names)
+            for i, name in enumerate(model.parameter_names)
         },
-        eigenvalues=known.eigenvalues.tolist() if finite else None,
-        directions=known.directions.T.tolist() if finite else None,
         identifiability=known,
     )

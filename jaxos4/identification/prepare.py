@@ -28,7 +28,6 @@ class Case(NamedTuple):
     - `problem`: the likelihood, with its bracket. `shooting`: the flight and its model.
     - `estimator`: what searches it; `name`: of the estimator.
     - `model`: the name of the equations.
-    - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`.
     - `held_out`: the flight with the measurements that are not fitted, if there are any.
     - `recording`: the number of the recording of each sample.
     - `provenance`: data, settings and versions.
@@ -41,7 +40,6 @@ class Case(NamedTuple):
     estimator: AbstractEstimator
     name: str
     model: str
-    prior: float
     held_out: ShootingProblem | None
     recording: np.ndarray
     provenance: Provenance
@@ -124,7 +122,7 @@ def prepare_flight(
         **versions(problem),
     )
     one = np.zeros(samples, int)
-    return Case(problem, problem, method, name, subject, kind.prior, other, one, provenance, name_of_other)
+    return Case(problem, problem, method, name, subject, other, one, provenance, name_of_other)
 
 
 def _restricted(problem: ShootingProblem, channels: str, name: str, recording: Recording) -> ShootingProblem:

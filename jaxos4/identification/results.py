@@ -4,6 +4,7 @@ import math
 from typing import Any, SupportsFloat
 
 import msgspec
+import numpy as np
 
 from ..airframe import airframe_table
 from ..analysis.frequency_response import FrequencyResponse
@@ -329,21 +330,24 @@ class FlightInformation(msgspec.Struct, frozen=True, eq=False):
     - `fitted`: whether the model could be fitted; otherwise all numbers hold at the bracket's centre.
     - `sigma`: the noise levels that were found, by channel.
     - `parameters`: by name.
-    - `eigenvalues`, `directions`: see `jaxos4.Identifiability`; a direction is a row. `None` without a trajectory.
-    - `identifiability`: the same as arrays; not in `to_dict`.
+    - `identifiability`: the same as arrays.
     """
 
     flight: str
     fitted: bool
     sigma: dict[str, float]
     parameters: dict[str, ParameterInformation]
-    eigenvalues: list[float] | None
-    directions: list[list[float]] | None
     identifiability: Identifiability
 
     def to_dict(self) -> dict[str, Any]:
-        """Dictionaries, lists, numbers and strings: what `jaxos4 identifiability` writes as JSON."""
-        return msgspec.to_builtins(_fields(self, "identifiability"))
+        """Dictionaries, lists, numbers and strings: what `jaxos4 identifiability` writes as JSON.
+
+        `eigenvalues`, `directions`: see `jaxos4.Identifiability`; a direction is a row. `None` without a trajectory.
+        """
+        known = self.identifiability
+        axes = {"eigenvalues": known.eigenvalues.tolist(), "directions": known.directions.T.tolist()}
+        axes = axes if np.isfinite(known.std).all() else dict.fromkeys(axes)
+        return msgspec.to_builtins(_fields(self, "identifiability") | axes)
 
 
 def _fields(struct: msgspec.Struct, *apart: str) -> dict[str, Any]:

@@ -106,7 +106,7 @@ def _case(
     recording = np.asarray(prepared.recordings)[number]
     problem = _innovations(shooting, prepared, room)
     return Case(
-        problem, shooting, _NEWTON, name, "flight", FilterError.prior, held_out, recording, provenance,
+        problem, shooting, _NEWTON, name, "flight", held_out, recording, provenance,
         validate.name if validate else "", prepared.doubts, prepared.log_step,
     )  # fmt: skip
 
