@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import jaxos4
-from jaxos4.report import read_results
-from jaxos4.study import load_study, metrics
+from jaxos4.study import load_study, metrics, read_results
 
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 sys.path.append(str(EXPERIMENTS))

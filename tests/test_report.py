@@ -19,11 +19,11 @@ from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.estimators import ESTIMATORS as REGISTRY
-from jaxos4.report import error_table, read_results, study_figures, study_page, write_report
-from jaxos4.report.study_data import scenarios
+from jaxos4.report import error_table, study_figures, study_page, write_report
+from jaxos4.report.study_tables import scenarios
 from jaxos4.report.style import drawing, log_axis, styles
 from jaxos4.report.text import percent, plain
-from jaxos4.study import metrics
+from jaxos4.study import metrics, read_results
 
 OF_SCENARIO = {"overview", "error", "efficiency", "coverage"}
 

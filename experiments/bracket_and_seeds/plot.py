@@ -8,10 +8,9 @@ import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxos4.report import read_results
 from jaxos4.report.study_figures import dodged
 from jaxos4.report.style import INK, grid, log_axis, styles
-from jaxos4.study import metrics
+from jaxos4.study import metrics, read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

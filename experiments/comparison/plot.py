@@ -10,11 +10,10 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from jaxos4.report import read_results
-from jaxos4.report.study_data import error_unit
+from jaxos4.report.study_tables import error_unit
 from jaxos4.report.style import INK, PAPER, grid
 from jaxos4.report.text import plain
-from jaxos4.study import metrics
+from jaxos4.study import metrics, read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

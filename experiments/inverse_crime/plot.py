@@ -11,9 +11,8 @@ import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxos4.report import read_results
 from jaxos4.report.style import FAINT, INK, grid, log_axis, scale_axis, styles
-from jaxos4.study import metrics
+from jaxos4.study import metrics, read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

@@ -82,7 +82,8 @@ def report(
 ) -> None:
     """Write the report of a study: report.html and figures/ as SVG and PDF."""
     with stages("loading the library") as progress:
-        from ..report import read_results, write_report
+        from ..report import write_report
+        from ..study import read_results
 
         progress("reading")
         dataset = read_results(directory)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ..study import metrics
-from .study_data import accuracy, bounds, error_unit, names, positive_scales
+from .study_tables import bounds, error_unit, names, positive_scales
 from .style import BOUND_DASHES, INK, Style, estimator_gid, grid, label, legend, log_axis, scale_axis, styles
 from .text import plain
 
@@ -122,7 +122,10 @@ def coverage(data: xr.Dataset) -> Figure | None:
 def overview(data: xr.Dataset) -> Figure | None:
     """RMSE / least bound, the mean of all parameters: left against the noise scale, right against the rollouts."""
     data = positive_scales(data)
-    found, rollouts = accuracy(data), metrics.mean_rollouts(data).transpose("scale", "estimator").values
+    found, rollouts = (
+        metrics.accuracy_interval(data),
+        metrics.mean_rollouts(data).transpose("scale", "estimator").values,
+    )
     values, low, high = (found[name].values for name in ("accuracy", "low", "high"))
     known = np.isfinite(values) & np.isfinite(rollouts)
     if not known.any():

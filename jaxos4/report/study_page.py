@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from .._files import check_writable, write_file
 from . import study_figures, study_tables
 from .html import Drawing, draw as draw_panels, render, swatch
-from .study_data import Scenario, best_estimators, bounds, names, scenarios
+from .study_tables import Scenario, best_estimators, bounds, names, scenarios
 from .style import BOUND_DASHES, drawing, pdf, styles
 
 MOST_DRAWN = 12

@@ -1,7 +1,8 @@
-"""The tables of a study as rows of text, for the page and for the terminal."""
+"""The scenarios of a study, and their tables as rows of text, for the page and for the terminal."""
 
+import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,14 +11,78 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from ..study import OUTCOMES, metrics
-from .study_data import bounds, names, scale_labels, scenarios
 from .text import MISSING, Listing, percent, plain
 
+_PHRASES = {
+    "model": "{} model",
+    "airframe": "airframe {}",
+    "excitation": "{}",
+    "duration": "{:g} s",
+    "method": "truth by {}",
+    "noise": "{} noise",
+    "width": "bracket x {:g}",
+    "channels": "{} channels",
+}
 # The mark after a number that is not a percentage, by the codes of `metrics.no_percentage`.
 _MARKS = ("", "†", "‡")
 # The table of coverage by parameter shows this level, or the nearest one in the study.
 _LEVEL = 0.95
 _MOST_LISTED = 20
+
+
+class Scenario(NamedTuple):
+    """The data that one table or figure compares: all noise scales and estimators, one value on each other axis."""
+
+    number: int
+    label: str
+    data: xr.Dataset
+
+
+def scenarios(dataset: xr.Dataset) -> Iterator[Scenario]:
+    """All scenarios, numbered from 1. The label names the dimensions that differ, or all if there is one scenario."""
+    fixed = [name for name in metrics.SCENARIO if name in _PHRASES]
+    varied = [name for name in fixed if dataset.sizes[name] > 1] or fixed
+    for number, at in enumerate(itertools.product(*(range(dataset.sizes[name]) for name in fixed)), start=1):
+        data = dataset.isel(dict(zip(fixed, at, strict=True)))
+        yield Scenario(number, ", ".join(_PHRASES[name].format(data[name].item()) for name in varied), data)
+
+
+def names(data: xr.Dataset | xr.DataArray, dimension: str) -> list[str]:
+    """The labels along a dimension."""
+    return [str(name) for name in data[dimension].values]
+
+
+def scale_labels(data: xr.Dataset) -> list[str]:
+    """The noise scales in words."""
+    return [f"noise x {scale:g}" for scale in data["scale"].values]
+
+
+def bounds(data: xr.Dataset) -> dict[str, int]:
+    """The channels that estimators look at, each with the index of an estimator that has their bound."""
+    found: dict[str, int] = {}
+    known = data["bound"].notnull().any([name for name in data["bound"].dims if name != "estimator"])
+    for place in np.argsort(~known.values, kind="stable").tolist():  # first those that were run
+        found.setdefault(str(data["seen"].isel(estimator=place).item()), place)
+    return dict(sorted(found.items(), key=lambda item: item[1]))
+
+
+def positive_scales(data: xr.Dataset) -> xr.Dataset:
+    """The data without the noise scale 0, which a logarithmic axis cannot show."""
+    return data.isel(scale=np.flatnonzero(data["scale"].values > 0))
+
+
+def error_unit(data: xr.Dataset, parameter: int) -> tuple[str, str, str]:
+    """The scale of a parameter's errors: "percent" or "absolute", the unit, and why not percent.
+
+    Absolute if the percentage of any point is meaningless, so that a panel has one scale.
+    """
+    reason = metrics.no_percentage(data).isel(parameter=parameter)
+    if not (reason > 0).any():
+        return "percent", "%", ""
+    worst = int(reason.where(reason > 0).min())
+    at = [f"{scale:g}" for scale in data["scale"].values[(reason > 0).any("estimator").values]]
+    where = f" at noise {', '.join(at)}" if len(at) < data.sizes["scale"] else ""
+    return "absolute", names(data, "unit")[parameter], metrics.NO_PERCENTAGE[worst] + where
 
 
 class Cell(NamedTuple):
@@ -107,6 +172,16 @@ def _result_table(data: xr.Dataset) -> Table:
 
     headings = [names(counts, "code")[place].replace("_", " ") for place in occurs]
     return _by_estimator(data, [*headings, "rollouts", "seed hits"], cells)
+
+
+def best_estimators(data: xr.Dataset) -> dict[str, str]:
+    """The estimators that are as accurate as the best one, within Monte-Carlo error, by the noise scales in words."""
+    found, best = metrics.accuracy_interval(data), {}
+    for scale, one in zip(scale_labels(data), (found.isel(scale=i) for i in range(data.sizes["scale"])), strict=True):
+        good = (one["low"] <= one["accuracy"].min()).values
+        if good.any():
+            best.setdefault(", ".join(np.array(names(data, "estimator"))[good]), []).append(scale)
+    return {", ".join(scales) if len(best) > 1 else "every noise": names for names, scales in best.items()}
 
 
 def troubled_flights(data: xr.Dataset) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from .dataset import (
     assemble as assemble,
     open_store as open_store,
     provenance as provenance,
+    read_results as read_results,
     read_store as read_store,
     save_dataset as save_dataset,
 )

@@ -57,6 +57,8 @@ _AXES = {
     "level": "share of intervals that should hold the truth",
 }
 RESULTS_FILE = "results.nc"
+# What a report needs of the Dataset.
+_NEEDED = {"truth", "center", "estimate", "half_width", "bound", "result", "rollouts", "hit", "seen", "unit"}
 _SPECIFICATION, _LOCK = "study.json", "lock"
 # Names of files that were being written when a run was killed.
 _UNFINISHED = ".*.part*"
@@ -226,6 +228,27 @@ def _dims(name: str) -> tuple[str, ...]:
 def save_dataset(dataset: xr.Dataset, directory: Path) -> None:
     """Writes a study's Dataset into its folder, completely or not at all."""
     write_netcdf(directory / RESULTS_FILE, dataset, 4)
+
+
+def read_results(directory: Path) -> xr.Dataset:
+    """Reads the Dataset in a study's folder.
+
+    **Raises:** `InputError` if there is no Dataset, or if the file is not the results of a study.
+    """
+    path = directory / RESULTS_FILE
+    if not directory.is_dir():
+        raise InputError(f"{directory}: no such folder; give one that `jaxos4 study` wrote.")
+    if not path.is_file():
+        raise InputError(f"{directory}: holds no {RESULTS_FILE}; give a folder that `jaxos4 study` wrote.")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", phony_dims="sort") as opened:
+            dataset = opened.load()
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        what = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
+    if missing := ", ".join(sorted(_NEEDED - dataset.variables.keys() | _AXES.keys() - set(dataset.dims))):
+        raise InputError(f"{path}: not the results of a study: no {missing}; give a folder that `jaxos4 study` wrote.")
+    return dataset
 
 
 def _coordinates(study: Study) -> dict[str, tuple]:
