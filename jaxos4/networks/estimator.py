@@ -103,11 +103,9 @@ class NetworkEstimator(eqx.Module):
         training diverges, or if the flights of the bracket diverge.
         """
         self._check(problem, bracket)
-        scales = np.asarray(self.noise, float)
-        features = _prepared(self.features, problem.restrict(self.channels), bracket, scales[1])
-        scaling, regressor = untrained(features, scales, key, {"width": self.width, "depth": self.depth})
-        pace: dict[str, Any] = {name: getattr(self, name) for name in ("batch", "steps", "patience", "learning_rate")}
-        regressor, history = train(regressor, scaling, features, scales, **pace, key=key)
+        features = _prepared(self.features, problem.restrict(self.channels), bracket, as_float(self.noise[1]))
+        scaling, regressor = untrained(features, self, key)
+        regressor, history = train(regressor, scaling, features, self, key)
         errors = calibrate(regressor, scaling, features, calibrated_scales(self.noise), self.held_out, key)
         return TrainedNetwork(self, features, scaling, regressor, errors, as_float(history), jax.random.key_data(key))
 
@@ -127,7 +125,7 @@ class NetworkEstimator(eqx.Module):
 
 @quick_jit
 def _prepared(features: str, problem: ShootingProblem, bracket: Bracket, noise: Scalar) -> Features:
-    return Features.of(features, problem, Coordinates.of(problem, bracket, as_float(noise)))
+    return Features.of(features, problem, Coordinates.of(problem, bracket, noise))
 
 
 class TrainedNetwork(AbstractEstimator):

@@ -18,6 +18,8 @@ from .features import CHUNK, Features, Flights, Pair, Purpose, draw_chunks, nois
 if TYPE_CHECKING:
     import optax  # `_optimiser` imports it, because it is slow to import
 
+    from .estimator import NetworkEstimator
+
 CHECK = 250
 """Steps between two evaluations of the validation loss."""
 
@@ -35,10 +37,9 @@ _NEWTON_SCHULZ = ((3.4445, -4.7750, 2.0315),) * 5  # Optax's coefficients; as ro
 _PER_FEATURE, _RIDGE = 4, 1e-6
 
 
-def untrained(
-    features: Features, scales: Float[np.ndarray, "2"], key: Key, shape: dict[str, Any]
-) -> tuple[Scaling, Regressor]:
+def untrained(features: Features, settings: "NetworkEstimator", key: Key) -> tuple[Scaling, Regressor]:
     """Scaling and regressor before training, with a linear map that is fitted to simulated flights."""
+    scales, shape = np.asarray(settings.noise, float), {"width": settings.width, "depth": settings.depth}
     count, purpose = max(CHUNK, _PER_FEATURE * features.size), Purpose.LINEAR_MAP
     chunks = noisy_chunks(features, draw_chunks(features, count, key=key, purpose=purpose), scales, key, purpose)
     return _untrained(features, chunks, scales, key, shape)
@@ -72,12 +73,7 @@ def train(
     regressor: Regressor,
     scaling: Scaling,
     features: Features,
-    scales: Float[np.ndarray, "2"],
-    *,
-    batch: int,
-    steps: int,
-    learning_rate: float,
-    patience: int,
+    settings: "NetworkEstimator",
     key: Key,
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
@@ -89,6 +85,7 @@ def train(
 
     **Raises:** `TrainingError` if the loss diverges, or if nearly all flights of the bracket diverge.
     """
+    scales, batch, steps = np.asarray(settings.noise, float), settings.batch, settings.steps
     held_out = draw_chunks(features, _VALIDATION * CHUNK, key=key, purpose=Purpose.VALIDATION)
     held_out = noisy_chunks(features, held_out, scales, key, Purpose.VALIDATION)
     flyable = np.mean([np.isfinite(np.asarray(chunk.features)).all(axis=1) for chunk in held_out])
@@ -97,7 +94,7 @@ def train(
         raise TrainingError(f"{what}: narrow the bracket, or shorten the flight.")
     # Single precision: rounding is far below the noise of a step's flights.
     regressor, held_out, data = _single(regressor), _single(held_out), _single((scaling, features, scales))
-    state, rates = _first_state(regressor), _learning_rates(learning_rate, steps)
+    state, rates = _first_state(regressor), _learning_rates(settings.learning_rate, steps)
     flown = batch * CHECK // _USES
     best, lowest, without_improvement, history = regressor, np.inf, 0, []
     for number, first in enumerate(range(0, steps, CHECK)):
@@ -116,7 +113,7 @@ def train(
         without_improvement += 1
         if current < lowest - _IMPROVEMENT * abs(current):
             best, lowest, without_improvement = regressor, current, 0
-        if without_improvement >= patience:
+        if without_improvement >= settings.patience:
             break
     whole = jax.tree.map(lambda x: as_float(np.asarray(x)) if eqx.is_inexact_array_like(x) else x, best)
     return whole, np.asarray(history)

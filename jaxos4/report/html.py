@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 
-from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
+from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, pdf, svg
 from .text import MISSING, plain
 
 # CSS pixels in a point, and by how much a panel may shrink and grow.
@@ -19,15 +19,17 @@ _THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)", PAPE
 
 
 class Drawing(NamedTuple):
-    """A figure as SVG, and the boxes of its panels, see `panel_boxes`."""
+    """A figure: the stem of the names of its files and ids, its SVG, the boxes of its panels, and its PDF, if any."""
 
+    stem: str
     svg: bytes
     boxes: list[list[float]]
+    pdf: bytes | None = None
 
 
-def draw(figure: Figure) -> Drawing:
+def draw(figure: Figure, stem: str, *, with_pdf: bool = False) -> Drawing:
     """Draws a figure for a page."""
-    return Drawing(svg(figure), panel_boxes(figure).tolist())
+    return Drawing(stem, svg(figure), panel_boxes(figure).tolist(), pdf(figure) if with_pdf else None)
 
 
 def render(template: str, **values: Any) -> str:
@@ -46,18 +48,14 @@ def _number(value: float | None, digits: int = 4) -> str:
     return MISSING if value is None else plain(value, digits)
 
 
-def inline(drawing: Drawing, stem: str, description: str, estimators: Sequence[str] = ()) -> Markup:
+def inline(drawing: Drawing, description: str, estimators: Sequence[str] = ()) -> Markup:
     """The panels of a drawing, each as an element `<svg>`: the page puts as many side by side as its width allows.
 
     What belongs to no panel, such as a legend, is left out: the page says it.
 
-    **Arguments:**
-
-    - `stem`: the ids in the elements begin with this text.
-    - `description`: what a screen reader says.
-    - `estimators`: their names, for tooltips.
+    `description`: what a screen reader says. `estimators`: their names, for tooltips.
     """
-    text = drawing.svg.decode()
+    text, stem = drawing.svg.decode(), drawing.stem
     # Coordinates to a hundredth of a point: a third of the bytes.
     text = re.sub(r'(?<= )(d|x|y)="[^"]*"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), text)
 

@@ -44,14 +44,14 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
     with drawing():
         figures = {"vehicle": vehicle(airframe, found.rigid_body.constants, center, look)}
         if found.sample_times:
-            figures["sample times"] = inertias_by_sample_time(found.sample_times, used.sample_time, look)
+            figures["sample-times"] = inertias_by_sample_time(found.sample_times, used.sample_time, look)
         if found.response is not None:
             figures["response"] = frequency_responses(found.response, look)
         for figure in figures.values():
             # The page shows each panel by itself. To fit all labels exactly would take a third of the time.
             figure.set_layout_engine(None)
             figure.subplots_adjust(**_MARGINS)
-        drawings = {name: draw(figure) for name, figure in figures.items()}
+        drawings = {name: draw(figure, name) for name, figure in figures.items()}
     text = render(
         "identification.html.j2",
         title=title,

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import xarray as xr
 from matplotlib.figure import Figure
@@ -11,7 +10,7 @@ from .._files import check_writable, write_file
 from . import study_figures, study_tables
 from .html import Drawing, draw as draw_panels, render, swatch
 from .study_tables import Scenario, best_estimators, bounds, names, scenarios
-from .style import BOUND_DASHES, drawing, pdf, styles
+from .style import BOUND_DASHES, drawing, styles
 
 MOST_DRAWN = 12
 """At most so many scenarios have figures. All scenarios have tables."""
@@ -27,14 +26,6 @@ SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
     "efficiency": study_figures.efficiency,
     "coverage": study_figures.coverage,
 }
-
-
-class Drawn(NamedTuple):
-    """A figure of a study: the name of its files without the suffix, the drawing for the page, and the PDF, if any."""
-
-    stem: str
-    drawing: Drawing
-    pdf: bytes | None
 
 
 def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
@@ -53,7 +44,7 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
         sections.append((scenario, draw(shown, scenario.data, suffix=suffix, with_pdf=with_pdf)))
     files = {target: _page(dataset, sections).encode()}
     for drawn in [drawn for _, figures in sections for drawn in figures.values()]:
-        contents = {"svg": drawn.drawing.svg, "pdf": drawn.pdf}
+        contents = {"svg": drawn.svg, "pdf": drawn.pdf}
         files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in contents.items() if content}
     folder.mkdir(exist_ok=True)
     for path, content in reversed(files.items()):  # the page last
@@ -63,17 +54,17 @@ def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True)
 
 def draw(
     figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, *, suffix: str = "", with_pdf: bool = True
-) -> dict[str, Drawn]:
+) -> dict[str, Drawing]:
     """The figures whose data are present. `suffix`: the end of the names of the files."""
     made = {}
     for name, draw_figure in figures.items():
         with drawing():
             if (figure := draw_figure(data)) is not None:
-                made[name] = Drawn(f"{name}{suffix}", draw_panels(figure), pdf(figure) if with_pdf else None)
+                made[name] = draw_panels(figure, f"{name}{suffix}", with_pdf=with_pdf)
     return made
 
 
-def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawn]]]) -> str:
+def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawing]]]) -> str:
     """The page. `sections`: each scenario with its figures."""
     attributes = {name: str(value) for name, value in dataset.attrs.items()}
     estimators = names(dataset, "estimator")

@@ -22,7 +22,7 @@ import xarray as xr
 
 from .._files import write_file
 from ..errors import InputError, TrainingError
-from ..networks import TrainedNetwork, encode_network, load_network
+from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_network
 from ..shooting import cores
 from .cell import blank_problem, fleet_of, key_of, program_of, run_cell
 from .dataset import Store, assemble, check_store, open_store, save_dataset
@@ -175,7 +175,8 @@ def train(study: Study, job: Job) -> bytes | str:
     try:
         with jax.enable_x64(True):
             fleet, key = fleet_of(study, job), key_of(study.network.seed, study.jobs()[job])
-            settings = study.network.estimator(job.channels, (min(scales), max(scales)))
+            training: dict[str, Any] = {"steps": study.network.steps, "held_out": study.network.held_out}
+            settings = NetworkEstimator(channels=job.channels, noise=(min(scales), max(scales)), **training)
             return encode_network(settings.fit(blank_problem(study, fleet, 1.0, job.channels), fleet.bracket, key=key))
     except FAILURES as error:
         return str(error)

@@ -56,10 +56,6 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     hybrid_channels: Literal["rates", "attitude", "all"] = "all"
     seed: Seed = 0
 
-    def estimator(self, channels: str, noise: tuple[float, float]) -> NetworkEstimator:
-        """The network to be trained."""
-        return NetworkEstimator(channels=channels, noise=noise, steps=self.steps, held_out=self.held_out)
-
 
 class Scenario(NamedTuple):
     """One point of the grid: what is flown, how it is measured, and which estimator identifies it."""
@@ -182,12 +178,6 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         if self.count > _MOST_CELLS:
             raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
 
-    def check_computable(self) -> None:
-        """Raises `InputError` for an excitation that an airframe cannot fly."""
-        for name, excitation, duration in itertools.product(self.airframes, self.excitations, self.durations):
-            with named(f"`excitations`: {excitation} of {duration:g} s by {name}"):
-                self.omega(excitation, name, duration)
-
     def vehicle(self, name: str) -> Airframe:
         """The airframe of that name. Raises `InputError` if there is none, or if its table is not usable."""
         if name in self.airframe:
@@ -259,7 +249,9 @@ def load_study(path: Path) -> Study:
     try:
         table = table | _inputs(table, Path(path).parent)
         study = msgspec.convert(table, Study)
-        study.check_computable()
+        for name, excitation, duration in itertools.product(study.airframes, study.excitations, study.durations):
+            with named(f"`excitations`: {excitation} of {duration:g} s by {name}"):
+                study.omega(excitation, name, duration)
     except (InputError, msgspec.ValidationError, RecursionError) as error:
         in_our_words = isinstance(error, InputError) or isinstance(error.__cause__, InputError)
         what = " ".join(str(error).split())[:300]
