@@ -97,13 +97,9 @@ def overwhelmed(fit: Fit) -> dict[str, str]:
     return weak
 
 
-def rigid_body(case: Case, fit: Fit, speed_noise: float = 0.0) -> RigidBody:
-    """The moments of inertia that explain the estimate best; none of a flight if they are not identifiable."""
-    if case.is_vehicle:
-        return vehicle_constants(fit, speed_noise)
+def rigid_body(fit: Fit) -> RigidBody:
+    """The moments of inertia of an OS4 that explain the estimate best; none if they are not identifiable."""
     model, estimate = fit.problem.model, fit.estimate
-    if model.parameter_names != PARAMETER_NAMES:
-        return RigidBody()
     rigid = fit_inertia(model, estimate.parameters, estimate.covariance)
     values, std = np.asarray(rigid.constants), np.asarray(rigid.std)
     if not np.isfinite(std).all() or (std > np.abs(values))[:3].any():

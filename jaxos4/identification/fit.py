@@ -156,7 +156,7 @@ def fit_innovations(
     problem, found, rollouts, notes, negative = _searched(estimator, problem, progress)
     progress("computing errors")
     values, std = np.asarray(found.parameters), _std(found)[: own.count]
-    noise = LogNoise(*values[own.count :].reshape(-1, 3).T)
+    noise = problem.noise(values)
     free, factor = np.flatnonzero(~np.isin(names, list(notes))), np.ones(values.size)
     if has_answer(found):
         factor[free] = _widening(problem, found, free, recording)

@@ -15,7 +15,7 @@ from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
 from ..shooting import with_room
-from .answers import AXES, NOISY, overwhelmed, parameter_table, rigid_body
+from .answers import AXES, NOISY, overwhelmed, parameter_table, rigid_body, vehicle_constants
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
@@ -272,11 +272,11 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
     table, held_out = parameter_table(case, fit), case.held_out
     if not case.is_vehicle:
         other = None if held_out is None else validate_on(fit, held_out, case.validate)
-        return {"parameters": table, "rigid_body": rigid_body(case, fit), "validation": other}
+        return {"parameters": table, "rigid_body": rigid_body(fit), "validation": other}
     step = float(fit.problem.flight.dt)
     known = [each.speed_noise for each in sample_times if each.sample_time == step]
     noise = known[0] if known else noise_of_speeds(fit.problem.flight, fit.problem.flight, fit.problem.model.airframe)
-    body = rigid_body(case, fit, noise)
+    body = vehicle_constants(fit, noise)
     predicted = skill = None
     if held_out is not None:
         progress("predicting what was not fitted")

@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialStates, Parameters, Scalar, as_float
+from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
 from ..bracket import PROPER_PRIOR, Bracket
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
@@ -65,6 +65,8 @@ class InnovationsProblem(AbstractProblem):
     """
 
     prior: ClassVar[float] = PROPER_PRIOR
+    windows: ClassVar[int] = 1  # pyright: ignore[reportIncompatibleVariableOverride]  # segments share all unknowns
+    free_size: ClassVar[int] = 0  # pyright: ignore[reportIncompatibleMethodOverride]  # a filter finds its own state
     problem: ShootingProblem
     start: Values = eqx.field(converter=as_float)
     segments: int = eqx.field(static=True)
@@ -102,16 +104,6 @@ class InnovationsProblem(AbstractProblem):
     def channels(self) -> tuple[str, ...]:
         """The names of the compared channels."""
         return tuple(CHANNEL_NAMES[column] for column in self.problem.columns)
-
-    @property
-    def windows(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """1: segments are parts of one window, which share all unknowns."""
-        return 1
-
-    @property
-    def free_size(self) -> int:
-        """0: a filter finds its own state."""
-        return 0
 
     @property
     def cut(self) -> Segments:
@@ -164,7 +156,7 @@ class InnovationsProblem(AbstractProblem):
         """The same problem, with another bracket for the parameters; unchanged for `None`."""
         return self if bracket is None else dataclasses.replace(self, problem=self.problem.within(bracket))
 
-    def noise(self, unknowns: Values) -> LogNoise:
+    def noise(self, unknowns: Float[Numeric, " unknowns"]) -> LogNoise:
         """The noise levels among the unknowns."""
         return LogNoise(*unknowns[self.problem.unknowns.count :].reshape(-1, 3).T)
 
