@@ -32,7 +32,7 @@ from ..noise import NOISES, SENSOR_SIGMA
 from ..results import NAMES, result_names
 from ..shooting import ShootingProblem
 from ..simulation import simulate
-from .specification import Cell, Job, Scenario, Study
+from .specification import Cell, Scenario, Study
 
 OUTCOMES = (*NAMES, "failed", "not_run")
 """Outcomes of an estimate. `failed`: its cell could not be computed; `not_run`: not yet. Files hold the index."""
@@ -72,8 +72,8 @@ class Flights(NamedTuple):
     measured: Lanes
 
 
-def fleet_of(study: Study, scenario: Scenario | Job) -> Fleet:
-    """Model, bracket and rotor speeds of a scenario or of a network's job."""
+def fleet_of(study: Study, scenario: Scenario) -> Fleet:
+    """Model, bracket and rotor speeds of a scenario."""
     with jax.enable_x64(True):
         model = MODELS[scenario.model](study.vehicle(scenario.airframe))
         offset = study.truth == "airframe"

@@ -8,6 +8,7 @@ in means; a mean over nothing is NaN. Errors are those of *converged* flights, w
 import math
 
 import numpy as np
+import scipy.special
 import xarray as xr
 
 from ..results import NINETY_FIVE
@@ -87,13 +88,13 @@ def efficiency(dataset: xr.Dataset) -> xr.Dataset:
     """RMSE / bound of converged flights, each relative to its own bound, with a 95 % Monte-Carlo interval.
 
     1 is the best value for an unbiased estimator. `low` and `high` are the interval of a Gaussian's standard deviation
-    from `count` draws (chi-squared, quantiles by Wilson and Hilferty 1931); NaN for fewer than two flights.
+    from `count` draws (chi-squared); NaN for fewer than two flights.
     """
     ratio = normalised_error(dataset)
     count = ratio.notnull().sum("flight")
     value = _rms(ratio)
     some = count.where(count > 1)
-    high, low = (value * np.sqrt(some / _chi_squared(some, tail)) for tail in (-NINETY_FIVE, NINETY_FIVE))
+    low, high = (value * np.sqrt(some / scipy.special.chdtri(some, above)) for above in (0.025, 0.975))
     return xr.Dataset({"efficiency": value, "low": low, "high": high, "count": count})
 
 
@@ -166,9 +167,3 @@ def _wilson(name: str, share: xr.DataArray, count: xr.DataArray) -> xr.Dataset:
     half = math.sqrt(z2) * np.sqrt(share * (1 - share) / some + z2 / (4 * some**2)) / (1 + z2 / some)
     low, high = (middle - half).clip(0, 1), (middle + half).clip(0, 1)
     return xr.Dataset({name: share, "low": low, "high": high, "count": count})
-
-
-def _chi_squared(freedom: xr.DataArray, deviations: float) -> xr.DataArray:
-    """The quantile of chi-squared at the level of a Gaussian `deviations` from its mean."""
-    part = 2 / (9 * freedom)
-    return freedom * (1 - part + deviations * np.sqrt(part)) ** 3

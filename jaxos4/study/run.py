@@ -26,7 +26,7 @@ from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_ne
 from ..shooting import cores
 from .cell import blank_problem, fleet_of, key_of, program_of, run_cell
 from .dataset import Store, assemble, check_store, open_store, save_dataset
-from .specification import Cell, Job, Study
+from .specification import Cell, Scenario, Study
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -139,8 +139,8 @@ def _run(
         return study.job(cell.scenario) is not None, begun[program]
 
     cells = sorted(map(study.cell, store.missing()), key=turn)
-    networks: dict[Job | None, Any] = {None: None}
-    tasks: dict[Any, Job | Cell] = {}
+    networks: dict[Scenario | None, Any] = {None: None}
+    tasks: dict[Any, Scenario | Cell] = {}
     for job in dict.fromkeys(job for cell in cells if (job := study.job(cell.scenario)) is not None):
         if store.read_network(numbers[job]) is None:
             networks[job] = submit(train, study, job)
@@ -166,7 +166,7 @@ def _give_memory_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def train(study: Study, job: Job) -> bytes | str:
+def train(study: Study, job: Scenario) -> bytes | str:
     """The bytes of a network's file, or a message that says why there is none. It serves all noises and scales.
 
     The numbers are the same bit for bit only on the same number of cores, which share the products of matrices.

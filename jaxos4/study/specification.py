@@ -80,17 +80,6 @@ class Scenario(NamedTuple):
 AXES = tuple(field if field.endswith("s") else f"{field}s" for field in Scenario._fields)
 
 
-class Job(NamedTuple):
-    """A network to be trained: `channels` are those that it looks at."""
-
-    model: str
-    airframe: str
-    excitation: str
-    duration: float
-    width: float
-    channels: str
-
-
 class Cell(NamedTuple):
     """`batch` flights of a scenario, from the number `first` on; `place` is its index along each axis."""
 
@@ -199,18 +188,21 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise ValueError(f"a rotor would exceed the `max_rotor_speed` of {fastest:g} rad/s; design another input.")
         return as_float(speeds)
 
-    def job(self, scenario: Scenario) -> Job | None:
-        """The network that a scenario's estimator needs; `None` if it needs none."""
+    def job(self, scenario: Scenario) -> Scenario | None:
+        """The scenario for which to train the network that an estimator needs; `None` if it needs none.
+
+        One network serves all methods, noises and scales. The `channels` are those that it looks at.
+        """
         kind = ESTIMATORS[scenario.estimator]
         channels = self.seed_channels(scenario) if kind.shoots else scenario.seen
-        same = (getattr(scenario, name) for name in Job._fields[:-1])
-        return Job._make([*same, channels]) if kind.needs_network else None
+        shared = {"method": self.fit_method, "noise": self.noises[0], "scale": 1.0, "estimator": "network"}
+        return scenario._replace(channels=channels, **shared) if kind.needs_network else None
 
     def seed_channels(self, scenario: Scenario) -> str:
         """The channels that a hybrid's network looks at: it only says where to shoot."""
         return min(scenario.seen, self.network.hybrid_channels, key=CHANNELS.__getitem__)
 
-    def jobs(self) -> dict[Job, int]:
+    def jobs(self) -> dict[Scenario, int]:
         """The networks that the study needs, with their numbers."""
         needed = (self.job(self.cell(index).scenario) for index in range(0, self.count, self.blocks))
         return {job: number for number, job in enumerate(dict.fromkeys(job for job in needed if job))}
