@@ -37,9 +37,13 @@ from .airframe import (
     load_airframe as load_airframe,
     plus_layout as plus_layout,
 )
-from .analysis.covariance import cramer_rao_bound as cramer_rao_bound, robust_covariance as robust_covariance
 from .analysis.diagnostics import Diagnostics as Diagnostics, residual_diagnostics as residual_diagnostics
-from .analysis.evaluation import Evaluation as Evaluation, evaluate as evaluate
+from .analysis.evaluation import (
+    Evaluation as Evaluation,
+    cramer_rao_bound as cramer_rao_bound,
+    evaluate as evaluate,
+    robust_covariance as robust_covariance,
+)
 from .analysis.frequency_response import (
     Agreement as Agreement,
     AxisResponse as AxisResponse,

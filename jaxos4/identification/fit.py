@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from .._custom_types import as_float
-from ..analysis.covariance import robust_covariance
 from ..analysis.diagnostics import Diagnostics, residual_diagnostics
-from ..analysis.evaluation import Evaluation, evaluate
+from ..analysis.evaluation import Evaluation, evaluate, robust_covariance
 from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
 from ..models.abstract import Parameter

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from .._custom_types import Key, Numeric, Parameters, Scalar, States, as_float
 from .._xla import quick_jit
-from ..analysis.covariance import cramer_rao_bound
+from ..analysis.evaluation import cramer_rao_bound
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..estimators import ESTIMATORS, IBSS, Hybrid, make_estimator
