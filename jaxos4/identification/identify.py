@@ -22,11 +22,10 @@ from ..results import result_names
 from .answers import channel_fits
 from .fit import Fit, fit_case, fit_flight
 from .judge import judge
-from .prepare import Case, prepare_flight
+from .prepare import Case, FlightSettings, VehicleSettings, own_settings, prepare_flight
 from .problem import Intervals, bracket_of, flight_problem
 from .results import FlightInformation, Identification, ParameterInformation, SampleTime, finite_or_none, has_answer
 from .sample_time import fit_at_sample_times
-from .settings import FlightSettings, VehicleSettings, own_settings
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
 
 Flights = Flight | Recording | Sequence[Flight | Recording]

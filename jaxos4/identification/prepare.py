@@ -1,11 +1,15 @@
-"""From recordings and a subject to the problem that an estimator solves, and the measurements that test the answer."""
+"""From recordings, a subject and settings to a case: what an estimator solves, and what tests the answer."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
+import jax
 import msgspec
 import numpy as np
 
+from .._version import __version__
+from ..airframe import PRESETS, Airframe
 from ..errors import InputError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, Hybrid, make_estimator
@@ -13,13 +17,81 @@ from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
+from ..recording.preparation import HOLDOUT
 from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem
 from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, loaded, network_for, network_provenance
 from .results import Provenance
-from .settings import FlightSettings, airframe_name, class_name, name_and_class, versions
 
 Progress = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightSettings:
+    """How to look at a flight of an OS4.
+
+    - `channels`: `"rates"`, `"attitude"` or `"all"`: the compared channels; by default everything that was measured.
+    - `initial_state`: `"free"`: estimated too; `"known"`: the first sample is exact.
+    - `window`: length of the windows for multiple shooting [s]; by default the flight is one window.
+    """
+
+    channels: str | None = None
+    initial_state: str = "free"
+    window: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class VehicleSettings:
+    """How to look at recordings of a vehicle.
+
+    - `terms`: of `jaxos4.TERMS`; by default those that the recordings allow.
+    - `begin`, `end`: use this part of each recording [s]; by default its usable stretches.
+    - `sample_time`: average to samples of this length [s]; by default 0.004 s if the recordings have shorter ones.
+    - `holdout`: share of the flight that is held out and predicted, 0 to 0.5; by default 0.25, or 0 with `validate`.
+    """
+
+    terms: Sequence[str] | None = None
+    begin: float | None = None
+    end: float | None = None
+    sample_time: float | None = None
+    holdout: float | None = None
+
+    def share(self, *, validated: bool) -> float:
+        """The share that is held out. `validated`: whether another recording is predicted."""
+        return self.holdout if self.holdout is not None else 0.0 if validated else HOLDOUT
+
+
+Settings = FlightSettings | VehicleSettings
+S = TypeVar("S", FlightSettings, VehicleSettings)
+
+
+def settings_for(subject: AbstractModel | Airframe, options: dict[str, Any]) -> Settings:
+    """The settings for a subject, from options by name; those that were not given are `None`.
+
+    **Raises:** `InputError` for an option that does not fit the subject.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    kind = VehicleSettings if isinstance(subject, Airframe) else FlightSettings
+    own = {field.name for field in dataclasses.fields(kind)}
+    for name in given:
+        if name in own or (name, given[name]) == ("initial_state", "free"):
+            continue
+        if kind is FlightSettings:
+            why = f"is for an `Airframe` as `subject`, not for the {class_name(subject, MODELS)} model"
+        elif name == "initial_state":
+            raise InputError(f"`initial_state` {given[name]}: a vehicle's filters find their own state; leave it out.")
+        else:
+            why = "a vehicle is identified from its rates and specific force, without windows"
+        raise InputError(f"`{name}`: {why}; leave it out.")
+    return kind(**{name: value for name, value in given.items() if name in own})
+
+
+def own_settings(kind: type[S], settings: Settings | None) -> S:
+    """The settings, or the default ones. Raises `InputError` if they are of another kind."""
+    if settings is not None and not isinstance(settings, kind):
+        what, got = "an airframe" if kind is VehicleSettings else "a model", type(settings).__name__
+        raise InputError(f"`settings`: must be {kind.__name__} for {what} as `subject`, got {got}.")
+    return kind() if settings is None else settings
 
 
 class Case(NamedTuple):
@@ -159,3 +231,32 @@ def _check_options(name: str, kind: type[AbstractEstimator], settings: FlightSet
 
 def _has_own_channels(kind: type[AbstractEstimator]) -> bool:
     return kind.looks_at != "all" and not kind.needs_network
+
+
+def versions(problem: ShootingProblem) -> dict[str, Any]:
+    """Versions, device and precision."""
+    return {
+        "version": __version__,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "precision": str(problem.flight.time.dtype),
+    }
+
+
+def airframe_name(airframe: Airframe) -> str:
+    """The name of a preset, or "custom"."""
+    return next((name for name, preset in PRESETS.items() if preset is airframe), "custom")
+
+
+def class_name(instance: object, kinds: Mapping[str, type]) -> str:
+    """The name of an object's class in a table of classes, or else the class's own name."""
+    return next((name for name, kind in kinds.items() if type(instance) is kind), type(instance).__name__)
+
+
+def name_and_class(estimator: str | AbstractEstimator) -> tuple[str, type[AbstractEstimator]]:
+    """The name and the class of an estimator. Raises `InputError` for an unknown name."""
+    if not isinstance(estimator, str):
+        return class_name(estimator, ESTIMATORS), type(estimator)
+    if estimator not in ESTIMATORS:
+        raise InputError(f"`estimator`: must be one of {', '.join(ESTIMATORS)}, got {estimator!r}.")
+    return estimator, ESTIMATORS[estimator]

@@ -21,10 +21,9 @@ from ..recording import preparation
 from ..recording.preparation import Prepared
 from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
-from .prepare import Case, Progress
+from .prepare import Case, Progress, VehicleSettings, airframe_name, name_and_class, versions
 from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for
 from .results import Provenance
-from .settings import VehicleSettings, airframe_name, name_and_class, versions
 
 # The scale of the errors of a simulation, for networks that are trained for a vehicle [rad/s].
 _FIRST_SIGMA = 0.5
