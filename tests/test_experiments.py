@@ -47,9 +47,9 @@ def plot(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             if ".pdf" not in suffixes:
                 patch.setattr(shared, "pdf", lambda figure: b"")
-            load(name, script).main(tmp_path / results, tmp_path / "figures")
+            load(name, script).main(tmp_path / results, tmp_path / f"{name} {script}")
         for suffix in suffixes:
-            figures = list((tmp_path / "figures").glob(f"*{suffix}"))
+            figures = list((tmp_path / f"{name} {script}").glob(f"*{suffix}"))
             assert figures
             assert all(path.name.startswith(name) and path.stat().st_size > 5000 for path in figures)
 
@@ -63,24 +63,13 @@ OTHERS = ("frontier", "rollout_budget", "published_corrected", "inverse_crime", 
 
 
 def small(name):
-    return EXPERIMENTS / name / "small.toml"
+    """The small configuration of an experiment; three studies share that of the comparison."""
+    return EXPERIMENTS / ("comparison" if name in ("noise_study", "scale") else name) / "small.toml"
 
 
 def near(found, expected, errors):
     """Whether all numbers are within these errors."""
     return bool(np.all(np.abs(np.asarray(found) - expected) < errors))
-
-
-@pytest.fixture
-def study(tmp_path, plot):
-    """Runs and plots the small configuration of an experiment that is a study."""
-
-    def results(name, **options):
-        shared.run_studies({name: load_study(small(name))}, tmp_path)
-        plot(name, results=name, **options)
-        return read_results(tmp_path / name).squeeze()
-
-    return results
 
 
 @pytest.fixture
@@ -103,34 +92,29 @@ def test_configurations(name):
     assert (EXPERIMENTS / name / "run.py").exists() == (name not in STUDIES)
 
 
-def test_comparison(study):
-    accuracy = metrics.accuracy(study("comparison", suffixes=(".svg", ".pdf")))
+def test_comparison_noise_study_and_scale(tmp_path, plot):
+    """One study of IBSS and equation error against the noise, and the figures of three experiments."""
+    shared.run_studies({"out": load_study(small("comparison"))}, tmp_path)
+    for name in ("noise_study", "scale", "comparison"):
+        plot(name, results="out", suffixes=(".svg", ".pdf") if name == "comparison" else (".svg",))
+    data = read_results(tmp_path / "out").squeeze()
+    accuracy, error = metrics.accuracy(data), metrics.estimator_error(data)["absolute"].sel(estimator="ibss")
     # On the rates of one second both are at the bound, within chance: 8 parameters of 32 flights.
     assert near(accuracy.sel(scale=1.0), 1, 3 / np.sqrt(2 * 8 * 32))
+    # Ten times the noise, ten times the error: the flights draw the same numbers.
+    np.testing.assert_allclose(error.sel(scale=1.0) / error.sel(scale=0.1), 10, rtol=0.1)
     # At ten times the noise IBSS ends at its limits around the bracket.
     assert (accuracy.sel(scale=10.0, estimator="ibss") < accuracy.sel(scale=10.0, estimator="equation-error")).all()
 
 
-def test_noise_study(study):
-    error = metrics.estimator_error(study("noise_study"))["absolute"].sel(estimator="ibss")
-    # Ten times the noise, ten times the error: the flights draw the same numbers.
-    np.testing.assert_allclose(error.sel(scale=1.0) / error.sel(scale=0.1), 10, rtol=0.1)
-
-
-def test_noise_kinds(study):
-    covered = metrics.mean_coverage(study("noise_kinds")).sel(level=0.95)
+def test_noise_kinds(tmp_path, plot):
+    shared.run_studies({"out": load_study(small("noise_kinds"))}, tmp_path)
+    plot("noise_kinds", results="out")
+    covered = metrics.mean_coverage(read_results(tmp_path / "out").squeeze()).sel(level=0.95)
     low, high = covered["low"].sel(noise="white"), covered["high"]
     # Without 10 % of the samples the errors are about 5 % larger, and the intervals too.
     assert float(low) < 0.95 < min(float(high.sel(noise=noise)) for noise in ("white", "lossy"))
     assert (covered["coverage"].sel(noise=["coloured", "biased"]) < low).all()
-
-
-def test_scale(study):
-    data = study("scale")
-    # Each of eight parameters is within five Monte-Carlo errors of the bound.
-    assert near(metrics.efficiency(data)["efficiency"], 1, 5 / np.sqrt(2 * 128))
-    covered = metrics.mean_coverage(data).sel(level=0.95)["coverage"]
-    assert near(covered, 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
 
 
 def test_frontier(run):
