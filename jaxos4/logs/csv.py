@@ -1,13 +1,11 @@
 """The flight CSV, the project's own log format. Its columns: docs/index.md."""
 
-import array
-import contextlib
 import csv
 import functools
 import itertools
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -18,9 +16,9 @@ from .assemble import COLUMN_NAMES as COLUMN_NAMES, COMMAND_NAMES, SPEED_NAMES
 from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, quoted, refuse
 
 _LONGEST_LINE = 1 << 20
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)  # float() also reads "nan", "1_0" and the digits of other scripts
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # float() also reads "nan" and "1_0"
 _IN_NUMBERS = dict.fromkeys(map(ord, "-+.0123456789eE,\n"))
+_EMPTY = re.compile(r"(?<![^,\n])(?=[,\n])")
 _BLOCK = 10_000  # lines that are read at once
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
@@ -40,34 +38,28 @@ def read_table(path: Path, known: Collection[str], *, skip: int = 0, missing: Co
 
     **Raises:** `InputError`, one line with file, row and column, whatever the file contains.
     """
-    first_row, values = skip + 2, array.array("d")
+    count, found = 0, []
     with opened(path) as file:
         for _ in range(skip):
             file.readline(_LONGEST_LINE)
         header = _header(path, file.readline(_LONGEST_LINE), known, skip + 1)
-        wanted = [name for name in header if name in known]
-        places = [header.index(name) for name in wanted]
-        lines, count = iter(functools.partial(file.readline, _LONGEST_LINE), ""), 0
+        wanted = {name: header.index(name) for name in header if name in known}
+        lines = iter(functools.partial(file.readline, _LONGEST_LINE), "")
         while block := list(itertools.islice(lines, _BLOCK)):
-            numbers = None if missing else _plain_numbers(block, len(header))
+            numbers = _plain_numbers(block, len(header), missing)
             if numbers is None:
-                lines = itertools.chain(block, lines)
-                break
-            values.frombytes(numbers[:, places].tobytes())
-            count += len(block)
-            _check_rows(path, count)
-        for cells in _rows(path, lines, len(header), first_row + count):
-            count += 1
-            given = [cells[place] for place in places]
-            if missing:
-                given = ["" if cell.strip() in missing else cell for cell in given]
-            values.extend(_numbers(path, wanted, given, first_row + count - 1))
-            _check_rows(path, count)
+                rows = [*_rows(path, block, lines, len(header), skip + 2 + count)]
+                numbers = np.array([_numbers(path, wanted, missing, *row) for row in rows])
+                found.append(numbers.reshape(len(rows), len(wanted)))
+            else:
+                found.append(numbers[:, [*wanted.values()]])
+            count += len(found[-1])
+            if count > MAX_ROWS:
+                refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
     if count < 2:
         refuse(path, f"has a header and {['no data', 'one row of data'][count]}; a flight needs two rows")
-    columns = np.asarray(values).reshape(count, len(wanted)).T.copy()
-    unknown = tuple(name for name in header if name not in known)
-    return Table(path, dict(zip(wanted, columns, strict=True)), unknown, first_row)
+    columns = dict(zip(wanted, np.concatenate(found).T.copy(), strict=True))
+    return Table(path, columns, tuple(name for name in header if name not in known), skip + 2)
 
 
 def write_flight(flight: Flight, path: Path, airframe: Airframe | None = None) -> None:
@@ -129,42 +121,33 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
     return names
 
 
-def _check_rows(path: Path, count: int) -> None:
-    if count > MAX_ROWS:
-        refuse(path, f"has more than {MAX_ROWS:,} rows; cut the log into flights, or keep fewer rows")
-
-
-def _plain_numbers(lines: list[str], width: int) -> np.ndarray | None:
-    """The numbers in lines without an empty cell, a blank or a fault, all at once; `None` for any other lines."""
-    text = "".join(lines)
-    if (
-        text.translate(_IN_NUMBERS)
-        or "\n\n" in text
-        or text[0] == "\n"
-        or len(max(lines, key=len)) >= _LONGEST_LINE - 1
-    ):
+def _plain_numbers(lines: list[str], width: int, missing: Collection[str]) -> np.ndarray | None:
+    """The numbers in lines without a fault, all at once; NaN for cells without a number. `None` for any other lines."""
+    text = "".join(lines).replace(", ", ",").rstrip("\n") + "\n"
+    for cell in missing:
+        text = re.sub(rf"(?<=[,\n]){cell}(?=[,\n])", "", text)
+    too_long = len(max(lines, key=len)) >= _LONGEST_LINE - 1
+    if too_long or text.translate(_IN_NUMBERS) or "\n\n" in text or text[0] == "\n":
         return None
     try:
-        numbers = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+        numbers = np.loadtxt(_EMPTY.sub("nan", text).splitlines(), delimiter=",", comments=None, ndmin=2)
     except ValueError:
         return None
-    return numbers if numbers.shape == (len(lines), width) and np.isfinite(numbers).all() else None
+    return numbers if numbers.shape == (len(lines), width) and not np.isinf(numbers).any() else None
 
 
-def _rows(path: Path, lines: Iterable[str], width: int, first_row: int) -> Iterator[list[str]]:
-    """The cells of each line, without the blank lines at the end of the file."""
-    blank = None
-    for row, line in enumerate(lines, first_row):
+def _rows(path: Path, block: list[str], rest: Iterable[str], width: int, row: int) -> Iterator[tuple[list[str], int]]:
+    """The cells of each line of a block, and its row, from `row` on; without the blank lines at the end of the file."""
+    for i, line in enumerate(block):
         if line.isspace():
-            blank = blank or row
-            continue
-        if blank:
-            refuse(path, "is blank; delete it", row=blank)
-        cells = _cells(path, line.rstrip("\n"), row)
+            if not all(map(str.isspace, itertools.chain(block[i:], rest))):
+                refuse(path, "is blank; delete it", row=row + i)
+            return
+        cells = _cells(path, line.rstrip("\n"), row + i)
         if len(cells) != width:
             what = f"has {counted(len(cells), 'cell')}, but the header has {width}; repair or delete the row"
-            refuse(path, what, row=row)
-        yield cells
+            refuse(path, what, row=row + i)
+        yield cells, row + i
 
 
 def _cells(path: Path, line: str, row: int) -> list[str]:
@@ -177,17 +160,15 @@ def _cells(path: Path, line: str, row: int) -> list[str]:
         refuse(path, "contains a cell that is too long; repair or delete the row", row=row)
 
 
-def _numbers(path: Path, columns: list[str], cells: list[str], row: int) -> list[float]:
-    if _PLAIN.fullmatch("".join(cells)):
-        with contextlib.suppress(ValueError):
-            values = [float(cell) if cell else math.nan for cell in cells]
-            if max(values) < math.inf > -min(values):
-                return values
+def _numbers(
+    path: Path, places: Mapping[str, int], missing: Collection[str], cells: list[str], row: int
+) -> list[float]:
     values = []
-    for column, cell in zip(columns, map(str.strip, cells), strict=True):
+    for column, place in places.items():
+        cell = cells[place].strip()
         number = _NUMBER.fullmatch(cell) is not None
         values.append(float(cell) if number else math.nan)
-        if cell and not math.isfinite(values[-1]):
+        if cell and cell not in missing and not math.isfinite(values[-1]):
             fault = ", which is too large for a number;" if number else ", which is not a number; correct it, or"
             fault = ";" if cell.lower().lstrip("+-") in _NO_NUMBER else fault
             what = f"contains {quoted(cell)}{fault} leave the cell empty if it was not measured"

@@ -205,8 +205,8 @@ def _correlations(
 
     **Arguments:** `between`: the first and the last delay of the gyro after the motors [s].
     """
-    pieces = [piece for piece in pieces if np.ptp(piece.time) > _SLOW * _STEP * 2]
     step = max([_STEP, *(piece.dt for piece in pieces)])
+    pieces = [piece for piece in pieces if np.ptp(piece.time) > 2 * _SLOW * step]
     pairs = [_response(piece, mixer, step) for piece in pieces]
     shifts = range(round(between[0] / step), round(between[1] / step) + 1)
     found = np.full((len(shifts), mixer.shape[0], len(AXES)), np.nan)
