@@ -18,7 +18,8 @@ from .table import MAX_ROWS, LogFormat, Path, Table, counted, opened, quoted, re
 _LONGEST_LINE = 1 << 20
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # float() also reads "nan" and "1_0"
 _IN_NUMBERS = dict.fromkeys(map(ord, "-+.0123456789eE,\n"))
-_EMPTY = re.compile(r"(?<![^,\n])(?=[,\n])")
+# An empty cell becomes NaN: in its first and second neighbour, at the end of a line, at its beginning.
+_FILLED = ((",,", ",nan,"), (",,", ",nan,"), (",\n", ",nan\n"), ("\n,", "\nnan,"))
 _BLOCK = 10_000  # lines that are read at once
 _NO_NUMBER = {"nan", "na", "n/a", "nil", "null", "none", "inf", "infinity", "", "-"}
 _NOT_UTF8 = "is not text in UTF-8; export the log as CSV in UTF-8"
@@ -123,14 +124,16 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
 
 def _plain_numbers(lines: list[str], width: int, missing: Collection[str]) -> np.ndarray | None:
     """The numbers in lines without a fault, all at once; NaN for cells without a number. `None` for any other lines."""
-    text = "".join(lines).replace(", ", ",").rstrip("\n") + "\n"
+    text = "\n" + "".join(lines).replace(", ", ",").rstrip("\n") + "\n"
     for cell in missing:
-        text = re.sub(rf"(?<=[,\n]){cell}(?=[,\n])", "", text)
+        text = re.sub(rf"(?<=[,\n]){re.escape(cell)}(?=[,\n])", "", text)
     too_long = len(max(lines, key=len)) >= _LONGEST_LINE - 1
-    if too_long or text.translate(_IN_NUMBERS) or "\n\n" in text or text[0] == "\n":
+    if too_long or text.translate(_IN_NUMBERS) or "\n\n" in text:
         return None
+    for empty, filled in _FILLED:
+        text = text.replace(empty, filled)
     try:
-        numbers = np.loadtxt(_EMPTY.sub("nan", text).splitlines(), delimiter=",", comments=None, ndmin=2)
+        numbers = np.loadtxt(text[1:].splitlines(), delimiter=",", comments=None, ndmin=2)
     except ValueError:
         return None
     return numbers if numbers.shape == (len(lines), width) and not np.isinf(numbers).any() else None
