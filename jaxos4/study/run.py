@@ -111,7 +111,9 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
         raise InputError("--scheduler: the cluster has no workers; start some, and run the study again.")
 
     def results(futures: list[Any]) -> Iterator[tuple[Any, Any]]:
-        for future in as_completed(futures, loop=client.loop, raise_errors=False):
+        finished = as_completed(futures, loop=client.loop, raise_errors=False)
+        futures.clear()  # a cluster keeps the result of each future that we keep
+        for future in finished:
             try:
                 result = future.result()
             except Exception as error:  # noqa: BLE001  # whatever a cluster raises, finished cells are kept
