@@ -196,7 +196,7 @@ def test_speed(report_of):
 
 def test_networks(report_of):
     cases = {"cases": ["standard"], "networks": ["score, mlp"], "noises": [1.0], "channels": "rates", "separate": False}
-    report = report_of("networks", flights=64, seed=7, steps=100, many=64, **cases)
+    report = report_of("networks", flights=128, seed=7, steps=100, many=64, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
     assert report["one_call"]["flights"] == 64
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
@@ -219,12 +219,12 @@ def test_baselines(report_of):
 
 def test_coverage(report_of):
     cases = {"model": "published", "channels": "rates", "estimators": ["ibss", "hybrid", "output-error"]}
-    rows = report_of("coverage", flights=64, seed=11, scales=[1.0], steps=100, **cases)["rows"]
+    rows = report_of("coverage", flights=128, seed=11, scales=[1.0], steps=100, **cases)["rows"]
     assert [row["estimator"] for row in rows] == cases["estimators"]
     for row in rows:
-        assert row["results"] == {"successful": 64}
+        assert row["results"] == {"successful": 128}
         assert near(row["std"], 1, 0.05)  # the intervals are not too wide
-        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 64))
+        assert near(row["covered"] + row["constants_covered"], 0.95, 4.5 * np.sqrt(0.95 * 0.05 / 128))
 
 
 def test_dirty_flights(report_of, plot):
