@@ -1,4 +1,4 @@
-"""`jaxos4.identify`: from recorded flights to parameters with intervals. `jaxos4.assess`: what flights can identify."""
+"""`jaxos4.identify`: from recorded flights to parameters with intervals."""
 
 import os
 import time
@@ -9,22 +9,19 @@ import msgspec
 import numpy as np
 
 from ..airframe import Airframe
-from ..analysis.evaluation import evaluate
-from ..analysis.identifiability import identifiability
 from ..errors import InputError
 from ..estimate import AbstractEstimator
-from ..estimators import IBSS
-from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
+from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
 from ..recording.reading import Recording, as_recordings
 from ..results import result_names
 from .answers import channel_fits
-from .fit import Fit, fit_case, fit_flight
+from .fit import Fit, fit_case
 from .judge import judge
 from .prepare import Case, FlightSettings, VehicleSettings, own_settings, prepare_flight
-from .problem import Intervals, bracket_of, flight_problem
-from .results import FlightInformation, Identification, ParameterInformation, SampleTime, finite_or_none, has_answer
+from .problem import Intervals
+from .results import Identification, SampleTime, finite_or_none
 from .sample_time import fit_at_sample_times
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
 
@@ -127,44 +124,4 @@ def describe(
         widened=fit.widened,
         sample_times=sample_times if len(sample_times) > 1 else (),
         **judged,
-    )
-
-
-def assess(
-    flight: Flight | Recording,
-    model: AbstractModel,
-    *,
-    bracket: Intervals = None,
-    channels: str | None = None,
-    initial_state: str = "free",
-    window: float | None = None,
-    progress: Callable[[str], None] = lambda stage: None,
-) -> FlightInformation:
-    """Find the noise levels of a flight, and which parameters it can identify at these. Arguments as of `identify`.
-
-    **Raises:** `InputError`, one line, for arguments and flights that cannot be used.
-    """
-    (recording,) = as_recordings(flight)
-    where = bracket_of(bracket, model)
-    settings = {"channels": channels, "initial_state": initial_state, "window": window}
-    problem = flight_problem(recording, model, where, **settings)
-    fit = fit_flight(IBSS(), problem, progress=progress)
-    known = identifiability(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
-    notes = known.notes(model.parameter_names)
-    return FlightInformation(
-        flight=recording.name,
-        fitted=has_answer(fit.estimate),
-        sigma=dict(zip(STATE_NAMES, fit.problem.sigma.tolist(), strict=True)),
-        parameters={
-            name: ParameterInformation(
-                bound=finite_or_none(known.std[i]),
-                others_known=finite_or_none(known.std_alone[i]),
-                half_width=float(known.half_width[i]),
-                noise_limit=finite_or_none(known.noise_limit[i]) if np.isfinite(known.std[i]) else None,
-                unit=model.parameter_units[i],
-                note=notes.get(name, ""),
-            )
-            for i, name in enumerate(model.parameter_names)
-        },
-        identifiability=known,
     )

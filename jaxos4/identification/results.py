@@ -4,11 +4,9 @@ import math
 from typing import Any, SupportsFloat
 
 import msgspec
-import numpy as np
 
 from ..airframe import airframe_table
 from ..analysis.frequency_response import FrequencyResponse
-from ..analysis.identifiability import Identifiability
 from ..analysis.prediction import Predictions
 from ..estimate import Estimate
 from ..results import result_names
@@ -302,52 +300,6 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 # Fields that are written of one kind of identification only.
 _OF_FLIGHTS = ("fit", "validation")
 _OF_VEHICLES = ("held", "noise", "doubts", "disturbances", "widened", "skill", "sample_times")
-
-
-class ParameterInformation(msgspec.Struct, frozen=True):
-    """The information of a flight about one parameter.
-
-    - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation; `None`: infinite.
-    - `others_known`: the same if all other parameters were known.
-    - `half_width`: of the bracket.
-    - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise.
-    - `unit`: of the first three.
-    - `note`: why the parameter is not identifiable, or an empty string.
-    """
-
-    bound: float | None
-    others_known: float | None
-    half_width: float
-    noise_limit: float | None
-    unit: str
-    note: str
-
-
-class FlightInformation(msgspec.Struct, frozen=True, eq=False):
-    """Which parameters one flight can identify. Made by `jaxos4.assess`.
-
-    - `flight`: its name.
-    - `fitted`: whether the model could be fitted; otherwise all numbers hold at the bracket's centre.
-    - `sigma`: the noise levels that were found, by channel.
-    - `parameters`: by name.
-    - `identifiability`: the same as arrays.
-    """
-
-    flight: str
-    fitted: bool
-    sigma: dict[str, float]
-    parameters: dict[str, ParameterInformation]
-    identifiability: Identifiability
-
-    def to_dict(self) -> dict[str, Any]:
-        """Dictionaries, lists, numbers and strings: what `jaxos4 identifiability` writes as JSON.
-
-        `eigenvalues`, `directions`: see `jaxos4.Identifiability`; a direction is a row. `None` without a trajectory.
-        """
-        known = self.identifiability
-        axes = {"eigenvalues": known.eigenvalues.tolist(), "directions": known.directions.T.tolist()}
-        axes = axes if np.isfinite(known.std).all() else dict.fromkeys(axes)
-        return msgspec.to_builtins(_fields(self, "identifiability") | axes)
 
 
 def _fields(struct: msgspec.Struct, *apart: str) -> dict[str, Any]:

@@ -1,0 +1,104 @@
+"""`jaxos4.assess`: which parameters a flight of an OS4 can identify."""
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ..analysis.evaluation import evaluate
+from ..analysis.identifiability import Identifiability, identifiability
+from ..estimators import IBSS
+from ..flight import STATE_NAMES, Flight
+from ..models.abstract import AbstractModel
+from ..recording.reading import Recording, as_recordings
+from .fit import fit_flight
+from .problem import Intervals, bracket_of, flight_problem
+from .results import finite_or_none, has_answer
+
+
+class ParameterInformation(msgspec.Struct, frozen=True):
+    """The information of a flight about one parameter.
+
+    - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation; `None`: infinite.
+    - `others_known`: the same if all other parameters were known.
+    - `half_width`: of the bracket.
+    - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise.
+    - `unit`: of the first three.
+    - `note`: why the parameter is not identifiable, or an empty string.
+    """
+
+    bound: float | None
+    others_known: float | None
+    half_width: float
+    noise_limit: float | None
+    unit: str
+    note: str
+
+
+class FlightInformation(msgspec.Struct, frozen=True, eq=False):
+    """Which parameters one flight can identify. Made by `jaxos4.assess`.
+
+    - `flight`: its name.
+    - `fitted`: whether the model could be fitted; otherwise all numbers hold at the bracket's centre.
+    - `sigma`: the noise levels that were found, by channel.
+    - `parameters`: by name.
+    - `identifiability`: the same as arrays.
+    """
+
+    flight: str
+    fitted: bool
+    sigma: dict[str, float]
+    parameters: dict[str, ParameterInformation]
+    identifiability: Identifiability
+
+    def to_dict(self) -> dict[str, Any]:
+        """Dictionaries, lists, numbers and strings: what `jaxos4 identifiability` writes as JSON.
+
+        `eigenvalues`, `directions`: see `jaxos4.Identifiability`; a direction is a row. `None` without a trajectory.
+        """
+        fields = msgspec.structs.asdict(self)
+        known = fields.pop("identifiability")
+        axes = {"eigenvalues": known.eigenvalues.tolist(), "directions": known.directions.T.tolist()}
+        axes = axes if np.isfinite(known.std).all() else dict.fromkeys(axes)
+        return msgspec.to_builtins(fields | axes)
+
+
+def assess(
+    flight: Flight | Recording,
+    model: AbstractModel,
+    *,
+    bracket: Intervals = None,
+    channels: str | None = None,
+    initial_state: str = "free",
+    window: float | None = None,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> FlightInformation:
+    """Find the noise levels of a flight, and which parameters it can identify at these. Arguments as of `identify`.
+
+    **Raises:** `InputError`, one line, for arguments and flights that cannot be used.
+    """
+    (recording,) = as_recordings(flight)
+    where = bracket_of(bracket, model)
+    settings = {"channels": channels, "initial_state": initial_state, "window": window}
+    problem = flight_problem(recording, model, where, **settings)
+    fit = fit_flight(IBSS(), problem, progress=progress)
+    known = identifiability(fit.evaluation or evaluate(fit.problem, fit.estimate.parameters), where)
+    notes = known.notes(model.parameter_names)
+    return FlightInformation(
+        flight=recording.name,
+        fitted=has_answer(fit.estimate),
+        sigma=dict(zip(STATE_NAMES, fit.problem.sigma.tolist(), strict=True)),
+        parameters={
+            name: ParameterInformation(
+                bound=finite_or_none(known.std[i]),
+                others_known=finite_or_none(known.std_alone[i]),
+                half_width=float(known.half_width[i]),
+                noise_limit=finite_or_none(known.noise_limit[i]) if np.isfinite(known.std[i]) else None,
+                unit=model.parameter_units[i],
+                note=notes.get(name, ""),
+            )
+            for i, name in enumerate(model.parameter_names)
+        },
+        identifiability=known,
+    )
