@@ -12,7 +12,7 @@ import pytest
 from helpers import standard_flight
 
 import jaxos4
-from jaxos4.models import Term, TermParameter, default_terms
+from jaxos4.models import Parameter, Term, default_terms
 from jaxos4.models.state import Rates
 from jaxos4.models.terms import (
     COMMANDS,
@@ -241,7 +241,7 @@ def brake(total, values, rates, forcing):
 
 def test_a_new_term_is_one_object(monkeypatch):
     """One `Term` in the registry is all that a vehicle needs to be simulated and estimated with it."""
-    parameters = tuple(TermParameter(f"{axis}_brake", "1/rad", 2.0) for axis in ("roll", "pitch", "yaw"))
+    parameters = tuple(Parameter(f"{axis}_brake", "1/rad", 2.0) for axis in ("roll", "pitch", "yaw"))
     term = Term("a moment against the square of each body rate", parameters, angular_acceleration=brake)
     monkeypatch.setitem(jaxos4.TERMS, "brake", term)
     model = jaxos4.FlightModel(terms=("brake", "offset"))
@@ -253,7 +253,7 @@ def test_a_new_term_is_one_object(monkeypatch):
     found = jaxos4.OutputError()(problem)
     np.testing.assert_allclose(found.parameters[-3:], [0.5, 0.3, 0.8], atol=1e-4)
     with pytest.raises(ValueError, match="acts on the forcing"):
-        Term("", (TermParameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda omega, *other: omega)
+        Term("", (Parameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda omega, *other: omega)
 
 
 def test_an_estimate_uses_the_terms_that_the_logs_allow():

@@ -4,9 +4,10 @@ from .abstract import (
     DEFAULT_HALF_WIDTH as DEFAULT_HALF_WIDTH,
     PARAMETER_NAMES as PARAMETER_NAMES,
     AbstractModel as AbstractModel,
+    Parameter as Parameter,
 )
 from .os4 import CorrectedOS4 as CorrectedOS4, PublishedOS4 as PublishedOS4
-from .terms import TERMS as TERMS, Term as Term, TermParameter as TermParameter, default_terms as default_terms
+from .terms import TERMS as TERMS, Term as Term, default_terms as default_terms
 from .vehicle import FlightModel as FlightModel
 
 MODELS = {"published": PublishedOS4, "corrected": CorrectedOS4}

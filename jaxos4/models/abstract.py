@@ -21,12 +21,17 @@ PARAMETER_NAMES = tuple(f"alpha{i}" for i in range(1, 9))
 DEFAULT_HALF_WIDTH = np.array([0.35, 0.05, 60.0, 0.35, 0.05, 60.0, 0.2, 35.0])
 
 Contradiction = Callable[[float, float], tuple[str, str] | None]
+Constant = float | Callable[[Airframe], Scalar]
 
 
 class Parameter(NamedTuple):
     """One unknown of a model.
 
-    - `in_forcing`: whether the forcing depends on the parameter. If not, the rate equations are linear in it.
+    - `half_width`, `center`: of the default bracket, for a term's parameter: a number, or a function of the airframe.
+    - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
+    - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
+    - `in_forcing`: whether the forcing depends on the parameter. If not, the rate equations are linear in it. A model
+      fills it in.
     - `nonnegative`: whether physics forbids a negative value.
     - `scales_torque`: whether torque exceeds that of the airframe by this factor.
     - `plain`: the usual value, at which the parameter is held unless the flights clearly contradict it. `None`: none.
@@ -36,6 +41,10 @@ class Parameter(NamedTuple):
 
     name: str
     unit: str
+    half_width: Constant = 0.0
+    center: Constant = 0.0
+    each_recording: bool = False
+    force_axis: int | None = None
     in_forcing: bool = False
     nonnegative: bool = False
     scales_torque: bool = False

@@ -5,7 +5,7 @@ A new term is one more `Term` in `TERMS`; everything else is found in that objec
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from .._custom_types import RotorSpeeds, Scalar
 from ..airframe import GRAVITY, Airframe
 from ..excitation import AXES
-from .abstract import Contradiction
+from .abstract import Contradiction, Parameter
 from .rotors import Commands, Grid, Motor, Part, Speeds, delayed, driven
 from .state import Forcing, Rates, Samples, Vector
 
@@ -44,28 +44,6 @@ VERTICAL_BIAS = _FORCE_BIASES[2]
 
 T = TypeVar("T")
 Values = Mapping[str, Float[Array, "..."]]
-Constant = float | Callable[[Airframe], Scalar]
-
-
-class TermParameter(NamedTuple):
-    """One parameter of a term.
-
-    - `half_width`, `center`: of the default bracket: a number, or a function of the airframe.
-    - `each_recording`: whether each recording has its own value. If not, the vehicle has one.
-    - `force_axis`: if given, the parameter exists only in models that predict the specific force along this axis.
-    - `nonnegative`, `scales_torque`, `plain`, `contradiction`: see `jaxos4.models.abstract.Parameter`.
-    """
-
-    name: str
-    unit: str
-    half_width: Constant
-    center: Constant = 0.0
-    each_recording: bool = False
-    force_axis: int | None = None
-    nonnegative: bool = False
-    scales_torque: bool = False
-    plain: float | None = None
-    contradiction: Contradiction | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +73,7 @@ class Term:
     """
 
     description: str
-    parameters: tuple[TermParameter, ...]
+    parameters: tuple[Parameter, ...]
     needs: frozenset[str] = frozenset()
     by_default: Callable[[frozenset[str]], bool] = lambda available: True
     force_axes: tuple[int, ...] = ()
@@ -218,43 +196,43 @@ def _add_force_bias(force: Vector, values: Values) -> Vector:
 
 
 # Small vehicles have 0.02 to 0.1 s.
-_LAG = TermParameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-_EARLY, _INF, _LATE, _CLOCKS)))
+_LAG = Parameter("rotor_lag", "s", 0.03, center=0.05, contradiction=_limits((-_EARLY, _INF, _LATE, _CLOCKS)))
 
 TERMS: dict[str, Term] = {
     "offset": Term(
         "a constant torque about each axis, of each recording: roll_offset, pitch_offset, yaw_offset [rad/s^2]",
-        tuple(TermParameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(AXES)),
+        tuple(Parameter(f"{x}_offset", "rad/s^2", _authority(i), each_recording=True) for i, x in enumerate(AXES)),
         angular_acceleration=_torque("offset", lambda rates, forcing: (1.0, 1.0, 1.0)),
     ),
     "center_of_mass": Term(
         "a torque proportional to thrust above hover, from an offset centre of mass: roll_thrust, pitch_thrust [rad/m]",
         # The bracket is an offset of 10 % of the arm.
-        tuple(TermParameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(AXES[:2])),
+        tuple(Parameter(f"{x}_thrust", "rad/m", _authority(i, GRAVITY)) for i, x in enumerate(AXES[:2])),
         angular_acceleration=_torque("thrust", lambda rates, forcing: (forcing.thrust - GRAVITY,) * 2),
     ),
     "damping": Term(
         "a moment against each body rate: roll_damping, pitch_damping, yaw_damping [1/s]",
         tuple(
-            TermParameter(f"{x}_damping", "1/s", y, nonnegative=True, contradiction=_DAMPED)
+            Parameter(f"{x}_damping", "1/s", y, nonnegative=True, contradiction=_DAMPED)
             for x, y in zip(AXES, _DAMPING, strict=True)
         ),
         angular_acceleration=_torque("damping", lambda rates, forcing: (-rates.p, -rates.q, -rates.r)),
     ),
     "velocity": Term(
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
-        tuple(TermParameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(AXES[:2])),
+        tuple(Parameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(AXES[:2])),
         needs=frozenset({VELOCITY}),
         angular_acceleration=_torque("velocity", lambda rates, forcing: _across(forcing.velocity)),
     ),
     "voltage": Term(
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
-        (TermParameter("voltage_exponent", "1", 0.5, center=0.5),),
+        (Parameter("voltage_exponent", "1", 0.5, center=0.5),),
         needs=frozenset({VOLTAGE, COMMANDS}),
         command=_scaled(lambda values, grid: _known(grid.voltage, VOLTAGE, "voltage") ** values["voltage_exponent"]),
     ),
     "fade": Term(
         "commands lose effect as the battery empties: battery_fade [1/s], the share of rotor speed lost in a second",
-        (TermParameter("battery_fade", "1/s", 3e-3),),
+        (Parameter("battery_fade", "1/s", 3e-3),),
         needs=frozenset({COMMANDS, VERTICAL_FORCE}),
         # A logged voltage knows it.
         by_default=lambda available: VOLTAGE not in available,
@@ -264,10 +242,8 @@ TERMS: dict[str, Term] = {
         "motors follow their commands under the load of the propellers: rotor_lag [s], thrust_curve, motor_braking",
         (
             _LAG,
-            TermParameter(
-                "thrust_curve", "1", 0.25, center=0.85, contradiction=_limits((0.0, STEEPEST, _BENT, _CLIMB))
-            ),
-            TermParameter("motor_braking", "1", 0.6, center=0.5, nonnegative=True, plain=1.0),
+            Parameter("thrust_curve", "1", 0.25, center=0.85, contradiction=_limits((0.0, STEEPEST, _BENT, _CLIMB))),
+            Parameter("motor_braking", "1", 0.6, center=0.5, nonnegative=True, plain=1.0),
         ),
         # Only a measured specific force separates the load of the propellers from their thrust.
         needs=frozenset({COMMANDS, FULL_SCALE, VERTICAL_FORCE}),
@@ -282,13 +258,13 @@ TERMS: dict[str, Term] = {
     "delay": Term(
         "motors act later than they are recorded, or earlier if negative: rotor_delay [s]",
         # A delay of the motors, and an offset between the clocks of motors and gyro, of either sign.
-        (TermParameter("rotor_delay", "s", 0.03),),
+        (Parameter("rotor_delay", "s", 0.03),),
         command=lambda omega, values, grid: delayed(omega, values["rotor_delay"], grid),
     ),
     "reaction": Term(
         "the yaw moment of rotors that accelerate: rotor_reaction = J_R / Iz",
         (
-            TermParameter(
+            Parameter(
                 "rotor_reaction", "1", lambda airframe: 0.01 + _reaction(airframe), center=_reaction, nonnegative=True
             ),
         ),
@@ -297,10 +273,10 @@ TERMS: dict[str, Term] = {
     "accelerometer": Term(
         "specific force is measured: thrust_gain, and ax_bias, ay_bias, az_bias [m/s^2] along the predicted axes",
         (
-            TermParameter("thrust_gain", "1", 0.5, center=1.0, scales_torque=True, contradiction=_limits(*_GAINS)),
+            Parameter("thrust_gain", "1", 0.5, center=1.0, scales_torque=True, contradiction=_limits(*_GAINS)),
             # A sensor that was levelled before take-off has a smaller bias.
             *(
-                TermParameter(name, "m/s^2", _BIAS, force_axis=axis, contradiction=_LEVEL if axis == 2 else None)
+                Parameter(name, "m/s^2", _BIAS, force_axis=axis, contradiction=_LEVEL if axis == 2 else None)
                 for axis, name in enumerate(_FORCE_BIASES)
             ),
         ),
@@ -312,20 +288,20 @@ TERMS: dict[str, Term] = {
     "inflow": Term(
         "thrust falls with the velocity along z, which changes the inflow of the rotors: z_drag [1/s]",
         # g over twice the induced velocity, which is 4 to 10 m/s in hover.
-        (TermParameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
+        (Parameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
         needs=frozenset({VELOCITY, VERTICAL_FORCE}),
         specific_force=_add_inflow,
     ),
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
-        (TermParameter("x_drag", "1/s", 1.0), TermParameter("y_drag", "1/s", 1.0)),
+        (Parameter("x_drag", "1/s", 1.0), Parameter("y_drag", "1/s", 1.0)),
         needs=frozenset({VELOCITY, MEASURED_VELOCITY, LATERAL_FORCE, VERTICAL_FORCE}),
         force_axes=(0, 1),
         specific_force=_add_drag,
     ),
     "gyro_bias": Term(
         "rates are measured with an offset, of each recording: p_bias, q_bias, r_bias [rad/s]",
-        tuple(TermParameter(f"{rate}_bias", "rad/s", 0.1, each_recording=True) for rate in "pqr"),
+        tuple(Parameter(f"{rate}_bias", "rad/s", 0.1, each_recording=True) for rate in "pqr"),
         by_default=lambda available: False,
         gyro=lambda rates, values: Rates(*(a + values[f"{rate}_bias"] for a, rate in zip(rates, "pqr", strict=True))),
     ),

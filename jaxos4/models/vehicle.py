@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from .._custom_types import Count, Parameters, Scalar, as_float
 from ..airframe import OS4, Airframe
 from ..flight import Inputs
-from .abstract import PARAMETER_NAMES, AbstractModel, Parameter
+from .abstract import PARAMETER_NAMES, AbstractModel, Constant, Parameter
 from .os4 import CorrectedOS4
 from .rotors import Grid, Part, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
@@ -21,9 +21,7 @@ from .terms import (
     TERMS,
     VELOCITY,
     VOLTAGE,
-    Constant,
     Term,
-    TermParameter,
     Values,
     default_terms,
     required,
@@ -33,8 +31,8 @@ DEFAULT_TERMS = default_terms(frozenset({COMMANDS}))
 # The samples of a padded flight that are computed together.
 _BLOCK = 512
 
-Row = tuple[Term, TermParameter, Parameter]
-"""A row of the table of parameters: a term, the parameter in it, and the parameter of the model."""
+Row = tuple[Term, str, Parameter]
+"""A row of the table of parameters: a term, the parameter's name in it, and the parameter of the model."""
 
 
 class FlightModel(AbstractModel):
@@ -242,9 +240,9 @@ class FlightModel(AbstractModel):
     def _table(self) -> tuple[Row, ...]:
         return _table(self._terms, self.force_axes, max(self.recordings) + 1)
 
-    def _of_terms(self, constant: Callable[[TermParameter], Constant]) -> Parameters:
+    def _of_terms(self, constant: Callable[[Parameter], Constant]) -> Parameters:
         """A constant of each row of the table, for this airframe."""
-        constants = [constant(source) for _, source, _ in self._table]
+        constants = [constant(parameter) for *_, parameter in self._table]
         values = {c: as_float(c(self.airframe) if callable(c) else c) for c in set(constants)}
         return jnp.stack([values[c] for c in constants]) if constants else jnp.zeros(0)
 
@@ -258,9 +256,9 @@ class FlightModel(AbstractModel):
     def _values(self, term: Term, parameters, forcing: Forcing | None) -> Values:
         """The values of a term's parameters by name: for each sample those of its recording."""
         found: dict[str, list[Scalar]] = {}
-        for place, (owner, source, _) in enumerate(self._table, start=len(PARAMETER_NAMES)):
+        for place, (owner, name, _) in enumerate(self._table, start=len(PARAMETER_NAMES)):
             if owner is term:
-                found.setdefault(source.name, []).append(parameters[place])
+                found.setdefault(name, []).append(parameters[place])
         shares = forcing.recording if forcing else ()
 
         def of_recording(values: list[Scalar]) -> Samples:
@@ -289,6 +287,5 @@ def _table(terms: tuple[Term, ...], force_axes: tuple[int, ...], recordings: int
         named = [(source, "") for source in sources if not source.each_recording]
         named += [(source, number) for number in numbers for source in sources if source.each_recording]
         for source, number in named:
-            copied = (source.nonnegative, source.scales_torque, source.plain, source.contradiction)
-            rows.append((term, source, Parameter(source.name + number, source.unit, term.in_forcing, *copied)))
+            rows.append((term, source.name, source._replace(name=source.name + number, in_forcing=term.in_forcing)))
     return tuple(rows)
