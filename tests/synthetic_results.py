@@ -17,16 +17,32 @@ VALUES |= {"roll_velocity": 0.2, "pitch_velocity": -0.1}
 SHARE = 0.01
 
 
+def row(estimate, std):
+    """A parameter of a result."""
+    return {"estimate": estimate, "std": std, "bound": std, "ci95": None, "unit": "", "note": ""}
+
+
+def held(value):
+    """A parameter that was not estimated."""
+    return {"value": value, "unit": "", "note": ""}
+
+
+def provenance(**fields):
+    """Where a result is from."""
+    versions = {"version": "0.6.0", "jax": "0.10.0", "device": "cpu", "precision": "float64"}
+    return {"airframe": "custom", "terms": [], "sample_time": 0.01, **versions, **fields}
+
+
 def vehicle_result(values=VALUES, **changes):
     """A vehicle, identified by filter error. Every parameter has a standard deviation of 1 %."""
     fixed = {"estimator": "filter-error", "model": "flight", "constants": {}, "airframe": AIRFRAME}
     std = {name: SHARE * abs(value) for name, value in values.items()}
     return {
         "result": "successful",
-        "parameters": {name: {"estimate": value, "std": std[name]} for name, value in values.items()},
-        "provenance": {"version": "0.5.0"},
+        "parameters": {name: row(value, std[name]) for name, value in values.items()},
+        "provenance": provenance(),
         "covariance": np.diag(np.square(list(std.values()))).tolist(),
-        "held": {"alpha1": {"value": -0.7}},
+        "held": {"alpha1": held(-0.7)},
         **fixed,
         **changes,
     }

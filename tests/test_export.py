@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 from helpers import refused
-from synthetic_results import AIRFRAME, VALUES, vehicle_result
+from synthetic_results import AIRFRAME, VALUES, held, vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table
@@ -74,8 +74,8 @@ def test_what_a_simulator_lacks_and_what_is_replaced_or_does_not_vary_is_noted(w
     assert f"{found.vehicle.rotor_inertia:.3g} kg m^2" in notes["mujoco"]
     values = VALUES | {"alpha2": 1e-3, "alpha5": 1e-3, "alpha4": 0.5}
     del values["alpha8"], values["yaw_damping"]
-    held = {"alpha1": {"value": -0.7}, "alpha8": {"value": 3.5e4}, "yaw_damping": {"value": 0.0}}
-    notes = export_vehicle(read_result(write(vehicle_result(values, held=held))), "mujoco").notes
+    apart = {"alpha1": held(-0.7), "alpha8": held(3.5e4), "yaw_damping": held(0.0)}
+    notes = export_vehicle(read_result(write(vehicle_result(values, held=apart))), "mujoco").notes
     assert "alpha4: replaced by the values that follow from Ix, Iy, Iz" in notes
     assert "do not vary in samples, because the flights do not identify them: alpha8, yaw_damping" in notes
     (of_rotors,) = [note for note in notes if "alpha2" in note]

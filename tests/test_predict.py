@@ -11,7 +11,7 @@ import xarray as xr
 from helpers import CRAZYFLIE, compiled_programs, refused
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from synthetic_results import vehicle_result
+from synthetic_results import provenance, row, vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_table
@@ -64,9 +64,12 @@ def result(values=None, *, gust=GUST, terms=TERMS, **changes):
     levels = {rate: (gust, GUST_TIME, GYRO) for rate in "pqr"}
     levels |= {axis: (1e-3, GUST_TIME, FORCE) for axis in ("ax", "ay")} | {"az": (THRUST_GUST, GUST_TIME, FORCE)}
     names = ("strength", "time_constant", "sensor")
-    noise = {channel: dict(zip(names, each, strict=True)) for channel, each in levels.items()}
-    provenance = {"terms": list(terms), "sample_time": DT}
-    about = {"airframe": airframe_table(CRAZYFLIE), "held": {}, "disturbances": noise, "provenance": provenance}
+    noise = {
+        channel: dict(zip(names, each, strict=True)) | {"unit": "", "correlation": 0.0}
+        for channel, each in levels.items()
+    }
+    about = {"airframe": airframe_table(CRAZYFLIE), "held": {}, "disturbances": noise}
+    about |= {"provenance": provenance(terms=list(terms), sample_time=DT)}
     return vehicle_result(truth(terms) if values is None else values, **about | changes)
 
 
@@ -75,7 +78,7 @@ def uncertain(seed):
     std = {name: 0.03 * abs(value) + 1e-4 for name, value in truth().items()}
     generator = np.random.default_rng(seed)
     values = {name: value + std[name] * generator.standard_normal() for name, value in truth().items()}
-    rows = {name: {"estimate": value, "std": std[name]} for name, value in values.items()}
+    rows = {name: row(value, std[name]) for name, value in values.items()}
     return result(parameters=rows, covariance=np.diag(np.square(list(std.values()))).tolist())
 
 
@@ -222,8 +225,8 @@ def test_a_result_of_several_recordings_gives_their_mean(write):
 
 
 def test_a_parameter_that_is_not_identified_is_noted(write):
-    rows = {name: {"estimate": value, "std": 0.01} for name, value in truth().items()}
-    rows["x_drag"] = {"estimate": None, "std": None}
+    rows = {name: row(value, 0.01) for name, value in truth().items()}
+    rows["x_drag"] = row(None, None)
     vehicle = jaxos4.forecast.vehicle_of(write(result(parameters=rows)))
     assert vehicle.notes == ("not identified, and predicted with the centre of the bracket: x_drag",)
     assert vehicle.parameters[vehicle.model.parameter_names.index("x_drag")] == 0.0
@@ -266,7 +269,12 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
 
 
 def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_path, write):
-    write(result(result="no_skill", doubts=[{"cause": "yaw is not predicted", "remedy": "fly more yaw"}]))
+    write(
+        result(
+            result="no_skill",
+            doubts=[{"result": "no_skill", "cause": "yaw is not predicted", "remedy": "fly more yaw"}],
+        )
+    )
     jaxos4.write_flight(flown(2), tmp_path / "log.csv", CRAZYFLIE)
     code, out, err = run("predict", "found.json", "log.csv")
     assert code == 1
@@ -278,8 +286,8 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
     ("content", "options", "fragments"),
     [
         (result(model="corrected"), (), ("found.json", "`model` corrected: only a vehicle")),
-        (result(disturbances={}), (), ("found.json", "does not say its disturbances")),
-        (result(provenance={"terms": ["warp"], "sample_time": DT}), (), ("found.json", "the term warp is not one of")),
+        (result(disturbances={}), (), ("found.json", "does not say the disturbance of p")),
+        (result(provenance=provenance(terms=["warp"])), (), ("found.json", "the term warp is not of")),
         (result(covariance=None), (), ("holds no estimate",)),
         (result({name: x for name, x in truth().items() if name != "x_drag"}), (), ("found.json", "has no x_drag")),
         (result(), ("--horizon", "30"), ("log.csv", "--horizon", "give at most")),
@@ -307,7 +315,7 @@ def test_flights_without_attitude_or_with_measured_speeds_are_refused(write):
     powered = write(
         result(
             truth() | {"voltage_exponent": 0.5},
-            provenance={"terms": [*TERMS, "voltage"], "sample_time": DT, "battery_voltage": 3.7},
+            provenance=provenance(terms=[*TERMS, "voltage"], sample_time=DT, battery_voltage=3.7),
         )
     )
     with pytest.raises(jaxos4.InputError, match="has no battery voltage, which the term voltage needs"):

@@ -3,21 +3,20 @@
 import itertools
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from ..airframe import Airframe, airframe_from_table
 from ..errors import InputError, named
+from ..identification.results import ResultFile
 from ..linalg import covariance_root
 from ..models.abstract import PARAMETER_NAMES
 from ..models.terms import TERMS
-from ..results import NAMES, meaning
+from ..results import meaning
 from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
 
-_VEHICLE = "flight"
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
 # differs from 1 by as many.
 _SIGNIFICANT = 3.0
@@ -33,57 +32,6 @@ _NOT_EXPORTED = {
 }
 # The uncertainty is too large if so many draws for one sample are impossible.
 _MOST_DRAWS = 1000
-
-
-class _Row(msgspec.Struct):
-    estimate: float | None
-    std: float | None
-
-
-class _Held(msgspec.Struct):
-    value: float
-
-
-class _Doubt(msgspec.Struct):
-    cause: str
-    remedy: str
-
-
-class Disturbance(msgspec.Struct, frozen=True):
-    """See `jaxos4.identification.results.Disturbance`."""
-
-    strength: float
-    time_constant: float
-    sensor: float
-
-
-class Provenance(msgspec.Struct, frozen=True):
-    """See `jaxos4.identification.results.Provenance`."""
-
-    terms: list[str] = []
-    sample_time: float | None = None
-    battery_voltage: float | None = None
-
-
-class ResultFile(msgspec.Struct):
-    """The parts of a result that an export or a prediction needs."""
-
-    estimator: str
-    model: str
-    result: str
-    parameters: dict[str, _Row]
-    constants: dict[str, Any]
-    airframe: dict[str, Any] | None
-    covariance: list[list[float]] | None
-    held: dict[str, _Held] = {}
-    doubts: list[_Doubt] = []
-    disturbances: dict[str, Disturbance] = {}
-    provenance: Provenance = Provenance()
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Why the estimate cannot be trusted, and what to do; one line each."""
-        return tuple(f"not to be trusted because {doubt.cause}; {doubt.remedy}" for doubt in self.doubts)
 
 
 class Identified(NamedTuple):
@@ -150,36 +98,9 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
     **Raises:** `InputError`, one line, if the file is no result, has no estimate, or describes an impossible vehicle;
     `OSError` if it cannot be read.
     """
-    file = read_file(path)
+    file = ResultFile.of(path)
     with named(path):
         return _identified(Path(path).name, file)
-
-
-def read_file(path: str | os.PathLike[str]) -> ResultFile:
-    """The parts of a result file. Raises `InputError` if it is no result or has no estimate, as `read_result` does."""
-    try:
-        file = msgspec.json.decode(Path(path).read_bytes(), type=ResultFile)
-    except msgspec.MsgspecError as error:
-        reason = " ".join(str(error).split())[:200]
-        remedy = "give a file of this version's `jaxos4 estimate --out`"
-        raise InputError(f"{path}: not a result ({reason}); {remedy}.") from None
-    with named(path):
-        return checked(file)
-
-
-def checked(file: ResultFile) -> ResultFile:
-    """The result. Raises `InputError` if it has no vehicle or no estimate, or is not of this version."""
-    if file.model != _VEHICLE:
-        raise InputError(f"`model` {file.model[:40]}: only a vehicle (--model flight) can be exported or can predict.")
-    if file.result not in NAMES:
-        raise InputError(f"`result` {file.result[:40]}: is not a result code; run `jaxos4 estimate` again.")
-    if not file.covariance or file.airframe is None:
-        raise InputError(f"{file.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
-    count = len(file.parameters)
-    shape = [len(row) for row in file.covariance] == count * [count]
-    if not shape or any(row[i] < 0 for i, row in enumerate(file.covariance)):
-        raise InputError(f"`covariance`: is not one of {count} parameters; run `jaxos4 estimate` again.")
-    return file
 
 
 def _identified(name: str, file: ResultFile) -> Identified:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -14,9 +13,8 @@ from .._custom_types import Parameters
 from .._xla import quick_jit
 from ..airframe import airframe_from_table
 from ..errors import InputError, named
-from ..export.result import ResultFile, checked, read_file
 from ..flight import FORCE_NAMES
-from ..identification import Identification
+from ..identification.results import Identification, ResultFile
 from ..linalg import covariance_root
 from ..models.terms import TERMS
 from ..models.vehicle import FlightModel
@@ -60,25 +58,21 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
 
     **Raises:** `InputError`, one line, if the result has no vehicle or no estimate; `OSError` if it cannot be read.
     """
-    if not isinstance(found, Identification):
-        file = read_file(found)
-        with named(found):
-            return _vehicle(file, Path(found).name)
-    return _vehicle(checked(msgspec.convert(found.to_dict(), ResultFile)), f"{found.estimator}, {found.model} model")
+    file = ResultFile.of(found)
+    if isinstance(found, Identification):
+        return _vehicle(file, f"{file.estimator}, {file.model} model")
+    with named(found):
+        return _vehicle(file, Path(found).name)
 
 
 def _vehicle(file: ResultFile, name: str) -> Vehicle:
-    used = file.provenance
-    if not file.disturbances or used.sample_time is None:
-        raise InputError("does not say its disturbances and its sample time; run `jaxos4 estimate` again.")
-    airframe = airframe_from_table(file.airframe or {})
+    used, airframe = file.provenance, airframe_from_table(file.airframe or {})
+    terms = used.terms or []
     try:
-        model = FlightModel(airframe, terms=tuple(used.terms), battery_voltage=used.battery_voltage)
+        model = FlightModel(airframe, terms=tuple(terms), battery_voltage=used.battery_voltage or None)
     except ValueError:
-        strangers = [term for term in used.terms if term not in TERMS]
-        which = (
-            f"the term {strangers[0][:40]} is not one of this version" if strangers else "its terms exclude each other"
-        )
+        strangers = [term for term in terms if term not in TERMS]
+        which = f"the term {strangers[0][:40]} is not of this version" if strangers else "its terms exclude each other"
         raise InputError(f"{which}; run `jaxos4 estimate` again.") from None
     known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
     known |= {row: each.value for row, each in file.held.items()}

@@ -1,6 +1,8 @@
 """The result of an identification: typed, and as JSON."""
 
 import math
+import os
+from pathlib import Path
 from typing import Any, SupportsFloat
 
 import msgspec
@@ -8,8 +10,9 @@ import msgspec
 from ..airframe import airframe_table
 from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.prediction import Predictions
+from ..errors import InputError, named
 from ..estimate import Estimate
-from ..results import result_names
+from ..results import NAMES, result_names
 from ..shooting import ShootingProblem
 
 NO_ANSWER = ("nonfinite_trajectory", "bracket_invalid", "network_mismatch")  # results without an estimate
@@ -28,12 +31,10 @@ def finite_or_none(value: SupportsFloat) -> float | None:
 class ParameterEstimate(msgspec.Struct, frozen=True):
     """One estimated parameter.
 
-    - `estimate`: in `unit`; `None` if the parameter is not identifiable.
+    - `estimate`, `ci95`: the estimate and its 95 % interval; `None` if the parameter is not identifiable.
     - `std`: standard deviation of the estimate; `None` if it is not finite.
     - `bound`: the Cramer-Rao bound at the noise levels that were found, as a standard deviation.
-    - `ci95`: the 95 % interval; `None` if the parameter is not identifiable.
-    - `unit`: of all these.
-    - `note`: a warning, or an empty string.
+    - `unit`: of all these. `note`: a warning, or an empty string.
     - `noise_limit`: the airframe's value could be distinguished from 0 up to this multiple of the noise. Only for one
       flight of an OS4.
     """
@@ -204,10 +205,6 @@ class Provenance(msgspec.Struct, frozen=True, kw_only=True):
     device: str
     precision: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """The fields that apply, by name."""
-        return msgspec.to_builtins(self)
-
 
 class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """The parameters of a quadrotor, with what a user needs to judge them. Made by `jaxos4.identify`.
@@ -291,16 +288,63 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         `airframe` has the keys of an airframe's file. `covariance` has the rows and columns of `parameters`; `None`
         without an answer.
         """
-        others = _OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES
-        fields = _fields(self, "rigid_body", "estimate", "problem", "is_vehicle", "predictions", "response", *others)
+        apart = {"rigid_body", "estimate", "problem", "is_vehicle", "predictions", "response"}
+        apart |= _OF_FLIGHTS if self.is_vehicle else _OF_VEHICLES
+        fields = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in apart}
         computed = {"constants": self.rigid_body.to_dict(), "airframe": airframe_table(self.problem.model.airframe)}
         return msgspec.to_builtins(fields | computed)
 
 
 # Fields that are written of one kind of identification only.
-_OF_FLIGHTS = ("fit", "validation")
-_OF_VEHICLES = ("held", "noise", "doubts", "disturbances", "widened", "skill", "sample_times")
+_OF_FLIGHTS = {"fit", "validation"}
+_OF_VEHICLES = {"held", "noise", "doubts", "disturbances", "widened", "skill", "sample_times"}
 
 
-def _fields(struct: msgspec.Struct, *apart: str) -> dict[str, Any]:
-    return {name: getattr(struct, name) for name in struct.__struct_fields__ if name not in apart}
+class ResultFile(msgspec.Struct, frozen=True, kw_only=True):
+    """The fields of `Identification.to_dict` that an export or a prediction needs."""
+
+    estimator: str
+    model: str
+    result: str
+    parameters: dict[str, ParameterEstimate]
+    provenance: Provenance
+    covariance: list[list[float]] | None
+    held: dict[str, HeldParameter] = {}
+    doubts: tuple[Doubt, ...] = ()
+    disturbances: dict[str, Disturbance] = {}
+    constants: dict[str, Any]
+    airframe: dict[str, Any] | None
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the estimate cannot be trusted, and what to do; one line each."""
+        return tuple(f"not to be trusted because {doubt}" for doubt in self.doubts)
+
+    @classmethod
+    def of(cls, found: Identification | str | os.PathLike[str]) -> "ResultFile":
+        """The result of a vehicle, or the one in a file that `jaxos4 estimate --out` wrote.
+
+        **Raises:** `InputError`, one line, if it is no result, has no vehicle or no estimate, or is not of this
+        version; `OSError` if the file cannot be read.
+        """
+        remedy, again = "give a file of this version's `jaxos4 estimate --out`", "run `jaxos4 estimate` again."
+        with named("" if isinstance(found, Identification) else found):
+            try:
+                if isinstance(found, Identification):
+                    own = msgspec.convert(found.to_dict(), cls)
+                else:
+                    own = msgspec.json.decode(Path(found).read_bytes(), type=cls)
+            except msgspec.MsgspecError as error:
+                what = " ".join(str(error).split())[:200]
+                raise InputError(f"not a result ({what}); {remedy}.") from None
+            if own.model != "flight":
+                which = "only a vehicle (--model flight) can be exported or can predict"
+                raise InputError(f"`model` {own.model[:40]}: {which}.")
+            if own.result not in NAMES:
+                raise InputError(f"`result` {own.result[:40]}: is not a result code; {again}")
+            if not own.covariance or own.airframe is None:
+                raise InputError(f"{own.result}: holds no estimate; see what `jaxos4 estimate` says about the flight.")
+            rows, count = own.covariance, len(own.parameters)
+            if [len(row) for row in rows] != count * [count] or any(row[i] < 0 for i, row in enumerate(rows)):
+                raise InputError(f"`covariance`: is not one of {count} parameters; {again}")
+            return own

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -65,7 +66,11 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         drawings=drawings,
         command=used.command or "",
         notes=[*used.notes, *filter(None, [found.motor_clock])],
-        provenance=[(name.replace("_", " "), _text(x)) for name, x in used.to_dict().items() if name not in _ELSEWHERE],
+        provenance=[
+            (name.replace("_", " "), _text(x))
+            for name, x in msgspec.to_builtins(used).items()
+            if name not in _ELSEWHERE
+        ],
     )
     write_file(path, text)
 
