@@ -16,8 +16,8 @@ from jaxos4.cli._output import in_options
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.identification import settings_for
 from jaxos4.recording import read_recording
+from jaxos4.recording.pieces import vehicle_evidence
 from jaxos4.recording.preparation import prepare
-from jaxos4.recording.reading import vehicle_evidence
 
 AIRFRAME = """
 mass = 0.65

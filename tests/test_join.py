@@ -13,8 +13,7 @@ import jaxos4
 from jaxos4.errors import InputError
 from jaxos4.logs.sampling import average
 from jaxos4.recording import Recording
-from jaxos4.recording.pieces import averaged, cut
-from jaxos4.recording.reading import as_recording
+from jaxos4.recording.pieces import as_recording, averaged, cut
 from jaxos4.recording.usable import Stretch
 
 

@@ -15,7 +15,7 @@ from jaxos4.identification.answers import vehicle_constants
 from jaxos4.identification.results import Constant, HeldParameter, SampleTime
 from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, noise_of_speeds, shortest
 from jaxos4.identification.vehicle import prepare_vehicle
-from jaxos4.recording.reading import as_recordings
+from jaxos4.recording.pieces import as_recordings
 
 
 def table(*rows):

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxos4
 from jaxos4.flight import STATE_NAMES
+from jaxos4.recording.pieces import as_recordings
 from jaxos4.recording.preparation import prepare
-from jaxos4.recording.reading import as_recordings
 from jaxos4.shooting import InnovationsProblem
 from jaxos4.shooting.gains import LogNoise
 from jaxos4.shooting.innovations import SETTLING

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxos4.recording import Recording
-from jaxos4.recording.velocity import motion_of
+from jaxos4.recording.velocity import measures_velocity, velocity_of
 
 G, FORGETS, SECONDS = 9.81, 2.0, 20.0
 ANGLES, VELOCITY, RATES = [6, 8, 10], [1, 3, 5], [7, 9, 11]
@@ -64,23 +64,22 @@ def without(recording, *columns):
 
 def test_a_measured_velocity_is_turned_by_the_attitude():
     recording, true, _ = trajectory(0.004)
-    found = motion_of(recording)
-    assert found.measured
-    np.testing.assert_allclose(found.velocity, true, atol=1e-9)
+    velocity, ups = velocity_of(recording)
+    assert measures_velocity(recording)
+    np.testing.assert_allclose(velocity, true, atol=1e-9)
     upright = to_earth(recording.states[:, ANGLES]).apply([0.0, 0.0, 1.0], inverse=True)
-    np.testing.assert_allclose(found.ups[0], upright, atol=1e-12)
+    np.testing.assert_allclose(ups[0], upright, atol=1e-12)
     gaps = recording._replace(states=recording.states.copy())
     gaps.states[20:24] = np.nan  # a gap has the value before it
-    np.testing.assert_allclose(motion_of(gaps).velocity[20:24], true[[19] * 4], atol=1e-9)
+    np.testing.assert_allclose(velocity_of(gaps)[0][20:24], true[[19] * 4], atol=1e-9)
 
 
 def test_dead_reckoning_converges_to_the_integral_that_forgets():
     errors = []
     for dt in (0.008, 0.004):
         recording, _, forgetful = trajectory(dt)
-        found = motion_of(without(recording, VELOCITY))
-        assert not found.measured
-        errors.append(np.abs(found.velocity - forgetful).max())
+        assert not measures_velocity(without(recording, VELOCITY))
+        errors.append(np.abs(velocity_of(without(recording, VELOCITY))[0] - forgetful).max())
     assert errors[1] < 0.05
     assert errors[1] < 0.7 * errors[0]
 
@@ -88,18 +87,18 @@ def test_dead_reckoning_converges_to_the_integral_that_forgets():
 @pytest.mark.parametrize("unknown", [[], ANGLES], ids=["attitude", "nothing"])
 def test_the_velocity_along_z_is_found(unknown):
     recording, true, _ = trajectory(0.004)
-    found, late = motion_of(without(recording, VELOCITY, unknown)), recording.time > 5
-    assert (found.velocity - true)[late, 2].std() < 0.3 * true[late, 2].std()
+    (velocity, ups), late = velocity_of(without(recording, VELOCITY, unknown)), recording.time > 5
+    assert (velocity - true)[late, 2].std() < 0.3 * true[late, 2].std()
     up = np.cos(recording.states[late, 6]) * np.cos(recording.states[late, 8])
-    assert np.abs(found.ups[0][late, 2] - up).max() < 0.03
+    assert np.abs(ups[0][late, 2] - up).max() < 0.03
 
 
 def test_a_constant_error_of_the_accelerometer_is_left_out_and_without_it_or_a_gyro_there_is_no_velocity():
     recording = without(trajectory(0.004)[0], VELOCITY)
-    motion, force = motion_of(recording), recording.specific_force.copy()
-    biased = recording._replace(specific_force=force + 0.5 * motion.ups[0])
-    np.testing.assert_allclose(motion_of(biased).velocity, motion.velocity, atol=1e-9)
+    (velocity, ups), force = velocity_of(recording), recording.specific_force.copy()
+    biased = recording._replace(specific_force=force + 0.5 * ups[0])
+    np.testing.assert_allclose(velocity_of(biased)[0], velocity, atol=1e-9)
     force[:, 1] = np.nan
     for lacking in (None, force):
-        assert motion_of(recording._replace(specific_force=lacking)) is None
-    assert motion_of(without(recording, RATES)) is None
+        assert velocity_of(recording._replace(specific_force=lacking)) is None
+    assert velocity_of(without(recording, RATES)) is None

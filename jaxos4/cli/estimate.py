@@ -94,7 +94,7 @@ def _subject(
     `given`: whether the user gave the airframe.
     """
     from ..models import MODELS
-    from ..recording import vehicle_evidence
+    from ..recording.pieces import vehicle_evidence
 
     shown = (f"{each.name} {why}" for each in recordings if (why := vehicle_evidence(each)))
     evidence = next(shown, "") if model is None else ""

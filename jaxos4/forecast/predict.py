@@ -15,8 +15,8 @@ from ..flight import Flight
 from ..identification import Identification
 from ..models.terms import COMMANDS, FULL_SCALE, TERMS, VOLTAGE
 from ..recording import preparation
+from ..recording.pieces import Recording, as_recording
 from ..recording.preparation import Prepared
-from ..recording.reading import Recording, as_recording
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .measured import Measured, Regression, constant_rates

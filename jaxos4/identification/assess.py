@@ -11,7 +11,7 @@ from ..analysis.identifiability import Identifiability, identifiability
 from ..estimators import IBSS
 from ..flight import STATE_NAMES, Flight
 from ..models.abstract import AbstractModel
-from ..recording.reading import Recording, as_recordings
+from ..recording.pieces import Recording, as_recordings
 from .fit import fit_flight
 from .problem import Intervals, bracket_of, flight_problem
 from .results import finite_or_none, has_answer

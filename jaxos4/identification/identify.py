@@ -14,7 +14,7 @@ from ..estimate import AbstractEstimator
 from ..flight import CHANNEL_NAMES, Flight
 from ..models.abstract import AbstractModel
 from ..networks import TrainedNetwork
-from ..recording.reading import Recording, as_recordings
+from ..recording.pieces import Recording, as_recordings
 from ..results import result_names
 from .answers import channel_fits
 from .fit import Fit, fit_case

@@ -17,8 +17,8 @@ from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
+from ..recording.pieces import Recording
 from ..recording.preparation import HOLDOUT
-from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem
 from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, loaded, network_for, network_provenance
 from .results import Provenance

@@ -18,7 +18,7 @@ from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
 from ..networks.file import load_network
 from ..noise import SENSOR_SIGMA
-from ..recording.reading import Recording
+from ..recording.pieces import Recording
 from ..shooting import ShootingProblem, Unknowns
 
 # A bracket, or `[lower, upper]` by parameter name; the model's default for all others.

@@ -18,8 +18,8 @@ from ..flight import Flight
 from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, default_terms
 from ..models.vehicle import FlightModel
 from ..recording import preparation
+from ..recording.pieces import Recording
 from ..recording.preparation import Prepared
-from ..recording.reading import Recording
 from ..shooting import InnovationsProblem, ShootingProblem, Unknowns, capacity_of, with_room
 from .prepare import Case, Progress, VehicleSettings, airframe_name, name_and_class, versions
 from .problem import GivenNetwork, Intervals, bracket_of, liveliest, vehicle_network_for

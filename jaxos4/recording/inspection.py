@@ -12,9 +12,8 @@ from ..airframe import GRAVITY, GUESS, Airframe
 from ..flight import CHANNEL_NAMES
 from ..logs import log_format
 from .motion import Excitation, excitation, motor_clock_note, opposite_axes, refused_note, rotor_signs, yaw_doubt
-from .pieces import cut
-from .reading import Recording
-from .usable import Stretch, nothing_usable, stretches
+from .pieces import Recording, Stretch, cut
+from .usable import nothing_usable, stretches
 
 FULL_SCALE = 1000.0
 """Commands have no unit: a command of 1 counts as this rotor speed [rad/s], if nothing better is known."""

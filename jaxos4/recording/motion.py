@@ -15,7 +15,7 @@ from ..airframe import Airframe
 from ..excitation import AXES
 from ..flight import STATE_NAMES, Flight
 from ..logs.sampling import average
-from .reading import Recording, as_recording
+from .pieces import Recording, as_recording
 
 RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
 WEAK = 0.1  # [rad/s], standard deviation of a body rate; less is not excited

@@ -1,19 +1,76 @@
-"""Pieces of recordings: cut, averaged to longer samples, joined, divided into measurements to fit and to predict."""
+"""Flights as recordings, and their pieces: cut, averaged, joined, divided into measurements to fit and to predict."""
 
+import os
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
-from ..flight import STATE_NAMES, Flight
+from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
+from ..logs import FORMATS, Recording as Recording, Table, log_format
 from ..logs.sampling import average
-from .reading import Recording, as_recording
-from .usable import Stretch
 
 # Sample times that differ by less than this share are equal.
 _EQUAL_STEPS = 1e-6
 # Length of a block that is held out [s]: each part of a flight then has blocks of both kinds.
 _BLOCK = 5.0
+
+
+class Stretch(NamedTuple):
+    """A part of a flight, from the sample at `begin` to the sample at `end` [s].
+
+    `reason`: why the part is not usable; empty if it is.
+    """
+
+    begin: float
+    end: float
+    reason: str = ""
+
+    @property
+    def length(self) -> float:
+        """Its duration [s]."""
+        return self.end - self.begin
+
+
+def as_recordings(
+    flights: Flight | Recording | Sequence[Flight | Recording], name: str = "flight"
+) -> tuple[Recording, ...]:
+    """One or several flights as recordings. A flight without a name is called `name`; several are numbered from 1."""
+    every = (flights,) if isinstance(flights, Flight | Recording) else tuple(flights)
+    return tuple(as_recording(each, f"{name} {i + 1}" if len(every) > 1 else name) for i, each in enumerate(every))
+
+
+def as_recording(flight: Flight | Recording, name: str = "flight") -> Recording:
+    """A flight as a recording of this name, without impossible values. A recording stays as it is.
+
+    **Raises:** `InputError` if more than 1 % of the values of a channel are impossible.
+    """
+    if isinstance(flight, Recording):
+        return flight
+    found = Recording.of(flight, name)
+    columns = {"t": found.time, **dict(zip(CHANNEL_NAMES, found.channels.T, strict=True))}
+    table = Table(name, columns, first_row=None).without_impossible()
+    if not table.impossible:
+        return found
+    states, force = np.split(np.stack([table.columns[each] for each in CHANNEL_NAMES], axis=1), [12], axis=1)
+    specific = None if found.specific_force is None else force
+    return found._replace(states=states, specific_force=specific, notes=(table.impossible_note,))
+
+
+def vehicle_evidence(recording: Recording) -> str:
+    """The evidence that a file is the log of a real vehicle, as the end of a sentence; empty if there is none.
+
+    A simulation of the OS4 has rotor speeds and states. A vehicle logs commands, or has an accelerometer, or writes a
+    format of its own.
+    """
+    if recording.commanded:
+        return "has commands, not rotor speeds"
+    if recording.specific_force is not None:
+        return "has an accelerometer"
+    if os.path.isfile(recording.name) and (kind := log_format(recording.name)) is not FORMATS[-1]:
+        return f"is a log of a vehicle ({kind.label})"
+    return ""
 
 
 def cut(flight: Recording, stretch: Stretch) -> Recording:

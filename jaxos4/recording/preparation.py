@@ -13,10 +13,9 @@ from ..flight import STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .motion import opposite_axes, refused_note, yaw_doubt
-from .pieces import averaged, cut, hold_out, joined, whole_windows
-from .reading import Recording
-from .usable import Stretch, nothing_usable, stretches
-from .velocity import Motion, motion_of
+from .pieces import Recording, Stretch, averaged, cut, hold_out, joined, whole_windows
+from .usable import nothing_usable, stretches
+from .velocity import Ups, measures_velocity, velocity_of
 
 # Length of a window, and the shortest sample [s]: no quadrotor's motion needs shorter samples.
 WINDOW, SAMPLE_TIME = 0.25, 0.004
@@ -161,10 +160,10 @@ def _sampled(
     pieces = [piece for _, piece in coarse if piece.time.size]
     if unused := [recording for i, recording in enumerate(recordings) if i not in numbers]:
         raise InputError(f"{unused[0].name}: no part is as long as a window, {WINDOW:g} s; leave this log out.")
-    motions = [motion for piece in pieces if (motion := motion_of(piece)) is not None]
-    moved = len(motions) == len(pieces)
-    if moved:
-        pieces = [piece._replace(body_velocity=motion.velocity) for piece, motion in zip(pieces, motions, strict=True)]
+    moved, ups = [velocity_of(piece) for piece in pieces], []
+    if None not in moved:
+        velocities, ups = zip(*moved, strict=True)
+        pieces = [piece._replace(body_velocity=each) for piece, each in zip(pieces, velocities, strict=True)]
     whole, whole_time = joined(pieces), np.concatenate([piece.time for piece in pieces])
     fitted, tested = hold_out(whole, length, holdout)
     return Prepared(
@@ -173,22 +172,20 @@ def _sampled(
         numbers,
         whole_time,
         length,
-        _available_inputs(whole, pieces, airframe, motions if moved else []),
-        _level(fitted, motions, float(airframe.gravity)) if moved else None,
+        _available_inputs(whole, pieces, airframe),
+        _level(fitted, ups, float(airframe.gravity)) if ups else None,
         (_seconds(fitted), 0.0 if tested is None else _seconds(tested)),
         *about,
     )
 
 
-def _available_inputs(
-    whole: Recording, pieces: Sequence[Recording], airframe: Airframe, motions: Sequence[Motion]
-) -> frozenset[str]:
+def _available_inputs(whole: Recording, pieces: Sequence[Recording], airframe: Airframe) -> frozenset[str]:
     """The inputs for `Term.needs` that the joined recording offers. A force counts if every piece measured it."""
     force = np.all([~np.isnan(piece.channels[:, len(STATE_NAMES) :]).all(axis=0) for piece in pieces], axis=0)
     offers = {
         COMMANDS: whole.commanded,
-        VELOCITY: bool(motions),
-        MEASURED_VELOCITY: bool(motions) and all(motion.measured for motion in motions),
+        VELOCITY: whole.body_velocity is not None,
+        MEASURED_VELOCITY: all(map(measures_velocity, pieces)),
         LATERAL_FORCE: force[0] and force[1],
         VERTICAL_FORCE: force[2],
         FULL_SCALE: airframe.has_full_scale,
@@ -197,7 +194,7 @@ def _available_inputs(
     return frozenset(name for name, offered in offers.items() if offered)
 
 
-def _level(fitted: Recording, motions: Sequence[Motion], gravity: float) -> tuple[float, float] | None:
+def _level(fitted: Recording, every: Sequence[Ups], gravity: float) -> tuple[float, float] | None:
     """The constant error of the accelerometer along z: the mean upright part of the specific force, less gravity.
 
     Over a stretch of flight a vehicle gains little velocity, so all forces together carry its weight.
@@ -205,12 +202,12 @@ def _level(fitted: Recording, motions: Sequence[Motion], gravity: float) -> tupl
     force = fitted.specific_force
     if force is None or not (known := np.isfinite(force).all(axis=1)).any():
         return None
-    ups = [np.concatenate(each)[known] for each in zip(*(motion.ups for motion in motions), strict=True)]
+    ups = [np.concatenate(each)[known] for each in zip(*every, strict=True)]
     other, upright = ((force[known] * up).sum(axis=1).mean() for up in ups)
     cosine = ups[-1][:, 2].mean()
     if cosine < _LEAST_UPRIGHT or force[known, 2].mean() < 0:  # the second: the z axis points down
         return None
-    gained = _GAINED * math.sqrt(len(motions)) / (np.count_nonzero(known) * fitted.dt)
+    gained = _GAINED * math.sqrt(len(every)) / (np.count_nonzero(known) * fitted.dt)
     return (upright - gravity) / cosine, math.hypot(gained, _CARRIED * gravity, upright - other) / cosine
 
 

@@ -8,7 +8,6 @@ feel them.
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -16,7 +15,7 @@ from jaxtyping import Bool
 from ..airframe import STANDARD_GRAVITY, Airframe
 from ..flight import Flight
 from .motion import RATE_COLUMNS
-from .reading import Recording, as_recording
+from .pieces import Recording, Stretch, as_recording
 
 ON_GROUND = "on the ground"
 SHORTEST = 1.0  # [s], of a usable stretch
@@ -46,22 +45,6 @@ _NAMES = {
     _CRASHED: "an impact",
     _GROUND: ON_GROUND,
 }
-
-
-class Stretch(NamedTuple):
-    """A part of a flight, from the sample at `begin` to the sample at `end` [s].
-
-    `reason`: why the part is not usable; empty if it is.
-    """
-
-    begin: float
-    end: float
-    reason: str = ""
-
-    @property
-    def length(self) -> float:
-        """Its duration [s]."""
-        return self.end - self.begin
 
 
 def stretches(flight: Flight | Recording, airframe: Airframe | None = None) -> tuple[Stretch, ...]:

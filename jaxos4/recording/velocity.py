@@ -1,59 +1,57 @@
 """The velocity along the body's axes and the upright direction, measured or by dead reckoning."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..airframe import GRAVITY
 from ..flight import STATE_NAMES
-from .reading import Recording
+from .pieces import Recording
 
 # Dead reckoning forgets its velocity with this time constant [s].
 _FORGETS = 2.0
 # The upright direction is drawn to the specific force with these time constants [s]: the first forgets errors of the
 # gyro sooner, the second holds in longer turns.
 _LEVELS = (2.0, 8.0)
+_ANGLES, _VELOCITY, _RATES = ("phi", "theta", "psi"), ("vx", "vy", "vz"), ("p", "q", "r")
 
 
-class Motion(NamedTuple):
-    """How a vehicle moved through still air.
-
-    - `velocity`: along the body's axes [m/s].
-    - `ups`: the upright direction in the body's axes, by each time constant. They differ in long turns, and if the gyro
-      errs. Both are the same if the attitude was measured.
-    - `measured`: whether the velocity was measured. If not, its slow changes are missing.
-    """
-
-    velocity: Float[np.ndarray, "samples 3"]
-    ups: tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]
-    measured: bool
+Ups = tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]
 
 
-def motion_of(recording: Recording) -> Motion | None:
-    """The motion of a recording in one piece, without gaps; `None` if the log does not say enough.
+def velocity_of(recording: Recording) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
+    """How a vehicle moved through still air; `None` if the log does not say enough.
 
     A velocity that was not measured follows from gyro and accelerometer: v' = force - g up - rates x v. Slow errors of
-    this sum are forgotten. The answers of torque and thrust to the velocity are faster.
+    this sum are forgotten, and so are slow changes of the velocity. The answers of torque and thrust to it are faster.
+
+    **Arguments:** a recording in one piece, without gaps.
+
+    **Returns:** the velocity along the body's axes [m/s], and the upright direction in these axes by each time
+    constant. They differ in long turns, and if the gyro errs. Both are the same if the attitude was measured.
     """
-    angles, velocity = (_filled(recording, names) for names in (("phi", "theta", "psi"), ("vx", "vy", "vz")))
-    if angles is not None and velocity is not None:
-        to_body = _to_body(*angles.T)
-        up = to_body[:, :, 2]
-        return Motion(np.einsum("tij,tj->ti", to_body, velocity), (up, up), measured=True)
-    rates, force = _filled(recording, ("p", "q", "r")), recording.specific_force
+    angles, velocity = (_filled(recording, names) for names in (_ANGLES, _VELOCITY))
+    to_body = None if angles is None else _to_body(*angles.T)
+    if to_body is not None and velocity is not None:
+        return np.einsum("tij,tj->ti", to_body, velocity), (to_body[:, :, 2], to_body[:, :, 2])
+    rates, force = _filled(recording, _RATES), recording.specific_force
     if rates is None or force is None or np.isnan(force).all(axis=0).any():
         return None
     force = _without_gaps(force)
-    if angles is None:
+    if to_body is None:
         up, slow = (_upright(rates, force, recording.dt, levels) for levels in _LEVELS)
     else:
-        up = slow = _to_body(*angles.T)[:, :, 2]
-    return Motion(_dead_reckoned(rates, force, up, recording.dt), (up, slow), measured=False)
+        up = slow = to_body[:, :, 2]
+    return _dead_reckoned(rates, force, up, recording.dt), (up, slow)
 
 
-def _filled(recording: Recording, names: tuple[str, ...]) -> Float[np.ndarray, "samples 3"] | None:
+def measures_velocity(recording: Recording) -> bool:
+    """Whether a recording has a velocity, and the attitude that turns it into the body's axes."""
+    return _filled(recording, _ANGLES + _VELOCITY) is not None
+
+
+def _filled(recording: Recording, names: tuple[str, ...]) -> Float[np.ndarray, "samples columns"] | None:
     values = recording.states[:, [STATE_NAMES.index(name) for name in names]]
     return None if np.isnan(values).all(axis=0).any() else _without_gaps(values)
 
