@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic_results import AIRFRAME, VALUES, vehicle_result
+from synthetic_results import AIRFRAME, VALUES, provenance, vehicle_result
 
 import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table, alpha_from_inertia
@@ -163,8 +163,8 @@ def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
 def predicted_flight(tmp_path):
     """The exported vehicle, its rotor speeds, and the flight from the first sample as `jaxos4.predict` predicts it."""
     model, values = rigid_model({name: VALUES[name] for name in VALUES if not name.startswith(("rotor", "thrust_cu"))})
-    level = dict(zip(("strength", "time_constant", "sensor"), (0.0, 0.25, 0.01), strict=True))
-    about = {"terms": list(TERMS), "sample_time": SAMPLE}
+    level = {"strength": 0.0, "unit": "", "time_constant": 0.25, "sensor": 0.01, "correlation": 0.0}
+    about = provenance(terms=list(TERMS), sample_time=SAMPLE)
     known = {"disturbances": dict.fromkeys(("p", "q", "r", "ax", "ay", "az"), level), "provenance": about, "held": {}}
     result = vehicle_result(values, airframe=airframe_table(model.airframe), **known)
     found = read(tmp_path, result)
