@@ -59,98 +59,74 @@ def multisine(
     return _rotor_speeds(airframe, acceleration, dt)
 
 
-def doublet(
-    airframe: Airframe,
-    *,
-    duration: float = 5.0,
-    dt: float = 0.01,
-    amplitude: Amplitude = 1.0,
-    axes: Sequence[str] = AXES,
-) -> RotorSpeeds:
-    """A doublet of torque about one axis after another.
+def doublet(airframe: Airframe, *, duration: float = 5.0, dt: float = 0.01, amplitude: Amplitude = 1.0) -> RotorSpeeds:
+    """A doublet of torque about roll, then pitch, then yaw.
 
     The pulses + - of 0.3 s end at rate zero and an angle of amplitude x 0.3 s. The mirror image - + brings the angle
     back, and a rest follows. The sequence repeats as often as it fits, then the quadrotor hovers. Only one axis turns
     at a time, so alpha1, alpha4 and alpha7 are not excited.
 
-    **Arguments:** those of `multisine`, and:
-
-    - `axes`: some of `"roll"`, `"pitch"`, `"yaw"`, in the order in which they are excited.
+    **Arguments:** those of `multisine`.
 
     **Raises:** as `multisine`, and if the duration is too short.
     """
-    return _pulses(airframe, DOUBLET, 0.3, duration, dt, amplitude, axes)
+    return _pulses(airframe, DOUBLET, 0.3, duration, dt, amplitude)
 
 
-def step3211(
-    airframe: Airframe,
-    *,
-    duration: float = 5.0,
-    dt: float = 0.01,
-    amplitude: Amplitude = 1.0,
-    axes: Sequence[str] = AXES,
-) -> RotorSpeeds:
+def step3211(airframe: Airframe, *, duration: float = 5.0, dt: float = 0.01, amplitude: Amplitude = 1.0) -> RotorSpeeds:
     """Pulses of 0.3, 0.2, 0.1 and 0.1 s and alternating sign about one axis after another; otherwise as `doublet`.
 
     Heights of 0.8, 1.2, 1.1 and 1.1 end at rest: 3 x 0.8 - 2 x 1.2 + 1.1 - 1.1 = 0. The angle is then amplitude x
     0.296 s.
     """
-    return _pulses(airframe, STEP_3211, 0.1, duration, dt, amplitude, axes)
+    return _pulses(airframe, STEP_3211, 0.1, duration, dt, amplitude)
 
 
 def chirp(
-    airframe: Airframe,
-    *,
-    duration: float = 5.0,
-    dt: float = 0.01,
-    amplitude: Amplitude = (1.0, 1.0, 0.5),
-    axes: Sequence[str] = AXES,
+    airframe: Airframe, *, duration: float = 5.0, dt: float = 0.01, amplitude: Amplitude = (1.0, 1.0, 0.5)
 ) -> RotorSpeeds:
     """A sweep from 0.6 to 3 Hz about one axis after another, faded in and out. The axes share the duration equally.
 
     As with `doublet`, alpha1, alpha4 and alpha7 are not excited.
 
-    **Arguments:** those of `doublet`. The yaw rate is half the others, because the yaw torque of rotors is small.
+    **Arguments:** those of `multisine`. The yaw rate is half the others, because the yaw torque of rotors is small.
 
     **Raises:** as `multisine`, and if an axis gets less than one cycle.
     """
-    intervals, order = _intervals(duration, dt), _axis_indices(axes)
+    intervals = _intervals(duration, dt)
     _check_frequencies("dt", _CHIRP, dt)
-    first, last = _CHIRP
-    samples = intervals // len(order)
+    samples = intervals // len(AXES)
     span = (samples - 1) * dt
-    if span * (first + last) / 2 < 1:
-        least = len(order) * (2 / (first + last) + 2 * dt)
+    if span * sum(_CHIRP) / 2 < 1:
+        least = len(AXES) * (2 / sum(_CHIRP) + 2 * dt)
         raise ValueError(f"`duration` must be at least {least:.3g} s for one cycle on each axis, got {duration:g} s.")
     sine, frequency = _sweep(samples, span, _CHIRP)
     angle = np.pad(sine / (2 * math.pi * frequency), 1)
     rate = np.diff(angle) / dt
     shape = np.diff(rate) / dt / np.abs(rate).max()
-    return _about_axes(airframe, shape, intervals, order, amplitude, dt)
+    return _about_axes(airframe, shape, intervals, amplitude, dt)
 
 
 Excite = Callable[..., RotorSpeeds]
 EXCITATIONS: dict[str, Excite] = {"multisine": multisine, "doublet": doublet, "3211": step3211, "chirp": chirp}
 
 
-def _pulses(airframe, heights, width, duration, dt, amplitude, axes) -> RotorSpeeds:
-    intervals, order = _intervals(duration, dt), _axis_indices(axes)
+def _pulses(airframe, heights, width, duration, dt, amplitude) -> RotorSpeeds:
+    intervals = _intervals(duration, dt)
     if round(width / dt) < 1:
         raise ValueError(f"`dt` must be at most the width of a pulse, {width:g} s, got {dt:g} s.")
     once = np.repeat(heights, round(width / dt))
     shape = np.concatenate([once, -once, np.zeros(round(width / dt))])
     shape = shape / (np.abs(np.cumsum(shape)).max() * dt)
-    sequence = len(order) * len(shape)
+    sequence = len(AXES) * len(shape)
     if sequence > intervals:
-        raise ValueError(
-            f"`duration` must be at least {sequence * dt:.6g} s for pulses on {len(order)} axes, got {duration:g} s."
-        )
-    return _about_axes(airframe, shape, intervals, order, amplitude, dt)
+        raise ValueError(f"`duration` must be at least {sequence * dt:.6g} s for pulses on 3 axes, got {duration:g} s.")
+    return _about_axes(airframe, shape, intervals, amplitude, dt)
 
 
-def _about_axes(airframe, shape: np.ndarray, intervals: int, order: list[int], amplitude, dt: float) -> RotorSpeeds:
+def _about_axes(airframe, shape: np.ndarray, intervals: int, amplitude, dt: float) -> RotorSpeeds:
     """`shape` (unit peak rate) about each axis in turn, repeated while a complete sequence fits."""
-    slots = intervals // (len(order) * len(shape)) * order
+    slots = intervals // (len(AXES) * len(shape)) * [0, 1, 2]
     return _rotor_speeds(airframe, _peak_rates(amplitude) * _in_turn([shape], intervals + 1, 3, slots), dt)
 
 
@@ -190,12 +166,6 @@ def _peak_rates(amplitude: Amplitude) -> np.ndarray:
     if peak.shape not in ((), (3,)) or not np.isfinite(peak).all():
         raise ValueError(f"`amplitude` must be one finite rate or three (roll, pitch, yaw) [rad/s], got {amplitude}.")
     return np.broadcast_to(peak, (3,))
-
-
-def _axis_indices(axes: Sequence[str]) -> list[int]:
-    if isinstance(axes, str) or not axes or any(axis not in AXES for axis in axes):
-        raise ValueError(f"`axes` must be a list of some of {', '.join(AXES)}, got {axes!r}.")
-    return [AXES.index(axis) for axis in axes]
 
 
 def _check_frequencies(name: str, frequencies: Sequence[float], dt: float) -> None:

@@ -77,10 +77,10 @@ def standard_problem(
     return jaxos4.ShootingProblem(model_class(jaxos4.OS4), flight, **arguments)
 
 
-def doublet_problem(axes, *, free=False):
+def doublet_problem(amplitude, *, free=False):
     """The rates of a noisy flight of doublets, and a bracket whose center is off."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
-    omega = jaxos4.doublet(model.airframe, duration=5.0, dt=DT, axes=axes)
+    omega = jaxos4.doublet(model.airframe, duration=5.0, dt=DT, amplitude=amplitude)
     flight = jaxos4.simulate(model, model.alpha, omega, dt=DT)
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
     start = None if free else flight.states[0]

@@ -59,15 +59,12 @@ def test_default_flights(airframe, excite):
 @every_in_turn
 @every_airframe
 @pytest.mark.parametrize("duration", [5.0, 11.37])
-def test_one_axis_at_a_time_in_the_order_given_and_back_to_rest(airframe, excite, duration):
+def test_one_axis_after_another_and_back_to_rest(airframe, excite, duration):
     rates, angles = rates_and_angles(airframe, excite(airframe, duration=duration))
     assert (np.abs(rates) > 1e-9).sum(axis=1).max() == 1
     np.testing.assert_allclose([rates[-1], angles[-1]], 0, atol=1e-10)
     np.testing.assert_allclose(np.abs(rates).max(axis=0), (1, 1, 0.5 if excite is chirp else 1), rtol=1e-9)
-    rates, _ = rates_and_angles(OS4, excite(OS4, axes=("yaw", "roll"), amplitude=0.5))
-    first = [np.flatnonzero(np.abs(rates[:, axis]) > 1e-9) for axis in range(3)]
-    assert first[2][0] < first[0][0]
-    assert first[1].size == 0
+    assert (np.diff(np.argmax(np.abs(rates) > 1e-9, axis=0)) > 0).all()  # roll, pitch, yaw
 
 
 def test_pulses_have_their_shapes_and_repeat_as_often_as_they_fit():
@@ -85,7 +82,7 @@ def test_pulses_have_their_shapes_and_repeat_as_often_as_they_fit():
 
 def test_chirp_sweeps_its_frequencies():
     """Zero crossings of the rate: close to the first half-period at the start and to the last at the end."""
-    rates, _ = rates_and_angles(OS4, chirp(OS4, duration=20.0, axes=("roll",)))
+    rates, _ = rates_and_angles(OS4, chirp(OS4, duration=60.0))
     sign = np.sign(rates[1:2000, 0])
     crossings = 0.01 * np.flatnonzero(sign[1:] != sign[:-1])
     half_periods = np.diff(crossings)

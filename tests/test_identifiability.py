@@ -40,7 +40,8 @@ def test_a_hover_excites_nothing():
 @pytest.mark.parametrize(("axis", "lost"), [("yaw", "123467"), ("roll", "1245678"), ("pitch", "134578")])
 def test_one_axis_excites_its_own_parameters_only(axis, lost):
     """Eqs. (1)-(3): alpha2 multiplies q in p', alpha5 multiplies r in q', so pitch and yaw excite those too."""
-    problem = problem_of(jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, axes=[axis]))
+    amplitude = [float(axis == each) for each in ("roll", "pitch", "yaw")]
+    problem = problem_of(jaxos4.doublet(jaxos4.OS4, duration=5.0, dt=DT, amplitude=amplitude))
     notes = analysed(problem).notes(problem.model.parameter_names)
     assert {name for name, why in notes.items() if why == "not identifiable: not excited"} == {
         f"alpha{i}" for i in lost

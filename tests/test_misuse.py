@@ -181,7 +181,6 @@ ARGUMENTS = [
     (EXCITATIONS.values(), "amplitude", (np.nan, (1.0, 1.0))),
     ([multisine], "tones", [((1.0,), (1.0,)), ((50.0,), (1.0,), (1.0,)), ((0.0,), (1.0,), (1.0,))]),
     ([doublet, step3211], "duration", [4.0]),
-    ([doublet, step3211, chirp], "axes", [(), "roll", ("roll", "heave")]),
     ([chirp], "duration", [1.0]),
 ]
 
