@@ -17,8 +17,7 @@ from ..models.state import Attitude, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
-from .sensors import Motion, Sense, Signals, log
-from .settings import ClosedLoop, PerAxis
+from .settings import ClosedLoop, Motion, PerAxis, Sense, Signals, log
 
 References = Float[Array, "samples 4"]
 
