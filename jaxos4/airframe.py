@@ -141,31 +141,27 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
 
 def airframe_from_table(table: dict[str, Any]) -> Airframe:
     """The airframe of a table with the keys of `load_airframe`. Raises `InputError` that names the wrong key."""
-    table = dict(table)
-    if "arm" in table:
-        if "rotor_positions" in table:
-            raise InputError("`arm` and `rotor_positions` exclude each other; keep one of them.")
-        arm = _numbers("arm", table.pop("arm"), ()).item()
-        if arm <= 0:
-            raise InputError(f"`arm` must be positive, got {arm}.")
-        table["rotor_positions"] = plus_layout(arm)
-    table.setdefault("rotor_spins", ALTERNATING_SPINS)
-    hover_speed = table.pop("hover_speed", None)
-    if hover_speed is not None and "thrust_coefficient" in table:
-        raise InputError("`hover_speed` and `thrust_coefficient` exclude each other; keep one of them.")
-    given = table.keys() | ({"thrust_coefficient"} if hover_speed is not None else set())
+    table = {"rotor_spins": ALTERNATING_SPINS} | table
+    for short, whole in _REPLACES.items():
+        if {short, whole} <= table.keys():
+            raise InputError(f"`{short}` and `{whole}` exclude each other; keep one of them.")
+    given = table.keys() | {whole for short, whole in _REPLACES.items() if short in table}
     required = [name for name in _SHAPES if name not in _OPTIONAL]
     missing = [name for name in required if name not in given]
     if missing:
         raise InputError(f"`{missing[0]}` is missing; an airframe needs {', '.join(required)}.")
-    unknown = [name for name in table if name not in _SHAPES]
+    unknown = [name for name in table if name not in _SHAPES and name not in _REPLACES]
     if unknown:
-        raise InputError(f"`{unknown[0]}` is not a known key; the keys are arm, hover_speed, {', '.join(_SHAPES)}.")
+        keys = ", ".join((*_REPLACES, *_SHAPES))
+        raise InputError(f"`{unknown[0]}` is not a known key; the keys are {keys}.")
     guessed = [name for name in _GUESSABLE if isinstance(table[name], str) and table[name] == GUESS]
-    constants = {name: _numbers(name, value, _SHAPES[name]) for name, value in table.items() if name not in guessed}
+    constants = {name: _numbers(name, value) for name, value in table.items() if name not in guessed}
     _check_sizes(constants, table)
-    if hover_speed is not None:
-        constants["thrust_coefficient"] = _thrust_coefficient(hover_speed, constants)
+    if "arm" in constants:
+        constants["rotor_positions"] = np.asarray(plus_layout(constants.pop("arm").item()))
+    if "hover_speed" in constants:
+        weight = constants["mass"] * constants.get("gravity", GRAVITY)
+        constants["thrust_coefficient"] = np.asarray(weight / (4 * constants.pop("hover_speed").item() ** 2))
     constants |= {name: value for name, value in _guesses(constants).items() if name in guessed}
     airframe = Airframe(**constants)
     mixer = np.asarray(airframe.mixer)
@@ -181,14 +177,6 @@ def airframe_table(airframe: Airframe) -> dict[str, Any]:
     """The constants of an airframe as numbers and lists: the inverse of `airframe_from_table`."""
     table = {name: np.asarray(getattr(airframe, name)) for name in _SHAPES}
     return {name: value.tolist() for name, value in table.items() if np.isfinite(value).all()}
-
-
-def _thrust_coefficient(hover_speed: Any, constants: dict[str, np.ndarray]) -> np.ndarray:
-    """The thrust coefficient with which four rotors at `hover_speed` carry the weight."""
-    speed = _numbers("hover_speed", hover_speed, ()).item()
-    if not 1e-3 < speed < 1e6:
-        raise InputError(f"`hover_speed` must be positive and of a rotor's size in rad/s, got {_short(hover_speed)}.")
-    return np.asarray(constants["mass"] * constants.get("gravity", GRAVITY) / (4 * speed**2))
 
 
 def _guesses(constants: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -220,13 +208,15 @@ def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> Non
 _VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
 _SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
 _OPTIONAL = {"gravity", "max_rotor_speed"}
+_REPLACES = {"arm": "rotor_positions", "hover_speed": "thrust_coefficient"}
 _GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
 # The least and the largest value, if they are not those of the other constants.
 _SIZES = {"rotor_positions": (-1e3, 1e3), "rotor_spins": (-1e3, 1e3), "rotor_inertia": (0.0, 1e3)}
-_SIZES["max_rotor_speed"] = (1e-15, math.inf)
+_SIZES |= {"max_rotor_speed": (1e-15, math.inf), "hover_speed": (1e-3, 1e6)}
 
 
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _numbers(name: str, value: Any) -> np.ndarray:
+    shape = _SHAPES.get(name, ())
     try:
         array = np.asarray(value)
     except (ValueError, OverflowError):
