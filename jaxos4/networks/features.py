@@ -163,18 +163,11 @@ def _noise_factor(jacobian: Float[Array, "samples size unknowns"]) -> Float[Arra
 
 
 class Flights(NamedTuple):
-    """Simulated flights without noise: features, and the true unknowns in bracket coordinates."""
+    """Simulated flights: features, the true unknowns, and the noise scale in multiples of sigma; `None`: no noise."""
 
     features: Float[Array, "*batch features"]
     u: Float[Array, "*batch unknowns"]
-
-
-class Pair(NamedTuple):
-    """A simulated flight with noise: features, noise scale (multiples of sigma), and the true unknowns."""
-
-    features: Float[Array, "*batch features"]
-    scale: Float[Array, "*batch"]
-    u: Float[Array, "*batch unknowns"]
+    scale: Float[Array, "*batch"] | None = None
 
 
 def draw_chunks(
@@ -200,7 +193,7 @@ def _chunk(features: Features, key: Key, place: Int[Numeric, ""], uniform: Bool[
 
 def with_noise(
     features: Features, flights: Flights, scales: Float[Numeric, "2"], uniform: Float[Array, "flights random"]
-) -> Pair:
+) -> Flights:
     """Adds noise to flights, with scales that are log-uniform between `scales`.
 
     `uniform`: random numbers between -1 and 1, one for the scale and one for each feature.
@@ -209,12 +202,12 @@ def with_noise(
     scale = jnp.exp((low + high + (high - low) * uniform[:, 0]) / 2)
     most = 1 - jnp.finfo(uniform.dtype).eps  # a finite number of standard deviations
     normal = jnp.sqrt(2.0) * jax.lax.erf_inv(jnp.clip(uniform[:, 1:], -most, most))
-    return Pair(flights.features + jax.vmap(features.noise)(scale[:, None] * normal), scale, flights.u)
+    return Flights(flights.features + jax.vmap(features.noise)(scale[:, None] * normal), flights.u, scale)
 
 
 def noisy_chunks(
     features: Features, chunks: list[Flights], scales: np.ndarray, key: Key, purpose: Purpose, turn: int = 1
-) -> list[Pair]:
+) -> list[Flights]:
     """Adds noise to chunks of flights. It is drawn at the places of the `purpose` after those of `turn` such lists."""
     numbers = turn * len(chunks) + np.arange(len(chunks))
     places = zip(chunks, place_of(purpose, numbers), strict=True)
@@ -224,7 +217,7 @@ def noisy_chunks(
 @quick_jit
 def _noisy_chunk(
     features: Features, chunk: Flights, scales: Float[Numeric, "2"], key: Key, place: Int[Numeric, ""]
-) -> Pair:
+) -> Flights:
     shape = CHUNK, 1 + features.size
     drawn = jax.random.uniform(jax.random.fold_in(key, place), shape, minval=-1, maxval=1, dtype=float)
     return with_noise(features, chunk, scales, drawn)

@@ -1,5 +1,6 @@
 """The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals."""
 
+import functools
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from .._custom_types import Key, Numeric, Scalar, as_float
 from .._xla import quick_jit
 from ..errors import TrainingError
 from .architecture import LEVELS, ErrorTable, Regressor, Scaling, compress, first_regressor, loss
-from .features import CHUNK, Features, Flights, Pair, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
+from .features import CHUNK, Features, Flights, Purpose, draw_chunks, noisy_chunks, place_of, with_noise
 
 if TYPE_CHECKING:
     import optax  # `_optimiser` imports it, because it is slow to import
@@ -47,9 +48,9 @@ def untrained(features: Features, settings: "NetworkEstimator", key: Key) -> tup
 
 @quick_jit
 def _untrained(
-    features: Features, chunks: list[Pair], scales: Float[Numeric, "2"], key: Key, shape: dict[str, Any]
+    features: Features, chunks: list[Flights], scales: Float[Numeric, "2"], key: Key, shape: dict[str, Any]
 ) -> tuple[Scaling, Regressor]:
-    samples = jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
+    samples = _joined(chunks)
     # The score's own derivatives give the bound.
     factor = features.noise_factor
     if factor is None:
@@ -125,7 +126,7 @@ def _advance(
     state: PyTree,
     data: tuple[Scaling, Features, Float[Array, "2"]],
     chunks: list[Flights],
-    held_out: list[Pair],
+    held_out: list[Flights],
     key: Key,
     places: Int[Numeric, " steps"],
     rates: Float[Numeric, " steps"],
@@ -134,14 +135,13 @@ def _advance(
 ) -> tuple[Regressor, PyTree, Scalar, Scalar]:
     """The first `count` steps of training, their mean loss, and the loss on `held_out` flights."""
     scaling, features, scales = data
-    flights = Flights(*(jnp.concatenate(parts).astype(jnp.float32) for parts in zip(*chunks, strict=True)))
-    validation = Pair(*map(jnp.concatenate, zip(*held_out, strict=True)))
+    flights = jax.tree.map(lambda x: x.astype(jnp.float32), _joined(chunks))
 
-    def mean_loss(regressor: Regressor, pairs: Pair) -> Scalar:
-        flown = jnp.isfinite(pairs.features).all(axis=1)
+    def mean_loss(regressor: Regressor, flights: Flights) -> Scalar:
+        flown = jnp.isfinite(flights.features).all(axis=1)
         # NaN would make the gradient NaN even at a weight of 0.
-        finite = pairs._replace(features=jnp.where(flown[:, None], pairs.features, 0.0))
-        losses = jax.vmap(lambda pair: loss(regressor, scaling, *pair))(finite)
+        finite = jnp.where(flown[:, None], flights.features, 0.0)
+        losses = jax.vmap(functools.partial(loss, regressor, scaling))(finite, flights.scale, flights.u)
         return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
 
     def step(i: Int[Array, ""], carry: tuple[PyTree, PyTree, Scalar]) -> tuple[PyTree, PyTree, Scalar]:
@@ -151,15 +151,19 @@ def _advance(
             jax.random.fold_in(key, places[i]), (batch, 2 + features.size), jnp.float32, minval=-1, maxval=1
         )
         picked = ((drawn[:, 0] + 1) / 2 * flights.u.shape[0]).astype(int)
-        pairs = with_noise(features, jax.tree.map(lambda leaf: leaf[picked], flights), scales, drawn[:, 1:])
-        value, gradient = jax.value_and_grad(lambda weights: mean_loss(eqx.combine(weights, rest), pairs))(weights)
+        noisy = with_noise(features, jax.tree.map(lambda leaf: leaf[picked], flights), scales, drawn[:, 1:])
+        value, gradient = jax.value_and_grad(lambda weights: mean_loss(eqx.combine(weights, rest), noisy))(weights)
         updates, state = _optimiser(rates[i]).update(gradient, state, weights)
         return eqx.apply_updates(weights, updates), state, total + value
 
     weights, rest = eqx.partition(regressor, eqx.is_inexact_array)
     weights, state, total = jax.lax.fori_loop(0, count, step, (weights, state, jnp.zeros((), jnp.float32)))
     regressor = eqx.combine(weights, rest)
-    return regressor, state, total / count, mean_loss(regressor, validation)
+    return regressor, state, total / count, mean_loss(regressor, _joined(held_out))
+
+
+def _joined(chunks: list[Flights]) -> Flights:
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
 
 
 @quick_jit
@@ -214,8 +218,8 @@ def calibrate(
 
 @quick_jit
 def _standardised(
-    regressor: Regressor, scaling: Scaling, pairs: Pair, scale: Scalar
+    regressor: Regressor, scaling: Scaling, flights: Flights, scale: Scalar
 ) -> Float[Array, "flights unknowns"]:
     """Errors in units of the standard deviation that the network gives, at one noise scale."""
-    output = jax.vmap(regressor, in_axes=(0, None, None))(pairs.features, scale, scaling)
-    return (output.u - pairs.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
+    output = jax.vmap(regressor, in_axes=(0, None, None))(flights.features, scale, scaling)
+    return (output.u - flights.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
