@@ -206,7 +206,6 @@ SETTINGS = [
     (jaxos4.EquationError, "bridge", [-1], "must be an integer of at least 0"),
     (jaxos4.RecursiveLeastSquares, "forgetting", [0.0, 1.1], "must be positive and finite and at most 1"),
     (jaxos4.RecursiveLeastSquares, "memory", [2.0], "must be finite and at least 0 and at most 1"),
-    (jaxos4.SVSF, "gamma", [1.0, -0.1, np.nan], "must be finite and at least 0 and at most 0.999"),
     (jaxos4.SVSF, "rates_layer", [0.0], "must be positive and finite"),
     (jaxos4.SVSF, "parameter_layer", [-1.0], "must be positive and finite"),
     (jaxos4.SVSF, "damping", [np.inf], "must be positive and finite"),

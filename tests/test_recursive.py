@@ -189,8 +189,8 @@ def test_a_free_start_or_missing_samples_only_cost_precision(free, covered):
 # The corrections themselves.
 
 
-def plain(states, omega, center, *, gamma, rates_layer, parameter_layer, damping, equilibration):
-    """One pass in plain NumPy from the printed equations, with the one-step influence by finite differences."""
+def plain(states, omega, center, *, rates_layer, parameter_layer, damping, equilibration):
+    """One pass in plain NumPy from the printed equations, with derivatives by finite differences."""
     sigma = jaxos4.SENSOR_SIGMA[RATES]
 
     def step(x, u, row):
@@ -198,7 +198,7 @@ def plain(states, omega, center, *, gamma, rates_layer, parameter_layer, damping
         full[RATES] = x
         return x + DT * published_derivative(full, row, center + u * HALF)[RATES]
 
-    x, u, remaining, phi, energy, history = np.zeros(3), np.zeros(8), np.zeros(3), np.zeros((3, 8)), np.zeros(8), []
+    x, u, phi, energy, history = np.zeros(3), np.zeros(8), np.zeros((3, 8)), np.zeros(8), []
     for k, y in enumerate(states):
         seen = ~np.isnan(y) & (k > 0)
         e = np.where(seen, y - x, 0.0)
@@ -212,11 +212,13 @@ def plain(states, omega, center, *, gamma, rates_layer, parameter_layer, damping
         layer = parameter_layer * np.sqrt((inverse**2) @ sigma**2)
         with np.errstate(divide="ignore", invalid="ignore"):
             sat = np.where(layer > 0, np.clip(w / layer, -1, 1), 0)
-        x = x + (np.abs(e) + gamma * remaining) * np.clip(e / (rates_layer * sigma), -1, 1)
-        u = np.clip(u + unit * (np.abs(w) + gamma * np.abs(w)) * sat, -4, 4)
-        remaining = np.where(seen, np.abs(y - x), remaining)
+        gain = np.minimum(np.abs(e) / (rates_layer * sigma), 1)
+        x = x + gain * e
+        u = np.clip(u + unit * np.abs(w) * sat, -4, 4)
         history.append(center + u * HALF)
-        phi = np.stack([(step(x, u + d, omega[k]) - step(x, u - d, omega[k])) / 2 for d in np.eye(8)], axis=1)
+        by_x = np.stack([(step(x + d, u, omega[k]) - step(x - d, u, omega[k])) / 2 for d in np.eye(3)], axis=1)
+        by_u = np.stack([(step(x, u + d, omega[k]) - step(x, u - d, omega[k])) / 2 for d in np.eye(8)], axis=1)
+        phi = by_u + by_x @ ((1 - gain)[:, None] * phi)
         x = step(x, u, omega[k])
     return np.stack(history)
 
@@ -228,8 +230,8 @@ def test_agrees_with_plain_numpy():
     center = np.asarray(random_starts(PUBLISHED(), 1, seed=4)[0])
     problem = standard_problem(channels="rates", duration=1.0, states=jnp.asarray(states))
     # Narrow layers, so that corrections leave them too.
-    settings = {"gamma": 0.3, "rates_layer": 2.0, "parameter_layer": 2.0, "damping": 8.0, "equilibration": 20.0}
-    history = SVSF(**settings, passes=1, memory=False)(problem, jaxos4.Bracket.around(center, HALF)).history
+    settings = {"rates_layer": 2.0, "parameter_layer": 2.0, "damping": 8.0, "equilibration": 20.0}
+    history = SVSF(**settings, passes=1)(problem, jaxos4.Bracket.around(center, HALF)).history
     assert history is not None
     expected = plain(states[:, RATES], np.asarray(problem.flight.omega), center, **settings)
     np.testing.assert_allclose(history / HALF, expected / HALF, atol=1e-9)

@@ -3,12 +3,13 @@
 Let e be the measured minus the predicted rates, and w = Phi12^+ e the change of the parameters that would have made
 the prediction right. The filter corrects rates and parameters element by element:
 
-    rates:       (|e| + gamma |e_before|) sat(e / psi_rates)
-    parameters:  (|w| + gamma |w|) sat(w / psi_parameters)
+    rates:       |e| sat(e / psi_rates)
+    parameters:  |w| sat(w / psi_parameters)
 
-where e_before is the residual after the last correction. This is Habibi's filter for fewer measurements than states:
-Phi12 is the derivative of the rates with respect to the parameters, and Phi22 = 1, because parameters are constant.
-Habibi divides by e and multiplies by it again; this code does neither, so that e = 0 is no special case.
+This is Habibi's filter for fewer measurements than states, with gamma = 0: Phi12 is the derivative of the rates with
+respect to the parameters, and Phi22 = 1, because parameters are constant. Habibi divides by e and multiplies by it
+again; this code does neither, so that e = 0 is no special case. Phi12 is the derivative of a prediction through all
+corrections before it. In Habibi's paper it is that of one step alone, whose errors are small compared with the noise.
 """
 
 import functools
@@ -32,7 +33,6 @@ _AVERAGED = 0.5  # the share of the last pass over which the parameters are aver
 class _Filter(NamedTuple):
     """The filter before a measurement; parameters in half-widths from the bracket's center.
 
-    - `residual`: size of the rates' error after the last correction.
     - `influence`: Phi12, the derivative of the rates with respect to the parameters.
     - `energy`: the squared influence of each parameter, summed over `samples` so far.
     - `covariance`: of the errors of rates, parameters, and the parameters' average.
@@ -40,7 +40,6 @@ class _Filter(NamedTuple):
 
     rates: Float[Array, "3"]
     parameters: Parameters
-    residual: Float[Array, "3"]
     influence: Float[Array, "3 parameters"]
     energy: Float[Array, " parameters"]
     samples: Float[Array, ""]
@@ -52,7 +51,6 @@ class SVSF(AbstractRecursion):
 
     **Arguments:**
 
-    - `gamma`: how much of its size an error outside the boundary layer keeps from sample to sample, 0 to 0.999.
     - `rates_layer`: boundary layer of the rates, in multiples of the problem's sigma.
     - `parameter_layer`: boundary layer of the parameters, in multiples of the noise of w from one sample.
     - `damping`: of the pseudo-inverse, in multiples of a parameter's root mean square influence. Phi12 maps 3 errors
@@ -60,8 +58,6 @@ class SVSF(AbstractRecursion):
     - `equilibration`: the pseudo-inverse has least norm in half-widths, multiplied by up to this factor for parameters
       with less influence than the greatest. With 1, the gyroscopic terms hardly move.
     - `passes`: number of passes over the flight. Each begins with the parameters of the pass before (iterative SVSF).
-    - `memory`: whether Phi12 is the derivative of a prediction through all corrections before it (`True`), or of one
-      step alone, as in Habibi's paper, whose errors are small compared with the noise.
 
     The answer is the mean of the parameters over the second half of the last pass; `history` holds the parameters of
     that pass. Only the body rates are used. A free initial state is fitted to the parameters at the end.
@@ -77,13 +73,11 @@ class SVSF(AbstractRecursion):
     looks_at: ClassVar[str] = "rates"
     prior: ClassVar[float] = GAUSSIAN_PRIOR
 
-    gamma: Scalar = eqx.field(converter=setting("gamma", high=0.999), default=0.0)
     rates_layer: Scalar = eqx.field(converter=setting("rates_layer", positive=True), default=110.0)
     parameter_layer: Scalar = eqx.field(converter=setting("parameter_layer", positive=True), default=50.0)
     damping: Scalar = eqx.field(converter=setting("damping", positive=True), default=3.0)
     equilibration: Scalar = eqx.field(converter=setting("equilibration", low=1.0), default=150.0)
     passes: int = eqx.field(static=True, converter=integer("passes", 1, static=True), default=4)
-    memory: bool = eqx.field(static=True, default=True)
 
     def identify(self, problem: ShootingProblem) -> Estimate:
         """See `AbstractRecursion`."""
@@ -99,7 +93,6 @@ class SVSF(AbstractRecursion):
         at_center = _Filter(
             rates=start[0],
             parameters=jnp.zeros(count, dtype=float),
-            residual=jnp.zeros(3, dtype=float),
             influence=jnp.zeros((3, count), dtype=float),
             energy=jnp.zeros(count, dtype=float),
             samples=jnp.zeros((), dtype=float),
@@ -136,7 +129,7 @@ class SVSF(AbstractRecursion):
         self, problem: ShootingProblem, box: Unknowns, before: _Filter, row: Rows, share: Float[Array, ""]
     ) -> tuple[_Filter, Parameters]:
         """Corrects with one measurement and predicts the next; returns the parameters after the correction too."""
-        rates, parameters, residual, influence, energy, _, covariance = before
+        rates, parameters, influence, energy, _, covariance = before
         sigma, count = problem.sigma[CASCADE_ORDER[:3]], parameters.shape[0]
         measured = jnp.stack(row.measured)
         valid = ~jnp.isnan(measured)
@@ -155,11 +148,10 @@ class SVSF(AbstractRecursion):
         noise = jnp.sqrt(jnp.square(inverse * sigma).sum(axis=1))
         layer = self.parameter_layer * jnp.where(noise > 0, noise, 1.0)
 
-        rate_gain, rate_slope = _gain(error, self.gamma * residual, self.rates_layer * sigma)
-        gain, slope = _gain(change, 0.0, layer)
+        rate_gain, rate_slope = _gain(error, self.rates_layer * sigma)
+        gain, slope = _gain(change, layer)
         rates = rates + rate_gain * error
-        parameters = jnp.clip(parameters + (1 + self.gamma) * unit * gain * change, -REACH, REACH)
-        residual = jnp.where(valid, jnp.abs(measured - rates), residual)
+        parameters = jnp.clip(parameters + unit * gain * change, -REACH, REACH)
 
         def advance(x: Float[Array, "3"], u: Parameters) -> Float[Array, "3"]:
             return stack(problem.step(unstack(x), row.forcing, tuple(box.center + box.width * u)))
@@ -167,11 +159,11 @@ class SVSF(AbstractRecursion):
         following = advance(rates, parameters)
         by_rates, by_parameters = jax.jacfwd(advance, argnums=(0, 1))(rates, parameters)
         remembered = jnp.where(valid, 1 - rate_gain, 1.0)[:, None] * influence
-        influence = by_parameters + (_product(by_rates, remembered) if self.memory else 0.0)
+        influence = by_parameters + (_product(by_rates, remembered))
 
         # Errors and noise pass through the slope of each correction.
         correct_rates = jnp.diag(jnp.where(valid, rate_slope, 0.0))
-        correct_parameters = ((1 + self.gamma) * unit * slope)[:, None] * inverse
+        correct_parameters = (unit * slope)[:, None] * inverse
         correct = jnp.concatenate([correct_rates, correct_parameters, jnp.zeros((count, 3), dtype=float)])
         identity = jnp.eye(3 + 2 * count, dtype=float)
         advanced = identity.at[:3, :3].set(by_rates).at[:3, 3 : 3 + count].set(by_parameters)
@@ -180,17 +172,13 @@ class SVSF(AbstractRecursion):
         passing = advanced.at[:, :3].add(-entering)
         added = _product(jnp.square(sigma) * entering, entering.T)
         covariance = _product(_product(passing, covariance), passing.T) + added
-        return _Filter(following, parameters, residual, influence, energy, samples, covariance), parameters
+        return _Filter(following, parameters, influence, energy, samples, covariance), parameters
 
 
-def _gain(
-    error: Float[Array, " n"], before: Float[Array, " n"] | float, layer: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """K and d/d error of K error = (|error| + before) sat(error / layer)."""
-    size = jnp.abs(error)
-    outside = size > layer
-    gain = (size + before) / jnp.where(outside, size, layer)
-    return gain, jnp.where(outside, 1.0, (2 * size + before) / layer)
+def _gain(error: Float[Array, " n"], layer: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """K and d/d error of K error = |error| sat(error / layer)."""
+    share = jnp.abs(error) / layer
+    return jnp.minimum(share, 1.0), jnp.where(share > 1, 1.0, 2 * share)
 
 
 _product = functools.partial(jnp.matmul, precision="highest")
