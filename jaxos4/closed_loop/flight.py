@@ -13,7 +13,8 @@ from .._custom_types import Key, Numeric, Scalar, as_float, setting
 from .._xla import quick_jit
 from ..airframe import alpha_scalars
 from ..flight import Flight
-from ..models.state import Attitude, Rates, Vector, attitude_rates
+from ..models.os4 import CorrectedOS4
+from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
@@ -101,15 +102,13 @@ def fly_standard(
 
 
 class _Acting(NamedTuple):
-    """Torque, forces and wind that act on the vehicle for a step.
+    """What acts on the vehicle for a step.
 
-    Torque [N m], thrust over the mass [m/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind
-    along the body's axes [m/s].
+    The rotors and Omega_r' [rad/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind along the
+    body's axes [m/s].
     """
 
-    torque: Vector
-    thrust: Scalar
-    residual_speed: Scalar
+    rotors: Forcing
     spin_up: Scalar
     gust: tuple[Scalar, ...]
     wind: Vector | None
@@ -136,13 +135,11 @@ class _Vehicle(NamedTuple):
 
     def cascade(self, state: Motion, forcing: _Acting, parameters: None) -> Motion:
         """The derivative of the motion: Newton and Euler in the body's axes."""
-        (p, q, r), (a1, a2, a3, a4, a5, a6, a7, a8) = state.rates, self.alpha
-        (roll, pitch, yaw), spinning, gust = forcing.torque, forcing.residual_speed, forcing.gust
-        turning = Rates(
-            q * r * a1 - a2 * spinning * q + a3 * roll + gust[0] - self.damping[0] * p,
-            p * r * a4 + a5 * spinning * p + a6 * pitch + gust[1] - self.damping[1] * q,
-            p * q * a7 + a8 * yaw + gust[2] - self.damping[2] * r - self.reaction * forcing.spin_up,
-        )
+        p, q, r = state.rates
+        turning = CorrectedOS4().angular_acceleration(state.rates, forcing.rotors, self.alpha)
+        each = zip(turning, forcing.gust[:3], self.damping, state.rates, strict=True)
+        turning = Rates(*(total + gust - damping * rate for total, gust, damping, rate in each))
+        turning = turning._replace(r=turning.r - self.reaction * forcing.spin_up)
         attitude = attitude_rates(state.rates, state.attitude)
         if state.velocity is None or forcing.wind is None:
             return Motion(turning, attitude, None)
@@ -160,7 +157,7 @@ class _Vehicle(NamedTuple):
 
     def specific_force(self, velocity: Vector | None, forcing: _Acting) -> Vector:
         """The specific force along the body's axes [m/s^2]: thrust, gust, and drag through the air."""
-        thrust = forcing.thrust + forcing.gust[3]
+        thrust = forcing.rotors.thrust + forcing.gust[3]
         if velocity is None or forcing.wind is None:
             return jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust
         x, y, z = (drag * (wind - v) for drag, v, wind in zip(self.drag, velocity, forcing.wind, strict=True))
@@ -221,9 +218,9 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     part = loop.rotor_delay / period - late
 
     def acting(weak, squares, residual, spin_up, gust, wind) -> _Acting:
-        *torque, thrust = weak * (mixer @ squares)
-        wind = None if wind is None else tuple(wind)
-        return _Acting(tuple(torque), thrust / airframe.mass, residual, spin_up, tuple(gust), wind)
+        roll, pitch, yaw, thrust = weak * (mixer @ squares)
+        rotors = Forcing(roll, pitch, yaw, thrust / airframe.mass, residual)
+        return _Acting(rotors, spin_up, tuple(gust), None if wind is None else tuple(wind))
 
     def run(carry: _Carry, row):
         k, reference, draw = row

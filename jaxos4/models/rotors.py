@@ -82,17 +82,6 @@ class Speeds(NamedTuple):
     change: RotorSpeeds
 
 
-class SquaredSpeeds(NamedTuple):
-    """The thrust of each rotor divided by b [rad^2/s^2].
-
-    `mean`: over the sample. `around`: at the begin of the sample, where measurements are; the mean before and after a
-    jump.
-    """
-
-    mean: RotorSpeeds
-    around: RotorSpeeds
-
-
 def measured_speeds(omega: Commands, part: Part) -> Speeds:
     """Speeds that are held over each sample. The last row of a stretch changes nothing."""
     speed = omega(part.rows)
@@ -100,12 +89,16 @@ def measured_speeds(omega: Commands, part: Part) -> Speeds:
     return Speeds(speed, speed, following - speed)
 
 
-def squared(speeds: Speeds, part: Part) -> SquaredSpeeds:
-    """Squares of speeds that change linearly over a sample: the mean square makes the mean torque."""
+def squared(speeds: Speeds, part: Part) -> tuple[RotorSpeeds, RotorSpeeds]:
+    """The thrust of each rotor divided by b [rad^2/s^2], of speeds that change linearly over a sample.
+
+    **Returns:** the mean over the sample, which makes the mean torque; and that at the begin of the sample, where
+    measurements are: the mean before and after a jump.
+    """
     begin, end, _ = speeds
     before = jnp.concatenate([part.before[None], end[:-1]])
     before = jnp.where(part.is_first[:, None], begin, before)
-    return SquaredSpeeds((begin * begin + begin * end + end * end) / 3, (before * before + begin * begin) / 2)
+    return (begin * begin + begin * end + end * end) / 3, (before * before + begin * begin) / 2
 
 
 def delayed(omega: Commands, delay: Scalar, grid: Grid) -> Commands:

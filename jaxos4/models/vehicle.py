@@ -157,8 +157,8 @@ class FlightModel(AbstractModel):
             omega = change(omega, values, grid)
         drive, values = next(iter(self._contributions("speed", parameters)), (None, {}))
         speeds = drive(omega(part.rows), values, part, airframe) if drive else measured_speeds(omega, part)
-        squares = squared(speeds, part)
-        roll, pitch, yaw, thrust = (squares.mean @ airframe.mixer.T).T
+        mean, around = squared(speeds, part)
+        roll, pitch, yaw, thrust = (mean @ airframe.mixer.T).T
         spins, mass = jnp.asarray(airframe.rotor_spins), airframe.mass
         found = Forcing(
             roll=roll,
@@ -167,7 +167,7 @@ class FlightModel(AbstractModel):
             thrust=thrust / mass,
             residual_speed=(speeds.begin + speeds.end) @ spins / 2,
             spin_up=speeds.change @ spins / inputs.dt,
-            specific_thrust=squares.around.sum(axis=1) * airframe.thrust_coefficient / mass,
+            specific_thrust=around.sum(axis=1) * airframe.thrust_coefficient / mass,
         )
         return found, speeds.end[-1]
 
@@ -267,13 +267,11 @@ class FlightModel(AbstractModel):
 
         return {name: of_recording(values) for name, values in found.items()}
 
-    def _needs(self, need: str) -> bool:
-        return any(need in term.needs for term in self._terms)
-
     def _with_velocity(self, forcing: Forcing, state: State) -> Forcing:
         """Take the body velocity from `state` if a term needs it and it was not measured."""
         t, attitude = state.translation, state.attitude
-        if not self._needs(VELOCITY) or forcing.velocity is not None or attitude is None or t is None:
+        needed = any(VELOCITY in term.needs for term in self._terms)
+        if not needed or forcing.velocity is not None or attitude is None or t is None:
             return forcing
         return forcing._replace(velocity=to_body(attitude, (t.vx, t.vy, t.vz)))
 
