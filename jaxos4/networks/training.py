@@ -1,6 +1,5 @@
 """The training of a network on simulated flights: first a linear map, then the loop, then calibrated intervals."""
 
-import functools
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -141,7 +140,7 @@ def _advance(
         flown = jnp.isfinite(flights.features).all(axis=1)
         # NaN would make the gradient NaN even at a weight of 0.
         finite = jnp.where(flown[:, None], flights.features, 0.0)
-        losses = jax.vmap(functools.partial(loss, regressor, scaling))(finite, flights.scale, flights.u)
+        losses = jax.vmap(lambda *one: loss(regressor, scaling, *one))(finite, flights.scale, flights.u)
         return jnp.where(flown, losses, 0.0).sum() / jnp.maximum(flown.sum(), 1)
 
     def step(i: Int[Array, ""], carry: tuple[PyTree, PyTree, Scalar]) -> tuple[PyTree, PyTree, Scalar]:
