@@ -53,15 +53,15 @@ class Estimate(eqx.Module):
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
     - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own); infinite without
       an estimate.
-    - `rollouts`: number of simulated flights, on any channels: one for a shot with its slope, one for each
-      unknown of a Fisher information.
+    - `rollouts`: the work in simulated flights, on any channels: one for a shot, and one for each of its derivatives.
+      IBSS, and the fit of an initial state alone, count the derivatives only.
     - `sweeps`: number of iterations, summed over the stages.
     - `result`: how the search ended.
     - `calibration`: of the intervals, if they were calibrated on simulated flights; `None` means Gaussian.
     - `seed`: the bracket that the search began from, if another estimator gave one.
     - `history`: the parameters after each sample, from a recursive estimator.
-    - `brackets`: the lower and upper end of each parameter's bracket in each sweep, from an estimator that records
-      them; NaN after the last sweep.
+    - `brackets`: the lowest and highest value of each parameter inside the brackets that each sweep opens, from an
+      estimator that records them; NaN after the last sweep.
     - `parts`: the likelihood of each part of the flight, from a problem whose parts are compared.
     """
 

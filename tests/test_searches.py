@@ -43,6 +43,22 @@ def test_both_kinds_of_directions_reach_the_maximum_of_the_likelihood(directions
         assert np.abs((estimates.parameters - best) / bound()).max() < most
 
 
+def test_recorded_brackets_close_in_on_the_estimate():
+    """They are recorded as each sweep opened them. That of a held parameter has no width."""
+    problem = standard_problem(states=noisy_states(1)[0], channels="rates")
+    bracket = jaxos4.Bracket.around(problem.model.alpha + 0.5 * HALF, HALF)
+    found = jaxos4.IBSS(record=20)(problem.hold({"alpha2": 0.0}), bracket)
+    sweeps, brackets = int(found.sweeps), np.asarray(found.brackets)
+    assert 3 < sweeps < 20
+    assert np.isnan(brackets[sweeps:]).all()
+    (lower, upper), held = brackets[:sweeps].swapaxes(0, 1), np.asarray(problem.model.parameter_names) == "alpha2"
+    assert (lower[:, held] == 0).all()
+    assert (upper[:, held] == 0).all()
+    assert (lower[:, ~held] < upper[:, ~held]).all()
+    assert ((lower[-1] <= found.parameters) & (found.parameters <= upper[-1])).all()
+    assert ((upper - lower)[-1] < (upper - lower)[0])[~held].all()
+
+
 def test_rollouts_are_counted_right():
     """Each simulated step calls back with its torque; the first torque starts a shot, on however many samples."""
     torques = []

@@ -1,7 +1,7 @@
 """The parts of IBSS: a stage, the directions of a sweep, and the brackets along them.
 
 All steps are in standard deviations. The unknowns of a window are the shared ones, then its own initial state.
-Directions are in the opposite order, so that a step along a parameter carries the initial states to where they fit.
+Its directions are those of the initial state, then the shared ones, which carry the initial state to where it fits.
 """
 
 import functools
@@ -19,15 +19,14 @@ from ..shooting.abstract import WindowUnknowns
 Flag = Bool[Array, ""]
 PerDirection = Float[Array, "windows n"]
 
-_STRIDE = 0.1  # the information that keeps predicted steps along an unknown with a stride short, see `Unknowns`
+_STRIDE_INFORMATION = 0.1  # in units of 1/stride^2: along a stride the information misjudges the curvature
 
 
 class Stage(NamedTuple):
     """A stage of a problem, see `Stages`.
 
-    - `searched`: the unknowns that this stage can find. `limits`: of all unknowns.
-    - `evaluate`: the cost of its data with gradient and information. `misfit`: how large the residuals are, in sigma.
-    - `prior`: the information about unknowns of which the cost has no prior.
+    - `evaluate`, `misfit`, `searched`, `smallest_step`: those of `Stages` for this stage. `limits`: of all unknowns.
+    - `added_information`: of directions, not of the cost: for unknowns without a prior, and to keep strides short.
     """
 
     problem: AbstractProblem
@@ -36,16 +35,15 @@ class Stage(NamedTuple):
     misfit: Callable[[Scalar], Scalar]
     searched: Bool[Array, " unknowns"]
     smallest_step: Scalar
-    prior: Float[Array, "windows unknowns unknowns"]
+    added_information: Float[Array, "windows unknowns unknowns"]
     limits: tuple[WindowUnknowns, WindowUnknowns]
 
     @classmethod
     def of(cls, problem: AbstractProblem, stages: Stages, number: Count, reach: Scalar) -> "Stage":
         """The stage of this number, whose search goes at most `reach` half-widths from the bracket's center."""
         unknowns, prior = problem.unknowns, 1 / jnp.square(prior_std(problem))
-        # A cost with a prior of its own needs no other, but the information misjudges the curvature along a stride.
-        own, least = unknowns.precision > 0, _STRIDE / jnp.square(unknowns.stride)
-        shared = jnp.where(own, least, prior[:, : unknowns.count] / problem.windows)
+        of_stride = _STRIDE_INFORMATION / jnp.square(unknowns.stride)
+        shared = jnp.where(unknowns.precision > 0, of_stride, prior[:, : unknowns.count] / problem.windows)
         return cls(
             problem=problem,
             last=number == stages.number - 1,
@@ -53,7 +51,7 @@ class Stage(NamedTuple):
             misfit=functools.partial(stages.misfit, number),
             searched=stages.searched[number],
             smallest_step=stages.smallest_step[number],
-            prior=prior.at[:, : unknowns.count].set(shared)[:, :, None] * np.eye(prior.shape[1]),
+            added_information=prior.at[:, : unknowns.count].set(shared)[:, :, None] * np.eye(prior.shape[1]),
             limits=problem.limits(reach),
         )
 
@@ -77,8 +75,8 @@ class Brackets(NamedTuple):
     """The bracket along each direction, as steps from where the sweep began.
 
     - `predicted`: the predicted step to the minimum.
-    - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: those of the part that may still
-      hold the minimum.
+    - `lowest`, `highest`: the ends of the bracket as it was opened. `lower`, `upper`: those of the part that no slope
+      has excluded; both at one opened end if the minimum lies beyond it.
     - `trial`, `last`: the steps of the next and of the last shot. `slope`, `rate`: the slope there, and its change.
     """
 
@@ -96,22 +94,21 @@ class Brackets(NamedTuple):
     def around(cls, predicted: PerDirection, half_width: PerDirection, below: PerDirection, above: PerDirection):
         """Brackets around predicted steps. The first trials are their middles, the rates those of unit information."""
         predicted = jnp.clip(jnp.nan_to_num(predicted), -below, above)
-        lowest = jnp.maximum(predicted - half_width, -below)
-        highest = jnp.minimum(predicted + half_width, above)
+        lowest, highest = jnp.maximum(predicted - half_width, -below), jnp.minimum(predicted + half_width, above)
         middle, zero = (lowest + highest) / 2, jnp.zeros_like(lowest)
         return cls(predicted, lowest, highest, lowest, highest, middle, middle, zero, jnp.ones_like(lowest))
 
-    def halved(self, slope: PerDirection) -> "Brackets":
+    def narrowed(self, slope: PerDirection) -> "Brackets":
         """The brackets after a shot at their trials: **the sign of the slope decides**, the secant proposes.
 
-        The next trial is the zero of a line through the last two slopes, or the middle if that is outside.
+        The next trial is where a line through the last two slopes is zero. If that lies outside of the bracket, it is
+        the end there, or the middle if a shot has moved that end.
         """
         lower = jnp.where(slope <= 0, self.trial, self.lower)
         upper = jnp.where(slope >= 0, self.trial, self.upper)
         secant = (slope - self.slope) / (self.trial - self.last)
         rate = jnp.where((secant > 0) & jnp.isfinite(secant), secant, self.rate)
         zero = self.trial - slope / rate
-        # An end that no shot has moved yet may be tried itself.
         outside = ((zero <= lower) & (lower > self.lowest)) | ((zero >= upper) & (upper < self.highest))
         following = jnp.where(outside, (lower + upper) / 2, jnp.clip(zero, lower, upper))
         return self._replace(lower=lower, upper=upper, trial=following, last=self.trial, slope=slope, rate=rate)

@@ -1,7 +1,7 @@
 """Iterative Bi-Section Shooting (IBSS): halve brackets on the slope of the trajectory mismatch.
 
 The paper names the method but does not give its steps; the steps here are our choice (docs/method/ibss.md). They are
-the five brackets of `IBSS.sweep`.
+the five calls in `IBSS.sweep`.
 """
 
 import functools
@@ -10,7 +10,6 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Count, InitialStates, Parameters, Scalar, integer, setting
@@ -22,19 +21,19 @@ from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
 from ..shooting.abstract import WindowUnknowns
 from .bisection import Brackets, Directions, Flag, PerDirection, Stage, prior_std
 
-FACTORS = {"whitened": joint_factor, "coordinate": coordinate_directions}
+KINDS_OF_DIRECTIONS = {"whitened": joint_factor, "coordinate": coordinate_directions}
 
 _COARSE = 0.5  # a stage that is not the last ends once no direction has more than this many standard deviations to go
-# The first brackets reach this many of the start's standard deviations, in brackets of this share of them.
+# The first sweep of a stage goes so many standard deviations of its start at most; brackets reach this share of them.
 _OPENING, _FIRST = 4.0, 0.05
-# A later bracket is the last relative error of the predictions, at least the second number, times the first.
-_SAFETY, _LEAST = 2.0, 0.01
-_GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose search ended at one of its ends, and of all together
+# Later half-widths are this many times the last error of the predictions. Both are shares of the longest step; that of
+# the half-width is at least the second number, and at most 1.
+_SAFETY, _NARROWEST = 2.0, 0.01
+_GROWTH, _WIDEST = 4.0, 256.0  # of a bracket whose last shot was at one of its ends, and of all together
 _CHANCE = 1.0  # a sweep that raises the cost by no more may have done so by chance
-# A vehicle's cost has kinks, at which no slope is small. A sweep of at most so many standard deviations that lowers the
-# cost by no more than the second number has found the minimum.
+# A sweep of at most so many standard deviations that lowers the cost by no more than the second number has stalled.
 _SHORT, _GAIN = 0.3, 1e-4
-# After a sweep that raised the cost, the next may go this share as far, and after any other this many times as far.
+# After a rejected sweep, the next may go this share as far, and after any other this many times as far.
 _RETREAT, _ADVANCE = 0.25, 1.4
 
 
@@ -43,37 +42,38 @@ class State(NamedTuple):
 
     - `unknowns`, `curvature`: where it is, and the curvature of the cost there.
     - `spread`: the covariance of the unknowns, which sizes the first brackets of a stage.
-    - `error`: how far the last predictions were off, as a share of the longest step. `growth`: by how much each
-      direction's bracket is wider than this error asks for.
-    - `trust`: the share of the longest predicted step that a sweep may go.
-    - `sweep`: the number of the next sweep in its stage; -1 for the first shot, which is at the start.
-    - `sweeps`, `rollouts`: how many sweeps bisected, and how many flights were simulated, in all stages.
-    - `done`: whether the stage ended by itself. `record`: the bracket of each parameter in each sweep.
+    - `relative_width`: the half-width of the next brackets, as a share of the longest step. `growth`: how many times as
+      wide each direction's bracket is.
+    - `trust`: the share of the longest predicted step that a sweep may go; 1: no limit.
+    - `number_in_stage`: of the next sweep; -1 for the first shot, which is at the start.
+    - `sweeps`, `rollouts`: how many sweeps shot, and `Estimate.rollouts`, in all stages so far.
+    - `done`: whether the stage ended by itself. `record`: see `Estimate.brackets`.
     """
 
     unknowns: WindowUnknowns
     curvature: Curvature
     spread: Float[Array, "windows unknowns unknowns"]
-    error: Scalar
+    relative_width: Scalar
     growth: PerDirection
     trust: Scalar
-    sweep: Count
+    number_in_stage: Count
     sweeps: Count
     rollouts: Count
     done: Flag
     record: Float[Array, "record 2 parameters"]
 
 
-# The narrowed brackets, the unknowns of the last shot and its curvature, and how many shots were made.
+_KEPT = ("unknowns", "curvature", "spread", "sweeps", "rollouts", "record")  # from stage to stage
+# What a sweep found: the brackets after its shots, the last shot's unknowns and curvature, and how many shots it took.
 Bisected = tuple[Brackets, WindowUnknowns, Curvature, Count]
 
 
 class IBSS(AbstractEstimator):
     """Iterative Bi-Section Shooting.
 
-    A *shot* simulates the flight at trial unknowns, with its derivatives. **The sign of the cost's slope along a
-    direction decides** which side of the trial holds the minimum, and so which part of the bracket is dropped. The
-    quadratic model of the cost and the secant through the last slopes only **propose** where to shoot. A *sweep* is one
+    A *shot* simulates the flight at trial unknowns, and gives the cost with its gradient and information. **The sign of
+    the cost's slope along a direction decides** which side of the trial holds the minimum, and so which part of the
+    bracket is dropped. The quadratic model and the secant through the last slopes only **propose**. A *sweep* is one
     iteration. A *stage* repeats sweeps on some of the data until the minimum is near; the last stage fits all of them.
     Parameters are bisected on the sum of all windows' slopes, initial states on those of their own window.
 
@@ -85,9 +85,9 @@ class IBSS(AbstractEstimator):
     - `halvings`: the shots of a sweep that narrow the brackets.
     - `max_sweeps`: the most sweeps of each stage; along coordinates, for each of them.
     - `tolerance`: the search ends once the minimum is at most this many standard deviations away along each
-      direction. They follow from the actual residuals, so the fit of noise-free data ends at rounding errors.
+      direction. These are scaled by the `misfit` of the residuals, so noise-free data are fitted to rounding errors.
     - `reach`: the search does not go further than this many half-widths from the bracket's center.
-    - `record`: how many sweeps' brackets the estimate keeps, to show how the search went.
+    - `record`: how many sweeps' brackets the estimate keeps.
     """
 
     looks_at: ClassVar[str] = "all"
@@ -103,8 +103,8 @@ class IBSS(AbstractEstimator):
     record: int = eqx.field(static=True, converter=integer("record", 0, static=True), default=0)
 
     def __check_init__(self):
-        if self.directions not in FACTORS:
-            raise ValueError(f"`directions` must be one of {', '.join(FACTORS)}, got {self.directions!r}.")
+        if self.directions not in KINDS_OF_DIRECTIONS:
+            raise ValueError(f"`directions` must be one of {', '.join(KINDS_OF_DIRECTIONS)}, got {self.directions!r}.")
 
     @quick_jit
     def __call__(
@@ -129,7 +129,7 @@ class IBSS(AbstractEstimator):
         self,
         problem: AbstractProblem,
         start: Float[Array, " unknowns"] | None = None,
-        spread: Float[Array, "known known"] | None = None,
+        spread: Float[Array, "given given"] | None = None,
         *,
         initial_state: InitialStates | None = None,
         cascade: Flag | bool = True,
@@ -143,20 +143,20 @@ class IBSS(AbstractEstimator):
           bracket, with its half-width as two standard deviations.
         - `initial_state`: where the search for a free initial state begins; by default the first measurements.
         - `cascade`: whether to go through all stages. A `start` that is close needs the last one only.
-        - `skip`: whether to return the start without a search. Other lanes of the batch do not wait for this one.
+        - `skip`: whether to return no answer, without a shot. Other lanes of the batch do not wait for this one.
         """
-        known = problem.first_state()[0] if initial_state is None else initial_state
+        initial = problem.first_state()[0] if initial_state is None else initial_state
         stages = problem.stages(cascade=self.directions == "whitened")
 
         def from_one(start: Parameters) -> Estimate:
-            first = self.init(problem, stages, problem.join(start, known), spread, skip)
+            first = self.init(problem, stages, problem.join(start, initial), spread, skip)
 
             def fit(number: Count, state: State) -> State:
                 """One stage: sweeps from where the last stage ended."""
                 stage = Stage.of(problem, stages, number, self.reach)
-                anew = {name: getattr(first, name) for name in ("error", "growth", "trust", "sweep", "done")}
-                ongoing, sweep = lambda state: ~self.terminate(stage, state), functools.partial(self.sweep, stage)
-                return jax.lax.while_loop(ongoing, sweep, state._replace(**anew))
+                sweep = functools.partial(self.sweep, stage)
+                begin = first._replace(**{name: getattr(state, name) for name in _KEPT})
+                return jax.lax.while_loop(lambda state: ~self.terminate(stage, state), sweep, begin)
 
             # One loop, so that the search is compiled once for all stages.
             end = jax.lax.fori_loop(jnp.where(cascade, 0, stages.number - 1), stages.number, fit, first)
@@ -172,21 +172,21 @@ class IBSS(AbstractEstimator):
         unknowns = jnp.clip(start, *problem.limits(self.reach))
         covariance = jax.vmap(jnp.diag)(jnp.square(prior_std(problem)))
         if spread is not None:
-            known = np.s_[:, : spread.shape[0], : spread.shape[0]]
+            size = spread.shape[0]
             # A search that is skipped may have no finite spread.
-            covariance = covariance.at[known].set(jnp.where(skip, covariance[known], spread))
-        none = jnp.zeros((), dtype=int)
-        shapes = jax.eval_shape(stages.evaluate, none, unknowns)
+            covariance = covariance.at[:, :size, :size].set(jnp.where(skip, covariance[:, :size, :size], spread))
+        zero = jnp.zeros((), dtype=int)
+        shapes = jax.eval_shape(stages.evaluate, zero, unknowns)
         return State(
             unknowns=unknowns,
             curvature=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes),
             spread=covariance,
-            error=jnp.zeros((), dtype=float),
+            relative_width=jnp.zeros((), dtype=float),
             growth=jnp.ones_like(unknowns),
             trust=jnp.ones((), dtype=float),
-            sweep=none - 1,
-            sweeps=none,
-            rollouts=none,
+            number_in_stage=zero - 1,
+            sweeps=zero,
+            rollouts=zero,
             done=jnp.asarray(skip),
             record=jnp.full((self.record, 2, problem.unknowns.count), jnp.nan),
         )
@@ -201,61 +201,59 @@ class IBSS(AbstractEstimator):
 
     def terminate(self, stage: Stage, state: State) -> Flag:
         """Whether the stage has ended. After its last sweep it looks once more whether the minimum is near."""
-        return state.done | (state.sweep > self._most_sweeps(stage))
+        return state.done | (state.number_in_stage > self._most_sweeps(stage))
 
     def _look_around(self, stage: Stage, state: State) -> Directions:
         """1. Choose directions in which the cost is nearly separable, from its curvature where the sweep begins."""
         unknowns, curvature, count = state.unknowns, state.curvature, stage.problem.unknowns.count
         moves = movable(unknowns, curvature.gradient, stage.limits, count)
         information = jnp.where(moves[:, :, None] & moves[:, None, :], curvature.information, 0.0)
-        factor, basis = FACTORS[self.directions](information + stage.prior, count)
+        factor, basis = KINDS_OF_DIRECTIONS[self.directions](information + stage.added_information, count)
         lower, upper = (jnp.where(moves, limit, unknowns) for limit in stage.limits)
         return Directions(factor, basis, moves, *room_to_limits(unknowns, basis, (lower, upper)))
 
     def _predict(self, stage: Stage, state: State, directions: Directions) -> tuple[PerDirection, Flag]:
-        """2. The step to the minimum of the quadratic model, and whether all steps are so short that the stage ends.
-
-        The information along each direction is 1, so the step is minus the slope.
-        """
+        """2. The step to the quadratic model's minimum (minus the slope: the information is 1). Is it near?"""
         steps = jnp.clip(-self._slopes(stage, directions, state.curvature), -directions.below, directions.above)
-        return steps, (state.sweep >= 0) & self._is_near(stage, state.curvature, steps)
+        return steps, (state.number_in_stage >= 0) & self._is_near(stage, state.curvature, steps)
 
     def _open(self, stage: Stage, state: State, directions: Directions, predicted: PerDirection) -> Brackets:
         """3. Open a bracket around the predicted step in each direction."""
+        longest = jnp.abs(predicted).max()
         opening = _OPENING * jnp.sqrt(jnp.einsum("wud,wuv,wvd->wd", directions.factor, state.spread, directions.factor))
-        longest, is_first = jnp.abs(predicted).max(), state.sweep == 0
-        later = jnp.maximum(state.error * longest, stage.smallest_step) * state.growth
-        half_width = jnp.where(is_first, _FIRST * opening, later)
-        # How far this sweep may go. Before the first shot, which is at the start: nowhere.
-        furthest = jnp.where(is_first, opening, jnp.inf)
-        furthest = jnp.where(state.trust < 1, state.trust * longest, furthest)
-        furthest = jnp.where(state.sweep < 0, 0.0, furthest)
-        if self.directions == "coordinate":  # each searched unknown has its turn
-            rank, searched = jnp.cumsum(stage.searched) - 1, stage.searched
-            turn = searched & (rank == state.sweep % jnp.maximum(searched.sum(), 1))
-            furthest = jnp.where(jnp.roll(turn, -stage.problem.unknowns.count), furthest, 0.0)
-        return Brackets.around(
-            predicted, half_width, jnp.minimum(directions.below, furthest), jnp.minimum(directions.above, furthest)
-        )
+        later = jnp.maximum(state.relative_width * longest, stage.smallest_step) * state.growth
+        half_width = jnp.where(state.number_in_stage == 0, _FIRST * opening, later)
+        furthest = self._furthest(stage, state, opening, longest)
+        below, above = jnp.minimum(directions.below, furthest), jnp.minimum(directions.above, furthest)
+        return Brackets.around(predicted, half_width, below, above)
+
+    def _furthest(self, stage: Stage, state: State, opening: PerDirection, longest: Scalar) -> PerDirection:
+        """How far this sweep may go. The first shot is at the start; of the coordinates, one has its turn."""
+        number, count = state.number_in_stage, stage.problem.unknowns.count
+        later = jnp.where(state.trust < 1, state.trust * longest, jnp.inf)
+        furthest = jnp.where(number < 0, 0.0, jnp.where(number == 0, opening, later))
+        if self.directions == "whitened":
+            return furthest
+        turn = stage.searched & (jnp.cumsum(stage.searched) - 1 == number % jnp.maximum(stage.searched.sum(), 1))
+        return jnp.where(jnp.roll(turn, -count), furthest, 0.0)  # the order of directions, see `bisection`
 
     def _bisect(self, stage: Stage, state: State, directions: Directions, near: Flag, brackets: Brackets) -> Bisected:
         """4. Shoot at the trials of all brackets at once, and drop the side that the sign of each slope excludes.
 
         The last shot is at what the others found. There is none if the minimum is near, or after the last sweep.
         """
-        over = near | (state.sweep >= self._most_sweeps(stage))
-        shots = jnp.where(state.sweep < 0, 1, jnp.where(over, 0, self.halvings + 1))
+        over = near | (state.number_in_stage >= self._most_sweeps(stage))
+        shots = jnp.where(state.number_in_stage < 0, 1, jnp.where(over, 0, self.halvings + 1))
 
         def shoot(carry):
             brackets, _, _, taken, _ = carry
-            unknowns = jnp.clip(
-                state.unknowns + jnp.einsum("wud,wd->wu", directions.basis, brackets.trial), *stage.limits
-            )
+            step = jnp.einsum("wud,wd->wu", directions.basis, brackets.trial)
+            unknowns = jnp.clip(state.unknowns + step, *stage.limits)
             curvature = stage.evaluate(unknowns)
             slope = self._slopes(stage, directions, curvature)
             close = curvature.shot.sound.all() & self._is_near(stage, curvature, slope)
-            # A failed shot points back to the beginning.
-            brackets = brackets.halved(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
+            # A broken slope counts as that of a minimum at step 0: with unit information the slope is then the step.
+            brackets = brackets.narrowed(jnp.where(jnp.isfinite(slope), slope, brackets.trial))
             return brackets, unknowns, curvature, taken + 1, close
 
         first = brackets, state.unknowns, state.curvature, jnp.zeros((), dtype=int), jnp.zeros((), dtype=bool)
@@ -263,36 +261,32 @@ class IBSS(AbstractEstimator):
 
     def _judge(self, stage: Stage, state: State, directions: Directions, near: Flag, found: Bisected) -> State:
         """5. Keep the new point, or go back and stay closer if the sweep made things worse."""
-        (brackets, unknowns, curvature, shots), first = found, state.sweep < 0
+        brackets, unknowns, curvature, shots = found
         shot, before = curvature.shot, state.curvature.shot
+        first = state.number_in_stage < 0
+        swept = ~first & (shots > 0)
+        gain = before.cost.sum() - shot.cost.sum()
+        stalled = swept & (gain <= _GAIN) & _may_stall(stage, state, found)
         finite = jnp.isfinite(unknowns).all() & jnp.isfinite(shot.cost).all()
-        # The cost of a flight that fails means nothing.
-        lower = shot.sound.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
-        gain, has_kinks = before.cost.sum() - shot.cost.sum(), jnp.isfinite(stage.problem.unknowns.stride).any()
-        short = shot.sound.all() & before.sound.all() & (jnp.abs(brackets.predicted).max() <= _SHORT)
-        stalled = has_kinks & ~first & (shots > 0) & short & (gain <= _GAIN)
-        failed = ~first & ~(finite & (~before.sound.all() | lower)) | (stalled & (gain < 0))
-        unknowns, curvature = jax.tree.map(
-            lambda new, old: jnp.where(failed, old, new), (unknowns, curvature), (state.unknowns, state.curvature)
-        )
-        steps, bisected = brackets.last, brackets.highest > brackets.lowest
-        off = _SAFETY * jnp.abs(steps - brackets.predicted).max()
-        at_end = (steps == brackets.lowest) | (steps == brackets.highest)
-        growth = jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0)
+        # The cost of an unsound trajectory means nothing.
+        not_worse = shot.sound.all() & (shot.cost.sum() <= before.cost.sum() + _CHANCE)
+        rejected = ~first & ~(finite & (~before.sound.all() | not_worse)) | (stalled & (gain < 0))
+        new, old = (unknowns, curvature), (state.unknowns, state.curvature)
+        unknowns, curvature = jax.tree.map(lambda new, old: jnp.where(rejected, old, new), new, old)
         covariance = jnp.square(jnp.maximum(stage.misfit(before.cost.sum()), 1.0)) * gram(directions.basis)
-        searched, counts = stage.searched & stage.searched[:, None] & ~first, ~first & (shots > 0)
+        relative_width, growth = _next_widths(stage, state, brackets)
         return State(
             unknowns=unknowns,
             curvature=curvature,
-            spread=jnp.where(searched, covariance, state.spread),
-            error=jnp.clip(off / jnp.maximum(jnp.abs(steps).max(), stage.smallest_step), _LEAST, 1.0),
-            growth=jnp.where(bisected, growth, state.growth),
-            trust=jnp.where(failed, state.trust * _RETREAT, jnp.minimum(state.trust * _ADVANCE, 1.0)),
-            sweep=state.sweep + 1,
-            sweeps=state.sweeps + counts,
+            spread=jnp.where(stage.searched & stage.searched[:, None] & ~first, covariance, state.spread),
+            relative_width=relative_width,
+            growth=growth,
+            trust=jnp.where(rejected, state.trust * _RETREAT, jnp.minimum(state.trust * _ADVANCE, 1.0)),
+            number_in_stage=state.number_in_stage + 1,
+            sweeps=state.sweeps + swept,
             rollouts=state.rollouts + shots * stage.searched.sum(),
             done=near | stalled | (first & ~finite),
-            record=_recorded(state, directions, brackets, counts) if self.record else state.record,
+            record=_recorded(stage, state, directions, brackets, swept) if self.record else state.record,
         )
 
     def _slopes(self, stage: Stage, directions: Directions, curvature: Curvature) -> PerDirection:
@@ -301,20 +295,36 @@ class IBSS(AbstractEstimator):
         return slopes_along(directions.basis, gradient, stage.problem.unknowns.count)
 
     def _is_near(self, stage: Stage, curvature: Curvature, steps: PerDirection) -> Flag:
-        """Whether so short steps to the minimum end a stage: the last stage is searched finely, the others coarsely."""
-        noise = stage.misfit(curvature.shot.cost.sum())
-        fine = jnp.maximum(self.tolerance * noise, stage.smallest_step)
-        return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(noise, 1.0))
+        """Whether so short steps, or slopes, end a stage: the last stage is searched finely, the others coarsely."""
+        misfit = stage.misfit(curvature.shot.cost.sum())
+        fine = jnp.maximum(self.tolerance * misfit, stage.smallest_step)
+        return jnp.abs(steps).max() <= jnp.where(stage.last, fine, _COARSE * jnp.maximum(misfit, 1.0))
 
     def _most_sweeps(self, stage: Stage) -> Count:
         return self.max_sweeps * (1 if self.directions == "whitened" else stage.searched.sum())
 
 
-def _recorded(
-    state: State, directions: Directions, brackets: Brackets, counts: Flag
-) -> Float[Array, "record 2 parameters"]:
-    """The record with the bracket of each parameter in one more sweep; sweeps beyond its length are dropped."""
+def _may_stall(stage: Stage, state: State, found: Bisected) -> Flag:
+    """Whether a sweep is short, on a cost whose slopes may be large at the minimum: those along strides are inexact."""
+    (brackets, _, curvature, _), unknowns = found, stage.problem.unknowns
+    sound = curvature.shot.sound.all() & state.curvature.shot.sound.all()
+    return jnp.isfinite(unknowns.stride).any() & sound & (jnp.abs(brackets.predicted).max() <= _SHORT)
+
+
+def _next_widths(stage: Stage, state: State, brackets: Brackets) -> tuple[Scalar, PerDirection]:
+    """`State.relative_width` and `State.growth` of the next sweep, from the errors of this sweep's predictions."""
+    steps = brackets.last
+    error = jnp.abs(steps - brackets.predicted).max()
+    longest = jnp.maximum(jnp.abs(steps).max(), stage.smallest_step)
+    at_end, was_open = (steps == brackets.lowest) | (steps == brackets.highest), brackets.highest > brackets.lowest
+    growth = jnp.where(at_end, jnp.minimum(_GROWTH * state.growth, _WIDEST), 1.0)
+    return jnp.clip(_SAFETY * error / longest, _NARROWEST, 1.0), jnp.where(was_open, growth, state.growth)
+
+
+def _recorded(stage: Stage, state: State, directions: Directions, brackets: Brackets, swept: Flag) -> Array:
+    """The record with what one more sweep opened: the values of each parameter between the ends of all brackets."""
     length, _, count = state.record.shape
-    widest = jnp.abs(directions.basis * ((brackets.highest - brackets.lowest) / 2)[:, None, :]).max(axis=(0, 2))[:count]
-    bracket = state.unknowns[0, :count] + jnp.stack([-widest, widest])
-    return state.record.at[jnp.where(counts, state.sweeps, length)].set(bracket, mode="drop")
+    basis = jnp.where(stage.searched[:count, None], directions.basis[0, :count], 0.0)
+    spans = basis * jnp.stack([brackets.lowest, brackets.highest])[:, 0, None]
+    bracket = state.unknowns[0, :count] + jnp.stack([spans.min(axis=0), spans.max(axis=0)]).sum(axis=-1)
+    return state.record.at[jnp.where(swept, state.sweeps, length)].set(bracket, mode="drop")

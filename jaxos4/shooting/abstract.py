@@ -148,7 +148,7 @@ class Stages(NamedTuple):
     - `evaluate`: from the number of a stage and the unknowns, the curvature of the stage's cost in all unknowns; 0 in
       those that it does not search.
     - `searched`: for each stage, the unknowns that it searches.
-    - `misfit`: from the number of a stage and its cost, by how much the residuals exceed the noise of the problem.
+    - `misfit`: from the number of a stage and its cost, the size of the residuals in standard deviations of the noise.
     - `smallest_step`: for each stage, the step in standard deviations below which rounding decides the sign of a slope.
     """
 
