@@ -1,11 +1,13 @@
 """Functions that the experiments share: batched identification, tables, Datasets and figure files."""
 
+import io
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import equinox as eqx
 import jax
+import matplotlib as mpl
 import numpy as np
 import xarray as xr
 from jaxtyping import Array, Float, Key as Keys
@@ -21,7 +23,7 @@ from jaxos4.estimate import AbstractEstimator, Estimate
 from jaxos4.flight import Flight
 from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import AbstractNoise
-from jaxos4.report.style import Style, drawing, pdf, svg
+from jaxos4.report.style import Style, drawing, svg
 from jaxos4.shooting import ShootingProblem
 from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset
 
@@ -105,6 +107,14 @@ def count_results(names: np.ndarray) -> dict[str, int]:
 def in_words(counts: dict[str, int]) -> str:
     """The counts of `count_results` as the text of a table cell."""
     return ", ".join(f"{count} {what}" for what, count in counts.items())
+
+
+def pdf(figure: Figure) -> bytes:
+    """The figure as PDF. The same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    with mpl.rc_context({"pdf.fonttype": 42}):
+        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None})
+    return buffer.getvalue()
 
 
 def write_figure(draw: Callable[[], Figure | None], directory: Path, name: str) -> None:

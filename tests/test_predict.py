@@ -296,7 +296,7 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
         (result(), ("--spacing", "-1"), ("--spacing", "at least 0")),
         (result(), ("--seed", "-1"), ("--seed",)),
         (result(), ("--out", "out.xlsx"), ("out.xlsx", ".nc or .csv")),
-        (result(), ("--figure", "out.gif"), ("out.gif", ".svg or .pdf")),
+        (result(), ("--figure", "out.gif"), ("out.gif", ".svg")),
         (result(), ("--out", "log.csv"), ("log.csv", "overwrite an input")),
     ],
 )

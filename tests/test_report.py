@@ -84,9 +84,8 @@ def page(report):
 def test_the_command_writes_the_same_files_from_the_dataset(study, report, tmp_path, run):
     folder = report[0].parent
     names = {path.relative_to(folder).as_posix() for path in report}
-    assert names == {"report.html"} | {f"figures/{n}.{s}" for n in OF_SCENARIO for s in ("svg", "pdf")}
+    assert names == {"report.html"} | {f"figures/{n}.svg" for n in OF_SCENARIO}
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == names
-    assert all(p.read_bytes().startswith(b"%PDF") for p in report if p.suffix == ".pdf")
     study.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     xr.testing.assert_equal(read_results(tmp_path), study)
     code, out, err = run("report", str(tmp_path))
@@ -176,7 +175,7 @@ SMALL = {"estimators": ("ibss", "svsf"), "spoiled": False}
 def test_what_is_absent_is_not_drawn_and_figures_have_a_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(study_page, "MOST_DRAWN", 1)
     study = few(models=("published", "corrected"), flights=4, scales=(1.0,), **SMALL)
-    written = write_report(study, tmp_path, with_pdf=False)
+    written = write_report(study, tmp_path)
     assert {path.stem for path in written[1:]} == {f"{name}-1" for name in OF_SCENARIO}
     text = written[0].read_text(encoding="utf-8")
     assert {"error-1", "error-2"} <= tables(text).keys()
@@ -191,7 +190,7 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
     study = study.assign_coords(estimator=["ibss", evil], model=[f"{evil} {{{{ 1 }}}}"], parameter=parameters)
     failures = json.dumps([{"cell": 0, "scale": 1.0, "estimator": evil, "message": evil}])
     study.attrs |= {"title": evil, "specification": f"</pre>{evil}", "command": evil, "failures": failures}
-    text = write_report(study, tmp_path, with_pdf=False)[0].read_text(encoding="utf-8")
+    text = write_report(study, tmp_path)[0].read_text(encoding="utf-8")
     stands_alone(text)
     assert words(text).count("alert(1)") >= 6
     assert all(name in words(text) for name in ("{{ 1 }}", "$\\frac{<b>}$"))

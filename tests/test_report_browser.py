@@ -86,7 +86,7 @@ DESIGNS = {
 def addresses(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     study = synthetic_study(flights=12, estimators=tuple(ESTIMATORS), scales=(0.1, 1.0))
-    files = {"study": write_report(study, folder, with_pdf=False)[0]}  # the page has the SVG
+    files = {"study": write_report(study, folder)[0]}
     for name, found in {
         "vehicle": identified_vehicle(sample_times=SAMPLE_TIMES),
         "without predictions": identified_vehicle(predictions=None),

@@ -17,7 +17,7 @@ from typing import Any
 from .._files import check_writable, load_netcdf, write_file
 from ..errors import InputError
 
-DRAWING = ("matplotlib.backends.backend_pdf", "matplotlib.backends.backend_svg", "matplotlib.figure")
+DRAWING = ("matplotlib.backends.backend_svg", "matplotlib.figure")
 """The modules that draw a figure: slow to import."""
 
 _PHRASES = {
@@ -103,6 +103,8 @@ def check_outputs(*inputs: Path | str | None, **outputs: Path | None) -> None:
         if out is None:
             continue
         target, option = check_writable(out), f"--{name.replace('_', '-')}"
+        if name == "figure" and out.suffix != ".svg":
+            raise InputError(f"--figure {out}: the figure is an SVG file; give it a name that ends in .svg.")
         if target.exists() and any(source.samefile(target) for source in sources):
             raise InputError(f"{out}: would overwrite an input; give the output another name.")
         if (other := names.setdefault(target, option)) != option:

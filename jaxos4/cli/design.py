@@ -65,8 +65,6 @@ def design(
     """Design the most informative flight within limits: rotor speeds, or the references of a controller."""
     asked = options.of_kind(closed_loop, locals())
     check_outputs(airframe, bracket, out=out, figure=figure)
-    if figure is not None and figure.suffix != ".svg":
-        raise InputError(f"--figure {figure}: the figure is an SVG file; give it a name that ends in .svg.")
     if not 0 < asked["accuracy"] < 1e6:
         raise InputError(f"--accuracy: must be positive and finite, got {asked['accuracy']:g}.")
     begin = time.perf_counter()

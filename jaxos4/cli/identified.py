@@ -71,7 +71,7 @@ def predict(
     seed: Annotated[int, Option(help="Random seed of the 95 % band.")] = 0,
     out: Annotated[Path | None, Option(help="The predictions, as netCDF (.nc) or CSV (.csv).")] = None,
     json: Annotated[Path | None, Option(help="The errors, as JSON.")] = None,
-    figure: Annotated[Path | None, Option(help="A figure of the predictions (.svg or .pdf).")] = None,
+    figure: Annotated[Path | None, Option(help="A figure of the predictions (.svg).")] = None,
 ) -> None:
     """Predict a flight with an identified vehicle, and compare with constant rates and a regression."""
     options.check_seed(seed)
@@ -82,8 +82,6 @@ def predict(
 
         if out is not None:
             check_suffix(out, ".nc", ".csv")
-        if figure is not None:
-            check_suffix(figure, ".svg", ".pdf")
         progress("reading")
         vehicle = vehicle_of(result)
         recording = read_recording(flight, vehicle.model.airframe)

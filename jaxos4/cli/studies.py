@@ -80,7 +80,7 @@ def _connected(address: str):
 def report(
     directory: Annotated[Path, Argument(metavar="DIR", help="The folder of a study, with its results.nc.")],
 ) -> None:
-    """Write the report of a study: report.html and figures/ as SVG and PDF."""
+    """Write the report of a study: report.html, and figures/ as SVG."""
     with stages("loading the library") as progress:
         from ..report import write_report
         from ..study import read_results
@@ -91,15 +91,12 @@ def report(
         page, *figures = write_report(dataset, directory)
     typer.echo(f"{page}: {page.stat().st_size / 1e6:.1f} MB, opens in any browser, no network needed")
     if figures:
-        count = len({path.stem for path in figures})
-        typer.echo(f"{figures[0].parent}: {count} figures, each as SVG and PDF")
+        typer.echo(f"{figures[0].parent}: {len(figures)} figures, as SVG")
 
 
 def compare(
     out: Annotated[Path | None, Option(help="The folder to write. Default: comparison, or comparison-quick.")] = None,
-    quick: Annotated[
-        bool, Option("--quick", help="Only body rates, 128 flights, four estimators, and SVG figures.")
-    ] = False,
+    quick: Annotated[bool, Option("--quick", help="Only body rates, 128 flights and four estimators.")] = False,
 ) -> None:
     """Compare all estimators on the standard flight at three noise levels: table, figures, report."""
     begin = time.perf_counter()
@@ -114,7 +111,7 @@ def compare(
     dataset = run_with_bar(comparison(quick=quick), directory)
     print_whole(Console(highlight=False), error_table(dataset))
     with stages("drawing"):
-        page, *_ = write_report(dataset, directory, with_pdf=not quick)
+        page, *_ = write_report(dataset, directory)
     typer.echo(f"{count_outcomes(dataset)}; {time.perf_counter() - begin:.0f} s")
     typer.echo(f"{page}: the report, with figures/ and results.nc beside it")
 

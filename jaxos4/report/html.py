@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 
-from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, pdf, svg
+from .style import FAINT, GRID, INK, PAPER, Style, panel_boxes, svg
 from .text import MISSING, plain
 
 # CSS pixels in a point, and by how much a panel may shrink and grow.
@@ -19,17 +19,16 @@ _THEMED = {INK: "currentColor", GRID: "var(--grid)", FAINT: "var(--faint)", PAPE
 
 
 class Drawing(NamedTuple):
-    """A figure: the stem of the names of its files and ids, its SVG, the boxes of its panels, and its PDF, if any."""
+    """A figure: the stem of the names of its file and ids, its SVG, and the boxes of its panels."""
 
     stem: str
     svg: bytes
     boxes: list[list[float]]
-    pdf: bytes | None = None
 
 
-def draw(figure: Figure, stem: str, *, with_pdf: bool = False) -> Drawing:
+def draw(figure: Figure, stem: str) -> Drawing:
     """Draws a figure for a page."""
-    return Drawing(stem, svg(figure), panel_boxes(figure).tolist(), pdf(figure) if with_pdf else None)
+    return Drawing(stem, svg(figure), panel_boxes(figure).tolist())
 
 
 def render(template: str, **values: Any) -> str:

@@ -1,7 +1,6 @@
 """The prediction of a flight, as text for a terminal and as a figure: `jaxos4 predict`."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -54,11 +53,11 @@ def print_prediction(console: Console, found: FlightPrediction) -> None:
 
 
 def write_prediction_figure(path: str | os.PathLike[str], found: FlightPrediction) -> None:
-    """Writes a figure as SVG or PDF, by the suffix. Raises `OSError` if it cannot be written.
+    """Writes a figure as SVG. Raises `OSError` if it cannot be written.
 
     It shows measured lines, and predictions with their band from starts that are one horizon apart; 10 s at most.
     """
-    from .style import BOUND_DASHES, INK, drawing, grid, pdf, style, svg  # a second that the table does not need
+    from .style import BOUND_DASHES, INK, drawing, grid, style, svg  # a second that the table does not need
 
     columns = [("roll [rad]", 6), ("pitch [rad]", 7), ("yaw [rad]", 8)]
     columns += [(f"{axis} [rad/s]", 9 + i) for i, axis in enumerate("pqr")]
@@ -99,7 +98,7 @@ def write_prediction_figure(path: str | os.PathLike[str], found: FlightPredictio
         below, width, height = 0.5, *figure.get_size_inches()
         figure.subplots_adjust(0.5 / width, (below + 0.4) / height, 1 - 0.1 / width, 1 - 0.3 / height, hspace=0.35)
         figure.legend(handles, labels, loc="lower left", ncols=3)
-        drawn = (pdf if Path(path).suffix == ".pdf" else svg)(figure)
+        drawn = svg(figure)
     write_file(path, drawn)
 
 

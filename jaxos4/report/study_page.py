@@ -28,39 +28,32 @@ SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
 }
 
 
-def write_report(dataset: xr.Dataset, directory: Path, *, with_pdf: bool = True) -> list[Path]:
-    """Writes `report.html`, `figures/*.svg` and `figures/*.pdf` into `directory`; returns their paths, the page first.
+def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
+    """Writes `report.html` and `figures/*.svg` into `directory`; returns their paths, the page first.
 
     All figures are drawn before the first file is written.
-
-    **Arguments:** `with_pdf`: if false, figures are SVG only, which takes half the time.
     """
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
     every, sections = list(scenarios(dataset)), []
     for scenario in every:
         shown = SCENARIO_FIGURES if scenario.number <= MOST_DRAWN else {}
-        suffix = f"-{scenario.number}" if len(every) > 1 else ""
-        sections.append((scenario, draw(shown, scenario.data, suffix=suffix, with_pdf=with_pdf)))
+        sections.append((scenario, draw(shown, scenario.data, f"-{scenario.number}" if len(every) > 1 else "")))
     files = {target: _page(dataset, sections).encode()}
-    for drawn in [drawn for _, figures in sections for drawn in figures.values()]:
-        contents = {"svg": drawn.svg, "pdf": drawn.pdf}
-        files |= {folder / f"{drawn.stem}.{suffix}": content for suffix, content in contents.items() if content}
+    files |= {folder / f"{drawn.stem}.svg": drawn.svg for _, figures in sections for drawn in figures.values()}
     folder.mkdir(exist_ok=True)
     for path, content in reversed(files.items()):  # the page last
         write_file(path, content)
     return list(files)
 
 
-def draw(
-    figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, *, suffix: str = "", with_pdf: bool = True
-) -> dict[str, Drawing]:
+def draw(figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, suffix: str = "") -> dict[str, Drawing]:
     """The figures whose data are present. `suffix`: the end of the names of the files."""
     made = {}
     for name, draw_figure in figures.items():
         with drawing():
             if (figure := draw_figure(data)) is not None:
-                made[name] = draw_panels(figure, f"{name}{suffix}", with_pdf=with_pdf)
+                made[name] = draw_panels(figure, f"{name}{suffix}")
     return made
 
 

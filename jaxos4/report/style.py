@@ -3,14 +3,13 @@
 import contextlib
 import io
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -79,7 +78,6 @@ _RC: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.4,
     "lines.markersize": 5,
-    "pdf.fonttype": 42,
     "svg.fonttype": "path",
     "svg.hashsalt": "jaxos4",
     "text.parse_math": False,  # names come from files: a dollar sign in one is a dollar sign
@@ -171,9 +169,12 @@ def legend(figure: Figure, estimators: Sequence[str], *, bounds: Sequence[str] =
 
 def svg(figure: Figure) -> bytes:
     """The figure as SVG. The same figure gives the same bytes. A browser shrinks it to the width of its window."""
-    drawn = _printed(figure, FigureCanvasSVG(figure).print_svg, {"Date": None, "Creator": None})
-    figure.set_layout_engine("none")  # keeps the layout for the next format
-    return drawn.replace(b"<svg ", b'<svg style="max-width: 100%; height: auto" ', 1)
+    buffer, resolution = io.BytesIO(), figure.dpi
+    # `savefig` also restores the resolution, but draws twice.
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+    figure.set_dpi(resolution)
+    figure.set_layout_engine("none")  # keeps the layout for the boxes of the panels
+    return buffer.getvalue().replace(b"<svg ", b'<svg style="max-width: 100%; height: auto" ', 1)
 
 
 def panel_boxes(figure: Figure) -> np.ndarray:
@@ -188,16 +189,3 @@ def panel_boxes(figure: Figure) -> np.ndarray:
     margin = np.abs(outer - inner).max(axis=0) * [-1, -1, 1, 1] + [-2, -2, 2, 2]
     left, bottom, right, top = (inner + margin).T
     return np.stack([left, 72 * figure.get_figheight() - top, right - left, top - bottom], axis=1)
-
-
-def pdf(figure: Figure) -> bytes:
-    """The figure as PDF. The same figure gives the same bytes."""
-    return _printed(figure, FigureCanvasPdf(figure).print_pdf, {"CreationDate": None})
-
-
-def _printed(figure: Figure, write: Callable[..., None], metadata: dict[str, None]) -> bytes:
-    """The bytes that `write`, a method of a canvas, prints. `savefig` also restores the resolution, but draws twice."""
-    buffer, resolution = io.BytesIO(), figure.dpi
-    write(buffer, metadata=metadata)
-    figure.set_dpi(resolution)
-    return buffer.getvalue()
