@@ -13,6 +13,8 @@ import warnings
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
+from ._programs import kept_program
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -84,11 +86,11 @@ def quick_jit(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         # Inside `jit`, even a constant is traced.
-        leaves = (jnp.asarray(0.0), *jax.tree.leaves((args, kwargs)))
-        quickly = (
-            not os.environ.get(NO_OPTIONS) and _options_known() and not any(isinstance(leaf, Tracer) for leaf in leaves)
-        )
-        return (outer if quickly else inner)(*args, **kwargs)
+        leaves = jax.tree.leaves((args, kwargs))
+        traced = any(isinstance(leaf, Tracer) for leaf in (jnp.asarray(0.0), *leaves))
+        if traced or os.environ.get(NO_OPTIONS) or not _options_known():
+            return inner(*args, **kwargs)
+        return (kept_program(function, QUICK, args, kwargs) or outer)(*args, **kwargs)
 
     return call
 

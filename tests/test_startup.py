@@ -15,7 +15,10 @@ import pytest
 from jax._src import compiler
 
 import jaxos4
+from jaxos4 import _programs
+from jaxos4._programs import _shape
 from jaxos4._xla import LOOP_FLAGS, NO_OPTIONS, make_loops_fast, quick_jit
+from jaxos4.bracket import _default
 from jaxos4.cli import _jax, _options, train
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
@@ -199,6 +202,56 @@ def test_the_cache_is_limited_and_keeps_what_was_used_last_and_a_folder_may_be_u
     for name in ("HOME", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "a"))  # not a folder
     assert _jax._usable_folder() is None
+
+
+class OwnModel(jaxos4.CorrectedOS4):
+    """A model whose source the package does not know."""
+
+
+@pytest.fixture
+def programs_are_kept(tmp_path):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.mark.usefixtures("programs_are_kept")
+def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known(tmp_path, monkeypatch):
+    function, one, other = _default.__wrapped__, jaxos4.PublishedOS4(jaxos4.OS4), jaxos4.PublishedOS4(jaxos4.VOOS)
+
+    def kept(*args, function=function):
+        monkeypatch.setattr(_programs, "_programs", {})  # as in another process
+        return _programs.kept_program(function, {}, args, {})
+
+    def files():
+        return {path.name: path.read_bytes() for path in tmp_path.glob("jaxos4-*")}
+
+    for model in (one, other):
+        for found, expected in zip(*map(jax.tree.leaves, (kept(model)(model), function(model))), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-14)
+    written = files()
+    assert len(written) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(_programs, "_write", None)  # tracing would call it
+        assert jax.tree.structure(kept(one)(one)) == jax.tree.structure(function(one))
+    # Another static value, and other sources, are other programs.
+    kept(jaxos4.CorrectedOS4(jaxos4.OS4))
+    with monkeypatch.context() as patch:
+        patch.setattr(_programs, "_surroundings", lambda: b"changed")
+        kept(one)
+    assert len(files()) == 3
+    # A damaged file is written again.
+    for name, content in written.items():
+        (tmp_path / name).write_bytes(content[:-1])
+    assert kept(one) is not None
+    assert all(_programs._read(tmp_path / name) for name in written)
+    assert kept(OwnModel(jaxos4.OS4)) is None
+    assert kept(1.0, function=lambda x: x) is None
+    assert kept(np.ones(1), function=_shape) is None  # its results are no arrays
+    assert len(files()) == 3
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert kept(one) is None
 
 
 def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path):

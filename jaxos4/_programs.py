@@ -1,0 +1,146 @@
+"""Traced programs are kept in files, so that the next process does not trace them again.
+
+JAX keeps compiled programs, and finds one by its traced program. To trace takes longer than to read what is compiled.
+So the traced program is exported to the same folder. The name of its file is a digest of all that tracing depends on:
+the function, the shapes and static values of its arguments, the sources of `jaxos4`, the installed packages and JAX's
+settings. Nothing is kept unless JAX keeps compiled programs (`jax_compilation_cache_dir`).
+"""
+
+import contextlib
+import functools
+import hashlib
+import io
+import os
+import pickle  # noqa: TID251 - what it reads lies beside machine code, which JAX reads
+import secrets
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+# Packages whose code the digest knows. A program that depends on a class or function of another package is not kept.
+_KNOWN = {"jaxos4", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "optax", "numpy", "builtins"}
+
+_programs: dict[str, Callable[..., Any] | None] = {}
+
+
+def kept_program(
+    function: Callable[..., Any], options: dict[str, Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Callable[..., Any] | None:
+    """The compiled program of a function for such arguments, to be called with them. `None` if it cannot be kept."""
+    import equinox as eqx
+    import jax
+
+    settings = jax.config.values
+    folder = settings["jax_compilation_cache_dir"]
+    on = folder and settings["jax_enable_compilation_cache"] and jax.device_count() == 1
+    if not on or not _is_known(function):
+        return None
+    leaves, tree = jax.tree.flatten((args, kwargs))
+    shapes = [_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
+    try:
+        description = _described((function.__module__, function.__qualname__, options, shapes, tree))
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return None
+    name = hashlib.sha256(_surroundings() + description).hexdigest()
+    if name not in _programs:
+        path, arrays = Path(folder) / f"jaxos4-{name}", [leaf for leaf in leaves if eqx.is_array(leaf)]
+        content = _read(path) or _write(path, function, args, kwargs)
+        _programs[name] = content and _compiled(*content, options, arrays)
+    return _programs[name]
+
+
+def _compiled(traced: Any, results: Any, options: dict[str, Any], arrays: list[Any]) -> Callable[..., Any]:
+    """A program of arrays, with the arguments and the results of the function that it was traced from."""
+    import equinox as eqx
+    import jax
+
+    of_arrays = jax.jit(traced.call, compiler_options=options).lower(*arrays).compile()
+    tree = jax.tree.structure(results)
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        leaves = (leaf for leaf in jax.tree.leaves((args, kwargs)) if eqx.is_array(leaf))
+        return jax.block_until_ready(jax.tree.unflatten(tree, of_arrays(*leaves)))
+
+    return call
+
+
+def _shape(leaf: Any) -> tuple[Any, ...]:
+    return leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False)
+
+
+def _is_known(code: Any) -> bool:
+    """Whether a class or function has a name in a package that the digest knows."""
+    return "<" not in code.__qualname__ and code.__module__.partition(".")[0] in _KNOWN
+
+
+class _Pickler(pickle.Pickler):
+    """Writes classes and functions by name, and refuses those whose code is not known."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type | types.FunctionType) and not _is_known(obj):
+            raise pickle.PicklingError(f"the code of {obj} is not known")
+        return NotImplemented
+
+
+def _described(value: Any) -> bytes:
+    with io.BytesIO() as file:
+        pickler = _Pickler(file)
+        pickler.fast = True  # equal values have equal bytes, whether or not their parts are one object
+        pickler.dump(value)
+        return file.getvalue()
+
+
+@functools.cache
+def _surroundings() -> bytes:
+    """What the tracing of every program depends on. A source is known by size and time, as in Python's own cache."""
+    import jax
+
+    sources = [(str(path), path.stat()) for path in sorted(Path(__file__).parent.rglob("*.py"))]
+    sizes = [(path, status.st_size, status.st_mtime_ns) for path, status in sources]
+    packages = sorted(os.listdir(Path(jax.__file__).parents[1]))  # with their versions
+    return repr((sizes, packages, sorted(jax.config.values.items()), jax.default_backend())).encode()
+
+
+def _read(path: Path) -> tuple[Any, Any] | None:
+    """The traced program of a file, and its results; `None` if there is no such file, or if it is damaged."""
+    import jax.export
+
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    if hashlib.sha256(content[32:]).digest() != content[:32]:
+        return None
+    results, traced = pickle.loads(content[32:])  # noqa: S301
+    return jax.export.deserialize(bytearray(traced)), results
+
+
+def _write(path: Path, function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Any, Any] | None:
+    """Traces a program and writes its file; `None` if it cannot be exported, or if a result is no array."""
+    import equinox as eqx
+    import jax
+    import jax.export
+
+    arrays, static = eqx.partition((args, kwargs), eqx.is_array)
+    leaves, tree = jax.tree.flatten(arrays)
+    results: list[Any] = []
+
+    def of_arrays(*leaves: Any) -> list[Any]:
+        args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
+        values, shape = jax.tree.flatten(function(*args, **kwargs))
+        if not all(map(eqx.is_array, values)):
+            raise NotImplementedError("a result is no array")
+        results.append(jax.tree.unflatten(shape, range(len(values))))
+        return values
+
+    try:
+        traced = jax.export.export(jax.jit(of_arrays))(*leaves)
+        content = pickle.dumps((results[0], bytes(traced.serialize())))
+    except (NotImplementedError, ValueError, pickle.PicklingError, AttributeError):
+        return None
+    temporary = path.with_name(f".{secrets.token_hex(8)}.part")
+    with contextlib.suppress(OSError):
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
+        temporary.replace(path)
+    return traced, results[0]
