@@ -12,6 +12,7 @@ import jaxos4
 from jaxos4.airframe import airframe_from_table, airframe_table
 from jaxos4.cli._options import Simulator
 from jaxos4.export import TARGETS, export_vehicle, read_result
+from jaxos4.export.vehicle import CARRIED, rigid_vehicle
 
 
 @pytest.fixture
@@ -89,9 +90,22 @@ def test_recordings_share_the_mean_offset_and_negative_damping_is_0(write):
     assert found.vehicle.torque[0] == pytest.approx(1.5 / 6.1e4)
     assert found.vehicle.damping[0] == 0
     assert "roll_damping" not in found.drawn
-    stranger = "roll_flapping: not carried: no term of this version has them"
+    stranger = "roll_flapping: not carried: an exported vehicle of this version has no such parameters"
     for note in ("mean of the recordings", "roll_damping: came out negative", stranger):
         assert any(note in line for line in found.notes), note
+
+
+def test_every_parameter_is_carried_or_noted(write):
+    """That of a term with which nobody thought of simulators too."""
+    airframe = airframe_from_table(AIRFRAME)
+    vehicle = rigid_vehicle(airframe, VALUES)
+    names = {parameter.name for term in jaxos4.TERMS.values() for parameter in term.parameters} | {"yaw_friction"}
+    found = read_result(write(vehicle_result(VALUES | dict.fromkeys(names - {*VALUES}, 0.1))))
+    notes = [name for note in found.notes for name in note.partition(":")[0].split(", ")]
+    for name in names:
+        moved = rigid_vehicle(airframe, VALUES | {name: 1.01 * VALUES.get(name, 0.1)})
+        differs = any(not np.array_equal(*both) for both in zip(vehicle, moved, strict=True))
+        assert differs == (name in CARRIED) == (name not in notes), name
 
 
 CURVES = {

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,19 +13,14 @@ from ..airframe import Airframe, airframe_from_table
 from ..errors import InputError, named
 from ..identification.results import ResultFile
 from ..linalg import covariance_root
-from ..models.abstract import PARAMETER_NAMES
-from ..models.terms import TERMS
 from ..results import meaning
-from .vehicle import INERTIAS, RigidVehicle, rigid_vehicle
+from .vehicle import CARRIED, INERTIAS, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
 # differs from 1 by as many.
 _SIGNIFICANT = 3.0
-# Parameters that no vehicle has below 0, although an estimate can be negative.
-_NOT_NEGATIVE = ("rotor_lag", "rotor_delay", "roll_damping", "pitch_damping", "yaw_damping")
-_NOT_NEGATIVE += ("x_drag", "y_drag", "z_drag")
-# Parameters without a place in a simulator's vehicle, and why. Notes on the rotors' inertia name alpha2 and alpha5.
-_NOT_EXPORTED = {
+# Why some parameters are not carried; notes on the rotors' inertia name alpha2 and alpha5. All others have one note.
+_NOT_CARRIED = {
     ("voltage_exponent", "battery_fade"): "no simulator has the battery's voltage",
     ("motor_braking",): "is not carried: exported motors brake as they drive",
     ("p_bias", "q_bias", "r_bias", "ax_bias", "ay_bias", "az_bias"): "an error of a sensor, not of the vehicle",
@@ -106,7 +102,7 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
 def _identified(name: str, file: ResultFile) -> Identified:
     airframe, covariance = airframe_from_table(file.airframe or {}), np.array(file.covariance)
     values, drawn, covariance, notes = _parts(file, covariance)
-    negative = [each for each in _NOT_NEGATIVE if values.get(each, 0.0) < 0]
+    negative = [each for each in NOT_NEGATIVE if values.get(each, 0.0) < 0]
     kept = [place for place, each in enumerate(drawn) if each not in negative]
     notes += [f"{each}: came out negative, which is impossible; it is 0 here" for each in negative]
     if not np.isfinite(airframe.max_rotor_speed):
@@ -129,7 +125,12 @@ def _identified(name: str, file: ResultFile) -> Identified:
 
 def _clipped(values: dict[str, float]) -> dict[str, float]:
     """Replaces negative values by 0 if no vehicle has them."""
-    return {name: max(value, 0.0) if name in _NOT_NEGATIVE else value for name, value in values.items()}
+    return {name: max(value, 0.0) if name in NOT_NEGATIVE else value for name, value in values.items()}
+
+
+def _vehicles_own(name: str) -> str:
+    """The name of a parameter without the number of its recording."""
+    return re.sub(r"_\d+$", "", name)
 
 
 def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], tuple[str, ...], np.ndarray, list[str]]:
@@ -150,19 +151,16 @@ def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], 
     for moment, name in INERTIAS.items():
         if name not in found:
             notes.append(f"{moment}: not identified; it follows from the airframe, or from the bracket")
-    for names, why in _NOT_EXPORTED.items():
-        some = [name for name in found if name.startswith(names)]
+    for names, why in _NOT_CARRIED.items():
+        some = [name for name in found if _vehicles_own(name) in names]
         if some:
             notes.append(f"{', '.join(some)}: {why}")
-    known = {parameter.name for term in TERMS.values() for parameter in term.parameters} | {*PARAMETER_NAMES}
-    if strangers := [name for name in rows if name not in known and name.rpartition("_")[0] not in known]:
-        notes.append(
-            f"{', '.join(strangers)}: not carried: no term of this version has them; run `jaxos4 estimate` again"
-        )
+    noted = {"alpha2", "alpha5", *CARRIED, *itertools.chain(*_NOT_CARRIED)}
+    if lost := [name for name in rows if _vehicles_own(name) not in noted]:
+        notes.append(f"{', '.join(lost)}: not carried: an exported vehicle of this version has no such parameters")
     if any(name.startswith("roll_offset_") for name in values):
         notes.append("offsets: the mean of the recordings")
-    apart = tuple(itertools.chain(("alpha2", "alpha5"), *_NOT_EXPORTED))
-    fixed = [name for name in values.keys() - found.keys() if not name.startswith(apart)]
+    fixed = [name for name in values.keys() - found.keys() if _vehicles_own(name) in CARRIED]
     if fixed:
         notes.append(f"do not vary in samples, because the flights do not identify them: {', '.join(sorted(fixed))}")
     zero = [name for name in (*INERTIAS.values(), "thrust_gain") if values.get(name) == 0]

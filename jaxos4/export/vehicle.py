@@ -12,6 +12,10 @@ from ..excitation import AXES
 
 # Moments of inertia, each with the parameter that is `thrust_gain` divided by it.
 INERTIAS = {"Ix": "alpha3", "Iy": "alpha6", "Iz": "alpha8"}
+# Parameters that are 0 in a vehicle if they come out negative, and all that `rigid_vehicle` reads.
+NOT_NEGATIVE = ("rotor_lag", "rotor_delay", *(f"{x}_damping" for x in AXES), "x_drag", "y_drag", "z_drag")
+CARRIED = (*INERTIAS.values(), "thrust_gain", *(f"{x}_offset" for x in AXES), "roll_thrust", "pitch_thrust")
+CARRIED += ("roll_velocity", "pitch_velocity", "rotor_reaction", "thrust_curve", *NOT_NEGATIVE)
 # The full-scale rotor speed, in hover speeds, if the airframe does not have it.
 _FULL_SCALE = 2.0
 
