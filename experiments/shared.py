@@ -25,7 +25,8 @@ from jaxos4.models.abstract import AbstractModel
 from jaxos4.noise import AbstractNoise
 from jaxos4.report.style import Style, drawing, svg
 from jaxos4.shooting import ShootingProblem
-from jaxos4.study import RESULTS_FILE, Study, device_name, provenance, save_dataset
+from jaxos4.study import Study, device_name
+from jaxos4.study.dataset import RESULTS_FILE, provenance, save_dataset
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""

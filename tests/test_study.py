@@ -14,8 +14,9 @@ from hypothesis import given, settings, strategies as st
 from small_study import AIRFRAME, run_study, specification
 
 import jaxos4
-from jaxos4.study import OUTCOMES, Study, cell as cell_module, load_study, open_store, read_store, run as run_module
+from jaxos4.study import OUTCOMES, Study, cell as cell_module, load_study, run as run_module
 from jaxos4.study.cell import run_cell
+from jaxos4.study.dataset import open_store, read_store
 from jaxos4.study.specification import AXES
 
 SPECIFICATION = """

@@ -13,7 +13,8 @@ from distributed.utils import get_mp_context
 from helpers import refused
 from small_study import NETWORKED, cells, environment, results, run_study, specification
 
-from jaxos4.study import assemble, load_study, open_store, run_on_cluster, save_dataset
+from jaxos4.study import load_study, run_on_cluster
+from jaxos4.study.dataset import assemble, open_store, save_dataset
 
 # The sockets of a killed worker are closed by the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -64,9 +65,9 @@ def test_a_study_is_the_same_on_a_cluster_that_loses_workers(whole, client, tmp_
     done, before = [], {path.relative_to(out): path.stat().st_mtime_ns for path in out.glob("*/0*")}
     with open_store(out, study, "a cluster") as store:
         finished = study.count - len(store.missing())
-        for step in run_on_cluster(store, client):
-            done.append(step.done)
-            if step.done in (finished + 2, finished + 9):
+        for _, number in run_on_cluster(store, client):
+            done.append(number)
+            if number in (finished + 2, finished + 9):
                 kill_a_worker(client)
         save_dataset(assemble(store), out)
     assert done[-1] == study.count

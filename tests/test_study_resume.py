@@ -14,7 +14,8 @@ import xarray as xr
 from helpers import refused
 from small_study import COMMAND, SPECIFICATION, cells, finish, results, run_study, specification, start
 
-from jaxos4.study import load_study, open_store, read_store
+from jaxos4.study import load_study
+from jaxos4.study.dataset import open_store, read_store
 from jaxos4.study.run import compute
 
 

@@ -20,7 +20,8 @@ from typing import Annotated
 import typer
 import xarray as xr
 
-from jaxos4.study import RESULTS_FILE, load_study
+from jaxos4.study import load_study
+from jaxos4.study.dataset import RESULTS_FILE
 
 COMMAND = "from jaxos4.cli import main; main()"
 

@@ -106,47 +106,37 @@ def constant_rates(
     return _moved(begin, np.repeat(begin[:, None, 10:], steps, 1), np.repeat(begin[:, None, 3:6], steps, 1), dt)
 
 
-class Regression(NamedTuple):
-    """A linear model: the change of rates, and the specific force, from rates, velocity and squared rotor speeds.
+def regressed(
+    trained: Measured,
+    begin: Float[np.ndarray, "starts 13"],
+    omega: Float[np.ndarray, "starts steps 4"],
+    dt: float,
+    gravity: float,
+) -> Float[np.ndarray, "starts steps 13"] | None:
+    """The states by a regression, one step after another; `None` if the flight `trained` measured too little.
 
-    - `weights`: least squares, of the features in the rows. `scale`: of the features.
-    - `gravity`: [m/s^2].
-    - `moves`: whether velocity was measured; if not, it stays constant.
+    Changes of the rates, and the specific force, are linear in rates, velocity and squared rotor speeds. If no velocity
+    was measured, it stays constant.
     """
-
-    weights: Float[np.ndarray, "features 6"]
-    scale: Float[np.ndarray, " features"]
-    gravity: float
-    moves: bool
-
-    @classmethod
-    def of(cls, flight: Measured, gravity: float) -> "Regression | None":
-        """The regression of a flight; `None` if it measured too little."""
-        moves = flight.has("velocity")
-        features, targets = _features(flight.states, flight.omega, moves), flight.accelerations(gravity)
-        targets = targets if moves else targets[:, :3]
-        usable = np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
-        if usable.sum() <= features.shape[1]:
-            return None
-        scale = np.maximum(np.abs(features[usable]).max(axis=0), 1e-12)
-        weights = np.linalg.lstsq(features[usable] / scale, targets[usable])[0]
-        return cls(weights, scale, gravity, moves)
-
-    def __call__(
-        self, begin: Float[np.ndarray, "starts 13"], omega: Float[np.ndarray, "starts steps 4"], dt: float
-    ) -> Float[np.ndarray, "starts steps 13"]:
-        """The states one step after another."""
-        rates, velocities, now = [], [], begin
-        for speeds in np.moveaxis(omega, 1, 0):
-            found = (_features(now, speeds, self.moves) / self.scale) @ self.weights
-            rate, velocity = np.clip(now[:, 10:] + dt * found[:, :3], -1e3, 1e3), now[:, 3:6]
-            if self.moves:
-                push = np.stack(turned(now[:, 6:10].T, tuple(found[:, 3:].T)), axis=1)
-                velocity = velocity + dt * (push - [0.0, 0.0, self.gravity])
-            now = _moved(now, rate[:, None], velocity[:, None], dt)[:, 0]
-            rates.append(rate)
-            velocities.append(velocity)
-        return _moved(begin, np.stack(rates, axis=1), np.stack(velocities, axis=1), dt)
+    moves = trained.has("velocity")
+    features, targets = _features(trained.states, trained.omega, moves), trained.accelerations(gravity)
+    targets = targets if moves else targets[:, :3]
+    usable = np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
+    if usable.sum() <= features.shape[1]:
+        return None
+    scale = np.maximum(np.abs(features[usable]).max(axis=0), 1e-12)
+    weights = np.linalg.lstsq(features[usable] / scale, targets[usable])[0]
+    rates, velocities, now = [], [], begin
+    for speeds in np.moveaxis(omega, 1, 0):
+        found = (_features(now, speeds, moves) / scale) @ weights
+        rate, velocity = np.clip(now[:, 10:] + dt * found[:, :3], -1e3, 1e3), now[:, 3:6]
+        if moves:
+            push = np.stack(turned(now[:, 6:10].T, tuple(found[:, 3:].T)), axis=1)
+            velocity = velocity + dt * (push - [0.0, 0.0, gravity])
+        now = _moved(now, rate[:, None], velocity[:, None], dt)[:, 0]
+        rates.append(rate)
+        velocities.append(velocity)
+    return _moved(begin, np.stack(rates, axis=1), np.stack(velocities, axis=1), dt)
 
 
 def _features(states: np.ndarray, omega: np.ndarray, moves: bool) -> np.ndarray:

@@ -19,7 +19,7 @@ from ..recording.pieces import Recording, as_recording
 from ..recording.preparation import Prepared
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
-from .measured import Measured, Regression, constant_rates
+from .measured import Measured, constant_rates, regressed
 from .motion import CHUNK, PARTS, Evidence, Lanes, fly_chunk, known_at_samples, settled, turned
 from .prediction import FlightPrediction
 from .vehicle import Vehicle, vehicle_of
@@ -86,7 +86,6 @@ def predict(
     ahead = start[:, None] + np.arange(1, steps + 1)
     gravity = float(vehicle.model.airframe.gravity)
     trained = Measured.of(found.problem.flight) if isinstance(found, Identification) else measured.first_half
-    regression = Regression.of(trained, gravity)
     gyro = np.broadcast_to(np.exp(noise.sensor[:3]), (steps, 3))
     sensors = np.concatenate([measured.contradictions(start, steps, gravity), gyro], axis=1)
     return FlightPrediction(
@@ -100,7 +99,7 @@ def predict(
         half_width=_NINETY_FIVE * np.sqrt(spread**2 + sensors**2),
         measured=measured.states[ahead],
         constant=constant_rates(begin, steps, dt),
-        regression=None if regression is None else regression(begin, measured.omega[ahead - 1], dt),
+        regression=regressed(trained, begin, measured.omega[ahead - 1], dt, gravity),
         missing=missing,
         seed=seed,
         notes=(*vehicle.notes, *prepared.notes),

@@ -14,7 +14,7 @@ import queue
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -40,13 +40,6 @@ FAILURES = (TrainingError, InputError, ValueError, ArithmeticError, RuntimeError
 _RETRIES = 2
 
 
-class Step(NamedTuple):
-    """`done` cells are finished; `label` names the last one."""
-
-    done: int
-    label: str
-
-
 def workers() -> list[Any]:
     """The device of each cell that this process computes at a time.
 
@@ -70,8 +63,10 @@ def plan(study: Study, directory: Path) -> dict[str, tuple[int, int]]:
     return rows
 
 
-def run_here(store: Store) -> Iterator[Step]:
+def run_here(store: Store) -> Iterator[tuple[str, int]]:
     """Computes the remaining cells, each by one worker: a divided program gives other last digits.
+
+    Yields the label of each cell that is finished, and the number of finished cells.
 
     A cell that cannot be computed is kept as failed; delete its file to try it again.
     """
@@ -99,8 +94,8 @@ def run_here(store: Store) -> Iterator[Step]:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
-    """Computes the remaining cells on a cluster, in the order in which they finish.
+def run_on_cluster(store: Store, client: "Client") -> Iterator[tuple[str, int]]:
+    """Computes the remaining cells on a cluster, in the order in which they finish. Yields as `run_here`.
 
     `client` must be made with `set_as_default=False`: under a default client, xarray would write the Dataset under a
     lock of the cluster. Raises `InputError` if the cluster has no workers, or loses a task more often than it allows.
@@ -126,7 +121,7 @@ def run_on_cluster(store: Store, client: "Client") -> Iterator[Step]:
 
 def _run(
     store: Store, submit: Callable[..., Any], results: Callable[[list[Any]], Iterator[tuple[Any, Any]]]
-) -> Iterator[Step]:
+) -> Iterator[tuple[str, int]]:
     """Trains the missing networks and computes the missing cells. Files are written by this process.
 
     - `submit`: takes a function and its arguments, some of which may be futures; returns a future.
@@ -156,16 +151,14 @@ def _run(
         if isinstance(task, Cell):
             write_file(store.cell_file(task.number), data)
             done += 1
-            yield Step(done, label_of(study, task))
+            *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in task.scenario)
+            varied = itertools.compress(shared, (length > 1 for length in study.shape))
+            yield " ".join([estimator, *varied]), done
         elif isinstance(data, bytes):
             write_file(store.network_file(numbers[task]), data)
-        _give_memory_back()
-
-
-def _give_memory_back() -> None:
-    """Returns the compiler's freed memory to the system; the C library keeps half a gigabyte of a large program."""
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # not every C library can
-        ctypes.CDLL(None).malloc_trim(0)
+        # The C library keeps half a gigabyte that the compiler freed. Not every one can give it back.
+        with contextlib.suppress(OSError, AttributeError, TypeError):
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def train(study: Study, job: Scenario) -> bytes | str:
@@ -200,12 +193,6 @@ def compute(study: Study, cell: Cell, network: Trained) -> bytes:
     return file.getvalue()
 
 
-def label_of(study: Study, cell: Cell) -> str:
-    """The name of a cell: its estimator, and its values on the axes that have more than one."""
-    *shared, estimator = (f"{value:g}" if isinstance(value, float) else str(value) for value in cell.scenario)
-    return " ".join([estimator, *itertools.compress(shared, (length > 1 for length in study.shape))])
-
-
 @functools.lru_cache(maxsize=8)
 def _loaded(network: bytes) -> TrainedNetwork:
     with jax.enable_x64(True):
@@ -217,7 +204,7 @@ def carry_out(
     out: Path,
     device: str,
     *,
-    run: Callable[[Store], Iterator[Step]] = run_here,
+    run: Callable[[Store], Iterator[tuple[str, int]]] = run_here,
     progress: Callable[[str, int], None] = lambda label, done: None,
 ) -> xr.Dataset:
     """Runs the missing cells of a study and writes its Dataset. Raises what `open_store` and `run` raise.
@@ -228,8 +215,8 @@ def carry_out(
     - `progress`: is called after each step, with its label and the number of finished cells.
     """
     with open_store(out, study, device) as store:
-        for step in run(store):
-            progress(step.label, step.done)
+        for label, done in run(store):
+            progress(label, done)
         progress("writing the Dataset", study.count)
         dataset = assemble(store)
         save_dataset(dataset, out)
