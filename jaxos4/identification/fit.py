@@ -4,7 +4,7 @@ The noise of a simulated likelihood is that of the sensors; it follows from the 
 it. A likelihood of innovations has its noise among its unknowns, and is fitted once.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,7 +21,7 @@ from ..models.abstract import Parameter
 from ..results import RESULTS
 from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
 from ..shooting.gains import LogNoise
-from .prepare import Case
+from .prepare import Case, Progress
 from .results import COLOURED, Disturbance, HeldParameter, has_answer
 
 # Noise levels are computed at most this often before the last estimate.
@@ -42,7 +42,6 @@ _MOST, _FEWEST = 20, 4
 _CHANCE = 0.05
 _NEGATIVE_NOTE = "came out negative, which is impossible"
 _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
-Progress = Callable[[str], None]
 
 
 class Fit(NamedTuple):
@@ -208,30 +207,22 @@ def _searched(
         progress("fitting again without what came out negative")
         problem, fixed = holding(dict.fromkeys(negative, 0.0)), dict.fromkeys(negative, _NEGATIVE_NOTE)
         found = search(problem)
-    if has_answer(found) and (plain := _nearly_plain(table, found)):
-        progress("fitting again without what the flights hardly show")
-        simpler = holding(plain)
-        other = search(simpler)
-        if has_answer(other) and float(other.cost) + _against(problem, plain) < float(found.cost) + _CLEARLY:
-            problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
-    return problem, found, rollouts, fixed, negative
-
-
-def _against(problem: InnovationsProblem, values: dict[str, float]) -> float:
-    """The cost that the brackets add at these values, as Gaussian priors. Held parameters have none."""
-    own = problem.problem.unknowns
-    places = [own.names.index(name) for name in values]
-    off = (np.array(list(values.values())) - np.asarray(own.center)[places]) / np.asarray(own.half_width)[places]
-    return float(np.square(off).sum()) / 2
-
-
-def _nearly_plain(table: tuple[Parameter, ...], found: Estimate) -> dict[str, float]:
-    """The plain values of the parameters that were found near them."""
-    return {
+    plain = {
         row.name: row.plain
         for row, value, std in _with_values(table, found)
         if row.plain is not None and std > 0 and abs(value - row.plain) < _SURELY * std
     }
+    if has_answer(found) and plain:
+        progress("fitting again without what the flights hardly show")
+        simpler = holding(plain)
+        other, own = search(simpler), problem.problem.unknowns
+        # The cost that the brackets add at these values, as Gaussian priors. Held parameters have none.
+        places = [own.names.index(name) for name in plain]
+        off = (np.array(list(plain.values())) - np.asarray(own.center)[places]) / np.asarray(own.half_width)[places]
+        against = float(np.square(off).sum()) / 2
+        if has_answer(other) and float(other.cost) + against < float(found.cost) + _CLEARLY:
+            problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
+    return problem, found, rollouts, fixed, negative
 
 
 def _with_values(table: tuple[Parameter, ...], found: Estimate) -> Iterator[tuple[Parameter, float, float]]:

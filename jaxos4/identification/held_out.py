@@ -35,7 +35,11 @@ def predict_held_out(case: Case, fit: Fit, held_out: ShootingProblem) -> tuple[P
     values = np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count]
 
     def scored(values: np.ndarray, noise: LogNoise | None) -> tuple[Predictions, Skill]:
-        parameters = _of_one_recording(fit.problem, held_out, values) if case.validate else values
+        parameters = values
+        if case.validate:  # the mean of those of which each fitted recording has its own
+            fitted = dict(zip(fit.problem.unknowns.names, values.tolist(), strict=True))
+            each = {n: [fitted[own] for own in fitted if own.rpartition("_")[0] == n] for n in held_out.unknowns.names}
+            parameters = np.array([fitted[n] if n in fitted else np.mean(each[n]) for n in each])
         known = None if noise is None else _disturbances(case, fit.problem, held_out, parameters, noise)
         predicted = predictions(held_out, as_float(parameters), disturbance=known, noise=noise)
         return predicted, skill(predicted)
@@ -77,13 +81,6 @@ def _disturbances(
 def _regressed(problem: ShootingProblem, room: int, values: np.ndarray, held: Sequence[bool]) -> np.ndarray:
     """The parameters by regression."""
     return np.asarray(_regression(with_room(problem, room), as_float(values), jnp.asarray(held)))
-
-
-def _of_one_recording(fitted: ShootingProblem, other: ShootingProblem, values: np.ndarray) -> np.ndarray:
-    """The parameters of another recording: the mean of those of which each fitted recording has its own."""
-    known = dict(zip(fitted.unknowns.names, values.tolist(), strict=True))
-    each = {name: [known[own] for own in known if own.rpartition("_")[0] == name] for name in other.unknowns.names}
-    return np.array([known[name] if name in known else np.mean(each[name]) for name in other.unknowns.names])
 
 
 @quick_jit

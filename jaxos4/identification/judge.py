@@ -15,7 +15,7 @@ from ..models.abstract import AbstractModel, Parameter
 from ..models.os4 import CorrectedOS4
 from ..recording.motion import OVER_NOISE, WEAK
 from ..shooting import with_room
-from .answers import AXES, NOISY, overwhelmed, parameter_table, rigid_body, vehicle_constants
+from .answers import AXES, INVERSE, NOISY, overwhelmed, parameter_table, rigid_body, vehicle_constants
 from .fit import Fit
 from .held_out import predict_held_out, validate_on
 from .prepare import Case, Progress
@@ -53,26 +53,22 @@ def doubts_of(
 
     The bounds of the parameters count, and not their standard deviations, which are large where the model is wrong.
     """
-    found = _found(parameters)
-    stds = {name: row.std for name, row in parameters.items() if name in found and row.std is not None}
+    rows = {
+        name: (row.estimate, row.std, row.bound)
+        for name, row in parameters.items()
+        if row.estimate is not None and row.std is not None
+    }
+    found = {name: (value, std if bound is None else bound) for name, (value, std, bound) in rows.items()}
+    stds = {name: std for name, (_, std, _) in rows.items()}
     contradicted = dict(_contradicted(model, found))
     is_thrust_wrong = any(parameter.scales_torque for parameter in contradicted)
     return (
         *contradicted.values(),
         *(() if is_thrust_wrong else _impossible_inertias(constants, model.airframe)),
-        *_answers(found),
-        *_contradictions(found, stds, model.airframe),
+        *_turns(found, stds, model.airframe),
         *_unseen(found, log_step),
         *_skill(skill, still),
     )
-
-
-def _found(parameters: dict[str, ParameterEstimate]) -> Found:
-    return {
-        name: (row.estimate, row.std if row.bound is None else row.bound)
-        for name, row in parameters.items()
-        if row.estimate is not None and row.std is not None
-    }
 
 
 def _contradicted(model: AbstractModel, found: Found) -> Iterator[tuple[Parameter, Doubt]]:
@@ -99,11 +95,8 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
                 f"{name} = {row.estimate:.3g} kg m^2 is {limit_passed} of a vehicle with this mass and arms",
                 f"check `mass`, `rotor_positions` and {scale} in the airframe, and which rotor is which",
             )
-    for axis, others in (("Ix", "IyIz"), ("Iy", "IxIz"), ("Iz", "IxIy")):
-        names = (axis, others[:2], others[2:])
-        if not all(name in constants for name in names):
-            continue
-        one, two, three = (constants[name] for name in names)
+    for axis, one in constants.items() if len(constants) == len(INVERSE) else ():
+        (second, two), (third, three) = (each for each in constants.items() if each[0] != axis)
         excess = one.estimate - two.estimate - three.estimate
         if excess > _SURE * np.sqrt(one.std**2 + two.std**2 + three.std**2) + 0.05 * one.estimate:
             remedy = (
@@ -112,7 +105,7 @@ def _impossible_inertias(constants: dict[str, Constant], airframe: Airframe) -> 
                 else "check `rotor_positions`"
             )
             yield _implausible(
-                f"{axis} = {one.estimate:.3g} exceeds {names[1]} + {names[2]} = {two.estimate + three.estimate:.3g} "
+                f"{axis} = {one.estimate:.3g} exceeds {second} + {third} = {two.estimate + three.estimate:.3g} "
                 "kg m^2, which no rigid body allows",
                 remedy,
             )
@@ -134,15 +127,6 @@ def vibration(disturbances: dict[str, Disturbance], sample_time: float) -> Itera
             )
 
 
-def _noisy_speeds(share: float) -> Iterator[Doubt]:
-    """Noise of measured rotor speeds makes moments of inertia too large. `share`: see `noise_of_speeds`."""
-    if share > NOISY:
-        yield _implausible(
-            f"measured rotor speeds are noisy: noise is {share:.0%} of their changes in a sample",
-            "give longer samples by `sample_time`, or log the speeds better",
-        )
-
-
 def _moved(sample_times: Sequence[SampleTime], step: float, body: RigidBody) -> Iterator[Doubt]:
     """A moment of inertia of `body` that is another one at the next longer sample time. `step`: the chosen one [s]."""
     place = next((i for i, each in enumerate(sample_times) if each.sample_time == step), len(sample_times))
@@ -157,11 +141,16 @@ def _moved(sample_times: Sequence[SampleTime], step: float, body: RigidBody) -> 
             )
 
 
-def _answers(found: Found) -> Iterator[Doubt]:
-    """Roll and pitch must answer the rotors, otherwise nothing was identified; and no axis with the opposite sign."""
+def _turns(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator[Doubt]:
+    """Roll and pitch must answer the rotors, and no axis with the opposite sign; else nothing was identified.
+
+    If none has, gyroscopic couplings must be those of a rigid body with these inertias.
+    """
+    opposite = False
     for name, axis in (("alpha3", "roll"), ("alpha6", "pitch"), ("alpha8", "yaw")):
         value, std = found.get(name, (0.0, 0.0))
         if value + _SURE * std < 0:
+            opposite = True
             yield _implausible(
                 f"{name} = {value:.3g} is negative: {axis} answers the rotors with the opposite sign",
                 "check `rotor_positions` and `rotor_spins`, and the axes of the log",
@@ -171,13 +160,7 @@ def _answers(found: Found) -> Iterator[Doubt]:
                 f"{axis} does not clearly answer the rotors ({name} cannot be distinguished from 0)",
                 f"fly more {axis}, or check `rotor_positions` in the airframe, and which rotor is which",
             )
-
-
-def _contradictions(found: Found, stds: dict[str, float], airframe: Airframe) -> Iterator[Doubt]:
-    """Gyroscopic couplings that no rigid body with these inertias has."""
-    needed = ("alpha1", "alpha3", "alpha4", "alpha6", "alpha7", "alpha8")
-    opposite = [name for name in needed[1::2] if name in found and found[name][0] + _SURE * found[name][1] < 0]
-    if opposite or not all(name in found for name in needed):
+    if opposite or not found.keys() >= {"alpha1", "alpha3", "alpha4", "alpha6", "alpha7", "alpha8"}:
         return
     model = CorrectedOS4(airframe)
     alpha, variance = np.array(model.alpha, dtype=float), np.full(8, np.inf)
@@ -211,16 +194,6 @@ def _unseen(found: Found, log_step: float) -> Iterator[Doubt]:
             f"rotor_delay = {delay:.2g} s: motors are recorded {1e3 * abs(delay):.0f} ms {how}, more than any rotor",
             "check the time stamps of motors and gyro",
         )
-
-
-def _held(fit: Fit) -> Iterator[Doubt]:
-    """Parameters that were not estimated, although what is known of them contradicts physics beyond chance.
-
-    One that is held at 0 came out negative. What is known of another one is its bracket.
-    """
-    widths = dict(zip(fit.problem.unknowns.names, np.asarray(fit.problem.unknowns.half_width).tolist(), strict=True))
-    known = {name: fit.negative.get(name, (row.value, widths[name])) for name, row in fit.held.items()}
-    return (doubt for _, doubt in _contradicted(fit.problem.model, known))
 
 
 def _still_axes(fit: Fit, predicted: Predictions) -> tuple[str, ...]:
@@ -297,14 +270,20 @@ def judge(case: Case, fit: Fit, sample_times: Sequence[SampleTime] = (), *, prog
         }
         still = (*still, *({"yaw"} - {*still}))
         notes.append(f"Iz is not identified: {yaw}; fly more yaw, or in calmer air")
+    own = fit.problem.unknowns
+    widths = dict(zip(own.names, np.asarray(own.half_width).tolist(), strict=True))
+    # One that is held at 0 came out negative. What is known of another held one is its bracket.
+    held = {name: fit.negative.get(name, (row.value, widths[name])) for name, row in fit.held.items()}
     doubts = (
         *(_implausible(cause, remedy) for cause, remedy in case.doubts),
         *(_implausible(why, f"fly more {axis}, or in calmer air") for axis, why in weak.items()),
-        *_held(fit),
+        *(doubt for _, doubt in _contradicted(fit.problem.model, held)),
         *doubts_of(fit.problem.model, trusted, body.constants, skill, still, case.log_step),
     )
-    doubts += (*vibration(fit.disturbances, step), *_noisy_speeds(noise), *_moved(sample_times, step, body))
-    values = as_float(np.asarray(fit.estimate.parameters)[: fit.problem.unknowns.count])
+    what = f"measured rotor speeds are noisy: noise is {noise:.0%} of their changes in a sample"
+    noisy = [_implausible(what, "give longer samples by `sample_time`, or log the speeds better")] * (noise > NOISY)
+    doubts += (*vibration(fit.disturbances, step), *noisy, *_moved(sample_times, step, body))
+    values = as_float(np.asarray(fit.estimate.parameters)[: own.count])
     return {
         "parameters": table,
         "rigid_body": body,

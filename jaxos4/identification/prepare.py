@@ -17,10 +17,11 @@ from ..models import MODELS
 from ..models.abstract import PARAMETER_NAMES, AbstractModel
 from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
+from ..networks.file import load_network
 from ..recording.pieces import Recording
 from ..recording.preparation import HOLDOUT
 from ..shooting import InnovationsProblem, ShootingProblem
-from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, loaded, network_for, network_provenance
+from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, network_for, network_provenance
 from .results import Provenance
 
 Progress = Callable[[str], None]
@@ -156,8 +157,9 @@ def prepare_flight(
     _check_options(name, kind, settings, network)
     if network is not None and not isinstance(estimator, str):
         raise InputError(f"`network`: this {name} estimator has one already; leave it out.")
-    own = estimator.network if isinstance(estimator, Hybrid) else estimator
-    trained = own if isinstance(own, TrainedNetwork) else loaded(network)
+    trained = estimator.network if isinstance(estimator, Hybrid) else estimator
+    if not isinstance(trained, TrainedNetwork):
+        trained = network if network is None or isinstance(network, TrainedNetwork) else load_network(network)
     if trained is not None and not kind.shoots and bracket is not None:
         raise InputError("`bracket`: a network searches the bracket that it was trained in; leave one of them out.")
     where, shooting = bracket_of(bracket, model), {"initial_state": settings.initial_state, "window": settings.window}

@@ -16,7 +16,6 @@ from ..flight import STATE_NAMES
 from ..models.abstract import AbstractModel
 from ..models.state import CASCADE_ORDER, CHANNELS
 from ..networks import NetworkEstimator, TrainedNetwork
-from ..networks.file import load_network
 from ..noise import SENSOR_SIGMA
 from ..recording.pieces import Recording
 from ..shooting import ShootingProblem, Unknowns
@@ -90,7 +89,11 @@ def flight_problem(
         raise InputError(
             f"{name}: first sample: `initial_state` known needs {', '.join(unknown)} there; use `initial_state` free."
         )
-    windows = 1 if window is None else _window_count(recording, window)
+    windows, (samples, dt) = 1, (flight.states.shape[0], float(flight.dt))
+    if window is not None:
+        if window < 2 * dt:
+            raise InputError(f"`window` {window:g}: less than two samples of {name}; give at least {2 * dt:g}.")
+        windows = min(max(round(samples * dt / window), 1), samples // 2)
     missing = [STATE_NAMES[i] for i in columns if not measured[:, i].any()]
     if windows > 1 and missing and chosen != "rates":
         raise InputError(
@@ -124,13 +127,6 @@ def _chosen_channels(name: str, measured: np.ndarray, channels: str | None) -> s
         missing = ", ".join(STATE_NAMES[i] for i in CASCADE_ORDER[_ADDED[channels]])
         raise InputError(f"{name}: `channels` {channels}: none of {missing} was measured; leave it out.")
     return channels
-
-
-def _window_count(recording: Recording, window: float) -> int:
-    samples, dt = recording.flight.states.shape[0], float(recording.flight.dt)
-    if window < 2 * dt:
-        raise InputError(f"`window` {window:g}: less than two samples of {recording.name}; give at least {2 * dt:g}.")
-    return min(max(round(samples * dt / window), 1), samples // 2)
 
 
 def train_network(
@@ -176,11 +172,6 @@ def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> Tr
     unknowns = problem.unknowns
     bracket = Bracket.around(unknowns.center, _FLYABLE * unknowns.half_width)
     return _train(_VEHICLE_TRAINING, problem, bracket, name, seed)
-
-
-def loaded(network: GivenNetwork) -> TrainedNetwork | None:
-    """A network, or the one in a file. Raises as `jaxos4.load_network`."""
-    return network if network is None or isinstance(network, TrainedNetwork) else load_network(network)
 
 
 def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:

@@ -68,13 +68,10 @@ def _started(problem: InnovationsProblem, found: np.ndarray) -> InnovationsProbl
 def shortest(answers: Sequence[SampleTime]) -> int:
     """The place of the sample time that the rule chooses. `answers`: the shortest sample time first."""
     answered = [i for i, answer in enumerate(answers) if answer.constants] or [0]
-    clean = [i for i in answered if _is_clean(answers[i])] or answered[-1:]
+    limits = [WHITE + _CHANCE / math.sqrt(max(answer.samples, 1)) for answer in answers]
+    clean = [i for i in answered if abs(answers[i].correlation) <= limits[i] and answers[i].speed_noise <= NOISY]
+    clean = clean or answered[-1:]
     return next((i for i in clean[:-1] if not moved(answers[i], answers[i + 1])), clean[0])
-
-
-def _is_clean(answer: SampleTime) -> bool:
-    chance = _CHANCE / math.sqrt(max(answer.samples, 1))
-    return abs(answer.correlation) <= WHITE + chance and answer.speed_noise <= NOISY
 
 
 def noise_of_speeds(flight: Flight, finest: Flight, airframe: Airframe) -> float:
@@ -118,12 +115,8 @@ def answer_of(case: Case, fit: Fit, finest: Flight) -> SampleTime:
     if answered and "yaw" in overwhelmed(fit):
         constants = {name: row for name, row in constants.items() if name != "Iz"}
     correlations = [row.correlation for name, row in fit.disturbances.items() if name in AXES] if fit.answered else []
-    largest = max(correlations, key=abs, default=1.0)
-    return SampleTime(float(flight.dt), constants, largest, _samples(fit), noise)
-
-
-def _samples(fit: Fit) -> int:
-    """How many innovations of a body rate count: the sum of their squares, which has a mean of 1."""
-    if not fit.answered or fit.estimate.parts is None:
-        return 0
-    return round(float(np.asarray(fit.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))
+    largest, samples = max(correlations, key=abs, default=1.0), 0
+    if fit.answered and fit.estimate.parts is not None:
+        # The sum of the squares of the innovations of a body rate, which have a mean of 1.
+        samples = round(float(np.asarray(fit.estimate.parts.products)[:, : len(AXES), 0].sum() / len(AXES)))
+    return SampleTime(float(flight.dt), constants, largest, samples, noise)

@@ -17,7 +17,7 @@ _LEVELS = (2.0, 8.0)
 _ANGLES, _VELOCITY, _RATES = ("phi", "theta", "psi"), ("vx", "vy", "vz"), ("p", "q", "r")
 
 
-Ups = tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]
+Ups = tuple[Float[np.ndarray, "_samples 3"], Float[np.ndarray, "_samples 3"]]
 
 
 def velocity_of(recording: Recording) -> tuple[Float[np.ndarray, "samples 3"], Ups] | None:
