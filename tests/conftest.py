@@ -44,19 +44,34 @@ FLAGS_ARE_OURS = os.environ.get("XLA_FLAGS") == OURS
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("ci")
 
+# Modules that share programs, networks and estimates: one worker runs them, one after another.
+TOGETHER = (
+    ("estimators", "errors", "searches", "recursive", "multiple_shooting", "diagnostics", "identifiability"),
+    ("network", "hybrid"),
+    ("vehicle", "vehicle_likelihood"),
+)
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("experiments", "design", "vehicle", "estimators", "network", "experiments_vehicle", "study_resume", "startup"),
-    *("hybrid", "errors", "filter_error", "multiple_shooting", "report_browser", "recursive", "study", "cli"),
-    *("predict", "vehicle_likelihood", "compare", "identifiability", "flight_model_fits", "closed_loop"),
-    *("flight_model", "searches", "identify", "sample_time", "study_cluster", "diagnostics", "simulate", "shooting"),
+    *("experiments", "estimators", "design", "vehicle", "network", "experiments_vehicle", "study_resume", "startup"),
+    *("filter_error", "report_browser", "study", "cli", "predict", "compare"),
+    *("flight_model_fits", "closed_loop", "flight_model", "identify", "study_cluster", "simulate", "shooting"),
 )
+
+
+def together_with(module: str) -> tuple[str, ...]:
+    """The modules that share programs with a module, and itself."""
+    return next((group for group in TOGETHER if module in group), (module,))
+
+
+def name_of(path: str) -> str:
+    return pathlib.PurePath(path).stem.removeprefix("test_")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sorts the modules. The order of the tests in a module does not change."""
-    places = {f"test_{name}": place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
+    order = [name for first in LONGEST for name in together_with(first)]
+    places = {name: place for place, name in enumerate(order)}
+    items.sort(key=lambda item: places.get(name_of(item.path.name), len(order)))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -70,10 +85,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
     """One worker runs all tests of a module, so that its fixtures and compiled programs are made once."""
     if config.getvalue("dist") != "load":  # the default of `-n`
         return None
-    from xdist.scheduler import LoadFileScheduling
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Together(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return together_with(name_of(nodeid.partition("::")[0]))[0]
 
     config.option.loadscopereorder = False
-    return LoadFileScheduling(config, log)
+    return Together(config, log)
 
 
 # Modules that compute for longer than they compile. XLA hardly optimises the programs of the others, which then compile

@@ -5,12 +5,13 @@ import functools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from helpers import inverse_square, numpy_jacobian, random_starts, standard_flight, standard_problem
+from helpers import inverse_square, noisy_states, numpy_jacobian, random_starts, standard_flight, standard_problem
 
 import jaxos4
 
 HALF = jaxos4.DEFAULT_HALF_WIDTH
 LANES = 64
+FEW = 16  # of an estimator that computes for longer than it compiles
 
 
 @eqx.filter_jit
@@ -32,6 +33,17 @@ def lanes(states, model_class=jaxos4.PublishedOS4, channels="rates", *, free=Fal
     problem = standard_problem(model_class, channels, free=free)
     problem = eqx.tree_at(lambda p: p.sigma, problem, scale * problem.sigma)
     return problem, states, omega, center - HALF, center + HALF
+
+
+def noisy(kind, model_class=jaxos4.PublishedOS4, channels="rates", free=False, scale=1.0, count=LANES):
+    """Estimates of noisy flights by the estimator that `kind()` makes. Tests in one process share them."""
+    return _noisy(kind, model_class, channels, free, scale, count)
+
+
+@functools.cache
+def _noisy(kind, model_class, channels, free, scale, count):
+    states = noisy_states(count, model_class, seed=50, scale=scale)
+    return identify(kind(), *lanes(states, model_class, channels, free=free, scale=scale))
 
 
 @functools.cache

@@ -1,7 +1,5 @@
 """Diagnostics of residuals accept true models and detect wrong ones."""
 
-import itertools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from helpers import measured, noisy_states, standard_flight, standard_problem
-from lanes import LANES, identify
+from lanes import LANES, identify, lanes
 
 import jaxos4
 
@@ -18,15 +16,11 @@ LAGS = 25
 
 def judged(states):
     """The diagnostics of a fit to each flight."""
-    problem, each = standard_problem(channels="rates"), []
-    around = jaxos4.Bracket.default(problem.model)
-    settings = [np.tile(x, (LANES, 1)) for x in (around.lower, around.upper)]
-    settings = [jnp.asarray(x) for x in (np.tile(problem.flight.omega, (LANES, 1, 1)), *settings)]
-    for first in range(0, len(states), LANES):
-        some = jnp.asarray(np.resize(states[first : first + LANES], (LANES, *states.shape[1:])))
-        found = identify(jaxos4.IBSS(), problem, some, *settings)
-        answers = zip(some, found.parameters, found.initial_state, strict=True)
-        for flown, parameters, start in itertools.islice(answers, len(states) - first):
+    each = []
+    for some in jnp.split(states, len(states) // LANES):
+        problem, *arguments = lanes(some)
+        found = identify(jaxos4.IBSS(), problem, *arguments)
+        for flown, parameters, start in zip(some, found.parameters, found.initial_state, strict=True):
             flight = eqx.tree_at(lambda p: p.flight.states, problem, flown)
             each.append(jaxos4.residual_diagnostics(jaxos4.evaluate(flight, parameters, start)))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
@@ -62,7 +56,7 @@ def test_figures_are_those_of_plain_numpy():
 
 
 def test_true_models_pass_as_often_as_the_level_says():
-    flights = 400
+    flights = 4 * LANES
     found = judged(noisy_states(flights, seed=21))
     error = np.sqrt(0.05 * 0.95 / (3 * flights))
     for p in (found.white_p, found.level_p):
@@ -74,14 +68,14 @@ def test_true_models_pass_as_often_as_the_level_says():
 
 
 FIFTH = np.arange(501)[:, None] % 5 == 0
-GAPS = {"7 of 10": np.random.default_rng(0).random((200, 501, 12)) > 0.7, "4 of 5": FIFTH}
+GAPS = {"7 of 10": np.random.default_rng(0).random((2 * LANES, 501, 12)) > 0.7, "4 of 5": FIFTH}
 
 
 @pytest.mark.parametrize("kept", GAPS.values(), ids=GAPS)
 def test_missing_samples_do_not_look_like_colour(kept):
     """Also of every fifth sample, which leaves pairs at five of 25 lags."""
-    found = judged(jnp.where(kept, noisy_states(200, seed=22), jnp.nan))
-    assert abs(float((found.white_p < 0.05).mean()) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 600)
+    found = judged(jnp.where(kept, noisy_states(2 * LANES, seed=22), jnp.nan))
+    assert abs(float((found.white_p < 0.05).mean()) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / found.white_p.size)
 
 
 def test_coloured_noise_and_a_wrong_size_are_seen():

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import noisy_states, random_starts, standard_flight, standard_problem
-from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors, identify, lanes, names
+from lanes import HALF, LANES, assert_chi_square, assert_covered, bound, errors, identify, lanes, names, noisy
 
 import jaxos4
 
@@ -41,15 +41,9 @@ FLIGHTS = [
 ]
 
 
-@functools.cache
-def noisy(name, model_class, channels, free, scale=1.0):
-    states = noisy_states(LANES, model_class, seed=50, scale=scale)
-    return identify(MAKE[name](), *lanes(states, model_class, channels, free=free, scale=scale))
-
-
 @pytest.mark.parametrize(("name", "model_class", "channels", "free", "scale", "least", "most"), FLIGHTS)
 def test_errors_are_as_large_as_they_claim(name, model_class, channels, free, scale, least, most):
-    estimates, unit = noisy(name, model_class, channels, free, scale), scale * bound(model_class, channels, free)
+    estimates, unit = noisy(MAKE[name], model_class, channels, free, scale), scale * bound(model_class, channels, free)
     assert names(estimates).tolist() == ["successful"] * LANES
     error = errors(estimates, model_class)
     efficiency = np.sqrt(np.mean((error / unit) ** 2, axis=0))

@@ -1,6 +1,5 @@
 """Laws that hold for every estimator of the registry that needs no network: one batch of noisy flights, one program."""
 
-import functools
 import json
 import os
 import subprocess
@@ -13,7 +12,20 @@ import numpy as np
 import optimistix
 import pytest
 from helpers import doublet_problem, how_we_compile, noisy_states, standard_flight, standard_problem
-from lanes import HALF, assert_chi_square, assert_nothing_invented, bound, errors, identify, lanes, lost, names
+from lanes import (
+    FEW,
+    HALF,
+    LANES,
+    assert_chi_square,
+    assert_nothing_invented,
+    bound,
+    errors,
+    identify,
+    lanes,
+    lost,
+    names,
+    noisy,
+)
 
 import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
@@ -21,31 +33,39 @@ from jaxos4.estimators import ESTIMATORS, make_estimator
 
 MODEL, P = jaxos4.PublishedOS4(), jaxos4.STATE_NAMES.index("p")
 NAMES = [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
-FEW = 16  # lanes of a batch
+SLOW = ("filter-error", "ant-colony")  # those that compute for longer than they compile
 
 
 @pytest.fixture(params=NAMES)
 def name(request):
-    """Every estimator in turn. Filter error computes for longer than it compiles."""
-    if request.param == "filter-error":
+    """Every estimator in turn."""
+    if request.param in SLOW:
         request.getfixturevalue("optimised")
     return request.param
 
 
-@functools.cache
-def noisy(name, scale=1.0):
-    return identify(make_estimator(name), *lanes(noisy_states(FEW, seed=50, scale=scale), scale=scale))
+def count_of(name):
+    """The lanes of a batch."""
+    return FEW if name in (*SLOW, "rls") else LANES
+
+
+def found_by(name, scale=1.0):
+    return noisy(ESTIMATORS[name], scale=scale, count=count_of(name))
+
+
+def flights_for(name):
+    return lanes(noisy_states(count_of(name), seed=50))
 
 
 def test_tiny_noise_gives_the_truth(name):
-    estimates = noisy(name, 1e-4)
+    estimates = found_by(name, 1e-4)
     assert set(names(estimates)) == {"successful"}
     most = 0.02 * HALF if name == "svsf" else 10 * 1e-4 * bound()
     assert (np.abs(estimates.parameters - MODEL.alpha) < most).all()
 
 
 def test_loop_jit_and_vmap_agree(name):
-    batched, (problem, states, _, lower, upper) = noisy(name), lanes(noisy_states(FEW, seed=50))
+    batched, (problem, states, _, lower, upper) = found_by(name), flights_for(name)
     assert set(names(batched)) == {"successful"}
     for lane in range(2):
         data = eqx.tree_at(lambda p: p.flight.states, problem, states[lane])
@@ -58,7 +78,7 @@ def test_loop_jit_and_vmap_agree(name):
 
 
 def test_failing_lanes_leave_their_neighbours_alone(name):
-    problem, *arrays = lanes(noisy_states(FEW, seed=50))
+    problem, *arrays = flights_for(name)
     states, omega, lower, upper = (np.array(x) for x in arrays)
     failed, vague = np.arange(1, 16, 2), np.array([2, 4, 6])
     omega[1, 250, 2] = np.nan
@@ -74,11 +94,11 @@ def test_failing_lanes_leave_their_neighbours_alone(name):
     omega[4] = MODEL.airframe.hover_speed
     states[6] = np.nan  # nothing was measured
     broken = identify(make_estimator(name), problem, *map(jnp.asarray, (states, omega, lower, upper)))
-    expected = np.full(FEW, "successful", dtype=object)
+    expected = np.full(len(states), "successful", dtype=object)
     expected[failed], expected[vague] = ["nonfinite_trajectory"] * 4 + ["bracket_invalid"] * 4, "unidentifiable"
     assert names(broken).tolist() == expected.tolist()
-    others = np.setdiff1d(np.arange(FEW), [*failed, *vague])
-    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(noisy(name)), strict=True):
+    others = np.setdiff1d(np.arange(len(states)), [*failed, *vague])
+    for kept, was in zip(jax.tree.leaves(broken), jax.tree.leaves(found_by(name)), strict=True):
         np.testing.assert_array_equal(np.asarray(kept)[others], np.asarray(was)[others])
     # Every parameter is finite. A lane without an answer is infinitely uncertain.
     assert all(np.isfinite(leaf).all() for leaf in (broken.parameters, broken.initial_state))
@@ -97,7 +117,7 @@ def test_failing_lanes_leave_their_neighbours_alone(name):
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "svsf"])
 def test_missing_samples_only_cost_precision(name):
     """Three of ten measurements are lost, and the covariance still describes the errors."""
-    estimates = identify(make_estimator(name), *lanes(lost(noisy_states(FEW, seed=7))))
+    estimates = identify(make_estimator(name), *lanes(lost(noisy_states(count_of(name), seed=7))))
     assert set(names(estimates)) == {"successful"}
     assert (np.median(estimates.std, axis=0) > 1.05 * bound()).all()
     assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))
@@ -138,7 +158,7 @@ json.dump(answers, sys.stdout)
 
 def test_single_precision_is_enough(tmp_path):
     """In a process of its own, with JAX as it comes."""
-    _, states, _, lower, upper = lanes(noisy_states(FEW, seed=50))
+    _, states, _, lower, upper = lanes(noisy_states(1, seed=50))
     exact, off = standard_flight(), MODEL.alpha + 0.5 * HALF
     data = exact.time, exact.omega, exact.states, states[0], noisy_states(2), lower[0], upper[0], off - HALF, off + HALF
     np.savez(tmp_path / "flights.npz", *data)
@@ -150,7 +170,7 @@ def test_single_precision_is_enough(tmp_path):
         assert result == "successful", name
         parameters, std = np.array(parameters), np.array(std)
         if name in ("filter-error", "kalman"):  # the answer of double precision
-            (most, wider), double = {"filter-error": (0.1, 0.05), "kalman": (0.05, 0.02)}[name], noisy(name)
+            (most, wider), double = {"filter-error": (0.1, 0.05), "kalman": (0.05, 0.02)}[name], found_by(name)
             assert (np.abs(parameters - double.parameters[0]) < most * double.std[0]).all(), name
             np.testing.assert_allclose(std, double.std[0], rtol=wider)
         elif name.startswith("ibss"):  # noisy flights, all channels: errors are those of the noise

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import DT, REFERENCES, noisy_states, published_derivative, random_starts, standard_problem
-from lanes import HALF, LANES, bound, errors, identify, lanes, lost, names
+from lanes import HALF, LANES, bound, errors, identify, lanes, lost, names, noisy
 
 import jaxos4
 from jaxos4.estimators.kalman import JointEKF
@@ -15,19 +15,13 @@ from jaxos4.estimators.svsf import SVSF
 
 PUBLISHED, CORRECTED = jaxos4.PublishedOS4, jaxos4.CorrectedOS4
 ORDER = np.array([7, 9, 11, 6, 8, 10, 0, 1, 2, 3, 4, 5])  # p, q, r, phi, theta, psi, x, vx, ...
-FEW = 16  # lanes of a batch
-
-
-@functools.cache
-def noisy(model_class, channels, free, passes=10):
-    arguments = lanes(noisy_states(FEW, model_class), model_class, channels, free=free, seed=100)
-    return identify(JointEKF(passes=passes), *arguments)
 
 
 def test_one_pass_is_not_enough_beyond_the_rates():
     """Why there are passes: the plain filter keeps the errors of its first linearisations, and does not know it."""
     case = CORRECTED, "all", False
-    (plain, few, enough), unit = (noisy(*case, passes) for passes in (1, 2, 10)), bound(*case)
+    kinds = (functools.partial(JointEKF, passes=1), functools.partial(JointEKF, passes=2), JointEKF)
+    (plain, few, enough), unit = (noisy(kind, *case) for kind in kinds), bound(*case)
     assert set(names(plain)) == {"successful"}
     assert (np.sqrt(np.mean((errors(plain, CORRECTED) / unit) ** 2, axis=0)) > 1.5).all()
     assert (np.asarray(enough.sweeps) > 2).all()
@@ -38,10 +32,10 @@ def test_one_pass_is_not_enough_beyond_the_rates():
 
 @pytest.mark.parametrize(("model_class", "channels", "free"), [(PUBLISHED, "rates", True), (CORRECTED, "all", False)])
 def test_history_ends_at_the_answer(model_class, channels, free):
-    estimates = noisy(model_class, channels, free)
+    estimates = noisy(JointEKF, model_class, channels, free)
     np.testing.assert_array_equal(estimates.rollouts, (8 + 3 * free + 1) * estimates.sweeps + 1)
     history = np.asarray(estimates.history)
-    assert history.shape == (FEW, 501, 8)
+    assert history.shape == (LANES, 501, 8)
     np.testing.assert_array_equal(history[:, -1], estimates.parameters)
     # The error shrinks on the way.
     off = np.sqrt(np.mean(((history - np.asarray(model_class().alpha)) / HALF) ** 2, axis=(0, 2)))
@@ -142,7 +136,7 @@ def test_a_linear_model_with_a_wide_prior_is_least_squares():
 
 def test_agrees_with_shooting():
     """The prior aside, which a wide bracket makes weak, both have the same optimum."""
-    problem, states, omega, lower, upper = lanes(noisy_states(FEW), seed=100)
+    problem, states, omega, lower, upper = lanes(noisy_states(LANES, seed=50))
     middle = (lower + upper) / 2
     wide = identify(JointEKF(), problem, states, omega, middle - 5 * HALF, middle + 5 * HALF)
     shot = identify(jaxos4.IBSS(tolerance=1e-4), problem, states, omega, lower, upper)
@@ -154,13 +148,8 @@ def test_agrees_with_shooting():
 RATES = [7, 9, 11]
 
 
-@functools.cache
-def noisy_svsf():
-    return identify(SVSF(), *lanes(noisy_states(LANES, seed=50)))
-
-
 def test_history_is_what_was_averaged_and_other_channels_do_not_matter():
-    estimates = noisy_svsf()
+    estimates = noisy(SVSF)
     history = np.asarray(estimates.history)
     assert history.shape == (LANES, 501, 8)
     late = np.arange(501) >= 0.5 * 501

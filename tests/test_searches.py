@@ -6,16 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import noisy_states, same, standard_flight, standard_problem
-from lanes import HALF, bound, identify, lanes, names
+from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
 
 PUBLISHED = jaxos4.PublishedOS4
-FEW = 16  # lanes of a batch
 
 
 def test_where_a_start_is_nan_the_search_begins_at_the_center():
-    arguments = lanes(noisy_states(FEW))
+    arguments = lanes(noisy_states(LANES))
     center = (arguments[-1] + arguments[-2]) / 2
     found = [identify(jaxos4.IBSS(), *arguments, start) for start in (center, center.at[7, 2].set(jnp.nan))]
     assert same(*found)
@@ -25,20 +24,23 @@ def test_where_a_start_is_nan_the_search_begins_at_the_center():
 
 
 def test_too_few_sweeps_are_reported():
-    estimates = identify(jaxos4.IBSS(max_sweeps=1, tolerance=1e-8), *lanes(noisy_states(FEW)))
+    estimates = identify(jaxos4.IBSS(max_sweeps=1, tolerance=1e-8), *lanes(noisy_states(LANES)))
     assert set(names(estimates)) == {"max_sweeps"}
     assert np.isfinite(estimates.parameters).all()
     assert (np.asarray(estimates.sweeps) == 3).all()  # one for each share of the flight
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("directions", ["whitened", "coordinate"])
 def test_both_kinds_of_directions_reach_the_maximum_of_the_likelihood(directions):
     """That of output error, which is that of another minimiser: `test_estimators.py`."""
-    arguments = lanes(noisy_states(FEW, seed=5))
-    best = identify(jaxos4.OutputError(tolerance=1e-9), *arguments).parameters
+    problem, *arguments = lanes(noisy_states(LANES, seed=5))
+    best = identify(jaxos4.OutputError(tolerance=1e-9), problem, *arguments).parameters
+    if directions == "coordinate":
+        best, *arguments = (each[:FEW] for each in (best, *arguments))
     # What the default tolerance allows is far below the noise.
     for settings, most in (({"tolerance": 1e-5}, 1e-4), ({}, 0.05)):
-        estimates = identify(jaxos4.IBSS(directions=directions, **settings), *arguments)
+        estimates = identify(jaxos4.IBSS(directions=directions, **settings), problem, *arguments)
         assert set(names(estimates)) == {"successful"}
         assert np.abs((estimates.parameters - best) / bound()).max() < most
 
@@ -94,8 +96,8 @@ def test_rollouts_are_counted_right():
 
 
 def test_the_colony_reaches_the_optimum_of_ibss_with_many_more_rollouts():
-    arguments = lanes(noisy_states(FEW, seed=50))
-    colony, ibss = (identify(estimator, *arguments) for estimator in (jaxos4.AntColony(), jaxos4.IBSS()))
+    colony = noisy(jaxos4.AntColony, count=FEW)
+    ibss = jax.tree.map(lambda leaf: leaf[:FEW], noisy(jaxos4.IBSS))
     assert set(names(colony)) == {"successful"}
     # A cost of 0.005 is an error of 0.1 standard deviations.
     assert (np.abs(colony.cost - ibss.cost) < 5 * jaxos4.AntColony().tolerance).all()

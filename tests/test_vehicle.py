@@ -128,7 +128,7 @@ def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
     assert seen.flight.time.shape == (24 * 62,)
     unknowns = seen.unknowns
     bracket = jaxos4.Bracket.around(unknowns.center + unknowns.half_width, 0.5 * unknowns.half_width)
-    settings = jaxos4.NetworkEstimator(steps=100, batch=64, noise=(1.0, 1.0), held_out=2000)
+    settings = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
     hybrid = jaxos4.Hybrid(settings.fit(seen, bracket, key=jax.random.key(0)), seen=seen)
     found, newton = hybrid(InnovationsProblem(shooting_problem(flight, airframe))), lane(found_by("filter error"), 0)
     assert names(found) == "successful"
@@ -137,7 +137,7 @@ def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
 
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
-    small = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=2000)
+    small = jaxos4.NetworkEstimator(steps=20, batch=16, noise=(1.0, 1.0), held_out=1000)
     monkeypatch.setattr(problems, "_VEHICLE_TRAINING", small)
     flight, airframe = (lane(part, 0) for part in flown())
     shorter = jax.tree.map(lambda leaf: leaf[:1001] if leaf.ndim else leaf, flight)
