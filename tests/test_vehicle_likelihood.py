@@ -47,15 +47,12 @@ def cost_of(problem, parameters, noise):
     return problem.innovations(parameters, noise).cost.sum()
 
 
-@eqx.filter_jit
-def searched(problem):
-    return jaxos4.FilterError()(problem)
-
-
-def named(problem, found):
-    """Value and standard deviation of each parameter."""
-    rows = zip(found.parameters.tolist(), found.std.tolist(), strict=True)
-    return dict(zip(problem.problem.unknowns.names, rows, strict=False))
+def case_of(flight, sample_time):
+    """As `jaxos4.identify` prepares it, so that all fits are one program."""
+    settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=sample_time, holdout=0.0)
+    nothing = dict.fromkeys(("estimator", "bracket", "network", "validate"))
+    (case,) = prepare_vehicle(as_recordings(flight), CRAZYFLIE, settings, **nothing)
+    return case
 
 
 # The choice of the sample time.
@@ -130,10 +127,7 @@ def test_four_sample_times_need_one_program():
 
 def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain():
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
-    settings = jaxos4.VehicleSettings(terms=TERMS, sample_time=2 * DT, holdout=0.0)
-    (case,) = prepare_vehicle(
-        as_recordings(flown()), CRAZYFLIE, settings, estimator=None, bracket=None, network=None, validate=None
-    )
+    case = case_of(flown(), 2 * DT)
     _, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
     assert set(answer.constants) == {"Ix", "Iy", "Iz"}
     place = fit.problem.model.parameter_names.index("thrust_gain")
@@ -258,8 +252,10 @@ def test_shifted_clocks_give_the_same_inertias():
     flight, found = flown(), {}
     for shift in (-5, 0, 5):
         rows = np.clip(np.arange(SAMPLES) - shift, 0, SAMPLES - 1)
-        problem = problem_of(dataclasses.replace(flight, omega=np.asarray(flight.omega)[rows]))
-        found[shift] = named(problem, searched(problem))
+        case = case_of(dataclasses.replace(flight, omega=np.asarray(flight.omega)[rows]), DT)
+        answer = case.estimator(case.problem)
+        values = zip(answer.parameters.tolist(), answer.std.tolist(), strict=True)
+        found[shift] = dict(zip(case.shooting.model.parameter_names, values, strict=False))
     for shift in (-5, 5):
         for name in ("alpha3", "alpha6"):
             (value, std), (own, _) = found[shift][name], found[0][name]
