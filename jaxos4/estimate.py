@@ -262,6 +262,7 @@ class AbstractEstimator(eqx.Module):
     - `needs_network`: whether it needs a trained network.
     - `in_closed_loop`: whether it searches a likelihood of innovations too, and so serves a vehicle that a controller
       flies.
+    - `in_comparison`: whether `jaxos4 compare` runs it; false if it takes longer than all others together.
     """
 
     looks_at: AbstractClassVar[str]
@@ -269,6 +270,7 @@ class AbstractEstimator(eqx.Module):
     prior: AbstractClassVar[float]
     needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = False
+    in_comparison: ClassVar[bool] = True
 
     @classmethod
     def of(cls, network: "AbstractEstimator | None" = None) -> "AbstractEstimator":

@@ -92,6 +92,7 @@ ESTIMATORS["toy"] = OneStep  # the line in the registry
 from jaxos4.cli import main
 from jaxos4.cli.studies import comparison
 
+assert {*ESTIMATORS} - {*comparison(quick=False).estimators} == {"ant-colony"}
 assert comparison(quick=False).estimators[-1] == "toy"
 for line in open(sys.argv[1]):
     sys.argv = ["jaxos4", *line.split()]

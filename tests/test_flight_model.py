@@ -254,6 +254,11 @@ def test_a_new_term_is_one_object(monkeypatch):
     np.testing.assert_allclose(found.parameters[-3:], [0.5, 0.3, 0.8], atol=1e-4)
     with pytest.raises(ValueError, match="acts on the forcing"):
         Term("", (Parameter("own_lag", "s", 0.1, each_recording=True),), speed=lambda omega, *other: omega)
+    servo = Term("", (Parameter("own_lag", "s", 0.1),), speed=lambda omega, *other: omega)
+    monkeypatch.setitem(jaxos4.TERMS, "servo", servo)
+    assert jaxos4.FlightModel(terms=("servo",)).parameter_names[8:] == ("own_lag",)
+    with pytest.raises(ValueError, match="lag says how the rotors follow their commands; leave out servo"):
+        jaxos4.FlightModel(terms=("servo", "lag"))
 
 
 def test_an_estimate_uses_the_terms_that_the_logs_allow():

@@ -22,7 +22,7 @@ _UNITS |= {"rotor1 rotor2 rotor3 rotor4": "rad/s"}
 
 
 def inspect(
-    log: Annotated[Path, Argument(metavar="LOG", help="A log: flight CSV, ULog, blackbox or Crazyflie.")],
+    log: Annotated[Path, Argument(metavar="LOG", help="A flight in one of the formats of docs/logs.md.")],
     airframe: Annotated[
         str | None,
         Option(help="A preset (os4, crazyflie, x500, ...) or a TOML file. Needed to compare torques and motion."),

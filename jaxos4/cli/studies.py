@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from ..errors import InputError
-from ._options import Estimator
+from ._options import ESTIMATORS
 from ._output import stages
 
 if TYPE_CHECKING:
@@ -134,8 +134,7 @@ def comparison(*, quick: bool) -> "Study":
         )
     return Study(
         title="IBSS, network, hybrid and baselines under sensor noise",
-        # The ant colony alone takes longer than all the others: `experiments/comparison` has it.
-        estimators=tuple(name.value for name in Estimator if name != "ant-colony"),
+        estimators=tuple(name for name, kind in ESTIMATORS.items() if kind.in_comparison),
         flights=256,
         network=Training(steps=2000, held_out=5000, hybrid_channels="rates"),
     )

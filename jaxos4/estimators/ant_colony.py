@@ -61,6 +61,7 @@ class AntColony(AbstractEstimator):
     shoots: ClassVar[bool] = True
     prior: ClassVar[float] = NO_PRIOR
     in_closed_loop: ClassVar[bool] = True
+    in_comparison: ClassVar[bool] = False  # `experiments/comparison` has it
 
     archive: int = eqx.field(static=True, converter=integer("archive", 2, static=True), default=50)
     ants: int = eqx.field(static=True, converter=integer("ants", 1, static=True), default=10)

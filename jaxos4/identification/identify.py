@@ -55,8 +55,8 @@ def identify(
     - `subject`: a model in alpha_1..8, such as `PublishedOS4()`, or the `Airframe` of a real vehicle.
     - `settings`: how to look at the flights: `FlightSettings` for a model, `VehicleSettings` for an airframe.
     - `estimator`: a name in `jaxos4.estimators.ESTIMATORS`, or an estimator. By default `"ibss"` for a model, and
-      `"filter-error"` for a vehicle, which flies in closed loop. Others for a vehicle: `"ibss"`, `"hybrid"`,
-      `"ant-colony"`, which search the same likelihood.
+      `"filter-error"` for a vehicle, which flies in closed loop. Others for a vehicle search the same likelihood,
+      for example `"ibss"`.
     - `bracket`: a `Bracket`, or `[lower, upper]` by parameter name; the model's default for all others.
     - `network`: for a model, a trained network or its file; without it, an estimator that needs a network trains one.
     - `validate`: another flight, which is not fitted but predicted.

@@ -15,7 +15,7 @@ from ..errors import InputError, TrainingError
 from ..estimate import AbstractEstimator
 from ..estimators import ESTIMATORS, IBSS, FilterError, Hybrid, make_estimator
 from ..flight import Flight
-from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, default_terms
+from ..models.terms import FULL_SCALE, TERMS, VERTICAL_BIAS, VOLTAGE, clash, default_terms
 from ..models.vehicle import FlightModel
 from ..recording import preparation
 from ..recording.pieces import Recording
@@ -210,6 +210,6 @@ def _checked_terms(terms: Sequence[str] | None, available: frozenset[str]) -> tu
         if missing:
             what = " and ".join(sorted(missing))
             raise InputError(f"`terms`: {term} needs {what}, which these logs did not measure; leave it out.")
-    if {"motor", "lag"} <= set(terms):
-        raise InputError("`terms`: motor includes the lag of the rotors; leave out lag.")
+    if why := clash(terms):
+        raise InputError(f"`terms`: {why}.")
     return tuple(term for term in TERMS if term in terms)

@@ -3,7 +3,7 @@
 A new term is one more `Term` in `TERMS`; everything else is found in that object.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -61,8 +61,8 @@ class Term:
     with the term. The contributions act in this order:
 
     - `command(omega, values, grid)`: the commands [rad/s], a function of the numbers of the samples.
-    - `speed(omega, values, part, airframe)`: the rotor speeds that follow the commands over some samples. Only one term
-      may have it.
+    - `speed(omega, values, part, airframe)`: the rotor speeds that follow the commands over some samples. Only one of
+      the terms in use may have it.
     - `angular_acceleration(total, values, rates, forcing)`: p', q', r' [rad/s^2].
     - `specific_force(force, values, forcing)`: along the body's axes [m/s^2].
     - `gyro(rates, values)`: the measured body rates [rad/s].
@@ -311,6 +311,12 @@ TERMS: dict[str, Term] = {
 def default_terms(available: frozenset[str]) -> tuple[str, ...]:
     """The terms that an estimate uses if the user names none, given what the logs and the airframe provide."""
     return tuple(name for name, term in TERMS.items() if term.needs <= available and term.by_default(available))
+
+
+def clash(terms: Container[str]) -> str:
+    """Why these terms cannot be used together; empty if they can."""
+    first, *others = [name for name, term in TERMS.items() if name in terms and term.speed] or [""]
+    return f"{first} says how the rotors follow their commands; leave out {', '.join(others)}" if others else ""
 
 
 def required(value: T | None, message: str) -> T:

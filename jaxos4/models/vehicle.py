@@ -23,6 +23,7 @@ from .terms import (
     VOLTAGE,
     Term,
     Values,
+    clash,
     default_terms,
     required,
 )
@@ -85,8 +86,8 @@ class FlightModel(AbstractModel):
         unknown = [term for term in terms if term not in TERMS]
         if unknown or len(set(terms)) < len(terms):
             raise ValueError(f"`terms` must be some of {', '.join(TERMS)}, each once, got {', '.join(terms)}.")
-        if {"motor", "lag"} <= set(terms):
-            raise ValueError("`terms`: motor includes the lag of the rotors; leave out lag.")
+        if why := clash(terms):
+            raise ValueError(f"`terms`: {why}.")
         if not recordings or sorted(set(recordings)) != list(range(max(recordings) + 1)):
             raise ValueError(f"`recordings` must count from 0 and leave no number out, got {recordings}.")
         unscaled = [term for term in terms if FULL_SCALE in TERMS[term].needs]

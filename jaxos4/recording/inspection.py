@@ -43,7 +43,7 @@ class Part(msgspec.Struct, frozen=True):
 class Inspection(msgspec.Struct, frozen=True):
     """The inspection of one log.
 
-    - `log`, `format`: the file, and "CSV", "ULog", "blackbox" or "Crazyflie".
+    - `log`, `format`: the file, and the `name` of its `LogFormat`.
     - `samples`, `begin`, `end`, `sample_time`: the uniform grid of the flight [s].
     - `measured`: by channel. `rotor1` to `rotor4` are speeds [rad/s], or commands as a share of full scale.
     - `findings`: why no vehicle can be identified from the log, and what to do, most important first.
