@@ -116,9 +116,6 @@ class References(task.AbstractTask):
 
     kind: ClassVar[str] = "references"
     vehicles: ClassVar[int] = LANES
-    starts: ClassVar[int] = 8
-    first: ClassVar[float] = 0.85
-    steps: ClassVar[int] = 80
 
     envelope: Envelope
     scale: Float[Numeric, "3"]
@@ -247,7 +244,7 @@ def design_references(
         criterion=criterion,
         **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )
-    return task.solve(references, compare=compare, key=key, progress=progress)
+    return task.solve(references, (8, 0.85, 80), compare=compare, key=key, progress=progress)
 
 
 def _too_gusty(name: str) -> InputError:

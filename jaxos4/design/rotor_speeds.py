@@ -38,6 +38,8 @@ _TARGET, _PRECISION = 0.95, 1e-3
 _MOST_CORRECTIONS, _MOST_AMPLIFIED, _FAR = 5, 100.0, 10.0
 # The amplitude of tones below this frequency [Hz] is that at this frequency: angles would allow almost none.
 _SLOWEST = 0.3
+# The searches begin with about half of the envelope: a coefficient of 1 alone uses all of it.
+_PLAN = (4, 0.17, 40)
 # Squared rotor speeds stay above this, which is outside of the envelope [rad^2/s^2].
 _LEAST = 1e-6
 
@@ -97,10 +99,6 @@ class RotorSpeeds(task.AbstractTask):
 
     kind: ClassVar[str] = "rotor speeds"
     vehicles: ClassVar[int] = VEHICLES
-    starts: ClassVar[int] = 4
-    # About half of the envelope: a coefficient of 1 alone uses all of it.
-    first: ClassVar[float] = 0.17
-    steps: ClassVar[int] = 40
 
     envelope: Envelope
     scale: Float[Numeric, " parameters"]
@@ -318,7 +316,7 @@ def design_input(
         start_is_known=start_is_known,
         criterion=criterion,
     )
-    found = task.solve(rotor_speeds, compare=compare, key=key, progress=progress)
+    found = task.solve(rotor_speeds, _PLAN, compare=compare, key=key, progress=progress)
     if not (found.designed.bounds < rotor_speeds.unexcited).any():
         raise InputError("the limits are too narrow: no input within them excites a parameter; widen them.")
     return found

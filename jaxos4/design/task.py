@@ -94,17 +94,13 @@ class AbstractTask(eqx.Module):
     """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
-    - `size`: the number of coefficients. `starts`: the number of searches. `first`: the length of their first
-      coefficients. `steps`: the number of steps of BFGS in a stage.
+    - `size`: the number of coefficients.
     - `names`, `units`: those of the parameters, the targets first. `scale`: for each target, a size of which accuracies
       are shares. `unexcited`: a parameter whose bound is not below this counts as not excited.
     """
 
     kind: ClassVar[str]
     vehicles: ClassVar[int]
-    starts: ClassVar[int]
-    first: ClassVar[float]
-    steps: ClassVar[int]
     size: eqx.AbstractVar[int]
     envelope: eqx.AbstractVar[Envelope]
     names: eqx.AbstractVar[tuple[str, ...]]
@@ -161,14 +157,17 @@ class Design(NamedTuple):
         return mean, int(excited.sum())
 
 
-def solve(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) -> Design:
-    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`."""
+def solve(task: AbstractTask, plan: tuple[int, float, int], *, compare: bool, key: Key, progress: Progress) -> Design:
+    """Search inputs, fit them into the envelope, and judge them, beside the standard inputs if `compare`.
+
+    `plan`: the number of searches, the length of their first coefficients, and the steps of BFGS in a stage.
+    """
     progress("compiling the search")
-    directions = jax.random.normal(jax.random.fold_in(key, 2), (task.starts, task.size), dtype=float)
-    starts = task.first / math.sqrt(task.size) * directions
-    costs = np.zeros(task.starts)
+    searches, first, steps = plan
+    directions = jax.random.normal(jax.random.fold_in(key, 2), (searches, task.size), dtype=float)
+    starts, costs = first / math.sqrt(task.size) * directions, np.zeros(searches)
     for number, penalty in enumerate(_PENALTIES, start=1):
-        starts, costs = jax.block_until_ready(_minimise(task, starts, as_float(penalty)))
+        starts, costs = jax.block_until_ready(_minimise(task, starts, as_float(penalty), steps))
         progress(f"search, stage {number} of {len(_PENALTIES)}")
     best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
     progress(f"flying {task.vehicles} vehicles")
@@ -180,7 +179,7 @@ def solve(task: AbstractTask, *, compare: bool, key: Key, progress: Progress) ->
 
 @quick_jit
 def _minimise(
-    task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar
+    task: AbstractTask, starts: Float[Array, "starts coefficients"], penalty: Scalar, steps: int
 ) -> tuple[Float[Array, "starts coefficients"], Float[Array, " starts"]]:
     """One stage of all searches: their last coefficients and costs. A trial whose simulation fails is rejected."""
 
@@ -191,7 +190,7 @@ def _minimise(
 
     def one(start: Coefficients) -> tuple[Coefficients, Scalar]:
         solver = optimistix.BFGS(_TOLERANCE, _TOLERANCE)
-        found = optimistix.minimise(cost, solver, start / _UNIT, penalty, max_steps=task.steps, throw=False)
+        found = optimistix.minimise(cost, solver, start / _UNIT, penalty, max_steps=steps, throw=False)
         return _UNIT * found.value, found.state.f_info.f
 
     return jax.vmap(one)(starts)
