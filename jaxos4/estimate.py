@@ -259,7 +259,7 @@ class AbstractEstimator(eqx.Module):
     - `shoots`: whether it minimises the problem's cost. If so, it can use windows, and its covariance follows from the
       noise.
     - `prior`: how it uses the bracket: `NO_PRIOR`, `GAUSSIAN_PRIOR` or `UNIFORM_PRIOR` of `jaxos4.bracket`.
-    - `needs_network`: whether it needs a trained network.
+    - `needs_network`: whether it needs a trained network, in a field `network`.
     - `in_closed_loop`: whether it searches a likelihood of innovations too, and so serves a vehicle that a controller
       flies.
     - `in_comparison`: whether `jaxos4 compare` runs it; false if it takes longer than all others together.
@@ -271,18 +271,6 @@ class AbstractEstimator(eqx.Module):
     needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = False
     in_comparison: ClassVar[bool] = True
-
-    @classmethod
-    def of(cls, network: "AbstractEstimator | None" = None) -> "AbstractEstimator":
-        """The estimator with its default settings. If it needs a network, it is `network`, or has a field `network`.
-
-        **Raises:** `ValueError` if the estimator needs a network and there is none.
-        """
-        if not cls.needs_network:
-            return cls()
-        if network is None:
-            raise ValueError(f"`network` must be a trained network for {cls.__name__}, got None.")
-        return network if isinstance(network, cls) else cls(**{"network": network})
 
     @abc.abstractmethod
     def __call__(self, problem: Any, bracket: Bracket | None = None) -> Estimate:

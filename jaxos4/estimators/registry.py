@@ -35,10 +35,15 @@ ESTIMATORS = Estimators(
 
 
 def make_estimator(name: str, network: "TrainedNetwork | None" = None) -> "AbstractEstimator":
-    """The estimator of that name, with its default settings, made from `network` if it needs one.
+    """The estimator of that name with its default settings. If it needs a network, it has `network`, or is `network`.
 
     **Raises:** `ValueError` for an unknown name, or if the estimator needs a network and there is none.
     """
     if name not in ESTIMATORS:
         raise ValueError(f"`name` must be one of {', '.join(ESTIMATORS)}, got {name!r}.")
-    return ESTIMATORS[name].of(network)
+    kind = ESTIMATORS[name]
+    if not kind.needs_network:
+        return kind()
+    if network is None:
+        raise ValueError(f"`network` must be a trained network for {kind.__name__}, got None.")
+    return network if isinstance(network, kind) else kind(**{"network": network})
