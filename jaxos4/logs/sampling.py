@@ -218,13 +218,6 @@ def unwrapped(t: Times, angles: Float[np.ndarray, "samples 3"]) -> Series:
     return Series(t, np.column_stack([unwrap(angles[:, 0])[0], angles[:, 1], unwrap(angles[:, 2])[0]]))
 
 
-def attitude_of(t: Times, quaternion: Float[np.ndarray, "samples 4"]) -> Series:
-    """Roll, pitch, yaw [rad] of quaternions (w, x, y, z), which need not be normalised. NaN if one is zero."""
-    with np.errstate(all="ignore"):
-        unit = quaternion / np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
-    return unwrapped(t, euler_angles(unit))
-
-
 def euler_angles(quaternion: Float[np.ndarray, "*samples 4"]) -> Float[np.ndarray, "*samples 3"]:
     """Roll, pitch, yaw [rad] of unit quaternions (w, x, y, z), without unwrapping."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
