@@ -55,20 +55,16 @@ class Bracket(eqx.Module):
     @property
     def center(self) -> Parameters:
         """The middle of each interval."""
-        lower, upper = self._ends
+        lower, upper = _numpy_if_known(self.lower, self.upper)
         with np.errstate(all="ignore"):
             return as_float((lower + upper) / 2)
 
     @property
     def half_width(self) -> Parameters:
         """Half the length of each interval."""
-        lower, upper = self._ends
+        lower, upper = _numpy_if_known(self.lower, self.upper)
         with np.errstate(all="ignore"):
             return as_float((upper - lower) / 2)
-
-    @property
-    def _ends(self) -> tuple[Numeric, Numeric]:
-        return _numpy_if_known(self.lower, self.upper)
 
 
 def _numpy_if_known(a: Array, b: Array) -> tuple[Numeric, Numeric]:

@@ -39,26 +39,19 @@ class InertiaFit(eqx.Module):
     - `mismatch`: (alpha - alpha(constants))^T C^-1 (alpha - alpha(constants)). If the alphas are those of a rigid body,
       it is chi-squared distributed with four degrees of freedom.
     - `p_value`: the probability that the alphas of a rigid body have this mismatch or a larger one.
-    - `triangle`: Iy + Iz - Ix, Iz + Ix - Iy, Ix + Iy - Iz [kg m^2]. No rigid body has a negative one.
-    - `triangle_std`: the standard deviations of `triangle`.
+    - `is_rigid_body`: whether Iy + Iz - Ix, Iz + Ix - Iy and Ix + Iy - Iz are positive within two standard deviations.
     """
 
     constants: Float[np.ndarray, "*batch 4"]
     covariance: Float[np.ndarray, "*batch 4 4"]
     mismatch: Float[np.ndarray, "*batch"]
     p_value: Float[np.ndarray, "*batch"]
-    triangle: Float[np.ndarray, "*batch 3"]
-    triangle_std: Float[np.ndarray, "*batch 3"]
+    is_rigid_body: Bool[np.ndarray | np.bool_, "*batch"]
 
     @property
     def std(self) -> Float[np.ndarray, "*batch 4"]:
         """Standard deviation of each constant."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
-
-    @property
-    def is_rigid_body(self) -> Bool[np.ndarray | np.bool_, "*batch"]:
-        """Whether every triangle inequality holds within two standard deviations."""
-        return (self.triangle > -2 * self.triangle_std).all(axis=-1)
 
 
 def fit_inertia(
@@ -97,14 +90,14 @@ def fit_inertia(
     mismatch = np.where(fitted, mismatch, np.inf)
     finite = np.where(fitted[..., None, None], spread, 0.0)[..., :3, :3]
     variance = np.einsum("ij,...jk,ik->...i", _TRIANGLE, finite, _TRIANGLE)
+    room = np.where(fitted[..., None], 2 * np.sqrt(np.maximum(variance, 0.0)), np.inf)
     return InertiaFit(
         constants=constants,
         covariance=spread,
         mismatch=mismatch,
         # The chi-squared distribution with four degrees of freedom in closed form.
         p_value=np.where(fitted, np.exp(-mismatch / 2) * (1 + np.where(fitted, mismatch, 0.0) / 2), 0.0),
-        triangle=constants[..., :3] @ _TRIANGLE,
-        triangle_std=np.where(fitted[..., None], np.sqrt(np.maximum(variance, 0.0)), np.inf),
+        is_rigid_body=(constants[..., :3] @ _TRIANGLE > -room).all(axis=-1),
     )
 
 
