@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -177,21 +177,12 @@ class _Carry(NamedTuple):
     signals: Signals | None
 
 
-class _Draws(NamedTuple):
-    """The random numbers of a flight, each row for one run of the controller.
+def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> tuple[Array, Array | None, Array, Any]:
+    """The random numbers of a flight, in rows for each run of the controller with `steps` of length `h`.
 
-    - `gusts`, `winds`: at the begin and the end of each step of the physics; gusts with the constant torque.
-    - `noise`: of gyro, attitude, accelerometer.
+    Gusts with the constant torque (4), and winds (3), at the begin and the end of each step; the noise of gyro,
+    attitude and accelerometer (9), and of the controller's own gyro (3).
     """
-
-    gusts: Float[Array, "runs ends 4"]
-    winds: Float[Array, "runs ends 3"] | None
-    noise: Float[Array, "runs 9"]
-    own_noise: Float[Array, "runs 3"] | None
-
-
-def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Draws:
-    """`steps` of length `h` in each run."""
     (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
     count, rows = runs * steps + 1, steps * np.arange(runs)[:, None] + np.arange(steps + 1)
     gusts = jnp.append(loop.gust, loop.thrust_gust) * ornstein_uhlenbeck(gust_key, count, h / loop.gust_time)
@@ -202,7 +193,7 @@ def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Draw
     if loop.sensors is not None:
         own = jnp.nan_to_num(loop.sensors.controller_gyro_noise) * jax.random.normal(own_key, (runs, 3))
     noise = noise * jax.random.normal(noise_key, (runs, 9))
-    return _Draws((jnp.append(loop.offset, 0.0) + gusts)[rows], winds, noise, own)
+    return (jnp.append(loop.offset, 0.0) + gusts)[rows], winds, noise, own
 
 
 @quick_jit
@@ -223,15 +214,15 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         return _Acting(rotors, spin_up, tuple(gust), None if wind is None else tuple(wind))
 
     def run(carry: _Carry, row):
-        k, reference, draw = row
-        weak, nothing, error = 1 - loop.sag * k / (runs - 1), jnp.zeros(()), draw.noise
-        at_once = jax.tree.map(lambda ends: ends[0], (draw.gusts, draw.winds))
+        k, reference, (*blown, error, own_error) = row
+        weak, nothing = 1 - loop.sag * k / (runs - 1), jnp.zeros(())
+        at_once = jax.tree.map(lambda ends: ends[0], blown)
         now = acting(weak, jnp.square(carry.speeds), nothing, nothing, *at_once)
         specific = jnp.stack(vehicle.specific_force(carry.motion.velocity, now)) + error[6:]
         rates, attitude = jnp.stack(carry.motion.rates), jnp.stack(carry.motion.attitude) + error[3:6]
         signals, seen, gyro = carry.signals, rates + error[:3], rates + error[:3]
         if sense is not None and signals is not None:
-            signals, seen = sense(signals, carry.speeds, gyro, rates + draw.own_noise, specific)
+            signals, seen = sense(signals, carry.speeds, gyro, rates + own_error, specific)
             gyro, specific = signals.filtered[:3], signals.filtered[6:]
         command, integral = _control(loop, mixer, reference, seen, attitude, carry.integral, period)
         commands = carry.commands.at[k + 1].set(command)
@@ -248,7 +239,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
             forcing = acting(weak, squares, residual, spin_up, *gust_and_wind)
             return (rk4_step(vehicle, motion, forcing, None, h), after), (speeds + after) / 2
 
-        middle = jax.tree.map(lambda ends: (ends[:-1] + ends[1:]) / 2, (draw.gusts, draw.winds))
+        middle = jax.tree.map(lambda ends: (ends[:-1] + ends[1:]) / 2, blown)
         (motion, speeds), means = jax.lax.scan(step, (carry.motion, carry.speeds), (jnp.arange(steps), *middle))
         mean = means.mean(axis=0)
         signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)

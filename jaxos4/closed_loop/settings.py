@@ -96,8 +96,7 @@ class ClosedLoop(eqx.Module):
     The vehicle. Its equations are those of `FlightModel` with the terms offset, damping, reaction, motor and delay, and
     what `air` adds:
 
-    - `airframe`: the true constants. Rotor speeds lie between 0 and its `max_rotor_speed`. Its `rotor_inertia` makes
-      the gyroscopic torque and the yaw moment of rotors that accelerate.
+    - `airframe`: the true constants.
     - `rotor_lag`, `rotor_delay`: lag and delay of the rotors behind their commands [s], not only whole samples.
     - `thrust_curve`, `motor_braking`: see `jaxos4.models.rotors`. With 1 and 1, rotors are first-order systems. Other
       values need `max_rotor_speed`.
@@ -124,7 +123,6 @@ class ClosedLoop(eqx.Module):
     - `attitude_gain` [1/s], `rate_gain` [1/s], `integral_gain` [1/s^2]: for each axis.
     - `controller_inertia`: Ix, Iy, Iz that the controller knows [kg m^2]; the true ones by default.
     - `log_every`: the controller runs so many times in each sample of the log.
-
     - `logged`: `"commands"`, or `"speeds"` for measured rotor speeds.
 
     **Raises:** `ValueError` that names the setting.

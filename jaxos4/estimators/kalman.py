@@ -5,7 +5,7 @@ measurements: each column of S is a tangent that travels with the state. A measu
 columns (Potter's update, one scalar at a time). No matrix is inverted, and P stays positive in single precision.
 """
 
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -22,16 +22,8 @@ from ..shooting import Rows, ShootingProblem, Unknowns
 _SETTLED = 0.1  # standard deviations: the passes end once one of them moves no parameter by more
 
 
-class _Filter(NamedTuple):
-    """The joint estimate of states, parameters and, if it is free, the initial state.
-
-    - `root`: S, with S S^T the covariance of the joint estimate.
-    - `nominal`: the states on the trajectory around which the model is linearised.
-    """
-
-    estimate: Float[Array, " joint"]
-    root: Float[Array, "joint unknowns"]
-    nominal: Float[Array, " size"]
+# The joint estimate of states, parameters and, if it is free, the initial state; and S.
+Filter = tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]]
 
 
 class JointEKF(AbstractRecursion):
@@ -121,18 +113,15 @@ def _run(
     constants = jnp.diag(spread)
     # A known initial state has no tangent of its own.
     moving = jnp.zeros((size, spread.shape[0]), dtype=constants.dtype).at[: problem.free_size].set(constants[count:])
-    filter_ = _Filter(
-        estimate=jnp.concatenate([start, prior.center, start[: problem.free_size]]),
-        root=jnp.concatenate([moving, constants]),
-        nominal=about[1],
-    )
+    begin = jnp.concatenate([start, prior.center, start[: problem.free_size]]), jnp.concatenate([moving, constants])
     channels, variances = jnp.arange(size), jnp.square(problem.sigma[CASCADE_ORDER[:size]])
 
-    def step(carry: _Filter, row: Rows) -> tuple[_Filter, Parameters]:
+    def step(carry: tuple[Filter, Array], row: Rows) -> tuple[tuple[Filter, Array], Parameters]:
+        before, nominal = carry  # the state on the trajectory around which the model is linearised
         measurements = channels, jnp.stack(row.measured), variances
-        (estimate, root), _ = jax.lax.scan(_update, carry[:2], measurements)
+        (estimate, root), _ = jax.lax.scan(_update, before, measurements)
         states, parameters, constant = estimate[:size], estimate[size : size + count], estimate[size:]
-        point = jnp.where(first, states, carry.nominal), jnp.where(first, parameters, about[0])
+        point = jnp.where(first, states, nominal), jnp.where(first, parameters, about[0])
 
         def advance(x: Float[Array, " size"], a: Parameters) -> Float[Array, " size"]:
             return stack(problem.step(unstack(x), row.forcing, tuple(a)))
@@ -141,16 +130,13 @@ def _run(
         predicted = following + linear(states - point[0], parameters - point[1])
         tangents = jax.vmap(linear, in_axes=1, out_axes=1)(root[:size], root[size : size + count])
         root = jnp.concatenate([tangents, root[size:]])
-        return _Filter(jnp.concatenate([predicted, constant]), root, following), parameters
+        return ((jnp.concatenate([predicted, constant]), root), following), parameters
 
-    (estimate, root, _), history = jax.lax.scan(step, filter_, rows)
+    ((estimate, root), _), history = jax.lax.scan(step, (begin, about[1]), rows)
     return estimate, root, history
 
 
-def _update(
-    filter_: tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]],
-    measurement: tuple[Int[Array, ""], Scalar, Scalar],
-) -> tuple[tuple[Float[Array, " joint"], Float[Array, "joint unknowns"]], None]:
+def _update(filter_: Filter, measurement: tuple[Int[Array, ""], Scalar, Scalar]) -> tuple[Filter, None]:
     """Potter's update of estimate and root with one measurement of one state; a NaN changes nothing."""
     (estimate, root), (channel, measured, variance) = filter_, measurement
     along = root[channel]
