@@ -3,7 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -13,16 +13,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._custom_types import Parameters, Scalar
 from ._xla import quick_jit
-from .bracket import Bracket
+from .bracket import NO_PRIOR, Bracket
 from .linalg import covariance_of_shared, invert
 from .results import RESULTS
 from .shooting import AbstractProblem, Curvature, Parts, ShootingProblem, in_blocks
 from .shooting.abstract import WindowUnknowns
-
-if TYPE_CHECKING:
-    from typing import ClassVar as AbstractClassVar  # what type checkers understand
-else:
-    from equinox import AbstractClassVar
 
 REACH = 4.0  # how many half-widths an answer may lie away from the center of its bracket
 # Gauss-Newton steps to an initial state, with the parameters known: the trajectory is nearly linear in that state.
@@ -265,9 +260,9 @@ class AbstractEstimator(eqx.Module):
     - `in_comparison`: whether `jaxos4 compare` runs it; false if it takes longer than all others together.
     """
 
-    looks_at: AbstractClassVar[str]
-    shoots: AbstractClassVar[bool]
-    prior: AbstractClassVar[float]
+    looks_at: ClassVar[str] = "all"
+    shoots: ClassVar[bool] = False
+    prior: ClassVar[float] = NO_PRIOR
     needs_network: ClassVar[bool] = False
     in_closed_loop: ClassVar[bool] = False
     in_comparison: ClassVar[bool] = True
@@ -283,8 +278,6 @@ class AbstractEstimator(eqx.Module):
 
 class AbstractRecursion(AbstractEstimator):
     """An estimator that goes through a flight sample by sample."""
-
-    shoots: ClassVar[bool] = False
 
     @abc.abstractmethod
     def identify(self, problem: ShootingProblem) -> Estimate:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Count, Key, Scalar, integer, setting
 from .._xla import quick_jit
-from ..bracket import NO_PRIOR, Bracket
+from ..bracket import Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at
 from ..shooting import ROUNDING, AbstractProblem
 
@@ -57,9 +57,7 @@ class AntColony(AbstractEstimator):
     All flights have the same random numbers.
     """
 
-    looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = True
-    prior: ClassVar[float] = NO_PRIOR
     in_closed_loop: ClassVar[bool] = True
     in_comparison: ClassVar[bool] = False  # `experiments/comparison` has it
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Count, Parameters, Scalar, as_float, integer, setting
 from .._xla import quick_jit
-from ..bracket import NO_PRIOR, Bracket
+from ..bracket import Bracket
 from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, best_start, in_one_program
 from ..linalg import gram, invert
 from ..models.state import CASCADE_ORDER, Rates
@@ -253,8 +253,6 @@ class EquationError(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "rates"
-    shoots: ClassVar[bool] = False
-    prior: ClassVar[float] = NO_PRIOR
 
     memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)
     bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
@@ -316,7 +314,6 @@ class RecursiveLeastSquares(AbstractRecursion):
     """
 
     looks_at: ClassVar[str] = "rates"
-    prior: ClassVar[float] = NO_PRIOR
 
     forgetting: Scalar = eqx.field(converter=setting("forgetting", high=1.0, positive=True), default=1.0)
     memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)

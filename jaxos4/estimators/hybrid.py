@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import Numeric
 from .._xla import quick_jit
-from ..bracket import NO_PRIOR, Bracket
+from ..bracket import Bracket
 from ..estimate import AbstractEstimator, Estimate
 from ..networks import TrainedNetwork
 from ..results import RESULTS
@@ -42,9 +42,7 @@ class Hybrid(AbstractEstimator):
       that of the innovations. It may differ from the training problem only in the measured values.
     """
 
-    looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = True
-    prior: ClassVar[float] = NO_PRIOR
     needs_network: ClassVar[bool] = True
     in_closed_loop: ClassVar[bool] = True
 

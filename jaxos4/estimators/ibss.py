@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Count, InitialStates, Parameters, Scalar, integer, setting
 from .._xla import quick_jit
-from ..bracket import NO_PRIOR, Bracket
+from ..bracket import Bracket
 from ..estimate import REACH, AbstractEstimator, Estimate, estimate_at, from_starts
 from ..linalg import coordinate_directions, gram, joint_factor, movable, room_to_limits, slopes_along
 from ..shooting import AbstractProblem, Curvature, Stages, in_blocks
@@ -90,9 +90,7 @@ class IBSS(AbstractEstimator):
     - `record`: how many sweeps' brackets the estimate keeps.
     """
 
-    looks_at: ClassVar[str] = "all"
     shoots: ClassVar[bool] = True
-    prior: ClassVar[float] = NO_PRIOR
     in_closed_loop: ClassVar[bool] = True
 
     directions: str = eqx.field(static=True, default="whitened")

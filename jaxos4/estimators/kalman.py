@@ -47,7 +47,6 @@ class JointEKF(AbstractRecursion):
     iterated updates as Gauss-Newton steps.
     """
 
-    looks_at: ClassVar[str] = "all"
     prior: ClassVar[float] = GAUSSIAN_PRIOR
 
     passes: Count = eqx.field(converter=integer("passes", 1), default=10)

@@ -137,7 +137,6 @@ class TrainedNetwork(AbstractEstimator):
     """
 
     looks_at: ClassVar[str] = "rates"
-    shoots: ClassVar[bool] = False
     prior: ClassVar[float] = UNIFORM_PRIOR
     needs_network: ClassVar[bool] = True
 
