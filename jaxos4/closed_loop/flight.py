@@ -164,19 +164,6 @@ class _Vehicle(NamedTuple):
         return x, y, thrust + z
 
 
-class _Carry(NamedTuple):
-    """The state from one run of the controller to the next.
-
-    `commands`: row k + 1 is the command of run k, row 0 the one before.
-    """
-
-    motion: Motion
-    speeds: Float[Array, "4"]
-    integral: PerAxis
-    commands: Float[Array, "runs 4"]
-    signals: Signals | None
-
-
 def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> tuple[Array, Array | None, Array, Any]:
     """The random numbers of a flight, in rows for each run of the controller with `steps` of length `h`.
 
@@ -213,19 +200,20 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         rotors = Forcing(roll, pitch, yaw, thrust / airframe.mass, residual)
         return _Acting(rotors, spin_up, tuple(gust), None if wind is None else tuple(wind))
 
-    def run(carry: _Carry, row):
+    def run(carry, row):
+        motion, speeds, integral, commands, signals = carry  # row k + 1 has the command of run k, row 0 the one before
         k, reference, (*blown, error, own_error) = row
         weak, nothing = 1 - loop.sag * k / (runs - 1), jnp.zeros(())
         at_once = jax.tree.map(lambda ends: ends[0], blown)
-        now = acting(weak, jnp.square(carry.speeds), nothing, nothing, *at_once)
-        specific = jnp.stack(vehicle.specific_force(carry.motion.velocity, now)) + error[6:]
-        rates, attitude = jnp.stack(carry.motion.rates), jnp.stack(carry.motion.attitude) + error[3:6]
-        signals, seen, gyro = carry.signals, rates + error[:3], rates + error[:3]
+        now = acting(weak, jnp.square(speeds), nothing, nothing, *at_once)
+        specific = jnp.stack(vehicle.specific_force(motion.velocity, now)) + error[6:]
+        rates, attitude = jnp.stack(motion.rates), jnp.stack(motion.attitude) + error[3:6]
+        seen = gyro = rates + error[:3]
         if sense is not None and signals is not None:
-            signals, seen = sense(signals, carry.speeds, gyro, rates + own_error, specific)
+            signals, seen = sense(signals, speeds, gyro, rates + own_error, specific)
             gyro, specific = signals.filtered[:3], signals.filtered[6:]
-        command, integral = _control(loop, mixer, reference, seen, attitude, carry.integral, period)
-        commands = carry.commands.at[k + 1].set(command)
+        command, integral = _control(loop, mixer, reference, seen, attitude, integral, period)
+        commands = commands.at[k + 1].set(command)
         before, now = (commands[jnp.maximum(k + 1 - late - i, 0)] for i in (1, 0))
 
         def step(moving, row):
@@ -240,11 +228,11 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
             return (rk4_step(vehicle, motion, forcing, None, h), after), (speeds + after) / 2
 
         middle = jax.tree.map(lambda ends: (ends[:-1] + ends[1:]) / 2, blown)
-        (motion, speeds), means = jax.lax.scan(step, (carry.motion, carry.speeds), (jnp.arange(steps), *middle))
+        (later, speeds), means = jax.lax.scan(step, (motion, speeds), (jnp.arange(steps), *middle))
         mean = means.mean(axis=0)
         signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)
         omega = command if loop.logged == "commands" else mean
-        return _Carry(motion, speeds, integral, commands, signals), (omega, carry.motion, gyro, attitude, specific)
+        return (later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
 
     weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())
     hover, _ = _speeds(mixer, jnp.zeros(3), weight, airframe.max_rotor_speed)
@@ -253,7 +241,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     still = jnp.zeros(9).at[8].set(vehicle.gravity)
     signals = None if sense is None else Signals(still, still, jnp.zeros(4))
     commands = jnp.broadcast_to(motor.command(hover), (runs + 1, 4))
-    first = _Carry(motion, hover, jnp.zeros(3), commands, signals)
+    first = motion, hover, jnp.zeros(3), commands, signals
     draws = _draw(loop, key, runs, steps, h)
     inputs = (jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), draws)
     return log(loop, dt, jax.lax.scan(run, first, inputs)[1], log_key)

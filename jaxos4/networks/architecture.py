@@ -46,13 +46,6 @@ class Scaling(eqx.Module):
         return jax.lax.rsqrt(1 / jnp.square(self.unit * scale) + 3)
 
 
-class NetworkOutput(NamedTuple):
-    """Unknowns in bracket coordinates, and the logarithm of their standard deviations in units of `Scaling.bound`."""
-
-    u: Float[Array, " unknowns"]
-    log_spread: Float[Array, " unknowns"]
-
-
 class GatedPerceptron(eqx.Module):
     """A multilayer perceptron whose last hidden layer multiplies a linear map of the inputs.
 
@@ -88,12 +81,15 @@ class Regressor(eqx.Module):
         self.perceptron = GatedPerceptron(*sizes, width, depth, key=first)
         self.spread = eqx.nn.MLP(*sizes, _SPREAD_WIDTH, _SPREAD_DEPTH, _SILU, dtype=float, key=second)
 
-    def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> NetworkOutput:
-        """Unknowns of one flight, from its features and its noise scale."""
+    def __call__(self, features: Float[Array, " features"], scale: Scalar, scaling: Scaling) -> tuple[Array, Array]:
+        """Unknowns of one flight in bracket coordinates, from its features and its noise scale.
+
+        **Returns:** them, and the logarithm of their standard deviations in units of `Scaling.bound`.
+        """
         compressed = compress(features / scaling.width)
         inputs = jnp.concatenate([compressed, (jnp.log(scale) / scaling.span)[None]])
         u = self.skip @ compressed + scaling.gain * self.perceptron(inputs)
-        return NetworkOutput(u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM))
+        return u, jnp.clip(self.spread(inputs), -_LARGEST_LOGARITHM, _LARGEST_LOGARITHM)
 
 
 def first_regressor(linear_map: Float[Array, "unknowns features"], key: Key, shape: dict[str, Any]) -> Regressor:
@@ -134,10 +130,10 @@ def loss(
     likelihood's weight, 1 / spread^2, training could settle at a bad answer with a large spread (beta-NLL; Seitzer et
     al. 2022). The likelihood trains the spread alone.
     """
-    output = regressor(features, scale, scaling)
-    error = (output.u - u) / scaling.bound(scale)
-    fixed_error, weight = jax.lax.stop_gradient((error, jnp.exp(-output.log_spread)))
-    likelihood = jnp.square(fixed_error * jnp.exp(-output.log_spread)) / 2 + output.log_spread
+    found, log_spread = regressor(features, scale, scaling)
+    error = (found - u) / scaling.bound(scale)
+    fixed_error, weight = jax.lax.stop_gradient((error, jnp.exp(-log_spread)))
+    likelihood = jnp.square(fixed_error * jnp.exp(-log_spread)) / 2 + log_spread
     return (weight * jnp.square(error)).mean() + likelihood.mean()
 
 

@@ -238,16 +238,16 @@ class TrainedNetwork(AbstractEstimator):
         within = jnp.clip(scale, *self.settings.noise)
         values, inflation = self.features(problem)
         finite = jnp.isfinite(values).all()
-        output = self.regressor(jnp.where(finite, values, 0.0), within, self.scaling)
-        parameters, initial_state = coordinates.split(output.u, count)
+        u, log_spread = self.regressor(jnp.where(finite, values, 0.0), within, self.scaling)
+        parameters, initial_state = coordinates.split(u, count)
 
         rms, correlation, factors, simultaneous = self.errors.at(within)
-        std = jnp.exp(output.log_spread[:count]) * self.scaling.bound(within)[:count] * rms * inflation
+        std = jnp.exp(log_spread[:count]) * self.scaling.bound(within)[:count] * rms * inflation
         deviations = std * coordinates.width[:count]
         parameters, correlation = _given_held(problem.unknowns, parameters, deviations, correlation)
         shot = problem.shots(parameters, initial_state)
         free = problem.unknowns.free
-        outside = (jnp.abs(output.u[:count]) > 1 + factors[-1] * std) & free
+        outside = (jnp.abs(u[:count]) > 1 + factors[-1] * std) & free
         unidentifiable = (std > self.prior) & free
 
         differences = self._differences(problem)

@@ -220,5 +220,5 @@ def _standardised(
     regressor: Regressor, scaling: Scaling, flights: Flights, scale: Scalar
 ) -> Float[Array, "flights unknowns"]:
     """Errors in units of the standard deviation that the network gives, at one noise scale."""
-    output = jax.vmap(regressor, in_axes=(0, None, None))(flights.features, scale, scaling)
-    return (output.u - flights.u) / (scaling.bound(scale) * jnp.exp(output.log_spread))
+    u, log_spread = jax.vmap(regressor, in_axes=(0, None, None))(flights.features, scale, scaling)
+    return (u - flights.u) / (scaling.bound(scale) * jnp.exp(log_spread))
