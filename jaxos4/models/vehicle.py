@@ -15,18 +15,7 @@ from .abstract import PARAMETER_NAMES, AbstractModel, Constant, Parameter
 from .os4 import CorrectedOS4
 from .rotors import Grid, Part, measured_speeds, squared
 from .state import Forcing, Rates, Samples, State, Translation, Vector, attitude_rates, to_body, to_earth
-from .terms import (
-    COMMANDS,
-    FULL_SCALE,
-    TERMS,
-    VELOCITY,
-    VOLTAGE,
-    Term,
-    Values,
-    clash,
-    default_terms,
-    required,
-)
+from .terms import COMMANDS, FULL_SCALE, TERMS, VELOCITY, VOLTAGE, Term, Values, clash, default_terms, required
 
 DEFAULT_TERMS = default_terms(frozenset({COMMANDS}))
 # The samples of a padded flight that are computed together.

@@ -70,11 +70,7 @@ def _untrained(
 
 
 def train(
-    regressor: Regressor,
-    scaling: Scaling,
-    features: Features,
-    settings: "NetworkEstimator",
-    key: Key,
+    regressor: Regressor, scaling: Scaling, features: Features, settings: "NetworkEstimator", key: Key
 ) -> tuple[Regressor, Float[np.ndarray, "checks 2"]]:
     """Trains a regressor by Muon with a cosine schedule; flights that diverge do not count.
 
