@@ -13,6 +13,10 @@ from .results import RESULTS
 
 STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz", "phi", "p", "theta", "q", "psi", "r")
 STATE_UNITS = ("m", "m/s", "m", "m/s", "m", "m/s", "rad", "rad/s", "rad", "rad/s", "rad", "rad/s")
+ANGLES, RATES, POSITION, VELOCITY = (
+    np.array([STATE_NAMES.index(name) for name in names])
+    for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
+)
 FORCE_NAMES = ("ax", "ay", "az")
 CHANNEL_NAMES = (*STATE_NAMES, *FORCE_NAMES)
 """Every channel that a flight can measure: the states, then the specific force."""

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Parameters, as_float
 from .._xla import quick_jit
-from ..models.state import CASCADE_ORDER, Rates
+from ..flight import RATES
+from ..models.state import Rates
 from ..results import NINETY_FIVE
 from ..shooting import ShootingProblem
 
@@ -123,7 +124,7 @@ def frequency_response(problem: ShootingProblem, parameters: Parameters) -> Freq
 
     Errors are those of Gaussian signals with this coherence (Bendat and Piersol, Random Data, section 9.2).
     """
-    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
+    rates = np.asarray(problem.flight.states)[:, RATES]
     dt = float(problem.flight.dt)
     known = ~np.isnan(rates.sum(axis=1))
     modelled = modelled_acceleration(problem, parameters)
@@ -144,7 +145,7 @@ def modelled_acceleration(problem: ShootingProblem, parameters: Parameters) -> F
 
     A rate that was not measured counts as 0.
     """
-    rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[:3]]
+    rates = np.asarray(problem.flight.states)[:, RATES]
     known = ~np.isnan(rates.sum(axis=1))
     return np.asarray(_modelled(problem, as_float(parameters), as_float(np.where(known[:, None], rates, 0.0))))
 

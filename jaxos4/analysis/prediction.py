@@ -10,14 +10,13 @@ from jaxtyping import Array, Float, Int
 
 from .._custom_types import Parameters, Scalar, as_float
 from .._xla import quick_jit
-from ..flight import Flight
-from ..models.state import CASCADE_ORDER, State, unstack
+from ..flight import RATES, Flight
+from ..models.state import State, unstack
 from ..shooting import FASTEST, ShootingProblem
 from ..shooting.gains import LogNoise, Observed, gains_of, is_rate, transition
 from .frequency_response import modelled_acceleration
 
 HORIZONS = (0.1, 0.25, 0.5)
-RATES = CASCADE_ORDER[:3]
 # Time between starts, and time around a start over which the measured rates are averaged [s].
 _EVERY, _AROUND = 0.05, 0.02
 # Number of parts of the flight for the jackknife, which omits one part at a time.

@@ -8,7 +8,6 @@ from .flight import (
     References as References,
     fly_closed_loop as fly_closed_loop,
     fly_standard as fly_standard,
-    ornstein_uhlenbeck as ornstein_uhlenbeck,
     random_references as random_references,
 )
 from .settings import LOGGED as LOGGED, Air as Air, ClosedLoop as ClosedLoop, Sensors as Sensors

@@ -171,12 +171,13 @@ def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> tuple
     attitude and accelerometer (9), and of the controller's own gyro (3).
     """
     (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
-    count, rows = runs * steps + 1, steps * np.arange(runs)[:, None] + np.arange(steps + 1)
-    gusts = jnp.append(loop.gust, loop.thrust_gust) * ornstein_uhlenbeck(gust_key, count, h / loop.gust_time)
+    shape, rows = (runs * steps + 1, 4), steps * np.arange(runs)[:, None] + np.arange(steps + 1)
+    gusts = jnp.append(loop.gust, loop.thrust_gust) * coloured(jax.random.normal(gust_key, shape), h / loop.gust_time)
     noise = jnp.repeat(jnp.stack([loop.gyro_noise, loop.attitude_noise, loop.force_noise]), 3)
     winds = own = None
     if loop.air is not None:
-        winds = loop.air.wind * ornstein_uhlenbeck(wind_key, count, h / loop.air.wind_time)[rows][..., :3]
+        processes = coloured(jax.random.normal(wind_key, shape), h / loop.air.wind_time)
+        winds = loop.air.wind * processes[rows][..., :3]
     if loop.sensors is not None:
         own = jnp.nan_to_num(loop.sensors.controller_gyro_noise) * jax.random.normal(own_key, (runs, 3))
     noise = noise * jax.random.normal(noise_key, (runs, 9))
@@ -272,8 +273,3 @@ def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> 
     wanted = jnp.linalg.solve(mixer, jnp.append(torque, thrust))
     squares = jnp.clip(wanted, 0.0, jnp.asarray(fastest) ** 2)
     return jnp.sqrt(squares), jnp.any(squares != wanted)
-
-
-def ornstein_uhlenbeck(key: Key, count: int, step: Scalar) -> Float[Array, "count 4"]:
-    """Four independent Ornstein-Uhlenbeck processes of unit variance; `step`: time step / correlation time."""
-    return coloured(jax.random.normal(key, (count, 4)), step)

@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Key, Scalar, setting
 from ..airframe import Airframe
-from ..flight import STATE_NAMES, Flight
+from ..flight import ANGLES, RATES, VELOCITY, Flight
 from ..models.rotors import Motor
-from ..models.state import CASCADE_ORDER, Attitude, Rates, Vector, to_earth
+from ..models.state import Attitude, Rates, Vector, to_earth
 from ..models.terms import STEEPEST
 from ..noise import FORCE_SIGMA
 from ..simulation import until_failure
@@ -29,7 +29,6 @@ Pair = Float[Array, "2"]
 LOGGED = ("commands", "speeds")
 # What a sensor logs when it fails.
 _IMPOSSIBLE = 1e6
-_VELOCITY = np.array([STATE_NAMES.index(name) for name in ("vx", "vy", "vz")])
 _BODY, _XYZ, _XY, _TILT = ("roll", "pitch", "yaw"), ("x", "y", "z"), ("x", "y"), ("roll", "pitch")
 
 
@@ -234,7 +233,7 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, Motion, Array, Array,
     omega = logged[0] if sensors is None else _late(logged[0], sensors.clock_offset * every / dt)
     omega = omega[::every] if commands else omega.reshape(-1, every, 4).mean(axis=1)
     motion, rates, attitude, specific = jax.tree.map(lambda x: x[::every], logged[1:])
-    states = jnp.full((omega.shape[0], 12), jnp.nan).at[:, CASCADE_ORDER[3:6]].set(attitude)
+    states = jnp.full((omega.shape[0], 12), jnp.nan).at[:, ANGLES].set(attitude)
     if sensors is not None:
         omega, step = omega + sensors.speed_noise * jax.random.normal(keys[0], omega.shape), sensors.speed_step
         omega = jnp.where(step > 0, step * jnp.round(omega / jnp.where(step > 0, step, 1.0)), omega)
@@ -242,8 +241,8 @@ def log(loop: ClosedLoop, dt: Scalar, logged: tuple[Array, Motion, Array, Array,
     if sensors is not None and motion.velocity is not None:
         velocity = jnp.stack(to_earth(motion.attitude, motion.velocity), axis=1)
         noise = sensors.velocity_noise * jax.random.normal(keys[2], velocity.shape)
-        states = states.at[:, _VELOCITY].set(velocity + noise)
-    states = states.at[:, CASCADE_ORDER[:3]].set(rates)
+        states = states.at[:, VELOCITY].set(velocity + noise)
+    states = states.at[:, RATES].set(rates)
 
     valid, result = until_failure(jnp.stack(jax.tree.leaves(motion), axis=1), motion.attitude.theta)
     return Flight(

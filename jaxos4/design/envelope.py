@@ -12,12 +12,8 @@ from jaxtyping import Array, Float
 from .._custom_types import Numeric, Scalar, setting
 from ..airframe import Airframe
 from ..errors import InputError, named
-from ..flight import STATE_NAMES
+from ..flight import ANGLES, POSITION, RATES, VELOCITY
 
-ANGLES, RATES, POSITION, VELOCITY = (
-    np.array([STATE_NAMES.index(name) for name in names])
-    for names in (("phi", "theta", "psi"), ("p", "q", "r"), ("x", "y", "z"), ("vx", "vy", "vz"))
-)
 # Shares of the limits by the name of the limit, for each sample.
 Uses = Mapping[str, Float[Numeric, "..."]]
 

@@ -15,7 +15,7 @@ from .._xla import quick_jit
 from ..bracket import Bracket
 from ..closed_loop import ClosedLoop, References, fly_closed_loop
 from ..errors import InputError
-from ..flight import Flight
+from ..flight import ANGLES, POSITION, VELOCITY, Flight
 from ..models.abstract import PARAMETER_NAMES
 from ..models.state import Attitude, to_earth
 from ..models.terms import COMMANDS, FULL_SCALE, VERTICAL_FORCE, default_terms
@@ -23,7 +23,7 @@ from ..models.vehicle import FlightModel
 from ..shooting import InnovationsProblem, ShootingProblem
 from ..shooting.gains import LogNoise
 from ..shooting.innovations import NOISE_PRECISION, joined
-from .envelope import ANGLES, POSITION, VELOCITY, Envelope, hover_squares
+from .envelope import Envelope, hover_squares
 from .rotor_speeds import drawn
 from .task import Inputs
 

@@ -19,8 +19,9 @@ from ..bracket import Bracket
 from ..closed_loop import ClosedLoop
 from ..errors import InputError
 from ..excitation import standard_references, with_largest
+from ..flight import ANGLES, RATES
 from . import task
-from .envelope import ANGLES, RATES, Envelope, Uses
+from .envelope import Envelope, Uses
 from .fleet import INERTIAS, LANES, Fleet, batch_of, fly_batch, model_of
 from .task import Coefficients, Designed, Flown
 

@@ -23,8 +23,9 @@ from .._custom_types import Count, Parameters, Scalar, as_float, integer, settin
 from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, best_start, in_one_program
+from ..flight import RATES
 from ..linalg import gram, invert
-from ..models.state import CASCADE_ORDER, Rates
+from ..models.state import Rates
 from ..shooting import ShootingProblem
 
 Rows = Float[Array, "samples 3 columns"]
@@ -67,7 +68,7 @@ class Regression(NamedTuple):
     @property
     def sigma(self) -> Float[Array, "3"]:
         """The noise of the rates [rad/s]."""
-        return self.problem.sigma[CASCADE_ORDER[:3]]
+        return self.problem.sigma[RATES]
 
     def rows(self) -> tuple[Rows, Callable[[Rows], Float[Array, "samples 3"]]]:
         """Regressors and, in the last column, the output: a row of unit noise for p, q and r at every sample.

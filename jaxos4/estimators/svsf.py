@@ -23,8 +23,9 @@ from jaxtyping import Array, Float
 from .._custom_types import Parameters, Scalar, integer, setting
 from ..bracket import GAUSSIAN_PRIOR
 from ..estimate import REACH, AbstractRecursion, Estimate, as_estimate, fit_start
+from ..flight import RATES
 from ..linalg import gram, invert
-from ..models.state import CASCADE_ORDER, stack, unstack
+from ..models.state import stack, unstack
 from ..shooting import Rows, ShootingProblem, Unknowns
 
 _AVERAGED = 0.5  # the share of the last pass over which the parameters are averaged
@@ -130,7 +131,7 @@ class SVSF(AbstractRecursion):
     ) -> tuple[_Filter, Parameters]:
         """Corrects with one measurement and predicts the next; returns the parameters after the correction too."""
         rates, parameters, influence, energy, _, covariance = before
-        sigma, count = problem.sigma[CASCADE_ORDER[:3]], parameters.shape[0]
+        sigma, count = problem.sigma[RATES], parameters.shape[0]
         measured = jnp.stack(row.measured)
         valid = ~jnp.isnan(measured)
         error = jnp.where(valid, measured - rates, 0.0)
