@@ -77,10 +77,12 @@ def standard_problem(
     return jaxos4.ShootingProblem(model_class(jaxos4.OS4), flight, **arguments)
 
 
-def doublet_problem(amplitude, *, free=False):
+def doublet_problem(*, only_roll, free=False):
     """The rates of a noisy flight of doublets, and a bracket whose center is off."""
     model = jaxos4.PublishedOS4(jaxos4.OS4)
-    omega = jaxos4.doublet(model.airframe, duration=5.0, dt=DT, amplitude=amplitude)
+    omega = jaxos4.doublet(model.airframe, duration=5.0, dt=DT)
+    if only_roll:  # an axis has 1.5 s
+        omega = jnp.concatenate([omega[:150], omega[:150], omega[:150], omega[450:]])
     flight = jaxos4.simulate(model, model.alpha, omega, dt=DT)
     noisy = jaxos4.WhiteNoise(jaxos4.SENSOR_SIGMA)(flight, key=jax.random.key(0))
     start = None if free else flight.states[0]
