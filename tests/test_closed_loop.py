@@ -12,7 +12,8 @@ from helpers import CRAZYFLIE, CRAZYFLIE_TOML, FULL_SPEED
 from scipy.spatial.transform import Rotation
 
 import jaxos4
-from jaxos4.closed_loop import fly_standard, ornstein_uhlenbeck
+from jaxos4.closed_loop import fly_standard
+from jaxos4.noise import coloured
 
 DT, SAMPLES = 0.004, 4001
 RATES, ANGLES, VELOCITY = [7, 9, 11], [6, 8, 10], [1, 3, 5]
@@ -200,7 +201,7 @@ def test_gusts_have_their_strength_and_their_correlation_time_and_follow_from_th
 
 def test_the_process_is_exact():
     step, count = 0.02, 200_000
-    noise = np.asarray(ornstein_uhlenbeck(jax.random.key(0), count, jnp.asarray(step)))
+    noise = np.asarray(coloured(jax.random.normal(jax.random.key(0), (count, 4)), jnp.asarray(step)))
     error = np.sqrt(2 / (count * step))  # of a variance
     np.testing.assert_allclose(noise.var(axis=0), 1, atol=4 * error)
     assert np.abs(np.corrcoef(noise.T) - np.eye(4)).max() < 4 * error
