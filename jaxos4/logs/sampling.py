@@ -40,7 +40,8 @@ def integral(series: Series, at: Float[np.ndarray, " n"], *, linear: bool = Fals
     """
     t, values = series
     mean = (values[:-1] + values[1:]) / 2 if linear else values[:-1]
-    total = np.vstack([np.zeros(values.shape[1]), np.cumsum(mean * np.diff(t)[:, None], axis=0)])
+    total = np.zeros_like(values, dtype=float)
+    np.cumsum(mean * np.diff(t)[:, None], axis=0, out=total[1:])
     left = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
     after = np.maximum(at - t[left], 0)[:, None]
     value = values[left]
@@ -74,6 +75,8 @@ def average(t: Times, omega: Rotors, channels: Columns, dt: float) -> Resampled:
     """
     own = (t[-1] - t[0]) / (t.size - 1)
     grid = _grid(t, dt)
+    means, any_measured = np.full((grid.size, channels.shape[1]), np.nan), np.isfinite(channels).any(axis=0)
+    channels = channels[:, any_measured]
     measured = np.isfinite(channels)
     edges = np.minimum(np.append(grid - dt / 2, grid[-1] + dt / 2), t[-1] + own / 2)
     total, share = (
@@ -81,7 +84,7 @@ def average(t: Times, omega: Rotors, channels: Columns, dt: float) -> Resampled:
         for values in (np.where(measured, channels, 0.0), measured.astype(float))
     )
     enough = share > _MEASURED * dt
-    means = np.where(enough, total / np.where(enough, share, 1.0), np.nan)
+    means[:, any_measured] = np.where(enough, total / np.where(enough, share, 1.0), np.nan)
     return grid, root_mean_square(Series(t, omega), grid), means
 
 
