@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -64,9 +65,10 @@ class Airframe(eqx.Module):
         return np.stack(rows) if all(isinstance(row, np.ndarray) for row in rows) else jnp.stack(rows)
 
     @property
-    def hover_speed(self) -> Scalar:
+    def hover_speed(self) -> Float[Numeric, ""]:
         """The rotor speed [rad/s] at which four equal rotors carry the weight."""
-        return jnp.sqrt(jnp.asarray(self.mass * self.gravity / (4 * self.thrust_coefficient)))
+        square = self.mass * self.gravity / (4 * self.thrust_coefficient)
+        return jnp.sqrt(square) if isinstance(square, jax.Array) else np.asarray(np.sqrt(square))
 
     @property
     def has_full_scale(self) -> bool:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._custom_types import Parameters, Scalar, as_float
+from .._custom_types import Numeric, Parameters, Scalar, as_float
 from .._xla import quick_jit
 from ..flight import RATES, Flight
 from ..models.state import State, unstack
@@ -81,7 +81,7 @@ def predictions(
     rate_problem = dataclasses.replace(problem, channels="rates", windows=1, initial_state=None, length=None)
     pushed = np.zeros(rates.shape) if disturbance is None else disturbance
     fading = as_float(np.ones(3) if noise is None else np.exp(np.asarray(noise.time_constant)[:3]))
-    begin = jnp.asarray(start), jnp.asarray(initial), as_float(pushed[start])
+    begin = start, initial, pushed[start]
     predicted = np.asarray(_predict(rate_problem, parameters, *begin, fading, int(ahead.max())))
     return Predictions(start, ahead * float(flight.dt), initial, predicted[:, ahead], rates[start[:, None] + ahead])
 
@@ -112,9 +112,9 @@ def _ahead(flight: Flight, horizons: tuple[float, ...]) -> Int[np.ndarray, " hor
 def _predict(
     problem: ShootingProblem,
     parameters: Parameters,
-    start: Int[Array, " starts"],
-    initial: Float[Array, "starts 3"],
-    disturbance: Float[Array, "starts 3"],
+    start: Int[Numeric, " starts"],
+    initial: Float[Numeric, "starts 3"],
+    disturbance: Float[Numeric, "starts 3"],
     time_constant: Float[Array, "3"],
     steps: int,
 ) -> Float[Array, "starts steps_and_one 3"]:
@@ -135,7 +135,7 @@ def _predict(
 
         return jax.lax.scan(step, (unstack(measured - added), pushed), rows)[1]
 
-    return jax.vmap(fly)(start, initial, disturbance)
+    return jax.vmap(fly)(jnp.asarray(start), jnp.asarray(initial), jnp.asarray(disturbance))
 
 
 def skill(predicted: Predictions) -> Skill:
@@ -166,7 +166,7 @@ def disturbances(problem: ShootingProblem, parameters: Parameters, noise: LogNoi
     modelled = np.pad(modelled_acceleration(problem, parameters), ((0, 1), (0, 0)))
     own = LogNoise(*(as_float(np.asarray(leaf)[: len(RATES)]) for leaf in noise))
     number = np.zeros(len(rates), dtype=int) if stretch is None else np.asarray(stretch)
-    known = _known_by(own, as_float(rates), as_float(modelled), jnp.asarray(number), problem.flight.dt)
+    known = _known_by(own, as_float(rates), as_float(modelled), number, problem.flight.dt)
     return np.asarray(known.disturbance)
 
 
@@ -181,7 +181,7 @@ def filtered(
     noise: LogNoise,
     measured: Float[Array, "samples channels"],
     modelled: Float[Array, "samples channels"],
-    stretch: Int[Array, " samples"],
+    stretch: Int[Numeric, " samples"],
     dt: Scalar,
 ) -> Filtered:
     """The rates and disturbances at each sample. Filters begin anew in each stretch.

@@ -190,7 +190,9 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     runs, period = samples * loop.log_every, dt / loop.log_every
     h, vehicle, airframe = period / steps, _Vehicle.of(loop), loop.airframe
     sense_key, log_key = jax.random.split(jax.random.fold_in(key, 1))
-    sense = None if loop.sensors is None else Sense.of(loop.sensors, airframe.hover_speed, period, sense_key)
+    sense = (
+        None if loop.sensors is None else Sense.of(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
+    )
     mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
     # A command acts `late` runs after its own, and in the first `part` of a run the one before it still acts.
     late = jnp.floor(loop.rotor_delay / period).astype(int)

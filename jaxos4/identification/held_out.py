@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._custom_types import as_float
+from .._custom_types import Numeric, as_float
 from .._xla import quick_jit
 from ..analysis.diagnostics import residual_diagnostics
 from ..analysis.evaluation import evaluate
@@ -80,11 +80,11 @@ def _disturbances(
 
 def _regressed(problem: ShootingProblem, room: int, values: np.ndarray, held: Sequence[bool]) -> np.ndarray:
     """The parameters by regression."""
-    return np.asarray(_regression(with_room(problem, room), as_float(values), jnp.asarray(held)))
+    return np.asarray(_regression(with_room(problem, room), as_float(values), np.asarray(held)))
 
 
 @quick_jit
-def _regression(problem: ShootingProblem, values: Array, held: Array) -> Array:
+def _regression(problem: ShootingProblem, values: Array, held: Numeric) -> Array:
     """The parameters by regression; held ones, and those that it cannot estimate, have the values of the fit."""
     linear = np.array([not each.in_forcing for each in problem.model.parameters])
     own = jnp.where(linear & ~held, problem.unknowns.center, values)

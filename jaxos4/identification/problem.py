@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._custom_types import as_float
 from ..bracket import Bracket
 from ..errors import InputError, named
 from ..flight import STATE_NAMES
@@ -48,7 +49,7 @@ def bracket_of(bracket: Intervals, model: AbstractModel) -> Bracket:
         if name not in names:
             raise InputError(f"`bracket`: knows no parameter `{name}`; the parameters are {', '.join(names)}.")
         ends[names.index(name)] = _interval(name, value)
-    return Bracket(jnp.asarray(ends[:, 0]), jnp.asarray(ends[:, 1]))
+    return Bracket(as_float(ends[:, 0]), as_float(ends[:, 1]))
 
 
 def _interval(name: str, value: Any) -> list[float]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import IO, Any, NamedTuple, NoReturn, TypeVar
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -231,7 +231,7 @@ class Recording(NamedTuple):
     def flight(self) -> Flight:
         """The `Flight`, in the precision of JAX."""
         arrays: dict[str, Any] = {field: getattr(self, field) for field in _ARRAYS}
-        arrays["stretch"] = None if self.stretch is None else jnp.asarray(self.stretch)
+        arrays["stretch"] = None if self.stretch is None else jax.device_put(self.stretch)
         return Flight(**arrays, commanded=self.commanded)
 
     @property

@@ -12,7 +12,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from .._custom_types import InitialStates, Parameters, Scalar, as_float
+from .._custom_types import InitialStates, Numeric, Parameters, Scalar, as_float
+from .._xla import quick_jit
 from ..bracket import NO_PRIOR, Bracket, is_identifiable
 from ..flight import Flight
 from ..models.abstract import AbstractModel
@@ -99,9 +100,9 @@ class Unknowns(eqx.Module):
         if len(values) == self.count:
             raise ValueError("`values` holds every unknown; leave at least one free.")
         held = np.isin(self.names, list(values))
-        known = np.flatnonzero(held)
-        center = self.center.at[known].set(jnp.stack([as_float(values[self.names[i]]) for i in known]))
-        return dataclasses.replace(self, center=center, free=self.free & ~held)
+        given = [as_float(values.get(name, 0.0)) for name in self.names]
+        center, free = _held(self.center, self.free, held, given)
+        return dataclasses.replace(self, center=center, free=free)
 
     @property
     def valid(self) -> Bool[Array, ""]:
@@ -137,6 +138,13 @@ class Unknowns(eqx.Module):
 def _all(mask: Bool[Array, "..."]) -> bool:
     """Whether all values are true and known while a program is traced."""
     return not isinstance(mask, Tracer) and bool(np.asarray(mask).all())
+
+
+@quick_jit  # one compiled program instead of one for each operation
+def _held(
+    center: Values, free: Bool[Array, " unknowns"], held: Bool[Numeric, " unknowns"], given: list[Scalar]
+) -> tuple[Values, Bool[Array, " unknowns"]]:
+    return jnp.where(held, jnp.stack(given), center), free & ~held
 
 
 class Stages(NamedTuple):
