@@ -8,7 +8,7 @@ from recorded_logs import GRAVITY, RPM, blackbox_csv, check, force, rates, speed
 from jaxos4.logs import read_log, read_recording
 from jaxos4.logs.blackbox_frames import Numbers
 from jaxos4.recording import cut
-from jaxos4.recording.motion import RotorSigns, rotor_signs
+from jaxos4.recording.motion import rotor_signs
 
 RATES = ("p", "q", "r")
 SETTINGS = {"Product": "Blackbox flight data recorder by Nicholas Sherlock", "acc_1G": "2048", "motor_poles": "12"}
@@ -205,7 +205,7 @@ def test_differences_after_a_lost_frame_are_ignored(accident, save):
 # Real logs. Decoding takes seconds: once for each log.
 
 # Rear right, front right, rear left, front left; props out.
-SIGNS = RotorSigns((-1, 1, -1, 1), (-1, -1, 1, 1), (1, -1, -1, 1))
+SIGNS = (-1, 1, -1, 1), (-1, -1, 1, 1), (1, -1, -1, 1)
 
 
 @pytest.mark.parametrize(

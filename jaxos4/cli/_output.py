@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from .._files import check_writable, load_netcdf, write_file
 from ..errors import InputError
 
@@ -109,6 +111,15 @@ def check_outputs(*inputs: Path | str | None, **outputs: Path | None) -> None:
             raise InputError(f"{out}: would overwrite an input; give the output another name.")
         if (other := names.setdefault(target, option)) != option:
             raise InputError(f"{out}: {other} and {option} name one file; give them two.")
+
+
+def end(result: str) -> None:
+    """Ends a command with exit code 1 if a result, by its name, is not to be trusted."""
+    from ..results import meaning
+
+    if result != "successful":
+        typer.echo(f"jaxos4: {result}: {meaning(result)}", err=True)
+        raise typer.Exit(1)
 
 
 def write_folder(texts: dict[str, str], folder: Path) -> None:

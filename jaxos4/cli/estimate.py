@@ -5,12 +5,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from typer import Argument, Option
 
 from ..errors import InputError
 from . import _options as options
-from ._output import DRAWING, check_outputs, import_beside, in_options, option_names, stages, write_json
+from ._output import DRAWING, check_outputs, end, import_beside, in_options, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from ..airframe import Airframe
@@ -125,7 +124,6 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
     from rich.console import Console
 
     from ..report import print_identification
-    from ..results import meaning
 
     console = Console()
     if out is not None:
@@ -137,6 +135,4 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
 
             write_flight_page(report, found, title=title)
         console.print(f"report: {report}", markup=False, highlight=False)
-    if not found.successful:
-        typer.echo(f"jaxos4: {found.result}: {meaning(found.result)}", err=True)
-        raise typer.Exit(1)
+    end(found.result)

@@ -9,7 +9,17 @@ from typer import Argument, Option
 from .._files import check_writable, write_file
 from ..errors import InputError
 from . import _options as options
-from ._output import DRAWING, check_outputs, import_beside, in_options, option_names, stages, write_folder, write_json
+from ._output import (
+    DRAWING,
+    check_outputs,
+    end,
+    import_beside,
+    in_options,
+    option_names,
+    stages,
+    write_folder,
+    write_json,
+)
 
 MOST_SAMPLES = 100_000
 
@@ -55,9 +65,7 @@ def export(
         typer.echo(doubt, err=True)
     for note in written.notes:
         typer.echo(f"note: {note}", err=True)
-    if not found.successful:
-        typer.echo(f"jaxos4: {found.result}: {found.reason}", err=True)
-        raise typer.Exit(1)
+    end(found.result)
 
 
 def predict(
@@ -100,12 +108,9 @@ def predict(
     from rich.console import Console
 
     from ..report import print_prediction
-    from ..results import meaning
 
     console = Console()
     print_prediction(console, found._replace(notes=tuple(in_options(note) for note in found.notes)))
     for path in filter(None, (out, json, figure)):
         console.print(f"written: {path}", markup=False, highlight=False)
-    if vehicle.result != "successful":
-        typer.echo(f"jaxos4: {vehicle.result}: {meaning(vehicle.result)}", err=True)
-        raise typer.Exit(1)
+    end(vehicle.result)

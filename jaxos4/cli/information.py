@@ -51,16 +51,16 @@ def inspect(
         vehicle = None if airframe is None else load_airframe(airframe)
         recording = read_recording(log, vehicle, full_scale=1.0)
         found = inspect_log(recording, vehicle)
-        draft = None if airframe_out is None else airframe_draft(recording)
+        text, missing = ("", ()) if airframe_out is None else airframe_draft(recording)
     console = Console(highlight=False, markup=False)
     if out is not None:
         write_json(found.to_dict(), out)
-    if draft is not None and airframe_out is not None:
-        write_file(airframe_out, draft.text)
+    if airframe_out is not None:
+        write_file(airframe_out, text)
     _print_contents(console, found, log_format(log).label)
     _print_parts(console, found)
-    if draft is not None:
-        still = f"; weigh or measure, and fill in: {', '.join(draft.missing)}" if draft.missing else ""
+    if airframe_out is not None:
+        still = f"; weigh or measure, and fill in: {', '.join(missing)}"
         console.print(f"airframe: {airframe_out}{still}", soft_wrap=True)
 
 

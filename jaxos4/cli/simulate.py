@@ -8,7 +8,7 @@ from typer import Option
 
 from ..errors import InputError, named
 from . import _options as options
-from ._output import check_outputs, stages
+from ._output import check_outputs, end, stages
 
 if TYPE_CHECKING:
     from ..flight import Flight
@@ -58,13 +58,11 @@ def simulate(
     with stages("loading the library") as progress:
         from ..airframe import load_airframe
         from ..logs import write_flight
-        from ..results import RESULTS, result_names
+        from ..results import result_names
 
         progress("compiling and simulating")
         flight, how = (_closed_loop if closed_loop else _open_loop)(asked)
-        if flight.result != RESULTS.successful:
-            typer.echo(f"jaxos4: {result_names(flight.result)}: {RESULTS[flight.result]}", err=True)
-            raise typer.Exit(1)
+        end(str(result_names(flight.result)))
         progress("writing")
         write_flight(flight, out, load_airframe(airframe))
     typer.echo(f"{out}: {flight.time.shape[0]} samples of {how}")

@@ -16,6 +16,7 @@ import numpy as np
 from .._version import __version__
 from ..errors import InputError
 from ..excitation import AXES
+from ..results import meaning
 from .result import Identified
 from .vehicle import RigidVehicle
 
@@ -82,7 +83,9 @@ def export_vehicle(found: Identified, to: str, *, samples: int = 0, seed: int = 
         if not isinstance(value, int) or value < 0:
             raise InputError(f"`{name}`: must be an integer of at least 0, got {value!r}.")
     target = TARGETS[to]
-    warning = () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {found.reason}.", *found.doubts)
+    warning = (
+        () if found.successful else (f"NOT TO BE TRUSTED: {found.result}: {meaning(found.result)}.", *found.doubts)
+    )
 
     def text(vehicle: RigidVehicle, *lines: str) -> str:
         made = f"Made by jaxos4 {__version__} from {found.source}."

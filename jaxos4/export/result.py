@@ -13,7 +13,6 @@ from ..airframe import Airframe, airframe_from_table
 from ..errors import InputError, named
 from ..identification.results import ResultFile
 from ..linalg import covariance_root
-from ..results import meaning
 from .vehicle import CARRIED, INERTIAS, NOT_NEGATIVE, RigidVehicle, rigid_vehicle
 
 # An inertia of the rotors is exported if it differs from 0 by this many standard deviations, a thrust curve if it
@@ -55,11 +54,6 @@ class Identified(NamedTuple):
     def successful(self) -> bool:
         """True if the estimate can be trusted."""
         return self.result == "successful"
-
-    @property
-    def reason(self) -> str:
-        """The meaning of the result code."""
-        return meaning(self.result)
 
     @property
     def vehicle(self) -> RigidVehicle:

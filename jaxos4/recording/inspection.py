@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 import msgspec
@@ -114,40 +114,36 @@ def _measured(recording: Recording) -> dict[str, Channel]:
     return channels
 
 
-class AirframeDraft(NamedTuple):
-    """The text of an airframe's file, and the keys that must be filled in before it can be used."""
-
-    text: str
-    missing: tuple[str, ...]
-
-
-def airframe_draft(recording: Recording) -> AirframeDraft:
+def airframe_draft(recording: Recording) -> tuple[str, tuple[str, ...]]:
     """Begin the file of an airframe with what a log knows: spins, hover speed, sometimes the rotors' positions.
 
     What must be weighed or measured is a comment, so that `load_airframe` names the first of these keys as missing.
 
     **Arguments:** `recording`: read without an airframe, and with `full_scale=1.0`.
+
+    **Returns:** the text, and the keys that must be filled in before it can be used.
     """
     facts, full = recording.facts, FULL_SCALE if recording.commanded else 1.0
     parts = [cut(recording, part) for part in stretches(recording) if not part.reason]
     signs, hover = None if facts.too_slow else rotor_signs(parts), _hover(parts)
-    spins = facts.rotor_spins or (None if signs is None else signs.spins)
+    forward, left, spins = signs or ((), (), None)
+    spins = facts.rotor_spins or spins
     template = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, keep_trailing_newline=True)
     template.loader = jinja2.PackageLoader("jaxos4.recording", ".")
     text = template.get_template("airframe.toml.j2").render(
         name=Path(recording.name).name,
         facts=facts,
-        corners=[] if signs is None else [_corner(*each) for each in zip(signs.forward, signs.left, strict=True)],
+        corners=list(zip(forward, left, strict=True)),
         spins=None if spins is None else [int(spin) for spin in spins],
         hover=hover,
         full=full,
         seconds=sum(float(np.ptp(part.time)) for part in parts),
         commanded=recording.commanded,
         guess=GUESS,
-        short=_short,
+        short=lambda value: np.vectorize(lambda x: float(f"{x:.4g}"))(value).tolist(),
     )
     known = {"rotor_positions": facts.rotor_positions, "rotor_spins": spins, "hover_speed": hover}
-    return AirframeDraft(text, ("mass", *(key for key, value in known.items() if value is None)))
+    return text, ("mass", *(key for key, value in known.items() if value is None))
 
 
 def _hover(parts: Sequence[Recording]) -> tuple[float, bool] | None:
@@ -163,16 +159,3 @@ def _hover(parts: Sequence[Recording]) -> tuple[float, bool] | None:
     share = float(np.median(vertical[np.isfinite(vertical)])) / GRAVITY if np.isfinite(vertical).any() else np.nan
     felt = bool(_PLAUSIBLE[0] < share < _PLAUSIBLE[1])
     return float(np.sqrt(np.median(squares) / (share if felt else 1.0))), felt
-
-
-def _corner(forward: float, left: float) -> tuple[str, str, str]:
-    """The signed x and y of a rotor, and its place in words."""
-    x, y = "x" if forward > 0 else "-x", "y" if left > 0 else "-y"
-    return x, y, f"{'front' if forward > 0 else 'rear'} {'left' if left > 0 else 'right'}"
-
-
-def _short(value: Any) -> Any:
-    """A number or nested numbers with at most four digits."""
-    if isinstance(value, tuple | list):
-        return [_short(each) for each in value]
-    return float(f"{value:.4g}")

@@ -5,7 +5,6 @@ The signs of that response also show where the rotors of an X are, and how they 
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -52,17 +51,6 @@ class Excitation(msgspec.Struct, frozen=True):
     rate: float | None
     noise: float | None
     verdict: str
-
-
-class RotorSigns(NamedTuple):
-    """The signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from above).
-
-    `spins`: `None` if the vehicle hardly yawed.
-    """
-
-    forward: Signs
-    left: Signs
-    spins: Signs | None
 
 
 def excitation(flight: Flight | Recording, airframe: Airframe | None = None) -> dict[str, Excitation]:
@@ -139,12 +127,13 @@ def yaw_doubt(axes: Mapping[str, float]) -> tuple[str, str] | None:
     )
 
 
-def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
+def rotor_signs(pieces: Sequence[Recording]) -> tuple[Signs, Signs, Signs | None] | None:
     """The places and spins of four rotors in an X, by how the vehicle turns after each pair of rotors speeds up.
 
-    `None`: the flight does not show it, or the rotors are no X.
-
     **Arguments:** usable stretches of flights, each of one vehicle, with motors and gyro logged fast.
+
+    **Returns:** the signs of the rotors' x (forward) and y (left), and their spins (+1: counter-clockwise seen from
+    above; `None`: the vehicle hardly yawed). `None`: the flight does not show it, or the rotors are no X.
     """
     _, found = _correlations(pieces, _PAIRS, _CAUSAL)
     roll, pitch = (_pair(found[:, :, axis]) for axis in (0, 1))
@@ -155,7 +144,7 @@ def rotor_signs(pieces: Sequence[Recording]) -> RotorSigns | None:
     forward = -_clear_sign(found[:, pitch, 1]) * _PAIRS[pitch]
     turn = _clear_sign(found[:, yaw, 2])
     spins = tuple((-turn * _PAIRS[yaw]).tolist()) if turn else None
-    return RotorSigns(tuple(forward.tolist()), tuple(left.tolist()), spins)
+    return tuple(forward.tolist()), tuple(left.tolist()), spins
 
 
 def motor_clock_note(pieces: Sequence[Recording], airframe: Airframe) -> str:

@@ -96,11 +96,14 @@ def prepare(
     **Raises:** `InputError`, one line, for arguments out of range and recordings that cannot be used.
     """
     _check_options(begin, end, sample_time, holdout)
-    _check_recordings(recordings)
     notes: list[str] = []
     parts: list[tuple[int, Recording]] = []
     doubts: list[tuple[str, str]] = []
     for number, recording in enumerate(recordings):
+        if any(recording.same_data(earlier) for earlier in recordings[:number]):
+            raise InputError(f"{recording.name}: given twice; give each log once.")
+        if np.isnan(recording.states[:, CASCADE_ORDER[:3]]).all(axis=0).any():
+            raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
         slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
         pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)
         if slow:
@@ -241,14 +244,6 @@ def _usable_parts(
         f"{seconds:.1f} of {last - first:.1f} s are used, in {len(usable)} stretches; not used: {reasons}"
         f"{'; ...' if len(refused) > _MOST_REASONS else ''}{'' if predicted else ' (`begin` and `end` override)'}"
     )
-
-
-def _check_recordings(recordings: Sequence[Recording]) -> None:
-    for number, recording in enumerate(recordings):
-        if any(recording.same_data(earlier) for earlier in recordings[:number]):
-            raise InputError(f"{recording.name}: given twice; give each log once.")
-        if np.isnan(recording.states[:, CASCADE_ORDER[:3]]).all(axis=0).any():
-            raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
 
 
 def _check_options(begin: float | None, end: float | None, sample_time: float | None, holdout: float) -> None:
