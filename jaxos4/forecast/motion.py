@@ -26,6 +26,11 @@ PARTS = {"position": np.r_[0:3], "velocity": np.r_[3:6], "attitude": np.r_[6:10]
 CHUNK = 32
 """The number of starts that fly in one call of a program."""
 
+# A recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
+_MEMORY = 5.0
+# The standard deviation of an offset of the specific force, and of the force that a model lacks [m/s^2]; and the
+# correlation time of the latter [s].
+PUSH, _PUSH_TIME = 1.0, 0.25
 # Rows after which the covariance of a filter no longer changes.
 _SETTLED = 512
 
@@ -60,8 +65,7 @@ class Lanes(NamedTuple):
     - `offset`: what p', q', r' [rad/s^2] and the specific force [m/s^2] have in this recording besides the model, from
       the past of each sample.
     - `filtered`: whether the future begins with the rates and the disturbance of the filters, or as measured.
-    - `begin`: errors of the state at the start; of the attitude as a small rotation [rad].
-    - `pushed`: errors of the disturbances at the start.
+    - `begin`, `pushed`: errors of the rates and of the disturbances at the start.
     - `off`: errors of the offsets, and what they make of the disturbances at the start, in standard deviations.
     - `gusts`: what rate and disturbance of each channel gain in each step besides the model.
     """
@@ -70,7 +74,7 @@ class Lanes(NamedTuple):
     forcing: Forcing
     offset: Float[Array, "lanes samples 6"]
     filtered: Bool[Array, " lanes"]
-    begin: Float[Array, "lanes 12"]
+    begin: Float[Array, "lanes 3"]
     pushed: Float[Array, "lanes channels"]
     off: Float[Array, "lanes 2 6"]
     gusts: Float[Array, "lanes steps channels 2"]
@@ -157,11 +161,10 @@ def _fly(
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), lane.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
     biased = jnp.stack(model.observe(State(Rates(*w)), still, scalars)[:3])
-    w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin[9:]
+    w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin
     error, absorbed = start.unsure * lane.off
     offset = lane.offset[first] + error
-    tilt = (jnp.ones(()), *(lane.begin[6:9] / 2))
-    begin = Motion(tuple(p + lane.begin[:3]), tuple(v + lane.begin[3:6]), _unit(product(tuple(q), tilt)), Rates(*w))
+    begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
 
     def step(carry: tuple[Motion, Array, Array], row) -> tuple[tuple[Motion, Array, Array], Array]:
         (motion, disturbance, sound), (forcing, gust) = carry, row
@@ -218,8 +221,6 @@ class Evidence(NamedTuple):
     - `states`: as in `PARTS`. `accelerations`: see `jaxos4.forecast.measured.Measured`.
     - `noise`: of the filters. `velocity_noise`: the standard deviation of the white noise of velocity [m/s].
     - `prior`: the standard deviation of each offset before the flight.
-    - `lacking`: the standard deviation of the force that a model lacks [m/s^2], and its correlation time [s].
-    - `memory`: the time constant with which a recording's offsets are forgotten [s].
     """
 
     states: Float[Array, "samples 13"]
@@ -227,8 +228,6 @@ class Evidence(NamedTuple):
     noise: LogNoise
     velocity_noise: Float[Array, "3"]
     prior: Float[Array, "6"]
-    lacking: Float[Array, "2"]
-    memory: Scalar
 
 
 @quick_jit
@@ -242,7 +241,7 @@ def known_at_samples(
     """
     rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
-    kept = jnp.exp(-flight.dt / evidence.memory)
+    kept = jnp.exp(-flight.dt / _MEMORY)
     weight, unsure = _offset_weights(model, evidence, kept, flight.dt)
 
     def of_lane(values: Array) -> tuple[Forcing, Array, Array, Array]:
@@ -274,7 +273,7 @@ def _offset_weights(
     as offsets are known not to differ.
     """
     noise, channels = evidence.noise, np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
-    strength, time_constant = (jnp.full(6, x) for x in evidence.lacking)
+    strength, time_constant = (jnp.full(6, x) for x in (PUSH, _PUSH_TIME))
     strength = strength.at[channels].set(jnp.exp(noise.strength))
     time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant))
     sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), evidence.velocity_noise])

@@ -20,17 +20,12 @@ from ..recording.preparation import Prepared
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .measured import Measured, constant_rates, regressed
-from .motion import CHUNK, PARTS, Evidence, Lanes, fly_chunk, known_at_samples, settled, turned
+from .motion import CHUNK, PARTS, PUSH, Evidence, Lanes, fly_chunk, known_at_samples, settled, turned
 from .prediction import FlightPrediction
 from .vehicle import Vehicle, vehicle_of
 
 # Futures of each start for the band, and half the width of a 95 % interval in their standard deviations (Student).
 _DRAWS, _NINETY_FIVE = 64, 1.9977
-# A recording's offsets are forgotten with this time constant [s]: batteries and propellers change slowly.
-_MEMORY = 5.0
-# The standard deviation of an offset of the specific force, and of the force that a model lacks [m/s^2]; and the
-# correlation time of the latter [s].
-_PUSH = 1.0, 0.25
 # What a log cannot replace by a prediction.
 _INPUTS = frozenset({COMMANDS, FULL_SCALE, VOLTAGE})
 
@@ -176,10 +171,9 @@ def _fly(
 
     after, added, absorbed = jax.tree.map(np.asarray, settled(evidence.noise, dt))
     first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
-    begin = np.pad(first[:, :3, 0], ((0, 0), (9, 0)))  # the rest is in `Measured.contradictions`
     gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
     off = generator.standard_normal((_DRAWS, 6))
-    drawn = begin, first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
+    drawn = first[:, :3, 0], first[..., 1], np.stack([off, -np.append(absorbed[:3], np.zeros(3)) * off], axis=1), gusts
     surely = (as_float(np.concatenate([np.zeros((2, *x.shape[1:])), x])) for x in drawn)
     lanes = Lanes(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
@@ -210,9 +204,7 @@ def _evidence(
         accelerations,
         noise=LogNoise(*map(as_float, noise)),
         velocity_noise=as_float(measured.noise[3:6]),
-        prior=as_float(np.append(vehicle.offset, [_PUSH[0] * ("velocity" not in missing)] * 3)),
-        lacking=as_float(np.array(_PUSH)),
-        memory=as_float(_MEMORY),
+        prior=as_float(np.append(vehicle.offset, [PUSH * ("velocity" not in missing)] * 3)),
     )
 
 
