@@ -90,31 +90,27 @@ def read_result(path: str | os.PathLike[str]) -> Identified:
     """
     file = ResultFile.of(path)
     with named(path):
-        return _identified(Path(path).name, file)
-
-
-def _identified(name: str, file: ResultFile) -> Identified:
-    airframe, covariance = airframe_from_table(file.airframe or {}), np.array(file.covariance)
-    values, drawn, covariance, notes = _parts(file, covariance)
-    negative = [each for each in NOT_NEGATIVE if values.get(each, 0.0) < 0]
-    kept = [place for place, each in enumerate(drawn) if each not in negative]
-    notes += [f"{each}: came out negative, which is impossible; it is 0 here" for each in negative]
-    if not np.isfinite(airframe.max_rotor_speed):
-        notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
-    found = Identified(
-        source=f"{name} ({file.estimator}, {file.model} model, {file.result})",
-        result=file.result,
-        airframe=airframe,
-        values=_clipped(values),
-        drawn=tuple(drawn[place] for place in kept),
-        covariance=covariance[np.ix_(kept, kept)],
-        doubts=file.reasons,
-        notes=tuple(notes),
-    )
-    if found.vehicle.impossible:
-        why = found.vehicle.impossible
-        raise InputError(f"no vehicle is like this: {why}; correct the airframe, or fly with more excitation.")
-    return found
+        airframe = airframe_from_table(file.airframe or {})
+        values, estimated, notes = _parts(file)
+        negative = [name for name in NOT_NEGATIVE if values.get(name, 0.0) < 0]
+        notes += [f"{name}: came out negative, which is impossible; it is 0 here" for name in negative]
+        if not np.isfinite(airframe.max_rotor_speed):
+            notes.append("max_rotor_speed: not in the airframe; it is twice the hover speed here")
+        drawn = tuple(name for name in estimated if name not in negative)
+        places = [list(file.parameters).index(name) for name in drawn]
+        found = Identified(
+            source=f"{Path(path).name} ({file.estimator}, {file.model} model, {file.result})",
+            result=file.result,
+            airframe=airframe,
+            values=_clipped(values),
+            drawn=drawn,
+            covariance=np.array(file.covariance)[np.ix_(places, places)],
+            doubts=file.reasons,
+            notes=tuple(notes),
+        )
+        if why := found.vehicle.impossible:
+            raise InputError(f"no vehicle is like this: {why}; correct the airframe, or fly with more excitation.")
+        return found
 
 
 def _clipped(values: dict[str, float]) -> dict[str, float]:
@@ -127,8 +123,8 @@ def _vehicles_own(name: str) -> str:
     return re.sub(r"_\d+$", "", name)
 
 
-def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], tuple[str, ...], np.ndarray, list[str]]:
-    """Values by name, the names that are drawn, their covariance, and notes."""
+def _parts(file: ResultFile) -> tuple[dict[str, float], list[str], list[str]]:
+    """Values by name, the names of those that were estimated, and notes."""
     rows, notes = file.parameters, []
     found = {name: (row.estimate, row.std or 0.0) for name, row in rows.items() if row.estimate is not None}
     for moment, name in INERTIAS.items():
@@ -160,5 +156,4 @@ def _parts(file: ResultFile, covariance: np.ndarray) -> tuple[dict[str, float], 
     zero = [name for name in (*INERTIAS.values(), "thrust_gain") if values.get(name) == 0]
     if zero:
         raise InputError(f"no vehicle is like this: {zero[0]} is 0; fly with more excitation.")
-    places = [place for place, name in enumerate(rows) if name in found]
-    return values, tuple(found), covariance[np.ix_(places, places)], notes
+    return values, list(found), notes

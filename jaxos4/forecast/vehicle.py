@@ -16,7 +16,6 @@ from ..errors import InputError, named
 from ..flight import FORCE_NAMES
 from ..identification.results import Identification, ResultFile
 from ..linalg import covariance_root
-from ..models.terms import TERMS
 from ..models.vehicle import FlightModel
 from ..shooting.gains import LogNoise
 
@@ -59,51 +58,41 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     **Raises:** `InputError`, one line, if the result has no vehicle or no estimate; `OSError` if it cannot be read.
     """
     file = ResultFile.of(found)
-    if isinstance(found, Identification):
-        return _vehicle(file, f"{file.estimator}, {file.model} model")
-    with named(found):
-        return _vehicle(file, Path(found).name)
-
-
-def _vehicle(file: ResultFile, name: str) -> Vehicle:
-    used, airframe = file.provenance, airframe_from_table(file.airframe or {})
-    terms = used.terms or []
-    try:
-        model = FlightModel(airframe, terms=tuple(terms), battery_voltage=used.battery_voltage or None)
-    except ValueError:
-        strangers = [term for term in terms if term not in TERMS]
-        which = f"the term {strangers[0][:40]} is not of this version" if strangers else "its terms exclude each other"
-        raise InputError(f"{which}; run `jaxos4 estimate` again.") from None
-    known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
-    known |= {row: each.value for row, each in file.held.items()}
-    alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))
-    center, width = (dict(zip(model.parameter_names, each, strict=True)) for each in (alpha, half_width))
-    listed, rows, covariance = [*file.parameters, *file.held], list(file.parameters), np.array(file.covariance)
-    # Each parameter is the mean of its rows: one, or one for each recording.
-    shares, values, missing, guessed = np.zeros((len(center), len(rows))), [], [], []
-    for place, each in enumerate(center):
-        own = [row for row in listed if re.fullmatch(rf"{each}(_\d+)?", row)]
-        estimated = [row for row in own if row in known]
-        if not own:
-            missing.append(each)
-        elif not estimated:
-            guessed.append(each)
-        values.append(np.mean([known[row] for row in estimated]) if estimated else center[each])
-        shares[place, [rows.index(row) for row in estimated if row in file.parameters]] = 1 / max(len(estimated), 1)
-    if missing:
-        raise InputError(f"has no {', '.join(missing)}; run `jaxos4 estimate` again.")
-    notes = [f"not identified, and predicted with the centre of the bracket: {', '.join(guessed)}"] * bool(guessed)
-    return Vehicle(
-        name,
-        model,
-        np.array(values),
-        shares @ covariance @ shares.T,
-        np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
-        _noise(file, model.force_axes),
-        used.sample_time,
-        file.result,
-        (*file.reasons, *notes),
-    )
+    own = f"{file.estimator}, {file.model} model"
+    name, place = (own, "") if isinstance(found, Identification) else (Path(found).name, found)
+    with named(place):
+        used, airframe = file.provenance, airframe_from_table(file.airframe or {})
+        model = FlightModel(airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
+        known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
+        known |= {row: each.value for row, each in file.held.items()}
+        alpha, half_width = (np.asarray(each).tolist() for each in _bracket(model))
+        center, width = (dict(zip(model.parameter_names, each, strict=True)) for each in (alpha, half_width))
+        listed, rows, covariance = [*file.parameters, *file.held], list(file.parameters), np.array(file.covariance)
+        # Each parameter is the mean of its rows: one, or one for each recording.
+        shares, values, missing, guessed = np.zeros((len(center), len(rows))), [], [], []
+        for place, each in enumerate(center):
+            own = [row for row in listed if re.fullmatch(rf"{each}(_\d+)?", row)]
+            estimated = [row for row in own if row in known]
+            if not own:
+                missing.append(each)
+            elif not estimated:
+                guessed.append(each)
+            values.append(np.mean([known[row] for row in estimated]) if estimated else center[each])
+            shares[place, [rows.index(row) for row in estimated if row in file.parameters]] = 1 / max(len(estimated), 1)
+        if missing:
+            raise InputError(f"has no {', '.join(missing)}; run `jaxos4 estimate` again.")
+        notes = [f"not identified, and predicted with the centre of the bracket: {', '.join(guessed)}"] * bool(guessed)
+        return Vehicle(
+            name,
+            model,
+            np.array(values),
+            shares @ covariance @ shares.T,
+            np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
+            _noise(file, model.force_axes),
+            used.sample_time,
+            file.result,
+            (*file.reasons, *notes),
+        )
 
 
 @quick_jit
