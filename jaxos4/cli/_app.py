@@ -10,11 +10,10 @@ import typer
 
 from ..errors import InputError, TrainingError
 from ._jax import NO_CACHE, prepare
-from .design import design
 from .estimate import estimate
+from .flying import design, simulate
 from .identified import export, predict
 from .information import identifiability, inspect
-from .simulate import simulate
 from .studies import compare, report, study
 from .train import train
 

@@ -1,18 +1,14 @@
 """The values of options, the options that several commands share, and the checks of their values."""
 
-from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
 from .._files import read_toml
 from ..errors import InputError
 from ..estimators import ESTIMATORS
-
-if TYPE_CHECKING:
-    from ..closed_loop import ClosedLoop
 
 # The names in the library's tables, written out because an import of these tables takes seconds; a test compares them.
 # `list(...)`: pyright takes the values of a written list for numbers.
@@ -39,28 +35,6 @@ WindowOption = Annotated[
 ]
 OutOption = Annotated[Path | None, Option(help="JSON file to write.")]
 
-# The options that `simulate` and `design` share.
-OpenLoopModelOption = Annotated[Model | None, Option(help="Equations of motion. Default: published.")]
-DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
-SampleTimeOption = Annotated[float | None, Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.")]
-GustOption = Annotated[
-    float | None, Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5.")
-]
-LagOption = Annotated[float | None, Option(help="With --closed-loop: lag of the rotors [s]. Default: 0.05.")]
-DelayOption = Annotated[float | None, Option(help="With --closed-loop: delay of the commands [s]. Default: 0.01.")]
-SensorsOption = Annotated[
-    Sensors | None,
-    Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
-]
-
-# The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
-_OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "model": Model["published"], "slew": None, "speeds": None}
-_OPEN |= {"excitation": Excitation["multisine"], "method": Method["euler"], "noise": 0.0}
-_OPEN |= {"channels": Channels["all"], "initial_state": InitialState["free"]}
-_CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
-_CLOSED |= {"sensors": None, "references": None}
-_MOST = {"gust": 1e6, "lag": 1.0, "delay": 1.0, "noise": 1e6}
-
 
 def check_seed(seed: int) -> None:
     """Refuses a random seed that JAX cannot use."""
@@ -81,34 +55,3 @@ def given(**settings: Any) -> dict[str, Any]:
 def read_bracket(path: Path | None) -> dict[str, Any] | None:
     """The table in the file of `--bracket`. Raises `InputError` if it is no TOML file."""
     return None if path is None else read_toml(path)
-
-
-def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of a command, with the defaults of its kind of flight.
-
-    Refuses options of the other kind, and settings that are out of range.
-    """
-    own, others = (_CLOSED, _OPEN) if closed_loop else (_OPEN, _CLOSED)
-    for name, value in given(**asked).items():
-        if name in others and name not in own:
-            how = "without --closed-loop; leave it out" if closed_loop else "with --closed-loop; add that"
-            raise InputError(f"--{name.replace('_', '-')}: is for flights {how}.")
-        if name in _MOST and not 0 <= value <= _MOST[name]:
-            raise InputError(f"--{name}: must lie in 0 to {_MOST[name]:g}, got {value}.")
-    check_seed(asked["seed"])
-    return dict(asked) | {name: default for name, default in own.items() if asked.get(name) is None}
-
-
-def make_loop(asked: Mapping[str, Any]) -> "ClosedLoop":
-    """The vehicle in closed loop with these options."""
-    from ..airframe import load_airframe
-    from ..closed_loop import ClosedLoop
-
-    vehicle = load_airframe(asked["airframe"])
-    logged, scaled = chosen(asked["sensors"]), vehicle.has_full_scale
-    if logged == "commands" and not scaled:
-        raise InputError(
-            f"--sensors commands: {asked['airframe']} has no max_rotor_speed [rad/s]; set it, or log speeds."
-        )
-    settings = given(rotor_lag=asked["lag"], rotor_delay=asked["delay"])
-    return ClosedLoop(vehicle, logged=logged or ("commands" if scaled else "speeds"), gust=asked["gust"], **settings)

@@ -16,6 +16,7 @@ from ..errors import InputError, named
 from ..flight import FORCE_NAMES
 from ..identification.results import Identification, ResultFile
 from ..linalg import covariance_root
+from ..models.terms import TERMS
 from ..models.vehicle import FlightModel
 from ..shooting.gains import LogNoise
 
@@ -62,6 +63,8 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     name, place = (own, "") if isinstance(found, Identification) else (Path(found).name, found)
     with named(place):
         used, airframe = file.provenance, airframe_from_table(file.airframe or {})
+        if strangers := [term for term in used.terms or () if term not in TERMS]:
+            raise InputError(f"the term {strangers[0][:40]} is not of this version; run `jaxos4 estimate` again.")
         model = FlightModel(airframe, terms=tuple(used.terms or ()), battery_voltage=used.battery_voltage or None)
         known = {row: each.estimate for row, each in file.parameters.items() if each.estimate is not None}
         known |= {row: each.value for row, each in file.held.items()}

@@ -148,13 +148,16 @@ def train_network(
     where = bracket_of(bracket, model)
     problem = flight_problem(recording, model, where, channels=channels, initial_state=initial_state)
     settings = dataclasses.replace(settings, channels=channels or _seen_channels(problem))
-    return _train(settings, problem, where, recording.name, seed)
+    with named(recording.name):
+        return settings.fit(problem, where, key=jax.random.key(seed))
 
 
 def network_for(problem: ShootingProblem, bracket: Bracket, name: str, *, shoots: bool, seed: int) -> TrainedNetwork:
     """Train a network for one flight, named `name`: briefly if shooting follows (`shoots`)."""
     steps = _SEED_STEPS if shoots else NetworkEstimator.steps
-    return _train(NetworkEstimator(channels=_seen_channels(problem), steps=steps), problem, bracket, name, seed)
+    settings = NetworkEstimator(channels=_seen_channels(problem), steps=steps)
+    with named(name):
+        return settings.fit(problem, bracket, key=jax.random.key(seed))
 
 
 def liveliest(problem: ShootingProblem) -> ShootingProblem:
@@ -172,7 +175,8 @@ def vehicle_network_for(problem: ShootingProblem, name: str, *, seed: int) -> Tr
     """Train a network for a part of a vehicle's flight in windows, at the noise levels of the problem."""
     unknowns = problem.unknowns
     bracket = Bracket.around(unknowns.center, _FLYABLE * unknowns.half_width)
-    return _train(_VEHICLE_TRAINING, problem, bracket, name, seed)
+    with named(name):
+        return _VEHICLE_TRAINING.fit(problem, bracket, key=jax.random.key(seed))
 
 
 def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str, Any]:
@@ -188,10 +192,3 @@ def network_provenance(given: GivenNetwork, network: TrainedNetwork) -> dict[str
 def _seen_channels(problem: ShootingProblem) -> str:
     rates = np.asarray(problem.flight.states)[:, CASCADE_ORDER[: CHANNELS["rates"]]]
     return "attitude" if problem.size > CHANNELS["rates"] and np.isnan(rates).all(axis=0).any() else "rates"
-
-
-def _train(
-    settings: NetworkEstimator, problem: ShootingProblem, bracket: Bracket, name: str, seed: int
-) -> TrainedNetwork:
-    with named(name):
-        return settings.fit(problem, bracket, key=jax.random.key(seed))

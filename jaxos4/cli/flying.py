@@ -1,0 +1,252 @@
+"""`jaxos4 simulate` and `jaxos4 design`: a simulated flight as CSV, and the most informative one to fly.
+
+Both are of an OS4 in open loop, or of a real vehicle under its controller.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Option
+
+from ..errors import InputError, named
+from . import _options as options
+from ._output import check_outputs, end, option_names, stages
+
+if TYPE_CHECKING:
+    from ..closed_loop import ClosedLoop
+    from ..design import Design
+    from ..flight import Flight
+
+MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
+# A list would make the names lower-case.
+Criterion = StrEnum("Criterion", {"D": "D", "A": "A", "worst": "worst"})
+
+OpenLoopModelOption = Annotated[options.Model | None, Option(help="Equations of motion. Default: published.")]
+DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
+SampleTimeOption = Annotated[float | None, Option(help="Sample time [s]. Default: 0.01; with --closed-loop: 0.004.")]
+GustOption = Annotated[
+    float | None, Option(help="With --closed-loop: standard deviation of torque / inertia [rad/s^2]. Default: 5.")
+]
+LagOption = Annotated[float | None, Option(help="With --closed-loop: lag of the rotors [s]. Default: 0.05.")]
+DelayOption = Annotated[float | None, Option(help="With --closed-loop: delay of the commands [s]. Default: 0.01.")]
+SensorsOption = Annotated[
+    options.Sensors | None,
+    Option(help="With --closed-loop: what is logged. Default: commands if the airframe has max_rotor_speed."),
+]
+
+# The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
+_OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": None, "noise": 0.0}
+_OPEN |= {"model": options.Model["published"], "excitation": options.Excitation["multisine"]}
+_OPEN |= {"method": options.Method["euler"], "channels": options.Channels["all"]}
+_OPEN |= {"initial_state": options.InitialState["free"]}
+_CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
+_CLOSED |= {"sensors": None, "references": None}
+_MOST = {"gust": 1e6, "lag": 1.0, "delay": 1.0, "noise": 1e6}
+
+
+def simulate(
+    out: Annotated[Path, Option(help="The flight file to write (CSV).")],
+    airframe: options.AirframeOption = "os4",
+    duration: DurationOption = None,
+    dt: SampleTimeOption = None,
+    seed: Annotated[int, Option(help="Random seed.")] = 0,
+    model: OpenLoopModelOption = None,
+    excitation: Annotated[options.Excitation | None, Option(help="Shape of the inputs. Default: multisine.")] = None,
+    speeds: Annotated[
+        Path | None, Option(help="CSV of rotor speeds to fly, as `design` writes it, instead of an excitation.")
+    ] = None,
+    method: Annotated[
+        options.Method | None, Option(help="Integrator of the equations of motion. Default: euler.")
+    ] = None,
+    noise: Annotated[
+        float | None, Option(help="White sensor noise, in multiples of the standard noise. Default: 0.")
+    ] = None,
+    closed_loop: Annotated[
+        bool, Option("--closed-loop", help="A controller flies a real vehicle through gusts.")
+    ] = False,
+    gust: GustOption = None,
+    lag: LagOption = None,
+    delay: DelayOption = None,
+    sensors: SensorsOption = None,
+    references: Annotated[
+        Path | None, Option(help="With --closed-loop: CSV of references, as `design` writes it. Default: random ones.")
+    ] = None,
+) -> None:
+    """Simulate a flight and write it as CSV: an OS4 in open loop, or a real vehicle in closed loop."""
+    given = dict(locals())
+    asked = of_kind(closed_loop, given)
+    check_outputs(airframe, references, speeds, out=out)
+    file, names = (references, ("duration", "dt")) if closed_loop else (speeds, ("duration", "excitation"))
+    for name in names:
+        if file is not None and given[name] is not None:
+            raise InputError(f"--{name}: {file} has its own; leave it out.")
+    if asked["dt"] > 0 and asked["duration"] / asked["dt"] > MOST_SAMPLES:
+        many = f"more than {MOST_SAMPLES} samples of {asked['dt']:g} s; ask for fewer."
+        raise InputError(f"--duration {asked['duration']:g}: {many}")
+    with stages("loading the library") as progress:
+        from ..airframe import load_airframe
+        from ..logs import write_flight
+        from ..results import result_names
+
+        progress("compiling and simulating")
+        flight, how = (_closed_loop if closed_loop else _open_loop)(asked)
+        end(str(result_names(flight.result)))
+        progress("writing")
+        write_flight(flight, out, load_airframe(airframe))
+    typer.echo(f"{out}: {flight.time.shape[0]} samples of {how}")
+
+
+def _closed_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
+    """A flight of a real vehicle, and how it was made."""
+    from ..closed_loop import fly_standard
+    from ..design import read_references
+
+    loop, references, dt = make_loop(asked), None, asked["dt"]
+    with named("--closed-loop"):
+        if asked["references"] is not None:
+            references, dt = read_references(asked["references"])
+        flight = fly_standard(loop, references=references, duration=asked["duration"], dt=dt, seed=asked["seed"])
+    return flight, f"{dt:g} s, closed loop, {loop.logged}, gusts of {asked['gust']:g} rad/s^2"
+
+
+def _open_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
+    """A flight with the rotor speeds of an excitation, or of a file, and how it was made."""
+    from .._custom_types import as_float
+    from ..airframe import load_airframe
+    from ..design import read_input
+    from ..excitation import EXCITATIONS
+    from ..models import MODELS
+    from ..noise import SENSOR_SIGMA, WhiteNoise, measure
+    from ..simulation import simulate as fly
+
+    model, shape, dt = MODELS[asked["model"]](load_airframe(asked["airframe"])), asked["excitation"], asked["dt"]
+    with named("" if asked["speeds"] else f"--excitation {shape}"):
+        if asked["speeds"] is None:
+            omega = EXCITATIONS[shape](model.airframe, duration=asked["duration"], dt=dt)
+        else:
+            omega = as_float(read_input(asked["speeds"], dt))
+        flight = fly(model, model.alpha, omega, dt=dt, method=asked["method"].value)
+    flight = measure(flight, WhiteNoise(asked["noise"] * SENSOR_SIGMA), seed=asked["seed"])
+    return flight, f"{dt:g} s, {asked['model']} model, {asked['method']}, noise {asked['noise']:g}"
+
+
+def design(
+    out: Annotated[Path, Option(help="The CSV to write: rotor speeds; with --closed-loop: references.")],
+    airframe: options.AirframeOption = "os4",
+    closed_loop: Annotated[
+        bool, Option("--closed-loop", help="References for a real vehicle, which flies under its controller.")
+    ] = False,
+    model: OpenLoopModelOption = None,
+    duration: DurationOption = None,
+    dt: SampleTimeOption = None,
+    slowest: Annotated[float | None, Option(help="Slowest rotor speed [rad/s].")] = None,
+    fastest: Annotated[float | None, Option(help="Fastest rotor speed [rad/s].")] = None,
+    slew: Annotated[float | None, Option(help="Fastest change of a rotor speed [rad/s^2].")] = None,
+    angle: Annotated[
+        float | None, Option(help="Largest angle [rad]; with --closed-loop: of the references, by default 0.3.")
+    ] = None,
+    rate: Annotated[float | None, Option(help="Largest body rate [rad/s].")] = None,
+    velocity: Annotated[float | None, Option(help="Largest velocity [m/s].")] = None,
+    distance: Annotated[float | None, Option(help="Largest distance from the start [m].")] = None,
+    bandwidth: Annotated[
+        float | None, Option(help="Highest frequency [Hz]. Default: 4; with --closed-loop: 6.")
+    ] = None,
+    bracket: options.BracketOption = None,
+    channels: Annotated[options.Channels | None, Option(help="Channels that will be measured. Default: all.")] = None,
+    initial_state: Annotated[
+        options.InitialState | None, Option(help="free: estimated too; known: as the first sample. Default: free.")
+    ] = None,
+    criterion: Annotated[
+        Criterion, Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound.")
+    ] = Criterion["D"],
+    accuracy: Annotated[
+        float | None,
+        Option(
+            help="Wanted standard deviation [% of half a bracket]. Default: 1; with --closed-loop: 5 % of inertias."
+        ),
+    ] = None,
+    gust: GustOption = None,
+    lag: LagOption = None,
+    delay: DelayOption = None,
+    sensors: SensorsOption = None,
+    figure: Annotated[Path | None, Option(help="SVG file: what to fly, and the bounds over time.")] = None,
+    seed: Annotated[int, Option(help="Random seed.")] = 0,
+) -> None:
+    """Design the most informative flight within limits: rotor speeds, or the references of a controller."""
+    asked = of_kind(closed_loop, locals())
+    check_outputs(airframe, bracket, out=out, figure=figure)
+    if not 0 < asked["accuracy"] < 1e6:
+        raise InputError(f"--accuracy: must be positive and finite, got {asked['accuracy']:g}.")
+    begin = time.perf_counter()
+    with stages("loading the library") as progress, option_names(bracket=bracket):
+        found = _find(asked, progress)
+        progress("writing")
+        found.task.write(found.designed, out)
+    from rich.console import Console
+
+    from ..report.design_page import print_design, write_design
+
+    if figure is not None:
+        with stages("drawing"):
+            write_design(found, asked["accuracy"] / 100, figure)
+    print_design(Console(highlight=False), found, asked["accuracy"] / 100)
+    kind, rows = found.task.kind if closed_loop else f"{asked['model']} model", found.designed.inputs.shape[0]
+    typer.echo(f"{out}: {rows} samples of {asked['dt']:g} s, {kind}, {time.perf_counter() - begin:.0f} s")
+
+
+def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "Design":
+    """The design of the kind that was asked for, beside the standard inputs."""
+    from ..airframe import load_airframe
+    from ..design import design_input, design_references, model_of
+    from ..identification.problem import bracket_of
+    from ..models import MODELS
+
+    limits = {name: asked[name] for name in ("slowest", "fastest", "slew", "angle", "rate", "velocity", "distance")}
+    settings = options.given(
+        duration=asked["duration"], dt=asked["dt"], bandwidth=asked["bandwidth"], key=asked["seed"]
+    )
+    settings |= {"criterion": asked["criterion"].value, "compare": True, "progress": progress}
+    intervals = options.read_bracket(asked["bracket"])
+    if asked["closed_loop"]:
+        loop = make_loop(asked)
+        settings |= options.given(angle=limits.pop("angle"))
+        bracket = bracket_of(intervals, model_of(loop))
+        return design_references(loop, bracket=bracket, limits=options.given(**limits), **settings)
+    subject, known = MODELS[asked["model"]](load_airframe(asked["airframe"])), asked["initial_state"] == "known"
+    settings |= {"limits": options.given(**limits), "channels": asked["channels"].value, "start_is_known": known}
+    return design_input(subject, bracket=bracket_of(intervals, subject), **settings)
+
+
+def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a command, with the defaults of its kind of flight.
+
+    Refuses options of the other kind, and settings that are out of range.
+    """
+    own, others = (_CLOSED, _OPEN) if closed_loop else (_OPEN, _CLOSED)
+    for name, value in options.given(**asked).items():
+        if name in others and name not in own:
+            how = "without --closed-loop; leave it out" if closed_loop else "with --closed-loop; add that"
+            raise InputError(f"--{name.replace('_', '-')}: is for flights {how}.")
+        if name in _MOST and not 0 <= value <= _MOST[name]:
+            raise InputError(f"--{name}: must lie in 0 to {_MOST[name]:g}, got {value}.")
+    options.check_seed(asked["seed"])
+    return dict(asked) | {name: default for name, default in own.items() if asked.get(name) is None}
+
+
+def make_loop(asked: Mapping[str, Any]) -> "ClosedLoop":
+    """The vehicle in closed loop with these options."""
+    from ..airframe import load_airframe
+    from ..closed_loop import ClosedLoop
+
+    vehicle = load_airframe(asked["airframe"])
+    logged, scaled = options.chosen(asked["sensors"]), vehicle.has_full_scale
+    if logged == "commands" and not scaled:
+        raise InputError(
+            f"--sensors commands: {asked['airframe']} has no max_rotor_speed [rad/s]; set it, or log speeds."
+        )
+    settings = options.given(rotor_lag=asked["lag"], rotor_delay=asked["delay"])
+    return ClosedLoop(vehicle, logged=logged or ("commands" if scaled else "speeds"), gust=asked["gust"], **settings)
