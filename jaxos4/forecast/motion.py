@@ -215,40 +215,38 @@ def fly_chunk(
     return jax.vmap(every)(first)
 
 
-class Evidence(NamedTuple):
-    """The measurements of a flight, and the knowledge of its offsets.
-
-    - `states`: as in `PARTS`. `accelerations`: see `jaxos4.forecast.measured.Measured`.
-    - `noise`: of the filters. `velocity_noise`: the standard deviation of the white noise of velocity [m/s].
-    - `prior`: the standard deviation of each offset before the flight.
-    """
-
-    states: Float[Array, "samples 13"]
-    accelerations: Float[Array, "samples 6"]
-    noise: LogNoise
-    velocity_noise: Float[Array, "3"]
-    prior: Float[Array, "6"]
-
-
 @quick_jit
 def known_at_samples(
-    model: FlightModel, flight: Flight, length: Count, parameters: Float[Array, "lanes parameters"], evidence: Evidence
+    model: FlightModel,
+    flight: Flight,
+    length: Count,
+    parameters: Float[Array, "lanes parameters"],
+    measured: tuple[Float[Array, "samples 13"], Float[Array, "samples 6"], Float[Array, "3"]],
+    noise: LogNoise,
+    prior: Float[Array, "6"],
 ) -> tuple[Known, Forcing, Float[Array, "lanes samples 6"]]:
     """The knowledge at each sample, by the first row of `parameters`; and forcing and offsets of each row: see `Lanes`.
 
-    The velocity is left out of the forcing: it will be that of the prediction. `length`: the samples of the flight that
-    are no padding.
+    The velocity is left out of the forcing: it will be that of the prediction.
+
+    **Arguments:**
+
+    - `length`: the samples of the flight that are no padding.
+    - `measured`: states, accelerations and the white noise of velocity: see `jaxos4.forecast.measured.Measured`.
+    - `noise`: of the filters. `prior`: the standard deviation of each offset before the flight.
     """
+    state, accelerations, velocity_noise = measured
     rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
     kept = jnp.exp(-flight.dt / _MEMORY)
-    weight, unsure = _offset_weights(model, evidence, kept, flight.dt)
+    sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), velocity_noise])
+    weight, unsure = _offset_weights(model, accelerations, noise, sensor, prior, kept, flight.dt)
 
     def of_lane(values: Array) -> tuple[Forcing, Array, Array, Array]:
         forcing, scalars = model.forcing(inputs, values), tuple(values)
         turning = jnp.stack(model.angular_acceleration(Rates(*middle.T), forcing, scalars), axis=1)
         pushing = jnp.stack(model.specific_force(forcing.thrust, forcing, scalars), axis=1)
-        residual = evidence.accelerations - jnp.concatenate([turning, pushing], axis=1)
+        residual = accelerations - jnp.concatenate([turning, pushing], axis=1)
         offset = weight * _past(jnp.nan_to_num(residual), kept)
         observe = jax.vmap(lambda rates, row: model.observe(State(Rates(*rates)), row, scalars))
         seen = observe(jnp.nan_to_num(rates), forcing)
@@ -260,24 +258,23 @@ def known_at_samples(
     force = force - _past(jnp.nan_to_num(force), kept) / jnp.maximum(_past(~jnp.isnan(force), kept), 1.0)
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     stretch = jnp.zeros(len(rates), dtype=int) if flight.stretch is None else flight.stretch
-    found = filtered(evidence.noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
-    return Known(evidence.states, found.rate[:, :3], found.disturbance, unsure), forcing, offset
+    found = filtered(noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
+    return Known(state, found.rate[:, :3], found.disturbance, unsure), forcing, offset
 
 
 def _offset_weights(
-    model: FlightModel, evidence: Evidence, kept: Scalar, dt: Scalar
+    model: FlightModel, accelerations: Array, noise: LogNoise, sensor: Array, prior: Array, kept: Scalar, dt: Scalar
 ) -> tuple[Float[Array, "samples 6"], Float[Array, "samples 6"]]:
     """The factor of the sum of the weighted residuals before a sample, and the standard deviation of the offsets.
 
     Each recording has its own offsets. The mean of the residuals, of which it forgets the oldest, is drawn to 0 as far
     as offsets are known not to differ.
     """
-    noise, channels = evidence.noise, np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
+    channels = np.array([0, 1, 2, *(3 + axis for axis in model.force_axes)])
     strength, time_constant = (jnp.full(6, x) for x in (PUSH, _PUSH_TIME))
     strength = strength.at[channels].set(jnp.exp(noise.strength))
     time_constant = time_constant.at[channels].set(jnp.exp(noise.time_constant))
-    sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), evidence.velocity_noise])
-    is_known, prior = ~jnp.isnan(evidence.accelerations), jnp.square(evidence.prior)
+    is_known, prior = ~jnp.isnan(accelerations), jnp.square(prior)
     total, squares = _past(is_known, kept), _past(is_known, kept**2)
     count = jnp.maximum(total, 1.0)
     seconds = dt * count**2 / jnp.maximum(squares, 1.0)  # a uniform mean over this time is as exact

@@ -20,7 +20,7 @@ from ..recording.preparation import Prepared
 from ..shooting import ShootingProblem, padded
 from ..shooting.gains import Covariance, LogNoise
 from .measured import Measured, constant_rates, regressed
-from .motion import CHUNK, PARTS, PUSH, Evidence, Lanes, fly_chunk, known_at_samples, settled, turned
+from .motion import CHUNK, PARTS, PUSH, Lanes, fly_chunk, known_at_samples, settled, turned
 from .prediction import FlightPrediction
 from .vehicle import Vehicle, vehicle_of
 
@@ -161,15 +161,28 @@ def _fly(
 ) -> tuple[
     Float[np.ndarray, "starts 13"], Float[np.ndarray, "starts 2 steps 13"], Float[np.ndarray, "starts steps 12"]
 ]:
-    """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures."""
+    """The states at the starts; those ahead, with and without the filters' knowledge; and the spread of the futures.
+
+    A position that was not measured is 0. If no velocity is measured, it is that of dead reckoning, and the specific
+    force has no offset.
+    """
     generator, channels, dt = np.random.default_rng(seed), noise.strength.size, problem.flight.dt
     parameters = as_float(np.concatenate([[vehicle.parameters] * 2, vehicle.draw(_DRAWS, generator)]))
     model = dataclasses.replace(vehicle.model, recordings=(0,) * (int(measured.stretch.max()) + 1))
-    evidence = _evidence(problem, vehicle, measured, noise, missing)
-    length = jax.device_put(np.asarray(len(measured.stretch)))
-    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, evidence)
+    state, samples, noise = measured.states.copy(), len(measured.stretch), LogNoise(*map(as_float, noise))
+    if "velocity" in missing:
+        reckoned = np.asarray(problem.flight.body_velocity)[:samples].T
+        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
+    if "position" in missing:
+        state[:, PARTS["position"]] = 0.0
+    accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
+    padding = ((0, problem.flight.time.size - samples), (0, 0))
+    rows, changes = (as_float(np.pad(x, padding, constant_values=np.nan)) for x in (state, accelerations))
+    prior = as_float(np.append(vehicle.offset, [PUSH * ("velocity" not in missing)] * 3))
+    seen, length = (rows, changes, as_float(measured.noise[3:6])), jax.device_put(np.asarray(samples))
+    known, forcing, offset = known_at_samples(model, problem.flight, length, parameters, seen, noise, prior)
 
-    after, added, absorbed = jax.tree.map(np.asarray, settled(evidence.noise, dt))
+    after, added, absorbed = jax.tree.map(np.asarray, settled(noise, dt))
     first = _pairs(after, generator.standard_normal((_DRAWS, channels, 2)))
     gusts = _pairs(added, generator.standard_normal((_DRAWS, steps, channels, 2)))
     off = generator.standard_normal((_DRAWS, 6))
@@ -178,34 +191,9 @@ def _fly(
     lanes = Lanes(parameters, forcing, offset, jnp.asarray(np.arange(len(parameters)) != 1), *surely)
 
     chunks = (np.minimum(np.arange(i, i + CHUNK), start.size - 1) for i in range(0, start.size, CHUNK))
-    found = [fly_chunk(vehicle.model, lanes, known, jnp.asarray(start[rows]), evidence.noise, dt) for rows in chunks]
+    found = [fly_chunk(vehicle.model, lanes, known, jnp.asarray(start[rows]), noise, dt) for rows in chunks]
     states, spread = (np.concatenate([np.asarray(each[i]) for each in found])[: start.size] for i in range(2))
-    return np.asarray(evidence.states)[start], states, spread
-
-
-def _evidence(
-    problem: ShootingProblem, vehicle: Vehicle, measured: Measured, noise: LogNoise, missing: tuple[str, ...]
-) -> Evidence:
-    """The measurements of the padded flight. A position that was not measured is 0.
-
-    If no velocity is measured, it is that of dead reckoning, and the specific force has no offset.
-    """
-    state, samples = measured.states.copy(), len(measured.stretch)
-    if "velocity" in missing:
-        reckoned = np.asarray(problem.flight.body_velocity)[:samples].T
-        state[:, PARTS["velocity"]] = np.stack(turned(state[:, PARTS["attitude"]].T, reckoned), 1)
-    if "position" in missing:
-        state[:, PARTS["position"]] = 0.0
-    padding = ((0, problem.flight.time.size - samples), (0, 0))
-    accelerations = measured.accelerations(float(vehicle.model.airframe.gravity))
-    state, accelerations = (as_float(np.pad(x, padding, constant_values=np.nan)) for x in (state, accelerations))
-    return Evidence(
-        state,
-        accelerations,
-        noise=LogNoise(*map(as_float, noise)),
-        velocity_noise=as_float(measured.noise[3:6]),
-        prior=as_float(np.append(vehicle.offset, [PUSH * ("velocity" not in missing)] * 3)),
-    )
+    return state[start], states, spread
 
 
 def _pairs(covariance: Covariance, normal: Float[np.ndarray, "*batch channels 2"]) -> np.ndarray:

@@ -64,12 +64,8 @@ class Fleet(NamedTuple):
     dt: Scalar
 
 
-class Flights(NamedTuple):
-    """Flights of a cell: true parameters, true states and measured states."""
-
-    truth: Float[Array, "lanes parameters"]
-    exact: Lanes
-    measured: Lanes
+# True parameters, true states and measured states of the flights of a cell.
+Flights = tuple[Float[Array, "lanes parameters"], Lanes, Lanes]
 
 
 def fleet_of(study: Study, scenario: Scenario) -> Fleet:
@@ -144,18 +140,20 @@ def _fly(
     truth, exact, noise_keys = jax.vmap(simulated)(jnp.asarray(numbers))
     # XLA takes seconds to compile a batch of random numbers for a CPU; one flight after the other runs as fast there.
     each = jax.lax.map if jax.default_backend() == "cpu" else lambda one, flights: jax.vmap(one)(flights)
-    return Flights(truth, exact.states, each(measured, (exact, noise_keys)))
+    return truth, exact.states, each(measured, (exact, noise_keys))
 
 
 @quick_jit
-def cramer_rao_std(blank: ShootingProblem, flights: Flights) -> Float[Array, "lanes parameters"]:
+def cramer_rao_std(
+    blank: ShootingProblem, exact: Lanes, truth: Float[Array, "lanes parameters"]
+) -> Float[Array, "lanes parameters"]:
     """The Cramer-Rao standard deviations of each flight, at the noise of a problem."""
 
     def one(states: States, parameters: Parameters) -> Parameters:
         start = None if blank.initial_state is not None else states[0][CASCADE_ORDER[: blank.size]]
         return jnp.sqrt(jnp.diagonal(cramer_rao_bound(problem_of(blank, states), parameters, start)))
 
-    return jax.vmap(one)(flights.exact, flights.truth)
+    return jax.vmap(one)(exact, truth)
 
 
 def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[str, np.ndarray]:
@@ -164,19 +162,19 @@ def run_cell(study: Study, cell: Cell, network: TrainedNetwork | None) -> dict[s
     with jax.enable_x64(True):
         with _ONE_THREAD:
             fleet = fleet_of(study, scenario)
-            flights = fly(study, fleet, cell)
+            truth, exact, measured = fly(study, fleet, cell)
             blank = blank_problem(study, fleet, scenario.scale or 1.0, scenario.seen)
             standard = blank_problem(study, fleet, 1.0, scenario.seen)
-            bound = scenario.scale * np.asarray(cramer_rao_std(standard, flights))
+            bound = scenario.scale * np.asarray(cramer_rao_std(standard, exact, truth))
         own = threading.Event()
         first = _COMPILED.setdefault(program_of(scenario), own)
         if first is not own:
             first.wait()
         try:
-            found = _answers(study, cell, fleet, blank, flights.measured, network)
+            found = _answers(study, cell, fleet, blank, measured, network)
         finally:
             own.set()
-        return _results(study, cell, flights, bound, jax.tree.map(np.asarray, found))
+        return _results(study, cell, np.asarray(truth), bound, jax.tree.map(np.asarray, found))
 
 
 def program_of(scenario: Scenario) -> tuple:
@@ -238,10 +236,10 @@ _OPTIMISED = eqx.filter_jit(_identify), eqx.filter_jit(_search)
 
 
 def _results(
-    study: Study, cell: Cell, flights: Flights, bound: np.ndarray, found: dict[str, Any]
+    study: Study, cell: Cell, truth: np.ndarray, bound: np.ndarray, found: dict[str, Any]
 ) -> dict[str, np.ndarray]:
     """The arrays of a cell's file. A flight without an estimate has NaN, and a result that says why."""
-    truth, seed, hit = np.asarray(flights.truth), found["seed"], np.full(study.batch, -1)
+    seed, hit = found["seed"], np.full(study.batch, -1)
     if seed is not None:
         hit = ((truth >= seed.lower) & (truth <= seed.upper)).all(axis=-1)
     finite = np.isfinite(found["std"]).all(axis=-1) & np.isfinite(found["parameters"]).all(axis=-1)

@@ -201,7 +201,7 @@ def assemble(store: Store) -> xr.Dataset:
             arrays["result"][lanes] = OUTCOMES.index("failed")
             # Another estimator that has run has stored the same truths, bit for bit.
             if np.isnan(arrays["truth"][shared]).all():
-                truth = fly(study, fleet_of(study, cell.scenario), cell).truth
+                truth, *_ = fly(study, fleet_of(study, cell.scenario), cell)
                 arrays["truth"][shared] = np.asarray(truth)[: flights.stop - flights.start]
             where = dict(zip(SCENARIO, cell.scenario, strict=True))
             failures.append({"cell": cell.number, "first": cell.first, **where, "message": str(results["failed"])})
