@@ -19,7 +19,7 @@ from jaxos4 import _programs
 from jaxos4._programs import _shape
 from jaxos4._xla import LOOP_FLAGS, NO_OPTIONS, make_loops_fast, quick_jit
 from jaxos4.bracket import _default
-from jaxos4.cli import _jax, _options, train
+from jaxos4.cli import _jax, _options, estimate
 from jaxos4.closed_loop import LOGGED
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import EXCITATIONS
@@ -153,7 +153,7 @@ def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_comma
     tables |= {"Channels": CHANNELS, "Features": FEATURES}
     for name, table in tables.items():
         assert list(getattr(_options, name)) == list(table)
-    defaults = {name: argument.default for name, argument in inspect.signature(train.train).parameters.items()}
+    defaults = {name: argument.default for name, argument in inspect.signature(estimate.train).parameters.items()}
     for name in ("noise", "steps", "features"):
         assert defaults[name] == getattr(NetworkEstimator, name)
     before = json.dumps(jax.config.values, default=str, sort_keys=True)

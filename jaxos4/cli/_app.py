@@ -10,12 +10,11 @@ import typer
 
 from ..errors import InputError, TrainingError
 from ._jax import NO_CACHE, prepare
-from .estimate import estimate
+from .estimate import estimate, train
 from .flying import design, simulate
 from .identified import export, predict
 from .information import identifiability, inspect
 from .studies import compare, report, study
-from .train import train
 
 _INTERRUPTED = 130
 _EPILOG = f"Compiled programs are kept in your cache folder, at most 1 GB. {NO_CACHE}=1 switches this off."
