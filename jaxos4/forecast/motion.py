@@ -44,18 +44,11 @@ class Motion(NamedTuple):
     rates: Rates
 
 
-class Known(NamedTuple):
-    """The knowledge at a sample; with a leading axis, at many.
-
-    - `state`: as measured, as in `PARTS`.
-    - `rates`, `disturbance`: by the filters [rad/s], [rad/s^2; m/s^2].
-    - `unsure`: the standard deviation of the offsets.
-    """
-
-    state: Float[Numeric, "*starts 13"]
-    rates: Float[Numeric, "*starts 3"]
-    disturbance: Float[Numeric, "*starts channels"]
-    unsure: Float[Numeric, "*starts 6"]
+# The state at each sample as measured, as in `PARTS`; the rates and the disturbance that the filters know [rad/s],
+# [rad/s^2; m/s^2]; the standard deviation of the offsets.
+Known = tuple[
+    Float[Numeric, "... 13"], Float[Numeric, "... 3"], Float[Numeric, "... channels"], Float[Numeric, "... 6"]
+]
 
 
 class Lanes(NamedTuple):
@@ -80,32 +73,26 @@ class Lanes(NamedTuple):
     gusts: Float[Array, "lanes steps channels 2"]
 
 
-class _Acting(NamedTuple):
-    """Inputs of a step: the forcing, and disturbances of p', q', r' [rad/s^2] and along the body's axes [m/s^2]."""
+class _Free(NamedTuple):
+    """A `FlightModel` whose attitude is a quaternion, and whose velocity is that of the motion.
 
-    forcing: Forcing
+    `turning`, `pushing`: disturbances of p', q', r' [rad/s^2], and along the body's axes [m/s^2].
+    """
+
+    model: FlightModel
     turning: Vector
     pushing: Vector
 
-
-class _Free(NamedTuple):
-    """A `FlightModel` whose attitude is a quaternion, and whose velocity is that of the motion."""
-
-    model: FlightModel
-
-    def cascade(self, state: Motion, forcing: _Acting, parameters) -> Motion:
+    @jax.jit  # traced once for the four stages of a step
+    def cascade(self, state: Motion, forcing: Forcing, parameters) -> Motion:
         """The time derivative of the motion."""
-        return _derivative(self.model, state, forcing, parameters)
-
-
-@jax.jit  # traced once for the four stages of a step
-def _derivative(model: FlightModel, state: Motion, acting: _Acting, parameters) -> Motion:
-    forcing = acting.forcing._replace(velocity=turned(inverse(state.attitude), state.velocity))
-    turning = model.angular_acceleration(state.rates, forcing, parameters)
-    force = model.specific_force(forcing.thrust, forcing, parameters)
-    x, y, z = turned(state.attitude, _sum(force, acting.pushing))
-    spin = product(state.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in state.rates)))
-    return Motion(state.velocity, (x, y, z - model.airframe.gravity), spin, Rates(*_sum(turning, acting.turning)))
+        forcing = forcing._replace(velocity=turned(inverse(state.attitude), state.velocity))
+        turning = self.model.angular_acceleration(state.rates, forcing, parameters)
+        force = self.model.specific_force(forcing.thrust, forcing, parameters)
+        x, y, z = turned(state.attitude, _sum(force, self.pushing))
+        spin = product(state.attitude, (jnp.zeros_like(x), *(rate / 2 for rate in state.rates)))
+        falling = x, y, z - self.model.airframe.gravity
+        return Motion(state.velocity, falling, spin, Rates(*_sum(turning, self.turning)))
 
 
 def product(a, b) -> Quaternion:
@@ -155,14 +142,15 @@ def _fly(
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
     scalars, axes = tuple(lane.parameters), model.force_axes
-    p, v, q, w = (start.state[places] for places in PARTS.values())
+    state, rates, disturbance, unsure = start
+    p, v, q, w = (state[places] for places in PARTS.values())
     # A gyro bias is part of the measurement, not of the state.
     steps = lane.gusts.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), lane.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
     biased = jnp.stack(model.observe(State(Rates(*w)), still, scalars)[:3])
-    w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin
-    error, absorbed = start.unsure * lane.off
+    w = jnp.where(lane.filtered, rates, w) - (biased - w) + lane.begin
+    error, absorbed = unsure * lane.off
     offset = lane.offset[first] + error
     begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
 
@@ -171,15 +159,14 @@ def _fly(
         pushed = reach * disturbance + gust[:, 0]
         turning = offset[:3] + pushed[:3] / dt
         pushing = offset[3:].at[np.asarray(axes, dtype=int)].add(pushed[3:])
-        acting = _Acting(forcing, tuple(turning), tuple(pushing))
-        moved = rk4_step(_Free(model), motion, acting, scalars, dt)
+        moved = rk4_step(_Free(model, tuple(turning), tuple(pushing)), motion, forcing, scalars, dt)
         moved = moved._replace(attitude=_unit(moved.attitude))
         values = jnp.stack(jax.tree.leaves(moved))
         sound = sound & jnp.isfinite(values).all() & (jnp.abs(jnp.stack(moved.rates)) < FASTEST).all()
         motion = jax.tree.map(lambda new, old: jnp.where(sound, new, old), moved, motion)
         return (motion, kept * disturbance + gust[:, 1], sound), jnp.stack(jax.tree.leaves(motion))
 
-    pushed = jnp.where(lane.filtered, start.disturbance, 0.0) + lane.pushed
+    pushed = jnp.where(lane.filtered, disturbance, 0.0) + lane.pushed
     pushed = pushed.at[:3].add(absorbed[:3])
     return jax.lax.scan(step, (begin, pushed, jnp.array(True)), (rows, lane.gusts))[1]
 
@@ -259,7 +246,7 @@ def known_at_samples(
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     stretch = jnp.zeros(len(rates), dtype=int) if flight.stretch is None else flight.stretch
     found = filtered(noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
-    return Known(state, found.rate[:, :3], found.disturbance, unsure), forcing, offset
+    return (state, found.rate[:, :3], found.disturbance, unsure), forcing, offset
 
 
 def _offset_weights(
