@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import Count, Parameters, Scalar, as_float, integer, setting
+from .._custom_types import Count, Parameters, Scalar, integer, setting
 from .._xla import quick_jit
 from ..bracket import Bracket
 from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, best_start, in_one_program
@@ -42,7 +42,7 @@ class Regression(NamedTuple):
     - `center`, `half_width`: of the bracket; a half-width of 0 holds a parameter.
     - `rates`: NaN if not measured, and at the first sample if the initial state is known.
     - `anchor`: the known initial rates; NaN if they are free. `anchored`: whether they are known.
-    - `memory`, `bridge`, `forgetting`: see `RecursiveLeastSquares`.
+    - `settings`: `memory`, `bridge` and `forgetting`.
     """
 
     problem: ShootingProblem
@@ -51,19 +51,17 @@ class Regression(NamedTuple):
     rates: Float[Array, "samples 3"]
     anchor: Float[Array, "3"]
     anchored: bool
-    memory: Scalar
-    bridge: Count
-    forgetting: Scalar
+    settings: "EquationError | RecursiveLeastSquares"
 
     @classmethod
-    def of(cls, problem: ShootingProblem, memory: Scalar, bridge: Count, forgetting: Scalar) -> "Regression":
+    def of(cls, problem: ShootingProblem, settings: "EquationError | RecursiveLeastSquares") -> "Regression":
         """The regression of a flight's body rates. Parameters in which it is not linear stay at their center."""
         unknowns, rates = problem.unknowns.usable, problem.restrict("rates")
         linear = np.array([not each.in_forcing for each in problem.model.parameters])
         anchored = problem.initial_state is not None
         anchor = rates.first_state()[0] if anchored else jnp.full(3, jnp.nan)
         half_width, measured = jnp.where(linear, unknowns.width, 0.0), rates.measured()[:, :3]
-        return cls(problem, unknowns.center, half_width, measured, anchor, anchored, memory, bridge, forgetting)
+        return cls(problem, unknowns.center, half_width, measured, anchor, anchored, settings)
 
     @property
     def sigma(self) -> Float[Array, "3"]:
@@ -88,13 +86,14 @@ class Regression(NamedTuple):
             usable &= (jnp.diff(self.problem.flight.stretch, append=-1) == 0)[:, None]
         increments = jnp.where(usable[..., None], increments, 0.0)
         output = filled / self.sigma
-        decay = self.memory * self.forgetting
+        forgetting = self.settings.forgetting
+        decay = self.settings.memory * forgetting
 
         def step(carry, sample):
             integral, mean, count = carry
             increment, usable, output, measured = sample
             row = integral.at[:, -1].add(output)
-            deviation, weight = row - mean, self.forgetting * count
+            deviation, weight = row - mean, forgetting * count
             scale = jnp.sqrt(1 / (1 + 1 / weight))
             mean = jnp.where(measured[:, None], mean + deviation / (1 + decay * count)[:, None], mean)
             count = jnp.where(usable, decay * count + measured, 0.0)
@@ -115,7 +114,7 @@ class Regression(NamedTuple):
         given = ~jnp.isnan(self.rates) | first
         last = jax.lax.cummax(jnp.where(given, samples, -1), axis=0)
         following = jax.lax.cummin(jnp.where(given, samples, rates.shape[0]), axis=0, reverse=True)
-        known = given | ((last >= 0) & (following < rates.shape[0]) & (following - last - 1 <= self.bridge))
+        known = given | ((last >= 0) & (following < rates.shape[0]) & (following - last - 1 <= self.settings.bridge))
         finite = jnp.where(given, rates, 0.0)
         before = jnp.take_along_axis(finite, jnp.maximum(last, 0), axis=0)
         after = jnp.take_along_axis(finite, jnp.minimum(following, rates.shape[0] - 1), axis=0)
@@ -156,7 +155,7 @@ class Regression(NamedTuple):
         included.
         """
         age = jnp.arange(rows.shape[0])[::-1]
-        weight = (self.forgetting**age)[:, None, None]
+        weight = (self.settings.forgetting**age)[:, None, None]
         regressors, output = rows[..., :-1], rows[..., -1]
         residuals = output - (regressors * steps).sum(axis=-1)
 
@@ -255,6 +254,7 @@ class EquationError(AbstractEstimator):
 
     looks_at: ClassVar[str] = "rates"
 
+    forgetting: ClassVar[float] = 1.0
     memory: Scalar = eqx.field(converter=setting("memory", high=1.0), default=1.0)
     bridge: Count = eqx.field(converter=integer("bridge", 0), default=4)
 
@@ -275,7 +275,7 @@ class EquationError(AbstractEstimator):
 
     def _identify(self, problem: ShootingProblem) -> Estimate:
         """One flight, or a block of flights."""
-        data = self._regression(problem)
+        data = Regression.of(problem, self)
         rows, back = data.rows()
         steps, inverse = solve(*normal_equations(rows))
         return data.answer(steps, data.covariance(rows, back, steps, inverse))
@@ -286,11 +286,8 @@ class EquationError(AbstractEstimator):
 
         Parameters in which the rate equations are not linear stay at the center of their bracket.
         """
-        data = self._regression(problem.within(bracket))
+        data = Regression.of(problem.within(bracket), self)
         return data.center + data.half_width * solve(*normal_equations(data.rows()[0]))[0]
-
-    def _regression(self, problem: ShootingProblem) -> Regression:
-        return Regression.of(problem, self.memory, self.bridge, as_float(1.0))
 
 
 class RecursiveLeastSquares(AbstractRecursion):
@@ -322,7 +319,7 @@ class RecursiveLeastSquares(AbstractRecursion):
 
     def identify(self, problem: ShootingProblem) -> Estimate:
         """See `AbstractRecursion`."""
-        count, data = problem.unknowns.count, Regression.of(problem, self.memory, self.bridge, self.forgetting)
+        count, data = problem.unknowns.count, Regression.of(problem, self)
         rows, back = data.rows()
 
         def update(carry, row):
