@@ -26,8 +26,8 @@ _LEAST = 1e-6
 class Grid(NamedTuple):
     """The sample time [s], and for each sample: its uninterrupted stretch, and the first and last sample of that.
 
-    `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by the voltage
-    to which the airframe's rotor speeds belong.
+    `elapsed`: the fitted time in the recording before this sample [s]. `voltage`: the battery's, divided by
+    `battery_voltage`, to which the airframe's rotor speeds belong.
     """
 
     dt: Scalar
@@ -38,19 +38,14 @@ class Grid(NamedTuple):
     voltage: Float[Array, " samples"] | None = None
 
     @classmethod
-    def of(
-        cls, inputs: Inputs, battery_voltage: Scalar | None = None, recordings: tuple[int, ...] | None = None
-    ) -> "Grid":
-        """The grid of a flight's inputs.
-
-        `battery_voltage`: to which the airframe's rotor speeds belong [V]. `recordings`: of each stretch, by default 0.
-        """
+    def of(cls, inputs: Inputs, battery_voltage: Scalar | None, recordings: tuple[int, ...]) -> "Grid":
+        """The grid of a flight's inputs. `recordings`: of each stretch."""
         voltage, samples = inputs.voltage, inputs.omega.shape[0]
         voltage = None if voltage is None or battery_voltage is None else voltage / battery_voltage
         zeros = jnp.zeros(samples, dtype=int)
         stretches = inputs.stretches or (zeros, zeros, zeros + samples - 1)
         elapsed = inputs.dt * jnp.arange(samples)
-        if recordings is not None and max(recordings) > 0:
+        if max(recordings) > 0:
             recording = jnp.asarray(recordings)[stretches[0]]
             elapsed = elapsed - jnp.full(max(recordings) + 1, jnp.inf).at[recording].min(elapsed)[recording]
         return cls(inputs.dt, *stretches, elapsed, voltage)
