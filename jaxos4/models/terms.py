@@ -15,7 +15,7 @@ from ..airframe import GRAVITY, Airframe
 from ..excitation import AXES
 from .abstract import Contradiction, Parameter
 from .rotors import Commands, Grid, Motor, Part, Speeds, delayed, driven
-from .state import Forcing, Rates, Samples, Vector
+from .state import Forcing, Rates, Vector
 
 # What a term can need from the logs or from the airframe.
 COMMANDS = "commands"
@@ -152,12 +152,6 @@ def _torque(name: str, per_unit: Callable[[Rates, Forcing], tuple]) -> Callable[
     return add
 
 
-def _across(velocity: Vector | None) -> tuple[Samples, Samples]:
-    """Along x the vehicle pitches, along y it rolls."""
-    x, y, _ = _known(velocity, VELOCITY, "body_velocity")
-    return y, x
-
-
 def _add_reaction(total: Rates, values: Values, rates: Rates, forcing: Forcing) -> Rates:
     spin_up = required(forcing.spin_up, "`forcing` must come from `FlightModel.forcing`.")
     return total._replace(r=total.r - values["rotor_reaction"] * spin_up)
@@ -180,14 +174,15 @@ def _drive(omega: RotorSpeeds, values: Values, part: Part, airframe: Airframe) -
 
 
 def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    vx, vy, _ = _known(forcing.velocity, VELOCITY, "body_velocity")
-    x, y, z = force
-    return x - values["x_drag"] * vx, y - values["y_drag"] * vy, z
+    """Against the velocity along each axis for which there is a parameter."""
+    drags = (values.get(f"{axis}_drag") for axis in "xyz")
+    each = zip(force, drags, _velocity(forcing), strict=True)
+    x, y, z = (a if drag is None else a - drag * v for a, drag, v in each)
+    return x, y, z
 
 
-def _add_inflow(force: Vector, values: Values, forcing: Forcing) -> Vector:
-    x, y, z = force
-    return x, y, z - values["z_drag"] * _known(forcing.velocity, VELOCITY, "body_velocity")[2]
+def _velocity(forcing: Forcing) -> Vector:
+    return _known(forcing.velocity, VELOCITY, "body_velocity")
 
 
 def _add_force_bias(force: Vector, values: Values) -> Vector:
@@ -222,7 +217,8 @@ TERMS: dict[str, Term] = {
         "a moment proportional to the body velocity: roll_velocity, pitch_velocity [rad/(m s)]",
         tuple(Parameter(f"{x}_velocity", "rad/(m s)", _authority(i, _FAST)) for i, x in enumerate(AXES[:2])),
         needs=frozenset({VELOCITY}),
-        angular_acceleration=_torque("velocity", lambda rates, forcing: _across(forcing.velocity)),
+        # Along y the vehicle rolls, along x it pitches.
+        angular_acceleration=_torque("velocity", lambda rates, forcing: _velocity(forcing)[1::-1]),
     ),
     "voltage": Term(
         "rotor speeds follow the battery's voltage to the power of voltage_exponent: 1 without compensation, 0 with it",
@@ -290,7 +286,7 @@ TERMS: dict[str, Term] = {
         # g over twice the induced velocity, which is 4 to 10 m/s in hover.
         (Parameter("z_drag", "1/s", 0.5, center=0.7, nonnegative=True, contradiction=_CLIMBS),),
         needs=frozenset({VELOCITY, VERTICAL_FORCE}),
-        specific_force=_add_inflow,
+        specific_force=_add_drag,
     ),
     "drag": Term(
         "a force against the body velocity: x_drag, y_drag [1/s]",
