@@ -37,6 +37,9 @@ class Calibration(eqx.Module):
     simultaneous: Float[Array, " levels"]
 
 
+_count = functools.partial(jnp.asarray, dtype=int)
+
+
 class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
@@ -64,8 +67,8 @@ class Estimate(eqx.Module):
     covariance: Float[Array, "parameters parameters"]
     initial_state: Float[Array, " starts"]
     cost: Scalar
-    rollouts: Int[Array, ""]
-    sweeps: Int[Array, ""]
+    rollouts: Int[Array, ""] = eqx.field(converter=_count)
+    sweeps: Int[Array, ""] = eqx.field(converter=_count)
     result: RESULTS
     calibration: Calibration | None = None
     seed: Bracket | None = None
@@ -111,15 +114,12 @@ def as_estimate(
     covariance: Float[Array, "parameters parameters"],
     initial_state: Float[Array, " starts"],
     cost: Scalar,
-    rollouts: Int[Array, ""] | int,
-    sweeps: Int[Array, ""] | int,
     sound: Bool[Array, ""],
     done: Bool[Array, ""],
     reach: Scalar | float = REACH,
     prior: float | None = None,
     history: Float[Array, "samples parameters"] | None = None,
-    brackets: Float[Array, "sweeps 2 parameters"] | None = None,
-    parts: Parts | None = None,
+    **more: Any,
 ) -> Estimate:
     """The answer of an algorithm as an `Estimate`, with its result code. All its parameters are finite.
 
@@ -129,6 +129,7 @@ def as_estimate(
     - `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
     - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`; by default as the problem does.
+    - The others are fields of an `Estimate`.
     """
     unknowns, own = problem.unknowns, len(problem.model.parameter_names)
     valid, free = unknowns.valid, unknowns.free
@@ -150,12 +151,9 @@ def as_estimate(
         covariance=jnp.where(answered, covariance, jnp.inf),
         initial_state=jnp.where(jnp.isfinite(initial_state), initial_state, 0.0),
         cost=jnp.where(answered, cost, jnp.inf),
-        rollouts=jnp.asarray(rollouts, dtype=int),
-        sweeps=jnp.asarray(sweeps, dtype=int),
         result=result,
         history=None if history is None else jnp.where(answered, history, center),
-        brackets=brackets,
-        parts=parts,
+        **more,
     )
 
 
