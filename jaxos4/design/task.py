@@ -8,7 +8,6 @@ Reference: Nocedal and Wright, Numerical Optimization, ch. 6 (BFGS) and 17 (pena
 
 import abc
 import math
-import os
 from collections.abc import Callable, Mapping
 from typing import ClassVar, NamedTuple
 
@@ -28,7 +27,7 @@ from ..linalg import gram, joint_factor
 from ..logs import write_flight
 from ..logs.assemble import SPEED_NAMES
 from ..logs.csv import read_table
-from ..logs.table import printable
+from ..logs.table import Path, refuse
 from .envelope import Envelope, Uses
 
 Coefficients = Float[Array, " coefficients"]
@@ -36,7 +35,6 @@ Inputs = Float[np.ndarray, "samples 4"]
 # Inputs, and the largest share of each limit that a vehicle uses.
 Flown = tuple[Inputs, dict[str, float]]
 Progress = Callable[[str], None]
-Path = str | os.PathLike[str]
 
 CRITERIA = ("D", "A", "worst")
 # In the criterion `worst`, the largest bound is replaced by this norm of the bounds, which has derivatives.
@@ -266,8 +264,7 @@ def read_input(path: Path, dt: float) -> Float[np.ndarray, "samples 4"]:
     """Read rotor speeds [rad/s] with the sample time `dt` [s]. Raises `InputError` as `read_references` does."""
     omega, step = _read(path, SPEED_NAMES)
     if (omega < 0).any() or abs(step - dt) > _PRECISION * dt:
-        name = printable(os.fspath(path))
-        raise InputError(f"{name}: has a negative cell, or is not sampled every {dt:g} s; design it for this `dt`.")
+        refuse(path, f"has a negative cell, or is not sampled every {dt:g} s; design it for this `dt`")
     return omega
 
 
@@ -281,13 +278,13 @@ def read_references(path: Path) -> tuple[Inputs, float]:
 
 def _read(path: Path, names: tuple[str, ...]) -> tuple[Inputs, float]:
     """The columns `names`, and the sample time."""
-    columns, name = read_table(path, ("t", *names)).columns, printable(os.fspath(path))
+    columns = read_table(path, ("t", *names)).columns
     for column in ("t", *names):
         if column not in columns:
-            raise InputError(f"{name}: column {column} is missing; its columns must be t, {', '.join(names)}.")
+            refuse(path, f"is missing; its columns must be t, {', '.join(names)}", column=column)
         if not np.isfinite(columns[column]).all():
-            raise InputError(f"{name}: column {column}: a cell is empty; give every sample a number.")
+            refuse(path, "a cell is empty; give every sample a number", column=column)
     steps = np.diff(columns["t"])
     if not steps.size or not np.all(np.abs(steps - steps.mean()) < _PRECISION * steps.mean()):
-        raise InputError(f"{name}: is not sampled at equal times; give one row for each sample.")
+        refuse(path, "is not sampled at equal times; give one row for each sample")
     return np.stack([columns[column] for column in names], axis=1), float(steps.mean())
