@@ -4,16 +4,14 @@ import contextlib
 import functools
 import io
 import math
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._files import BROKEN
-from ..errors import InputError
 from .sampling import Series, in_order, logged_rate
-from .table import Path, printable, read_bytes, refuse
+from .table import Path, read_bytes, refuse
 
 MAGIC = b"ULog\x01\x12\x35"
 HALF_TURN = np.array([1.0, -1.0, -1.0])  # about x: from forward, right, down to forward, left, up
@@ -87,8 +85,7 @@ def decoded(path: Path, topics: Sequence[str]) -> Topics:
         from pyulog.core import ULog
         from pyulog.exceptions import ULogException
     except ImportError:
-        name = printable(os.fspath(path))
-        raise InputError(f"{name}: reading a ULog file needs pyulog; install jaxos4[ulog].") from None
+        refuse(path, "reading a ULog file needs pyulog; install jaxos4[ulog]")
     content = read_bytes(path, _LARGEST)
     if content.endswith(_LOST):  # a loss of power leaves zeros at the end
         content = content.rstrip(b"\0")
