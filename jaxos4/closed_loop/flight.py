@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -164,7 +164,7 @@ class _Vehicle(NamedTuple):
         return x, y, thrust + z
 
 
-def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> tuple[Array, Array | None, Array, Any]:
+def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> tuple[Array | None, ...]:
     """The random numbers of a flight, in rows for each run of the controller with `steps` of length `h`.
 
     Gusts with the constant torque (4), and winds (3), at the begin and the end of each step; the noise of gyro,
@@ -204,7 +204,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         return _Acting(rotors, spin_up, tuple(gust), None if wind is None else tuple(wind))
 
     def run(carry, row):
-        motion, speeds, integral, commands, signals = carry  # row k + 1 has the command of run k, row 0 the one before
+        motion, speeds, integral, commands, signals = carry  # in row k + 1: the command of run k
         k, reference, (*blown, error, own_error) = row
         weak, nothing = 1 - loop.sag * k / (runs - 1), jnp.zeros(())
         at_once = jax.tree.map(lambda ends: ends[0], blown)
