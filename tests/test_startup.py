@@ -5,13 +5,13 @@ import inspect
 import json
 import os
 import pathlib
-import shutil
 import subprocess
 import sys
 
 import jax
 import numpy as np
 import pytest
+from helpers import how_we_compile
 from jax._src import compiler
 
 import jaxos4
@@ -144,7 +144,7 @@ omega = jaxos4.multisine(jaxos4.OS4, duration=0.05)
 assert (simulate(model.alpha) == simulate(model.alpha)).all()
 import diffrax
 """
-    process = start(code=code)
+    process = start(code=code, **how_we_compile())
     assert process.returncode == 0, process.stderr
 
 
@@ -169,26 +169,20 @@ def programs(*arguments: str, cwd: pathlib.Path, **environment: str) -> tuple[in
     return int(hits), int(misses)
 
 
-@pytest.fixture(scope="module")
-def filled(tmp_path_factory):
-    """The environment of a home whose cache a first command has filled, and the number of its programs."""
-    folder = tmp_path_factory.mktemp("home")
-    home = {"HOME": str(folder), "XDG_CACHE_HOME": str(folder / "cache")}
-    hits, misses = programs(*SIMULATE, cwd=folder, **home)
-    assert (hits, misses > 1) == (0, True)
-    return home, misses
-
-
-def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwise(filled, tmp_path):
-    home, count = filled
-    assert programs(*SIMULATE, cwd=tmp_path, **home) == (count, 0)
+def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwise(tmp_path):
+    """The first one is the console command. It ends the process without the clean-up of Python: nothing is lost."""
+    home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    console = COMMAND.replace("main", "console")
+    first = start(*SIMULATE, code=console, cwd=tmp_path, **home)
+    assert (first.returncode, first.stderr, "flight.csv: 11 samples" in first.stdout) == (0, "", True)
+    assert len((tmp_path / "flight.csv").read_text().splitlines()) == 12
+    refused = start("estimate", "nowhere.csv", code=console, cwd=tmp_path, **home)
+    assert (refused.returncode, "nowhere.csv: there is no such file" in refused.stderr) == (2, True)
+    compiled = (tmp_path / "cache" / "jaxos4" / "programs").glob("*")
+    cut, *others = (path for path in compiled if not path.name.startswith("jaxos4-"))
+    cut.write_bytes(cut.read_bytes()[:100])  # compiled again, in silence
+    assert programs(*SIMULATE, cwd=tmp_path, **home)[0] == len(others) > 1
     assert programs(*SIMULATE, cwd=tmp_path, JAXOS4_NO_CACHE="1", **home) == (0, 0)
-    # Another folder is chosen. A program that was cut off is compiled again, in silence.
-    chosen = tmp_path / "chosen"
-    shutil.copytree(pathlib.Path(home["XDG_CACHE_HOME"]) / "jaxos4" / "programs", chosen)
-    for path in chosen.iterdir():
-        path.write_bytes(path.read_bytes()[:100])
-    assert programs(*SIMULATE, cwd=tmp_path, JAX_COMPILATION_CACHE_DIR=str(chosen), **home)[0] == 0
 
 
 def test_the_cache_is_limited_and_keeps_what_was_used_last_and_a_folder_may_be_unusable(tmp_path, monkeypatch):
@@ -252,19 +246,6 @@ def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known
     assert len(files()) == 3
     jax.config.update("jax_compilation_cache_dir", None)
     assert kept(one) is None
-
-
-def test_the_console_command_ends_with_the_code_and_the_output_of_main(tmp_path):
-    """It ends the process without the clean-up of Python: nothing that was printed or written may be lost."""
-    console = [sys.executable, "-c", "import sys; sys.argv[0] = 'jaxos4'; from jaxos4.cli import console; console()"]
-    for arguments, code, expected in (
-        (["estimate", "nowhere.csv"], 2, "nowhere.csv: there is no such file"),
-        (["simulate", "--out", "flight.csv", "--duration", "0.5"], 0, "flight.csv: 51 samples"),
-    ):
-        done = subprocess.run([*console, *arguments], capture_output=True, text=True, cwd=tmp_path)
-        assert done.returncode == code, done.stderr
-        assert expected in done.stdout + done.stderr
-    assert len((tmp_path / "flight.csv").read_text().splitlines()) == 52
 
 
 NATIVE, WIDE = LOOP_FLAGS.values()
