@@ -261,7 +261,7 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
     assert agreement({})["share"] is None
 
 
-@pytest.mark.usefixtures("quickly_compiled")
+@pytest.mark.usefixtures("optimised")
 def test_public_flights(report_of, shared_flights):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}
