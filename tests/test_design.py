@@ -23,7 +23,7 @@ BRACKET = jaxos4.Bracket.default(MODEL)
 SECONDS = 2.0
 LOOP = jaxos4.ClosedLoop(CRAZYFLIE, gust=5.0)
 LOOP_BRACKET = jaxos4.Bracket.default(design.model_of(LOOP))
-LOOP_DT, LOOP_SECONDS = 0.004, 6.0
+LOOP_DT, LOOP_SECONDS = 0.004, 4.0
 CLOSED = ("--closed-loop", "--airframe", "mine.toml")
 
 
@@ -39,7 +39,7 @@ def speeds():
 
 @pytest.fixture(scope="module")
 def references():
-    """References of 6 s."""
+    """References of 4 s."""
     return design.design_references(LOOP, bracket=LOOP_BRACKET, **LOOP_SETTINGS, compare=True, key=0)
 
 
@@ -137,7 +137,7 @@ def test_designed_references_tell_twice_as_much_as_3211(references):
     assert max(found.gain(name)[0] for name in found.standard) < 0.6
     for one in (found.designed, found.standard["3211"]):
         assert (np.abs(one.inputs).max(axis=0) <= np.array([0.3, 0.3, 0.3, 1.5]) * (1 + 1e-9)).all()
-        assert one.inputs.shape == (1501, 4)
+        assert one.inputs.shape == (1001, 4)
     period = round(found.designed.period / LOOP_DT)
     np.testing.assert_allclose(found.designed.inputs[period:], found.designed.inputs[:-period], atol=1e-9)
 
@@ -185,7 +185,7 @@ def test_repeated_references_add_the_same_information(references):
 
 
 def test_the_command_writes_references_that_simulate_flies(references, command, run, tmp_path):
-    out, loop = command("design_references", references, LOOP_BRACKET, LOOP_SETTINGS, *CLOSED, "--duration", "6")
+    out, loop = command("design_references", references, LOOP_BRACKET, LOOP_SETTINGS, *CLOSED, "--duration", "4")
     for words in ("x 3211", "of 64 vehicles", "known to 5 %: Ix after"):
         assert words in out
     assert jax.tree.structure(loop) == jax.tree.structure(LOOP)
@@ -196,7 +196,7 @@ def test_the_command_writes_references_that_simulate_flies(references, command, 
     np.testing.assert_allclose(written, references.designed.inputs, atol=1e-6)
     code, out, err = run("simulate", *CLOSED, "--references", "new.csv", "--out", "flight.csv")
     assert (code, err) == (0, "")
-    assert "1501 samples of 0.004 s" in out
+    assert "1001 samples of 0.004 s" in out
 
 
 @pytest.mark.parametrize(
