@@ -181,7 +181,7 @@ def _add_drag(force: Vector, values: Values, forcing: Forcing) -> Vector:
     return x, y, z
 
 
-def _velocity(forcing: Forcing) -> Vector:
+def _velocity(forcing: Forcing):
     return _known(forcing.velocity, VELOCITY, "body_velocity")
 
 
