@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,24 +93,17 @@ class Cell(NamedTuple):
     mark: str = ""
 
 
-class Row(NamedTuple):
-    """One row. `estimator`: the index of its estimator, if it has one. The page hides the row with the estimator."""
-
-    label: str
-    cells: tuple[Cell, ...]
-    estimator: int | None = None
-
-
 class Table(NamedTuple):
     """Rows of text, in groups of one noise scale.
 
     - `headings`: of the columns after the first, each with its unit or an empty string.
-    - `groups`: the label of each group, and its rows.
+    - `groups`: the label of each group, and its rows: a label, cells, and the index of an estimator if the row is of
+      one. The page hides the row with the estimator.
     - `notes`: the meaning of the marks.
     """
 
     headings: list[tuple[str, str]]
-    groups: list[tuple[str, list[Row]]]
+    groups: Sequence[tuple[str, Sequence[tuple[str, tuple[Cell, ...], int | None]]]]
     notes: tuple[str, ...] = ()
 
 
@@ -147,11 +140,11 @@ def _error_table(data: xr.Dataset, *, digits: int = 3) -> Table:
 
     groups = []
     for place, label in enumerate(scale_labels(data)):
-        rows = [Row(f"bound, {seen}", cells(best.isel(scale=place, estimator=at))) for seen, at in bounds(data).items()]
-        for at, name in enumerate(names(data, "estimator")):
-            rows.append(Row(name, cells(found.isel(scale=place, estimator=at)), at))
-        groups.append((label, [*rows, Row("bracket centre", cells(middle.isel(scale=place)))]))
-    used = {cell.mark for _, rows in groups for row in rows for cell in row.cells}
+        least = [(f"bound, {x}", cells(best.isel(scale=place, estimator=at)), None) for x, at in bounds(data).items()]
+        every = enumerate(names(data, "estimator"))
+        rows = [(name, cells(found.isel(scale=place, estimator=at)), at) for at, name in every]
+        groups.append((label, [*least, *rows, ("bracket centre", cells(middle.isel(scale=place)), None)]))
+    used = {cell.mark for _, rows in groups for _, cells, _ in rows for cell in cells}
     notes = (
         f"{mark} absolute error, in the parameter's unit: {reason}, so a percentage is meaningless."
         for mark, reason in zip(_MARKS, metrics.NO_PERCENTAGE, strict=True)
@@ -219,7 +212,7 @@ def _by_estimator(data: xr.Dataset, headings: list[str], cells: Callable[[dict[s
     """A table with a row for each noise scale and estimator; `cells` gives the row's cells from its indices."""
     estimators = list(enumerate(names(data, "estimator")))
     groups = [
-        (label, [Row(name, cells({"scale": scale, "estimator": at}), at) for at, name in estimators])
+        (label, [(name, cells({"scale": scale, "estimator": at}), at) for at, name in estimators])
         for scale, label in enumerate(scale_labels(data))
     ]
     return Table([(heading, "") for heading in headings], groups)
@@ -247,7 +240,7 @@ def error_table(dataset: xr.Dataset) -> RenderableType:
         blank = [""] * len(headings)
         for label, group in table.groups:
             rows += [["", *blank]] * bool(rows) + [[label, *blank]]
-            rows += [[row.label, *(cell.text + cell.mark for cell in row.cells)] for row in group]
+            rows += [[name, *(cell.text + cell.mark for cell in cells)] for name, cells, _ in group]
         listing = Listing(["", *headings], rows, headings, apart=1)  # 80 columns must do
         parts += [Text(f"RMS error [%], {scenario.label}"), listing.table()]
         notes |= dict.fromkeys(table.notes)
