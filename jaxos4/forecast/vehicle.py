@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -85,13 +84,18 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
         if missing:
             raise InputError(f"has no {', '.join(missing)}; run `jaxos4 estimate` again.")
         notes = [f"not identified, and predicted with the centre of the bracket: {', '.join(guessed)}"] * bool(guessed)
+        channels = (*"pqr", *(FORCE_NAMES[axis] for axis in model.force_axes))
+        if lacking := [each for each in channels if each not in file.disturbances]:
+            raise InputError(f"does not say the disturbance of {lacking[0]}; run `jaxos4 estimate` again.")
+        levels = [file.disturbances[each] for each in channels]
+        table = np.array([(each.strength, each.time_constant, each.sensor) for each in levels])
         return Vehicle(
             name,
             model,
             np.array(values),
             shares @ covariance @ shares.T,
             np.array([width.get(f"{axis}_offset", 0.0) for axis in ("roll", "pitch", "yaw")]),
-            _noise(file, model.force_axes),
+            LogNoise(*np.log(np.maximum(table, _LEAST)).T),
             used.sample_time,
             file.result,
             (*file.reasons, *notes),
@@ -102,13 +106,3 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
 def _bracket(model: FlightModel) -> tuple[Parameters, Parameters]:
     """The centre and the half-width of the default bracket."""
     return model.alpha, model.half_width
-
-
-def _noise(file: ResultFile, force_axes: Sequence[int]) -> LogNoise:
-    channels = (*"pqr", *(FORCE_NAMES[axis] for axis in force_axes))
-    try:
-        levels = [file.disturbances[channel] for channel in channels]
-    except KeyError as error:
-        raise InputError(f"does not say the disturbance of {error.args[0]}; run `jaxos4 estimate` again.") from None
-    table = np.array([(each.strength, each.time_constant, each.sensor) for each in levels])
-    return LogNoise(*np.log(np.maximum(table, _LEAST)).T)

@@ -166,8 +166,12 @@ def fit_innovations(
         if name in notes
     }
     spread = as_float(np.asarray(found.covariance) * np.outer(factor, factor))
+    shooting = problem.problem if shooting is None else shooting
+    sigma = np.array(shooting.sigma)
+    sigma[shooting.columns] = np.exp(noise.sensor)
+    sigma = as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0))
     return Fit(
-        problem=_with_sensors(problem.problem if shooting is None else shooting, noise),
+        problem=eqx.tree_at(lambda p: p.sigma, shooting, sigma),
         estimate=eqx.tree_at(lambda e: e.covariance, found, spread),
         bound=std,
         rollouts=rollouts,
@@ -255,13 +259,6 @@ def _widening(
     prior = np.diag(1 / np.square(np.asarray(problem.problem.unknowns.half_width)[fitted]))
     ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
     return np.max([np.ones(fitted.size), *ways], axis=0)
-
-
-def _with_sensors(problem: ShootingProblem, noise: LogNoise) -> ShootingProblem:
-    """The problem with the sensors' noise that was found."""
-    sigma = np.array(problem.sigma)
-    sigma[problem.columns] = np.exp(noise.sensor)
-    return eqx.tree_at(lambda p: p.sigma, problem, as_float(np.where(np.isfinite(sigma) & (sigma > 0), sigma, 1.0)))
 
 
 def _disturbances(problem: InnovationsProblem, found: Estimate, noise: LogNoise) -> dict[str, Disturbance]:

@@ -19,7 +19,6 @@ from ..models.state import CASCADE_ORDER
 from ..networks import TrainedNetwork
 from ..networks.file import load_network
 from ..recording.pieces import Recording
-from ..recording.preparation import HOLDOUT
 from ..shooting import InnovationsProblem, ShootingProblem
 from .problem import GivenNetwork, Intervals, bracket_of, flight_problem, network_for, network_provenance
 from .results import Provenance
@@ -56,10 +55,6 @@ class VehicleSettings:
     end: float | None = None
     sample_time: float | None = None
     holdout: float | None = None
-
-    def share(self, *, validated: bool) -> float:
-        """The share that is held out. `validated`: whether another recording is predicted."""
-        return self.holdout if self.holdout is not None else 0.0 if validated else HOLDOUT
 
 
 Settings = FlightSettings | VehicleSettings

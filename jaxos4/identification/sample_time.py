@@ -43,7 +43,12 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
             if fits and fits[0].answered and isinstance(case.problem, InnovationsProblem):
-                case = case._replace(problem=_started(case.problem, np.asarray(fits[0].estimate.parameters)))
+                own, found = case.problem.problem.unknowns, np.asarray(fits[0].estimate.parameters)
+                off = np.abs(found[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
+                if not (off < _NEAR * REACH).all():
+                    # The answer may be another minimum. Only the noise starts at that of the last answer.
+                    found = np.where(np.arange(found.size) >= own.count, found, np.nan)
+                case = case._replace(problem=case.problem.starting_from(found))
             fits.insert(0, fit_case(case))
             if len(fits) == 1:
                 beside.submit(compile_ahead, case)
@@ -51,18 +56,6 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
-
-
-def _started(problem: InnovationsProblem, found: np.ndarray) -> InnovationsProblem:
-    """The problem, with a search that starts at the answer of the last fit.
-
-    If a parameter went to its limit, the answer may be another minimum. The parameters then start at their centers, and
-    only the noise at that of the last answer.
-    """
-    own = problem.problem.unknowns
-    off = np.abs(found[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
-    is_inside = (off < _NEAR * REACH).all()
-    return problem.starting_from(np.where(is_inside | (np.arange(found.size) >= own.count), found, np.nan))
 
 
 def shortest(answers: Sequence[SampleTime]) -> int:

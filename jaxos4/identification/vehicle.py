@@ -55,7 +55,8 @@ def prepare_vehicle(
         )
     if network is not None or isinstance(estimator, Hybrid):
         raise InputError("`network`: a vehicle's network is trained for its own flights; use `estimator` hybrid.")
-    holdout = settings.share(validated=validate is not None)
+    by_default = preparation.HOLDOUT if validate is None else 0.0
+    holdout = by_default if settings.holdout is None else settings.holdout
     prepared = preparation.prepare(
         recordings, airframe, begin=settings.begin, end=settings.end, sample_time=settings.sample_time, holdout=holdout
     )
@@ -79,7 +80,10 @@ def _case(
 ) -> Case:
     terms, voltage = _checked_terms(settings.terms, prepared.available), prepared.battery_voltage
     model = FlightModel(airframe, terms=terms, recordings=prepared.recordings, battery_voltage=voltage)
-    unknowns = Unknowns.of(model, bracket_of(_levelled(bracket, prepared, model), model))
+    if prepared.level is not None and not isinstance(bracket, Bracket) and VERTICAL_BIAS in model.parameter_names:
+        value, error = prepared.level  # the flight says how the accelerometer errs along z
+        bracket = {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
+    unknowns = Unknowns.of(model, bracket_of(bracket, model))
     shooting = _problem(model, prepared.fitted, windows=prepared.windows, unknowns=unknowns)
     measured = np.count_nonzero(~np.isnan(shooting.recorded()))
     if measured <= unknowns.count:
@@ -126,14 +130,6 @@ def with_estimator(case: Case, estimator: str | AbstractEstimator, *, seed: int,
         what = f"no network for these flights ({error}); IBSS searched the whole bracket"
     notes = [*case.provenance.notes, f"{estimator}: {what}"]
     return case._replace(estimator=method, provenance=msgspec.structs.replace(case.provenance, notes=notes))
-
-
-def _levelled(bracket: Intervals, prepared: Prepared, model: FlightModel) -> Intervals:
-    """The bracket, in which the error of the accelerometer along z is known if the flight says it."""
-    if prepared.level is None or isinstance(bracket, Bracket) or VERTICAL_BIAS not in model.parameter_names:
-        return bracket
-    value, error = prepared.level
-    return {VERTICAL_BIAS: [value - error, value + error], **(bracket or {})}
 
 
 def _problem(model: FlightModel, flight: Flight, **settings: Any) -> ShootingProblem:
