@@ -18,8 +18,8 @@ Section = Iterator[str | Listing]
 
 def print_identification(console: Console, found: Identification) -> None:
     """Prints doubts, notes, parameters, moments of inertia and the quality of the fit; or why there is no answer."""
-    every = (_notes, _parameters, _held, _fit, _inertias, _sample_times, _validation, _disturbances, _skill, _summary)
-    for section in every if found.has_answer else (_notes, _failure):
+    of_kind = (_held, _inertias, _of_vehicle) if found.is_vehicle else (_fit, _inertias, _validation)
+    for section in (_notes, _parameters, *of_kind, _summary) if found.has_answer else (_notes, _failure):
         for part in section(found):
             if isinstance(part, Listing):
                 part.print_on(console)
@@ -80,8 +80,6 @@ def _held(found: Identification) -> Section:
 
 
 def _fit(found: Identification) -> Section:
-    if found.is_vehicle:
-        return
     percents = [f"{name} {row.percent:.1f}" for name, row in found.fit.items() if row.percent is not None]
     yield f"fit [%], 100 is a perfect prediction: {', '.join(percents)}."
     coloured = ", ".join(name for name, row in found.fit.items() if row.correlation > COLOURED)
@@ -124,18 +122,8 @@ def _inertias(found: Identification) -> Section:
         yield f"inertias [kg m^2], 95 %: {', '.join(inertias)}{verdict}."
 
 
-def _sample_times(found: Identification) -> Section:
-    rows = []
-    for each in found.sample_times:
-        chosen = " (chosen)" if math.isclose(each.sample_time, found.provenance.sample_time) else ""
-        inertias = [f"{name} {row.estimate:.3g}" for name, row in each.constants.items()]
-        rows.append(f"{1e3 * each.sample_time:.3g} ms {' '.join(inertias) or 'no answer'}{chosen}")
-    if rows:
-        yield f"sample times: {', '.join(rows)}."
-
-
 def _validation(found: Identification) -> Section:
-    if found.is_vehicle or found.validation is None:
+    if found.validation is None:
         return
     flight, fit = found.validation.flight, found.validation.fit
     if fit is None:
@@ -145,22 +133,26 @@ def _validation(found: Identification) -> Section:
     yield f"validation on {flight} [%] (residuals in multiples of the noise): {', '.join(channels)}."
 
 
-def _disturbances(found: Identification) -> Section:
+def _of_vehicle(found: Identification) -> Section:
+    rows = []
+    for each in found.sample_times:
+        chosen = " (chosen)" if math.isclose(each.sample_time, found.provenance.sample_time) else ""
+        inertias = [f"{name} {row.estimate:.3g}" for name, row in each.constants.items()]
+        rows.append(f"{1e3 * each.sample_time:.3g} ms {' '.join(inertias) or 'no answer'}{chosen}")
+    if rows:
+        yield f"sample times: {', '.join(rows)}."
     if found.disturbances:
-        rows = found.disturbances.items()
-        gusts = ", ".join(f"{name} {x.strength:.2g} {x.unit} over {x.time_constant:.2g} s" for name, x in rows)
+        levels = found.disturbances.items()
+        gusts = ", ".join(f"{name} {x.strength:.2g} {x.unit} over {x.time_constant:.2g} s" for name, x in levels)
         yield f"disturbances that the model lacks, and their correlation time: {gusts}."
-        sensors = ", ".join(f"{name} {x.sensor:.2g}" for name, x in rows)
+        sensors = ", ".join(f"{name} {x.sensor:.2g}" for name, x in levels)
         yield f"white noise of the sensors [rad/s; m/s^2]: {sensors}."
     if found.widened:
         factors = ", ".join(f"{name} {factor:.1f}" for name, factor in found.widened.items())
         yield f"intervals widened, because parts of the flights disagree, by the factor: {factors}."
-
-
-def _skill(found: Identification) -> Section:
     if found.skill is None:
         return
-    skill, rows = found.skill, []
+    skill, table = found.skill, []
     yield (
         "Predictions of data that were not fitted: 1 is perfect, 0 as good as constant rates; +- one standard "
         f"error ({skill.starts} starts)."
@@ -168,8 +160,8 @@ def _skill(found: Identification) -> Section:
     rates = (skill.p, skill.q, skill.r)
     for i, horizon in enumerate(skill.horizons):
         cells = [f"{_share(rate.skill[i])} +- {_share(rate.std[i])}" for rate in rates]
-        rows.append((f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates)))
-    yield Listing(("ahead", "p", "q", "r", "equation error: p, q, r"), rows)
+        table.append((f"{horizon:.2f} s", *cells, ", ".join(_share(rate.equation_error[i]) for rate in rates)))
+    yield Listing(("ahead", "p", "q", "r", "equation error: p, q, r"), table)
 
 
 def _summary(found: Identification) -> Section:
