@@ -14,7 +14,7 @@ from matplotlib.ticker import MultipleLocator
 
 from .._files import check_writable, write_file
 from ..airframe import Airframe
-from ..analysis.frequency_response import AxisResponse, FrequencyResponse
+from ..analysis.frequency_response import FrequencyResponse
 from ..analysis.inertia import CenterOfMass, center_of_mass
 from ..analysis.prediction import Predictions
 from ..identification.results import Constant, Identification, SampleTime
@@ -61,7 +61,6 @@ def write_flight_page(path: str | os.PathLike[str], found: Identification, *, ti
         center=[f"{each.axis} {_plus_minus(1e3 * each.value, 1e3 * each.std)} mm" for each in center],
         ninety_five=NINETY_FIVE,
         rates=None if found.predictions is None else predicted_rates(found.predictions, used.sample_time, look),
-        agreement={} if found.response is None else {n: _agreement(x) for n, x in found.response._asdict().items()},
         band=f"{100 * _BAND:g}",
         drawings=drawings,
         command=used.command or "",
@@ -216,10 +215,3 @@ def inertias_by_sample_time(answers: Sequence[SampleTime], chosen: float, look: 
         ticks_at(panel.xaxis, ticks)
     label(figure, x="sample time [ms]")
     return figure
-
-
-def _agreement(axis: AxisResponse) -> str:
-    agreement = axis.agreement()
-    if math.isnan(agreement.ratio):
-        return "no clear response"
-    return "{:.2f} ({:.2f} to {:.2f}) times the model".format(agreement.ratio, *agreement.interval)
