@@ -12,6 +12,7 @@ import pytest
 import jaxos4
 from jaxos4.study import load_study, metrics, read_results
 
+pytestmark = pytest.mark.usefixtures("optimised")  # they compute for longer than they compile
 EXPERIMENTS = pathlib.Path(__file__).resolve().parents[1] / "experiments"
 sys.path.append(str(EXPERIMENTS))
 
@@ -196,9 +197,9 @@ def test_speed(report_of):
 
 def test_networks(report_of):
     cases = {"cases": ["standard"], "networks": ["score, mlp"], "noises": [1.0], "channels": "rates", "separate": False}
-    report = report_of("networks", flights=128, seed=7, steps=100, many=64, **cases)
+    report = report_of("networks", flights=128, seed=7, steps=100, many=128, **cases)
     rows = {row["estimator"]: row for row in report["rows"]}
-    assert report["one_call"]["flights"] == 64
+    assert report["one_call"]["flights"] == 128
     assert list(rows) == ["score, mlp", "hybrid", "ibss"]
     # Each of eight parameters within five Monte-Carlo errors of the bound.
     assert all(near(rows[n]["efficiency"], 1, 5 * rows[n]["monte_carlo_error"]) for n in ("hybrid", "ibss"))
@@ -261,7 +262,6 @@ def test_pairs_of_public_flights_agree_if_their_difference_is_inside_its_interva
     assert agreement({})["share"] is None
 
 
-@pytest.mark.usefixtures("optimised")
 def test_public_flights(report_of, shared_flights):
     """One flight is identified, and another one predicted better than by constant velocity."""
     names = {"fitted": ["B8_star_fast_rep1"], "predicted": ["B8_star_fast_rep2"]}

@@ -7,8 +7,9 @@ from test_experiments import load, plot, report_of  # noqa: F401
 
 import jaxos4
 
+pytestmark = pytest.mark.usefixtures("optimised")
 
-@pytest.mark.usefixtures("optimised")
+
 def test_real_flight(shared_flights, report_of, plot):  # noqa: F811
     report = report_of(
         "real_flight", flights=shared_flights, names=["rollpitch"], estimators=["filter-error"], end=12.0
@@ -35,7 +36,6 @@ def test_real_flight_needs_its_flights(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.usefixtures("optimised")
 def test_closed_loop(report_of, plot, monkeypatch):  # noqa: F811
     def load_with_small_chunks(name, script="run"):
         module = load(name, script)
@@ -57,7 +57,6 @@ def test_closed_loop(report_of, plot, monkeypatch):  # noqa: F811
         report_of("closed_loop", **{**cases, "seed": 17})
 
 
-@pytest.mark.usefixtures("optimised")
 def test_effects(report_of, plot):  # noqa: F811
     """The effects of real flights are flown, identified and drawn."""
     report = report_of("closed_loop", "effects", flights=1, duration=10.0, effects=["clock"])
@@ -67,7 +66,6 @@ def test_effects(report_of, plot):  # noqa: F811
         assert abs(case["summary"]["thrust"]["mean"]) < 0.05
 
 
-@pytest.mark.usefixtures("optimised")
 def test_rotorpy(report_of, tmp_path):  # noqa: F811
     pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy")
     cases = {"flights": 1, "kinds": ["calm"], "duration": 8.0, "estimators": ["filter-error"]}
@@ -92,7 +90,6 @@ def test_rotorpy(report_of, tmp_path):  # noqa: F811
     assert path.stat().st_mtime_ns == recorded
 
 
-@pytest.mark.usefixtures("optimised")
 def test_commands_that_are_too_rare_are_named(shared_flights, report_of):  # noqa: F811
     (row,) = report_of("public_flights", "radio", flights=shared_flights, every=[40]).values()
     assert row["result"] != "successful"
