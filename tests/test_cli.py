@@ -230,7 +230,7 @@ REFUSED = {
     f"{DESIGN} --duration 2 --rate -1": ["--rate must be positive"],
     f"{DESIGN} --accuracy 0": ["--accuracy"],
     f"{DESIGN} --bandwidth 100": ["--bandwidth", "0.2 to 25 Hz"],  # by default 5 s, sampled every 0.01 s
-    f"{DESIGN} --figure new.csv": ["--figure", "--out"],
+    f"{DESIGN} --out new.svg --figure new.svg": ["--out and --figure name one file"],
     f"{DESIGN} --figure new.png": ["--figure new.png", ".svg"],
     f"{DESIGN} --gust 5": ["--gust", "with --closed-loop; add that"],
     f"{REFERENCES} --duration 1000": ["--duration", "250 to 20000 samples"],

@@ -160,8 +160,10 @@ def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
     assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
 
 
-def predicted_flight(tmp_path):
+@pytest.fixture(scope="module")
+def predicted_flight(tmp_path_factory):
     """The exported vehicle, its rotor speeds, and the flight from the first sample as `jaxos4.predict` predicts it."""
+    tmp_path = tmp_path_factory.mktemp("flight")
     model, values = rigid_model({name: VALUES[name] for name in VALUES if not name.startswith(("rotor", "thrust_cu"))})
     level = {"strength": 0.0, "unit": "", "time_constant": 0.25, "sensor": 0.01, "correlation": 0.0}
     about = provenance(terms=list(TERMS), sample_time=SAMPLE)
@@ -206,9 +208,9 @@ def flown_by_rotorpy(found, omega, begin):
 
 
 @pytest.mark.parametrize("fly", [flown_by_mujoco, flown_by_rotorpy])
-def test_a_vehicle_flies_the_predicted_flight(mujoco, tmp_path, fly):
+def test_a_vehicle_flies_the_predicted_flight(mujoco, predicted_flight, fly):
     """For 2 s, from the same start, with the same rotor speeds."""
-    found, omega, predicted = predicted_flight(tmp_path)
+    found, omega, predicted = predicted_flight
     flown = fly(found, omega[: len(predicted) - 1], predicted[0])
     assert np.abs(departures(predicted[1:], flown)).max() < 1e-6
     assert np.abs(departures(predicted[:1], flown))[-1].min() > 0.05  # it flies somewhere
