@@ -23,13 +23,14 @@ NO_OPTIONS = "JAXOS4_NO_XLA_OPTIONS"
 
 LOOP_FLAGS = {
     "xla_cpu_small_while_loop_byte_threshold": (
-        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000,-unroll-full-max-count=15"
     ),
     "xla_cpu_prefer_vector_width": "--xla_cpu_prefer_vector_width=512",
 }
 """The flags of the process, by the names of their options.
 
 - Loops whose step moves less than a gigabyte become native functions. Larger ones keep XLA's threads.
+- Loops over 16 lanes stay loops: LLVM turns a loop into vectors, but not the scalar code that it unrolls it to.
 - Vectors are as wide as the processor's. Results are the same.
 """
 
