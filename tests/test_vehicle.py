@@ -191,7 +191,7 @@ def test_a_flight_that_the_model_cannot_follow_has_no_answer():
     assert not fit.answered
     assert names(fit.estimate) == "nonfinite_trajectory"
     bracket = problem.problem.unknowns.bracket
-    found = jaxos4.FilterError()(problem, jaxos4.Bracket(bracket.upper, bracket.lower))
+    found = jaxos4.FilterError()(problem.within(jaxos4.Bracket(bracket.upper, bracket.lower)))
     assert names(found) == "bracket_invalid"
     assert not np.isfinite(np.asarray(found.covariance)).any()
 
