@@ -19,6 +19,8 @@ CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or pathlib.Path(__file__).re
 jax.config.update("jax_compilation_cache_dir", str(CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
+# Also in a container that sets PYTHONDONTWRITEBYTECODE: to compile the checked modules and the tests takes 3 s.
+sys.dont_write_bytecode = False
 # Before the first import of jaxos4: all its annotated functions and modules are checked. The two files that decode a
 # log number by number have no arrays, and the checks would take four times as long as the decoding.
 PACKAGE = pathlib.Path(__file__).resolve().parents[1] / "jaxos4"
