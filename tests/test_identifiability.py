@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import DT, measured, noisy_states, numpy_jacobian, standard_flight, standard_problem
-from lanes import LANES, identify
+from lanes import LANES, identify, lanes
 
 import jaxos4
 from jaxos4.shooting import ROUNDING
@@ -113,27 +113,24 @@ def test_a_profile_is_the_parabola_of_the_bound():
 
 def residual_noise(flights, correlation_time):
     """Errors of flights with Gauss-Markov noise, in standard deviations of the bound and of the robust covariance."""
-    problem, noise = standard_problem(channels="rates"), jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, correlation_time)
-    around, keys = jaxos4.Bracket.default(problem.model), jax.random.split(jax.random.key(11), flights)
-    same = [np.tile(x, (LANES, *[1] * x.ndim)) for x in (problem.flight.omega, around.lower, around.upper)]
+    noise, keys = (
+        jaxos4.GaussMarkov(jaxos4.SENSOR_SIGMA, correlation_time),
+        jax.random.split(jax.random.key(11), flights),
+    )
     naive, robust = [], []
-    for first in range(0, flights, LANES):
-        states = measured(noise, problem.flight, keys[first : first + LANES])
-        found = identify(jaxos4.IBSS(), problem, states, *map(jnp.asarray, same))
-        error = np.asarray(found.parameters - problem.model.alpha)
-        for lane in range(LANES):
-            noisy = eqx.tree_at(lambda p: p.flight.states, problem, states[lane])
-            fitted = jaxos4.evaluate(noisy, found.parameters[lane], found.initial_state[lane])
-            covariance = jaxos4.robust_covariance(fitted)
-            robust.append(error[lane] / np.sqrt(np.diagonal(covariance)))
-        naive.extend(error / found.std)
+    for some in jnp.split(keys, flights // LANES):
+        problem, states, *arguments = lanes(measured(noise, standard_flight(), some))
+        found = identify(jaxos4.IBSS(), problem, states, *arguments)
+        for flown, parameters, start, std in zip(states, found.parameters, found.initial_state, found.std, strict=True):
+            noisy, error = eqx.tree_at(lambda p: p.flight.states, problem, flown), parameters - problem.model.alpha
+            covariance = jaxos4.robust_covariance(jaxos4.evaluate(noisy, parameters, start))
+            robust.append(np.asarray(error) / np.sqrt(np.diagonal(covariance)))
+            naive.append(np.asarray(error / std))
     return np.array(naive), np.array(robust)
 
 
-@pytest.mark.usefixtures("optimised")
 def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_not():
-    flights = 256
-    naive, robust = residual_noise(flights, 0.05)
+    naive, robust = residual_noise(2 * LANES, 0.05)
     covered = [(np.abs(x) < 1.96).mean() for x in (naive, robust)]
     assert covered[0] < 0.6
     # The fit explains some slow noise as motion, so it is missing in the residuals.
