@@ -5,6 +5,7 @@ inside a scan are scalars of a lane, because stacking them in every step is slow
 """
 
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,14 +16,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._custom_types import InitialState, Numeric, Parameters, Scalar
-from ..models.state import Forcing, State, unstack
+from ..models.state import Forcing, State, Translation, unstack
 from .batching import computed_once, with_batch
+from .sparsity import Panel, panels_of, symmetric
 
 # A body rate [rad/s] that no quadrotor reaches and no gyro measures: a faster trajectory has diverged.
 FASTEST = 1e3
-
-# Rows of the information that are summed together, without the columns right of their square.
-_PANEL = 4
 
 # From a state, the forcing and the parameters: the state one sample later, and the output of noise-free sensors.
 Advance = Callable[[State, Forcing, tuple[Scalar, ...]], tuple[State, tuple[Scalar, ...]]]
@@ -174,14 +173,18 @@ def shoot_with_derivatives(
 class _Carried(NamedTuple):
     """A linearised shot up to some sample.
 
-    `information`: panels of `_PANEL` rows of the information, each without what lies right of its square.
+    - `late`: the tangents of the unknowns that act on the translation alone; `tangent`: those of all others.
+    - `gradient`: in the unknowns of `tangent`, and then of `late`.
+    - `panels`: some rows of the information, in the columns of `tangent`, and then of `late`, without what lies right
+      of the rows' square.
     """
 
     state: State
     tangent: State
+    late: Translation | None
     shot: Shot
-    gradient: Float[Array, "unknowns *lanes"]
-    information: tuple[Array, ...]
+    gradient: list[Array]
+    panels: list[list[Array]]
 
 
 def _linearised_shot(
@@ -199,21 +202,16 @@ def _linearised_shot(
 
     Rows and weights that all lanes share have a last axis of 1.
     """
-    (count, *lanes), size = parameters.shape, initial_state.shape[0]
-    free = size if initial_state_is_free else 0
-    unknowns = count + free
-    panels = [(top, min(top + _PANEL, unknowns)) for top in range(0, unknowns, _PANEL)]
-    # NumPy, so that they are constants of the program.
-    identity = np.eye(unknowns, dtype=parameters.dtype)
-    parameter_tangents = tuple(identity[:, :count].T)
-    start_tangents = identity[:, count:].T if free else np.zeros((size, unknowns), dtype=parameters.dtype)
+    count, *lanes = parameters.shape
     scalars = tuple(parameters)
-
-    def zeros(*shape: int) -> Array:
-        return jnp.zeros((*shape, *lanes), dtype=parameters.dtype)
 
     def along_lanes(leaf: Array) -> Array:
         return jnp.broadcast_to(leaf, tuple(lanes))
+
+    at = unstack(initial_state), jax.tree.map(lambda leaf: along_lanes(leaf[0]), rows.forcing), scalars
+    cut, panels = panels_of(advance, at, forcing_parameters, free=initial_state_is_free)
+    # NumPy, so that they are constants of the program.
+    parameter_tangents = tuple(np.eye(count, cut, dtype=parameters.dtype))
 
     def step(carry: _Carried, row: Rows) -> _Carried:
         sound = carry.shot.sound & _is_sound(carry.state)
@@ -223,35 +221,64 @@ def _linearised_shot(
 
         # The rates alone are cheaper to repeat.
         repeated = not lanes or state.attitude is None
-        shot = functools.partial(_linearised_sample, advance, row, (state, forcing, scalars), weights, sound)
-        following, push, cost, pull, squares = shot() if repeated else computed_once(sound, shot)
+        at, late = (state, forcing, scalars), carry.late
+        shot = functools.partial(_linearised_sample, advance, row, at, weights, sound, late is not None)
+        following, push, push_late, cost, pull, squares = shot() if repeated else computed_once(sound, shot)
         directions = [carry.tangent, parameter_tangents]
         if row.forcing_tangents is not None:
-            nothing, positions = zeros(unknowns), np.asarray(forcing_parameters)
+            nothing, positions = jnp.zeros((cut, *lanes), parameters.dtype), np.asarray(forcing_parameters)
             wide = jax.tree.map(lambda slope: nothing.at[positions].set(slope), row.forcing_tangents)
             directions.insert(1, wide)
 
         def pushed(*direction: Any) -> tuple[State, tuple[Lanes, ...]]:
             return push(*jax.tree.map(along_lanes, direction))
 
-        tangent, slopes = jax.vmap(pushed)(*directions)
-        gradient = carry.gradient - sum(p * s for p, s in zip(pull, slopes, strict=True))
-        information = tuple(
-            panel + sum((w * s[top:end])[:, None] * s[:end] for w, s in zip(squares, slopes, strict=True))
-            for panel, (top, end) in zip(carry.information, panels, strict=True)
-        )
-        return _Carried(following, tangent, Shot(carry.shot.cost + cost, sound), gradient, information)
+        tangent, *slopes = jax.vmap(pushed)(*directions)
+        if push_late is not None:
+            moved, more = jax.vmap(push_late)(late)
+            late, slopes = moved.translation, [*slopes, more]
 
-    tangents = np.reshape(start_tangents, (*start_tangents.shape, *(1 for _ in lanes)))
-    first = _Carried(
+        gradient = [g - sum(map(operator.mul, pull, s)) for g, s in zip(carry.gradient, slopes, strict=True)]
+        information = [
+            _added(blocks, panel, cut, squares, slopes) for panel, blocks in zip(panels, carry.panels, strict=True)
+        ]
+        return _Carried(following, tangent, late, Shot(carry.shot.cost + cost, sound), gradient, information)
+
+    last = _fold(step, _before(initial_state, count, cut, panels), rows, length)
+    information = tuple(jnp.concatenate(blocks, axis=1) for blocks in last.panels)
+    return Curvature(last.shot, jnp.concatenate(last.gradient), symmetric(information))
+
+
+def _before(initial_state: Float[Array, "size *lanes"], count: int, cut: int, panels: list[Panel]) -> _Carried:
+    """What is carried to the first sample: `count` parameters, and `cut` unknowns with a `tangent`."""
+    (size, *lanes), unknowns, dtype = initial_state.shape, panels[-1][1], initial_state.dtype
+    own = np.eye(size, unknowns, count, dtype=dtype).reshape(size, unknowns, *(1 for _ in lanes))
+    tangents = jnp.broadcast_to(own, (size, unknowns, *lanes))
+
+    def zeros(*shape: int) -> Array:
+        return jnp.zeros((*shape, *lanes), dtype=dtype)
+
+    def blocks(top: int, end: int) -> list[Array]:
+        return [zeros(end - top, width) for width in ([end] if top < cut else [cut, end - cut])]
+
+    return _Carried(
         state=unstack(initial_state),
-        tangent=unstack(jnp.broadcast_to(tangents, (size, unknowns, *lanes))),
+        tangent=unstack(tangents[:, :cut]),
+        late=unstack(tangents[:, cut:]).translation if cut < unknowns else None,
         shot=Shot(zeros(), jnp.ones(tuple(lanes), dtype=bool)),
-        gradient=zeros(unknowns),
-        information=tuple(zeros(end - top, end) for top, end in panels),
+        gradient=[zeros(width) for width in (cut, unknowns - cut) if width],
+        panels=[blocks(top, end) for top, end, _ in panels],
     )
-    last = _fold(step, first, rows, length)
-    return Curvature(last.shot, last.gradient, _symmetric(last.information))
+
+
+def _added(
+    blocks: list[Array], panel: Panel, cut: int, squares: list[Lanes], slopes: list[tuple[Array, ...]]
+) -> list[Array]:
+    """The rows of a panel with those of one sample."""
+    (top, end, outputs), late = panel, len(blocks) - 1
+    own = slice(top - cut * late, end - cut * late)
+    rows = [(i, (squares[i] * slopes[late][i][own])[:, None]) for i in outputs]
+    return [b + sum(row * s[i][: b.shape[1]] for i, row in rows) for b, s in zip(blocks, slopes, strict=False)]
 
 
 def _linearised_sample(
@@ -260,8 +287,12 @@ def _linearised_sample(
     at: tuple[State, Forcing, tuple[Lanes, ...]],
     weights: tuple[Lanes, ...],
     sound: Bool[Array, "*lanes"],
-) -> tuple[State, Callable, Lanes, list[Lanes], list[Lanes]]:
-    """The next state, the derivative of `advance`, the cost, and the weighted errors and squared weights."""
+    late: bool,
+) -> tuple[State, Callable, Callable | None, Lanes, list[Lanes], list[Lanes]]:
+    """The next state, the derivative of `advance`, the cost, and the weighted errors and squared weights.
+
+    If `late`, the second derivative is that in the translation alone.
+    """
     state, forcing, scalars = at
     if row.forcing_tangents is None:
         linear = jax.linearize(lambda state, scalars: advance(state, forcing, scalars), state, scalars)
@@ -271,16 +302,12 @@ def _linearised_sample(
     errors = _errors(row, predicted, weights, sound)
     known = [jnp.where(jnp.isnan(y) | ~sound, 0.0, w) for y, w in zip(row.measured, weights, strict=True)]
     pull = [w * e for w, e in zip(known, errors, strict=True)]
-    return following, push, _half_square(errors), pull, [w * w for w in known]
-
-
-def _symmetric(panels: tuple[Array, ...]) -> Float[Array, "unknowns unknowns *lanes"]:
-    """The symmetric matrix of which each panel holds some rows, without what lies right of the panel's square."""
-    size, lanes = panels[-1].shape[1], panels[0].ndim - 2
-    filled = [jnp.pad(panel, ((0, 0), (0, size - panel.shape[1]), *((0, 0),) * lanes)) for panel in panels]
-    lower = jnp.concatenate(filled)
-    below = np.tri(size, dtype=bool).reshape(size, size, *(1,) * lanes)
-    return jnp.where(below, lower, jnp.swapaxes(lower, 0, 1))
+    push_late = None
+    if late:
+        _, push_late = jax.linearize(
+            lambda t: advance(state._replace(translation=t), forcing, scalars), state.translation
+        )
+    return following, push, push_late, _half_square(errors), pull, [w * w for w in known]
 
 
 def _is_sound(state: State) -> Bool[Array, " *lanes"]:
