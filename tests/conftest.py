@@ -60,20 +60,20 @@ LONGEST = (
 )
 
 
-def together_with(module: str) -> tuple[str, ...]:
-    """The modules that share programs with a module, and itself."""
-    return next((group for group in TOGETHER if module in group), (module,))
-
-
-def name_of(path: str) -> str:
-    return pathlib.PurePath(path).stem.removeprefix("test_")
+def work_of(path: str) -> tuple[str, int]:
+    """The first of the modules that run together with that of a path, and its place among them."""
+    name = pathlib.PurePath(path).stem.removeprefix("test_")
+    return next(((group[0], group.index(name)) for group in TOGETHER if name in group), (name, 0))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sorts the modules. The order of the tests in a module does not change."""
-    order = [name for first in LONGEST for name in together_with(first)]
-    places = {name: place for place, name in enumerate(order)}
-    items.sort(key=lambda item: places.get(name_of(item.path.name), len(order)))
+
+    def place(item: pytest.Item) -> tuple[int, int]:
+        first, number = work_of(item.path.name)
+        return LONGEST.index(first) if first in LONGEST else len(LONGEST), number
+
+    items.sort(key=place)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -91,7 +91,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log):
 
     class Together(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return together_with(name_of(nodeid.partition("::")[0]))[0]
+            return work_of(nodeid.partition("::")[0])[0]
 
     config.option.loadscopereorder = False
     return Together(config, log)

@@ -11,7 +11,7 @@ import jaxos4
 
 HALF = jaxos4.DEFAULT_HALF_WIDTH
 LANES = 64
-FEW = 16  # of an estimator that computes for longer than it compiles
+FEW = 16  # of estimators that compute for long
 
 
 @eqx.filter_jit
@@ -44,6 +44,11 @@ def noisy(kind, model_class=jaxos4.PublishedOS4, channels="rates", free=False, s
 def _noisy(kind, model_class, channels, free, scale, count):
     states = noisy_states(count, model_class, seed=50, scale=scale)
     return identify(kind(), *lanes(states, model_class, channels, free=free, scale=scale))
+
+
+def count_of(name):
+    """The lanes of a batch for the estimator of this name."""
+    return FEW if name in ("filter-error", "ant-colony", "rls") else LANES
 
 
 @functools.cache

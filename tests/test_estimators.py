@@ -12,20 +12,7 @@ import numpy as np
 import optimistix
 import pytest
 from helpers import doublet_problem, how_we_compile, noisy_states, standard_flight, standard_problem
-from lanes import (
-    FEW,
-    HALF,
-    LANES,
-    assert_chi_square,
-    assert_nothing_invented,
-    bound,
-    errors,
-    identify,
-    lanes,
-    lost,
-    names,
-    noisy,
-)
+from lanes import HALF, assert_chi_square, assert_nothing_invented, bound, count_of, identify, lanes, lost, names, noisy
 
 import jaxos4
 from jaxos4.bracket import GAUSSIAN_PRIOR
@@ -33,28 +20,18 @@ from jaxos4.estimators import ESTIMATORS, make_estimator
 
 MODEL, P = jaxos4.PublishedOS4(), jaxos4.STATE_NAMES.index("p")
 NAMES = [name for name, kind in ESTIMATORS.items() if not kind.needs_network]
-SLOW = ("filter-error", "ant-colony")  # those that compute for longer than they compile
 
 
 @pytest.fixture(params=NAMES)
 def name(request):
     """Every estimator in turn."""
-    if request.param in SLOW:
+    if request.param in ("filter-error", "ant-colony"):  # they compute for long
         request.getfixturevalue("optimised")
     return request.param
 
 
-def count_of(name):
-    """The lanes of a batch."""
-    return FEW if name in (*SLOW, "rls") else LANES
-
-
 def found_by(name, scale=1.0):
     return noisy(ESTIMATORS[name], scale=scale, count=count_of(name))
-
-
-def flights_for(name):
-    return lanes(noisy_states(count_of(name), seed=50))
 
 
 def test_tiny_noise_gives_the_truth(name):
@@ -65,7 +42,7 @@ def test_tiny_noise_gives_the_truth(name):
 
 
 def test_loop_jit_and_vmap_agree(name):
-    batched, (problem, states, _, lower, upper) = found_by(name), flights_for(name)
+    batched, (problem, states, _, lower, upper) = found_by(name), lanes(noisy_states(count_of(name), seed=50))
     assert set(names(batched)) == {"successful"}
     for lane in range(2):
         data = eqx.tree_at(lambda p: p.flight.states, problem, states[lane])
@@ -78,7 +55,7 @@ def test_loop_jit_and_vmap_agree(name):
 
 
 def test_failing_lanes_leave_their_neighbours_alone(name):
-    problem, *arrays = flights_for(name)
+    problem, *arrays = lanes(noisy_states(count_of(name), seed=50))
     states, omega, lower, upper = (np.array(x) for x in arrays)
     failed, vague = np.arange(1, 16, 2), np.array([2, 4, 6])
     omega[1, 250, 2] = np.nan
@@ -120,7 +97,7 @@ def test_missing_samples_only_cost_precision(name):
     estimates = identify(make_estimator(name), *lanes(lost(noisy_states(count_of(name), seed=7))))
     assert set(names(estimates)) == {"successful"}
     assert (np.median(estimates.std, axis=0) > 1.05 * bound()).all()
-    assert_chi_square(errors(estimates), np.linalg.inv(estimates.covariance))
+    assert_chi_square(np.asarray(estimates.parameters - MODEL.alpha), np.linalg.inv(estimates.covariance))
 
 
 @pytest.mark.parametrize(
