@@ -29,8 +29,8 @@ from ..shooting.abstract import WindowUnknowns
 _DAMPING_FACTOR = 10.0  # how much more, or less, is damped after a step that failed, or succeeded
 # A search ends here too: steps with less than this damping failed, although they promised some of the gain.
 _STALLED, _FLAT = 1.0, 0.05
-# The share of a gain that counts if an unknown with a stride promises it: its gradient is approximate.
-_ROUGH = 0.1
+# The information that damps an unknown with a stride in any case, per squared stride: it misjudges the curvature there.
+_LEAST = 0.3
 _COARSE = 1e-3  # the tolerance of output error on the problems before the last
 
 
@@ -74,6 +74,11 @@ class Newton(NamedTuple):
         """The longest step of each unknown."""
         return self.problem.each_window(self.problem.unknowns.stride, jnp.inf)
 
+    @property
+    def least(self) -> WindowUnknowns:
+        """The information that damps each unknown in any case."""
+        return _LEAST / jnp.square(self.stride)
+
     def minimum(self, start: WindowUnknowns, max_steps: Count) -> Search:
         """The best unknowns after at most `max_steps` steps from the start."""
         problem, count = self.problem, self.problem.unknowns.count
@@ -109,11 +114,10 @@ class Newton(NamedTuple):
         """Whether a step ends the search."""
         if self.scale is not None:
             return (jnp.abs(step) <= self.tolerance * self.scale).all()
-        unit, least = self._unit(curvature.information), 1 / jnp.square(self.stride)
+        unit = self._unit(curvature.information)
         # By how much the step should lower the cost, as if it were hardly damped.
-        eased = (jnp.maximum(damping, 1.0) * unit + least) / (unit + least)
-        counts = jnp.where(jnp.isfinite(self.stride), _ROUGH, 1.0)
-        left = -(counts * eased * curvature.gradient * step).sum()
+        eased = (jnp.maximum(damping, 1.0) * unit + self.least) / (unit + self.least)
+        left = -(eased * curvature.gradient * step).sum()
         return (left < self.gain) | ((damping > _STALLED) & (left < _FLAT))
 
     def _step(self, best: WindowUnknowns, curvature: Curvature, damping: Scalar) -> WindowUnknowns:
@@ -122,8 +126,7 @@ class Newton(NamedTuple):
         moves = movable(best, curvature.gradient, self.problem.limits(REACH), count)
         moves = moves.at[:, :count].set(moves[:, :count] & free)
         information = jnp.where(moves[:, :, None] & moves[:, None, :], curvature.information, 0.0)
-        # The information misjudges the curvature along an unknown with a stride: damp it in any case.
-        added = damping * self._unit(information) + 1 / jnp.square(self.stride)
+        added = damping * self._unit(information) + self.least
         basis = joint_factor(information + jax.vmap(jnp.diag)(added), count).basis
         slopes = slopes_along(basis, jnp.where(moves, curvature.gradient, 0.0), count)
         return -(basis * slopes[:, None, :]).sum(axis=-1)
@@ -201,7 +204,7 @@ class FilterError(AbstractEstimator):
     **Arguments:**
 
     - `tolerance`: the search ends with a step that promises to lower the cost by less. An error of one standard
-      deviation costs 0.5. A promise of the noise levels counts a tenth.
+      deviation costs 0.5.
     - `max_steps`: of the search from one time constant of the disturbance.
     """
 
