@@ -1,13 +1,13 @@
-"""Traced programs are kept in files, so that the next process does not trace them again.
+"""Traced programs are kept in files, so that the next command does not trace them again.
 
 JAX keeps compiled programs, and finds one by its traced program. To trace takes longer than to read what is compiled.
-So the traced program is exported to the same folder. The name of its file is a digest of all that tracing depends on:
-the function, the shapes and static values of its arguments, the sources of `jaxos4`, the installed packages and JAX's
-settings. Nothing is kept unless JAX keeps compiled programs (`jax_compilation_cache_dir`).
+So the traced program is exported to the same folder. The name of its file is a digest of the function, the shapes and
+static values of its arguments, the sources of `jaxos4`, the installed packages and JAX's settings. This is enough for a
+command, which runs no other code. It is not enough for a program of the user, who may add a term to a table, or switch
+a setting in a part of the program: so only the command line keeps programs, see `keep_programs`.
 """
 
 import contextlib
-import functools
 import hashlib
 import io
 import os
@@ -22,6 +22,12 @@ from typing import Any
 _KNOWN = {"jaxos4", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "optax", "numpy", "builtins"}
 
 _programs: dict[str, Callable[..., Any] | None] = {}
+_surroundings: list[bytes] = []  # what every program of this process depends on; empty: nothing is kept
+
+
+def keep_programs() -> None:
+    """Keeps traced programs from now on, if JAX keeps compiled ones. Call it when all settings of JAX are chosen."""
+    _surroundings[:] = [_describe_surroundings()]
 
 
 def kept_program(
@@ -34,15 +40,16 @@ def kept_program(
     settings = jax.config.values
     folder = settings["jax_compilation_cache_dir"]
     on = folder and settings["jax_enable_compilation_cache"] and jax.device_count() == 1
-    if not on or not _is_known(function):
+    searches_errors = settings["jax_disable_jit"] or settings["jax_debug_nans"]  # in each operation of a function
+    if not _surroundings or not on or searches_errors or not _is_known(function):
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
     shapes = [_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
     try:
         description = _described((function.__module__, function.__qualname__, options, shapes, tree))
-    except (pickle.PicklingError, AttributeError, TypeError):
+    except (pickle.PicklingError, AttributeError, TypeError, ValueError):
         return None
-    name = hashlib.sha256(_surroundings() + description).hexdigest()
+    name = hashlib.sha256(_surroundings[0] + description).hexdigest()
     if name not in _programs:
         path, arrays = Path(folder) / f"jaxos4-{name}", [leaf for leaf in leaves if eqx.is_array(leaf)]
         content = _read(path) or _write(path, function, args, kwargs)
@@ -91,9 +98,8 @@ def _described(value: Any) -> bytes:
         return file.getvalue()
 
 
-@functools.cache
-def _surroundings() -> bytes:
-    """What the tracing of every program depends on. A source is known by size and time, as in Python's own cache."""
+def _describe_surroundings() -> bytes:
+    """Sources, packages and settings. A source is known by size and time, as in Python's own cache."""
     import jax
 
     sources = [(str(path), path.stat()) for path in sorted(Path(__file__).parent.rglob("*.py"))]
@@ -134,10 +140,11 @@ def _write(path: Path, function: Callable[..., Any], args: Any, kwargs: Any) -> 
         results.append(jax.tree.unflatten(shape, range(len(values))))
         return values
 
+    of_arrays.__name__ = function.__name__  # in profiles and logs
     try:
         traced = jax.export.export(jax.jit(of_arrays))(*leaves)
         content = pickle.dumps((results[0], bytes(traced.serialize())))
-    except (NotImplementedError, ValueError, pickle.PicklingError, AttributeError):
+    except (NotImplementedError, ValueError, TypeError, pickle.PicklingError, AttributeError):
         return None
     temporary = path.with_name(f".{secrets.token_hex(8)}.part")
     with contextlib.suppress(OSError):

@@ -212,6 +212,7 @@ def programs_are_kept(tmp_path):
 
 @pytest.mark.usefixtures("programs_are_kept")
 def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known(tmp_path, monkeypatch):
+    monkeypatch.setattr(_programs, "_surroundings", [b"this process"])
     function, one, other = _default.__wrapped__, jaxos4.PublishedOS4(jaxos4.OS4), jaxos4.PublishedOS4(jaxos4.VOOS)
 
     def kept(*args, function=function):
@@ -232,7 +233,7 @@ def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known
     # Another static value, and other sources, are other programs.
     kept(jaxos4.CorrectedOS4(jaxos4.OS4))
     with monkeypatch.context() as patch:
-        patch.setattr(_programs, "_surroundings", lambda: b"changed")
+        patch.setattr(_programs, "_surroundings", [b"changed"])
         kept(one)
     assert len(files()) == 3
     # A damaged file is written again.
@@ -244,6 +245,9 @@ def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known
     assert kept(1.0, function=lambda x: x) is None
     assert kept(np.ones(1), function=_shape) is None  # its results are no arrays
     assert len(files()) == 3
+    with monkeypatch.context() as patch:
+        patch.setattr(_programs, "_surroundings", [])  # not the command line
+        assert kept(one) is None
     jax.config.update("jax_compilation_cache_dir", None)
     assert kept(one) is None
 

@@ -6,6 +6,8 @@ import tempfile
 import warnings
 from pathlib import Path
 
+from .._programs import keep_programs
+
 NO_CACHE = "JAXOS4_NO_CACHE"
 """The environment variable that switches off the cache of compiled programs."""
 
@@ -32,6 +34,7 @@ def prepare() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
     # Another process may be writing the same program, or remove it: it is then compiled again.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+    keep_programs()
 
 
 def rarely_collect_garbage() -> None:
