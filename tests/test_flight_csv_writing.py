@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import same
-from hypothesis import given, settings, strategies as st
+from hypothesis import example, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from test_flight_csv import csv, read_flight_and_notes
 
@@ -49,6 +49,7 @@ def folder(tmp_path_factory):
 
 
 @given(flight=flights())
+@example(flight=Flight(np.arange(2) / 64, np.zeros((2, 4)), np.full((2, 12), -0.0)))
 @settings(max_examples=150)
 def test_reading_gives_back_every_bit(flight, folder):
     path = folder / "flight.csv"

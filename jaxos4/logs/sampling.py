@@ -212,7 +212,8 @@ def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Res
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:
     """Remove the jumps of 2 pi from an angle [rad], and count them. Values before the first jump do not change."""
     measured, unwrapped = np.isfinite(angle), angle.copy()
-    unwrapped[measured] = np.unwrap(angle[measured])
+    without_turns = np.unwrap(angle[measured])
+    unwrapped[measured] = np.where(without_turns == angle[measured], angle[measured], without_turns)  # keeps -0.0
     return unwrapped, int(np.count_nonzero(np.abs(np.diff(angle[measured])) > math.pi))
 
 
