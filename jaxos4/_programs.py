@@ -12,11 +12,12 @@ import hashlib
 import io
 import os
 import pickle  # noqa: TID251 - what it reads lies beside machine code, which JAX reads
-import secrets
 import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from ._files import write_file
 
 # Packages whose code the digest knows. A program that depends on a class or function of another package is not kept.
 _KNOWN = {"jaxos4", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "optax", "numpy", "builtins"}
@@ -26,22 +27,28 @@ _surroundings: list[bytes] = []  # what every program of this process depends on
 
 
 def keep_programs() -> None:
-    """Keeps traced programs from now on, if JAX keeps compiled ones. Call it when all settings of JAX are chosen."""
-    _surroundings[:] = [_describe_surroundings()]
+    """Keeps traced programs from now on, if JAX keeps compiled ones. Call it when all settings of JAX are chosen.
+
+    Nothing is kept if JAX looks for errors in each operation, which a kept program does not show.
+    """
+    import jax
+
+    settings = jax.config.values
+    if settings["jax_enable_compilation_cache"] and not (settings["jax_disable_jit"] or settings["jax_debug_nans"]):
+        _surroundings[:] = [_describe_surroundings()]
 
 
 def kept_program(
     function: Callable[..., Any], options: dict[str, Any], args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Callable[..., Any] | None:
     """The compiled program of a function for such arguments, to be called with them. `None` if it cannot be kept."""
+    if not _surroundings:
+        return None
     import equinox as eqx
     import jax
 
-    settings = jax.config.values
-    folder = settings["jax_compilation_cache_dir"]
-    on = folder and settings["jax_enable_compilation_cache"] and jax.device_count() == 1
-    searches_errors = settings["jax_disable_jit"] or settings["jax_debug_nans"]  # in each operation of a function
-    if not _surroundings or not on or searches_errors or not _is_known(function):
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    if not folder or jax.device_count() > 1 or not _is_known(function):
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
     shapes = [_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
@@ -105,7 +112,7 @@ def _describe_surroundings() -> bytes:
     sources = [(str(path), path.stat()) for path in sorted(Path(__file__).parent.rglob("*.py"))]
     sizes = [(path, status.st_size, status.st_mtime_ns) for path, status in sources]
     packages = sorted(os.listdir(Path(jax.__file__).parents[1]))  # with their versions
-    return repr((sizes, packages, sorted(jax.config.values.items()), jax.default_backend())).encode()
+    return repr((sizes, packages, sorted(jax.config.values.items()))).encode()
 
 
 def _read(path: Path) -> tuple[Any, Any] | None:
@@ -136,7 +143,7 @@ def _write(path: Path, function: Callable[..., Any], args: Any, kwargs: Any) -> 
         args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
         values, shape = jax.tree.flatten(function(*args, **kwargs))
         if not all(map(eqx.is_array, values)):
-            raise NotImplementedError("a result is no array")
+            raise TypeError("a result is no array")
         results.append(jax.tree.unflatten(shape, range(len(values))))
         return values
 
@@ -146,8 +153,6 @@ def _write(path: Path, function: Callable[..., Any], args: Any, kwargs: Any) -> 
         content = pickle.dumps((results[0], bytes(traced.serialize())))
     except (NotImplementedError, ValueError, TypeError, pickle.PicklingError, AttributeError):
         return None
-    temporary = path.with_name(f".{secrets.token_hex(8)}.part")
     with contextlib.suppress(OSError):
-        temporary.write_bytes(hashlib.sha256(content).digest() + content)
-        temporary.replace(path)
+        write_file(path, hashlib.sha256(content).digest() + content)
     return traced, results[0]

@@ -16,7 +16,7 @@ from lanes import LANES, assert_chi_square, bound, errors, identify, lanes, name
 
 import jaxos4
 from jaxos4.estimators import FilterError
-from jaxos4.models.state import CASCADE_ORDER
+from jaxos4.flight import RATES
 from jaxos4.shooting import InnovationsProblem, pad_flight
 from jaxos4.shooting.filters import BLOCK
 from jaxos4.shooting.gains import LogNoise, Observed, gains_of
@@ -24,7 +24,6 @@ from jaxos4.shooting.innovations import SETTLING
 from jaxos4.shooting.segments import Segments
 
 MODEL = jaxos4.PublishedOS4()
-RATES = CASCADE_ORDER[:3]
 # Without gyroscopic torques a disturbed rate changes no other channel.
 UNCOUPLED = jnp.array([0.0, 0.0, 133.0, 0.0, 0.0, 133.0, 0.0, 77.0])
 NOISE = LogNoise(*(jnp.log(jnp.array(x)) for x in ([4.0, 2.0, 1.0], [0.2, 0.05, 1.0], [0.02, 0.01, 0.03])))

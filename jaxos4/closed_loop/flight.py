@@ -18,7 +18,8 @@ from ..models.state import Attitude, Forcing, Rates, Vector, attitude_rates
 from ..noise import coloured
 from ..simulation import rk4_step
 from ..trigonometry import sincos
-from .settings import ClosedLoop, Motion, PerAxis, Sense, Signals, log
+from .sensors import Motion, Sense, Signals, log
+from .settings import ClosedLoop, PerAxis
 
 References = Float[Array, "samples 4"]
 
@@ -102,10 +103,10 @@ def fly_standard(
 
 
 class _Acting(NamedTuple):
-    """What acts on the vehicle for a step.
+    """Rotors, gusts and wind during a step.
 
-    The rotors and Omega_r' [rad/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind along the
-    body's axes [m/s].
+    Forcing by the rotors and Omega_r' [rad/s^2], gusts of p', q', r' [rad/s^2] and the vertical force [m/s^2], and wind
+    along the body's axes [m/s].
     """
 
     rotors: Forcing

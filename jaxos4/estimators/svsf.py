@@ -160,7 +160,7 @@ class SVSF(AbstractRecursion):
         following = advance(rates, parameters)
         by_rates, by_parameters = jax.jacfwd(advance, argnums=(0, 1))(rates, parameters)
         remembered = jnp.where(valid, 1 - rate_gain, 1.0)[:, None] * influence
-        influence = by_parameters + (_product(by_rates, remembered))
+        influence = by_parameters + _product(by_rates, remembered)
 
         # Errors and noise pass through the slope of each correction.
         correct_rates = jnp.diag(jnp.where(valid, rate_slope, 0.0))

@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._custom_types import Count, Numeric, Scalar
 from .._xla import quick_jit
 from ..analysis.prediction import filtered
-from ..flight import STATE_NAMES, Flight
-from ..models.state import CASCADE_ORDER, Forcing, Rates, State
+from ..flight import RATES, STATE_NAMES, Flight
+from ..models.state import Forcing, Rates, State
 from ..models.vehicle import FlightModel
 from ..shooting import FASTEST
 from ..shooting.gains import Covariance, LogNoise, first_covariance, next_gains, step_of, transition
@@ -223,7 +223,7 @@ def known_at_samples(
     - `noise`: of the filters. `prior`: the standard deviation of each offset before the flight.
     """
     state, accelerations, velocity_noise = measured
-    rates, inputs = flight.states[:, CASCADE_ORDER[:3]], flight.inputs._replace(length=length)
+    rates, inputs = flight.states[:, RATES], flight.inputs._replace(length=length)
     middle = jnp.nan_to_num((rates + jnp.roll(rates, -1, axis=0)) / 2)
     kept = jnp.exp(-flight.dt / _MEMORY)
     sensor = jnp.concatenate([jnp.exp(noise.sensor[:3]), velocity_noise])

@@ -58,9 +58,9 @@ def vehicle_of(found: Identification | str | os.PathLike[str]) -> Vehicle:
     **Raises:** `InputError`, one line, if the result has no vehicle or no estimate; `OSError` if it cannot be read.
     """
     file = ResultFile.of(found)
-    own = f"{file.estimator}, {file.model} model"
-    name, place = (own, "") if isinstance(found, Identification) else (Path(found).name, found)
-    with named(place):
+    given = isinstance(found, Identification)
+    name = f"{file.estimator}, {file.model} model" if given else Path(found).name
+    with named("" if given else found):
         used, airframe = file.provenance, airframe_from_table(file.airframe or {})
         if strangers := [term for term in used.terms or () if term not in TERMS]:
             raise InputError(f"the term {strangers[0][:40]} is not of this version; run `jaxos4 estimate` again.")

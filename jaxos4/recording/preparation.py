@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ..airframe import Airframe
 from ..errors import InputError, named
-from ..flight import STATE_NAMES, Flight
+from ..flight import RATES, STATE_NAMES, Flight
 from ..models.state import CASCADE_ORDER
 from ..models.terms import COMMANDS, FULL_SCALE, LATERAL_FORCE, MEASURED_VELOCITY, VELOCITY, VERTICAL_FORCE, VOLTAGE
 from .motion import opposite_axes, refused_note, yaw_doubt
@@ -102,7 +102,7 @@ def prepare(
     for number, recording in enumerate(recordings):
         if any(recording.same_data(earlier) for earlier in recordings[:number]):
             raise InputError(f"{recording.name}: given twice; give each log once.")
-        if np.isnan(recording.states[:, CASCADE_ORDER[:3]]).all(axis=0).any():
+        if np.isnan(recording.states[:, RATES]).all(axis=0).any():
             raise InputError(f"{recording.name}: a vehicle model needs p, q and r; log the gyro.")
         slow = (recording.facts._replace(gyro=None) if predicted else recording.facts).too_slow
         pieces, note = _usable_parts(recording, airframe, begin, end, slow, predicted)

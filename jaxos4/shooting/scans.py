@@ -250,7 +250,7 @@ def _linearised_shot(
 
 
 def _before(initial_state: Float[Array, "size *lanes"], count: int, cut: int, panels: list[Panel]) -> _Carried:
-    """What is carried to the first sample: `count` parameters, and `cut` unknowns with a `tangent`."""
+    """The carry before the first sample, for `count` parameters, and `cut` unknowns with a `tangent`."""
     (size, *lanes), unknowns, dtype = initial_state.shape, panels[-1][1], initial_state.dtype
     own = np.eye(size, unknowns, count, dtype=dtype).reshape(size, unknowns, *(1 for _ in lanes))
     tangents = jnp.broadcast_to(own, (size, unknowns, *lanes))
