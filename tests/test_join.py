@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 
 import jaxos4
 from jaxos4.errors import InputError
-from jaxos4.logs.sampling import average
+from jaxos4.logs.sampling import averages
 from jaxos4.recording import Recording
 from jaxos4.recording.pieces import as_recording, averaged, cut
 from jaxos4.recording.usable import Stretch
@@ -67,10 +67,10 @@ def test_velocity_and_voltage_are_kept_if_every_stretch_has_them_and_averaged_an
     else:
         assert joined is None
     flight = Recording.of(stretch(401, 0, voltage=True, dt=0.001))
-    coarse = averaged(flight, 0.004)
+    (coarse,) = averaged(flight, [0.004])
     expected = averaged_slowly(flight.time, flight.voltage[:, None], np.asarray(coarse.time), 0.004)[:, 0]
     np.testing.assert_allclose(coarse.voltage, expected, rtol=1e-9)
-    assert averaged(flight._replace(voltage=None), 0.004).voltage is None
+    assert averaged(flight._replace(voltage=None), [0.004])[0].voltage is None
     np.testing.assert_array_equal(cut(flight, Stretch(0.1, 0.2)).voltage, flight.voltage[100:201])
 
 
@@ -112,7 +112,7 @@ def test_averages_are_means_over_the_sample(ratio, lost):
     rng, t, dt = np.random.default_rng(0), 3.0 + 0.001 * np.arange(83), 0.001 * ratio
     channels = np.cumsum(rng.normal(size=(83, 3)), axis=0)
     channels[rng.uniform(size=channels.shape) < lost] = np.nan
-    grid, _, found = average(t, rng.uniform(100, 300, (83, 4)), channels, dt)
+    grid, _, found = averages(t, rng.uniform(100, 300, (83, 4)), channels)(dt)
     np.testing.assert_allclose(grid, t[0] + dt * np.arange(grid.size), rtol=1e-12)
     assert grid[-1] <= t[-1] + 1e-6 < grid[-1] + dt + 1e-6
     np.testing.assert_allclose(found, averaged_slowly(t, channels, grid, dt), rtol=1e-9, atol=1e-9)

@@ -108,7 +108,7 @@ def test_impulse_is_conserved_whatever_the_rates(seed, measured):
     t = np.cumsum(rng.uniform(0.001, 0.1, 60))
     rows = np.sort(rng.uniform(t[0], t[-1], 40))
     values = rng.uniform(0, 900, (60, 4))
-    got = root_mean_square(Series(t, values), rows, linear=measured)
+    got = root_mean_square(Series(t, values), linear=measured)(rows)
     fine = np.linspace(rows[0], rows[-1], 400_001)
     held = values[np.searchsorted(t, fine, side="right") - 1] ** 2
     if measured:

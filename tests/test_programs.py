@@ -5,6 +5,7 @@
 
 import functools
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ import pytest
 from helpers import compiled_programs, curvatures, first_state, noisy_states, standard_flight, standard_problem
 
 import jaxos4
-from jaxos4.shooting import padded
+from jaxos4.shooting import for_threads, padded
 from jaxos4.simulation import METHODS
 
 # The search, the simulation with all derivatives, the default bracket, the intervals, a comparison of result codes.
@@ -80,6 +81,13 @@ def test_a_batch_is_the_same_on_any_number_of_cores_by_one_program(monkeypatch):
     np.testing.assert_array_equal(*found)
     alone = [identify(states[i], problem, jnp.negative) for i in (0, 100, 149)]
     np.testing.assert_allclose(found[0][np.array([0, 100, 149])], alone, rtol=1e-9)
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_another_thread_has_the_precision_of_its_caller(double):
+    with jax.enable_x64(double), ThreadPoolExecutor(1) as other:
+        kind = other.submit(for_threads(lambda: jnp.zeros(()).dtype)).result()
+    assert kind == (jnp.float64 if double else jnp.float32)
 
 
 @pytest.mark.parametrize("channels", ["rates", "all"])

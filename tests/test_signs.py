@@ -81,7 +81,7 @@ def test_a_fit_is_refused_with_the_remedy_unless_the_vehicle_does_not_turn():
     assert (prepared.windows > 0, prepared.doubts) == (True, ())
     still = recording._replace(states=0.001 * recording.states)
     assert opposite_axes([still], turned(CRAZYFLIE, "rotor_spins")) == opposite_axes([], CRAZYFLIE) == []
-    brief = cut(averaged(recording, 0.02), Stretch(0.0, 1.5))  # too short for signals from 2 Hz on
+    brief = cut(averaged(recording, [0.02])[0], Stretch(0.0, 1.5))  # too short for signals from 2 Hz on
     assert opposite_axes([brief], turned(CRAZYFLIE, "rotor_spins")) == []
     assert (refused_note({}), yaw_doubt({})) == ("", None)
 

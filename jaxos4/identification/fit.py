@@ -82,10 +82,12 @@ class Fit(NamedTuple):
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.held]
 
 
-def fit_case(case: Case, *, progress: Progress = lambda stage: None) -> Fit:
-    """The fit of a prepared case, by its likelihood."""
+def fit_case(case: Case, *, first: Estimate | None = None, progress: Progress = lambda stage: None) -> Fit:
+    """The fit of a prepared case, by its likelihood. `first`: see `fit_innovations`."""
     if isinstance(case.problem, InnovationsProblem):
-        return fit_innovations(case.estimator, case.problem, case.recording, shooting=case.shooting, progress=progress)
+        return fit_innovations(
+            case.estimator, case.problem, case.recording, shooting=case.shooting, first=first, progress=progress
+        )
     return fit_flight(case.estimator, case.problem, progress=progress)
 
 
@@ -137,6 +139,7 @@ def fit_innovations(
     recording: np.ndarray,
     *,
     shooting: ShootingProblem | None = None,
+    first: Estimate | None = None,
     progress: Progress = lambda stage: None,
 ) -> Fit:
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
@@ -149,9 +152,10 @@ def fit_innovations(
 
     - `recording`: the number of the recording of each sample.
     - `shooting`: the flight and its model, if that of the problem is padded.
+    - `first`: the estimate of all parameters, if it was computed before.
     """
     own, names = problem.problem.unknowns, problem.model.parameter_names
-    problem, found, rollouts, notes, negative = _searched(estimator, problem, progress)
+    problem, found, rollouts, notes, negative = _searched(estimator, problem, first, progress)
     progress("computing errors")
     values, std = np.asarray(found.parameters), _std(found)[: own.count]
     noise = problem.noise(values)
@@ -184,7 +188,7 @@ def fit_innovations(
 
 
 def _searched(
-    estimator: AbstractEstimator, problem: InnovationsProblem, progress: Progress
+    estimator: AbstractEstimator, problem: InnovationsProblem, first: Estimate | None, progress: Progress
 ) -> tuple[InnovationsProblem, Estimate, int, dict[str, str], dict[str, tuple[float, float]]]:
     """The problem with some parameters held at values that the flights do not contradict, and its estimate.
 
@@ -202,8 +206,10 @@ def _searched(
     def holding(values: dict[str, float]) -> InnovationsProblem:
         return problem.hold({name: np.asarray(value) for name, value in values.items()}).starting_from(found.parameters)
 
-    progress("compiling, and fitting parameters and disturbances")
-    found, fixed, negative = search(problem), {}, {}
+    if first is None:
+        progress("compiling, and fitting parameters and disturbances")
+        first = search(problem)
+    found, fixed, negative = first, {}, {}
     if has_answer(found):
         rows = _with_values(table, found)
         negative = {row.name: (x, std) for row, x, std in rows if row.nonnegative and x < -_NEGATIVE * std}

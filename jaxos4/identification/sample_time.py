@@ -12,17 +12,18 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
 import numpy as np
 
 from ..airframe import Airframe
-from ..estimate import REACH
+from ..estimate import REACH, Estimate
 from ..flight import Flight
-from ..shooting import InnovationsProblem
+from ..shooting import InnovationsProblem, for_threads
 from .answers import AXES, NOISY, overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
 from .held_out import compile_ahead
 from .prepare import Case, Progress
-from .results import Constant, SampleTime
+from .results import Constant, SampleTime, has_answer
 
 # The limit of a correlation of white innovations: the first number plus so many standard errors. The largest of 24
 # correlations (3 rates, 8 lags) is compared.
@@ -36,26 +37,37 @@ _NEAR = 0.95
 def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[int, Fit, tuple[SampleTime, ...]]:
     """The place of the case that the rule chooses, its fit, and the answers of all.
 
+    The search for all parameters starts at that of the sample time before. What the flights do not show is held beside
+    it, in another thread.
+
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
-    fits: list[Fit] = []
+    found, fits = None, []
     with ThreadPoolExecutor(1) as beside:
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            if fits and fits[0].answered and isinstance(case.problem, InnovationsProblem):
-                own, found = case.problem.problem.unknowns, np.asarray(fits[0].estimate.parameters)
-                off = np.abs(found[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
-                if not (off < _NEAR * REACH).all():
-                    # The answer may be another minimum. Only the noise starts at that of the last answer.
-                    found = np.where(np.arange(found.size) >= own.count, found, np.nan)
-                case = case._replace(problem=case.problem.starting_from(found))
-            fits.insert(0, fit_case(case))
-            if len(fits) == 1:
-                beside.submit(compile_ahead, case)
+            case = case if found is None else starting_from(case, found)
+            found = jax.block_until_ready(case.estimator(case.problem))
+            if not fits:
+                beside.submit(for_threads(compile_ahead), case)
+            fits.insert(0, beside.submit(for_threads(fit_case), case, first=found))
+    fits = [fit.result() for fit in fits]
     finest = cases[0].shooting.flight
     answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
+
+
+def starting_from(case: Case, found: Estimate) -> Case:
+    """The case, whose search starts at the answer for another sample time, if there is one."""
+    if not has_answer(found) or not isinstance(case.problem, InnovationsProblem):
+        return case
+    own, start = case.problem.problem.unknowns, np.asarray(found.parameters)
+    off = np.abs(start[: own.count] - np.asarray(own.center)) / np.asarray(own.half_width)
+    if not (off < _NEAR * REACH).all():
+        # The answer may be another minimum. Only the noise starts at that of the last answer.
+        start = np.where(np.arange(start.size) >= own.count, start, np.nan)
+    return case._replace(problem=case.problem.starting_from(start))
 
 
 def shortest(answers: Sequence[SampleTime]) -> int:

@@ -124,19 +124,29 @@ def _header(path: Path, line: str, known: Collection[str], row: int) -> list[str
 
 def _plain_numbers(lines: list[str], width: int, missing: Collection[str]) -> np.ndarray | None:
     """The numbers in lines without a fault, all at once; NaN for cells without a number. `None` for any other lines."""
-    text = "\n" + "".join(lines).replace(", ", ",").rstrip("\n") + "\n"
+    text = "".join(lines)
+    if " " in text:  # to look for one character is fast
+        text = text.replace(", ", ",")
     for cell in missing:
-        text = re.sub(rf"(?<=[,\n]){re.escape(cell)}(?=[,\n])", "", text)
-    too_long = len(max(lines, key=len)) >= _LONGEST_LINE - 1
-    if too_long or text.translate(_IN_NUMBERS) or "\n\n" in text:
+        text = re.sub(rf"(^|(?<=,)){re.escape(cell)}(?=,|$)", "", text, flags=re.MULTILINE)
+    if text.isspace() or len(max(lines, key=len)) >= _LONGEST_LINE - 1 or text.translate(_IN_NUMBERS):
         return None
-    for empty, filled in _FILLED:
-        text = text.replace(empty, filled)
     try:
-        numbers = np.loadtxt(text[1:].splitlines(), delimiter=",", comments=None, ndmin=2)
-    except ValueError:
-        return None
+        numbers = _array(text)
+    except ValueError:  # some cells are empty
+        text = f"\n{text}\n"
+        for empty, filled in _FILLED:
+            text = text.replace(empty, filled)
+        try:
+            numbers = _array(text)
+        except ValueError:
+            return None
     return numbers if numbers.shape == (len(lines), width) and not np.isinf(numbers).any() else None
+
+
+def _array(text: str) -> np.ndarray:
+    """The numbers in lines that are not blank."""
+    return np.loadtxt(text.splitlines(), delimiter=",", comments=None, ndmin=2)
 
 
 def _rows(path: Path, block: list[str], rest: Iterable[str], width: int, row: int) -> Iterator[tuple[list[str], int]]:

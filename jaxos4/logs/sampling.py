@@ -1,7 +1,7 @@
 """Samples at any times, brought to other times: integrals, means, interpolation. Gaps stay unmeasured (NaN)."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -33,8 +33,8 @@ class Series(NamedTuple):
     values: Columns
 
 
-def integral(series: Series, at: Float[np.ndarray, " n"], *, linear: bool = False) -> Float[np.ndarray, "n columns"]:
-    """The integral of each column from the first sample to the times `at`. Before the first sample it is 0.
+def integral(series: Series, *, linear: bool = False) -> Callable[[Times], Columns]:
+    """The integral of each column from the first sample, as a function of the time. Before the first sample it is 0.
 
     A value is held until the next one, and the last one for ever. If `linear`, values are interpolated instead.
     """
@@ -42,50 +42,66 @@ def integral(series: Series, at: Float[np.ndarray, " n"], *, linear: bool = Fals
     mean = (values[:-1] + values[1:]) / 2 if linear else values[:-1]
     total = np.zeros_like(values, dtype=float)
     np.cumsum(mean * np.diff(t)[:, None], axis=0, out=total[1:])
-    left = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
-    after = np.maximum(at - t[left], 0)[:, None]
-    value = values[left]
-    if linear:
-        right = np.minimum(left + 1, t.size - 1)
-        width = np.where(right > left, t[right] - t[left], 1.0)[:, None]
-        value = value + (values[right] - value) / width * after / 2
-    return total[left] + value * after
+
+    def until(at: Times) -> Columns:
+        left = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
+        after = np.maximum(at - t[left], 0)[:, None]
+        value = values[left]
+        if linear:
+            right = np.minimum(left + 1, t.size - 1)
+            width = np.where(right > left, t[right] - t[left], 1.0)[:, None]
+            value = value + (values[right] - value) / width * after / 2
+        return total[left] + value * after
+
+    return until
 
 
-def root_mean_square(series: Series, rows: Rows, *, linear: bool = False) -> Float[np.ndarray, "rows columns"]:
+def root_mean_square(series: Series, *, linear: bool = False) -> Callable[[Rows], Columns]:
     """Root mean square of each rotor's speed or command from each row to the next, so that its impulse is conserved.
 
     Thrust and torque are proportional to the square. Speeds are held until the next sample; if `linear`, their squares
-    are interpolated. The last row has the speed at that time. No row lies before the first sample.
+    are interpolated. The last row has the speed at that time. The rows are times; none lies before the first sample.
     """
     squares = Series(series.t, np.square(series.values))
-    last = np.searchsorted(series.t, rows[-1], side="right") - 1
-    out = np.empty((rows.size, squares.values.shape[1]))
-    out[:-1] = np.diff(integral(squares, rows, linear=linear), axis=0) / np.diff(rows)[:, None]
-    out[-1] = [np.interp(rows[-1], series.t, column) for column in squares.values.T] if linear else squares.values[last]
-    return np.sqrt(np.maximum(out, 0.0))
+    impulse = integral(squares, linear=linear)
+
+    def at(rows: Rows) -> Columns:
+        last = np.searchsorted(series.t, rows[-1], side="right") - 1
+        out = np.empty((rows.size, squares.values.shape[1]))
+        out[:-1] = np.diff(impulse(rows), axis=0) / np.diff(rows)[:, None]
+        out[-1] = squares.values[last]
+        if linear:
+            out[-1] = [np.interp(rows[-1], series.t, column) for column in squares.values.T]
+        return np.sqrt(np.maximum(out, 0.0))
+
+    return at
 
 
-def average(t: Times, omega: Rotors, channels: Columns, dt: float) -> Resampled:
-    """Average uniformly sampled rows to longer samples of `dt` [s], from the first time on.
+def averages(t: Times, omega: Rotors, channels: Columns) -> Callable[[float], Resampled]:
+    """Uniformly sampled rows, averaged to longer samples: a function of their length [s], from the first time on.
 
-    Each measurement becomes the mean over `dt` around its time, which removes vibration above the new rate without a
-    delay. It is missing (NaN) if less than about half of that time was measured. Each rotor speed becomes the root mean
-    square over the sample that follows. `t`: times [s]; `omega`: rotor speeds [rad/s].
+    Each measurement becomes the mean over a sample around its time, which removes vibration above the new rate without
+    a delay. It is missing (NaN) if less than about half of that time was measured. Each rotor speed becomes the root
+    mean square over the sample that follows. `t`: times [s]; `omega`: rotor speeds [rad/s].
     """
     own = (t[-1] - t[0]) / (t.size - 1)
-    grid = _grid(t, dt)
-    means, any_measured = np.full((grid.size, channels.shape[1]), np.nan), np.isfinite(channels).any(axis=0)
-    channels = channels[:, any_measured]
     measured = np.isfinite(channels)
-    edges = np.minimum(np.append(grid - dt / 2, grid[-1] + dt / 2), t[-1] + own / 2)
-    total, share = (
-        np.diff(integral(Series(t - own / 2, values), edges), axis=0)
-        for values in (np.where(measured, channels, 0.0), measured.astype(float))
-    )
-    enough = share > _MEASURED * dt
-    means[:, any_measured] = np.where(enough, total / np.where(enough, share, 1.0), np.nan)
-    return grid, root_mean_square(Series(t, omega), grid), means
+    some, gaps = measured.any(axis=0), ~measured.all(axis=0)
+    total = integral(Series(t - own / 2, np.where(measured, channels, 0.0)[:, some]))
+    share = integral(Series(t - own / 2, measured[:, some & gaps].astype(float)))
+    speeds = root_mean_square(Series(t, omega))
+
+    def average(dt: float) -> Resampled:
+        grid = _grid(t, dt)
+        edges = np.minimum(np.append(grid - dt / 2, grid[-1] + dt / 2), t[-1] + own / 2)
+        covered = np.repeat(np.diff(np.maximum(edges, t[0] - own / 2))[:, None], channels.shape[1], axis=1)
+        covered[:, some & gaps] = np.diff(share(edges), axis=0)
+        means = np.full((grid.size, channels.shape[1]), np.nan)
+        means[:, some] = np.diff(total(edges), axis=0)
+        means /= np.where(covered > _MEASURED * dt, covered, np.nan)
+        return grid, speeds(grid), means
+
+    return average
 
 
 def at_rows(rows: Rows, series: Series, *, step: float | None = None) -> Float[np.ndarray, "rows columns"]:
@@ -166,7 +182,7 @@ def gyro_rows(
     if rows.size > MAX_ROWS:
         refuse(table.path, f"has more than {MAX_ROWS:,} samples of the gyro; cut the log into flights")
     columns = {"t": rows - rows[0]} | dict(zip("pqr", rates.values[inside].T, strict=True))
-    columns |= zip(rotor_names, root_mean_square(rotors, rows, linear=measured).T, strict=True)
+    columns |= zip(rotor_names, root_mean_square(rotors, linear=measured)(rows).T, strict=True)
     for names, series in others.items():
         if series is not None:
             columns |= zip(names, at_rows(rows, possible(names, series)).T, strict=True)
@@ -206,7 +222,7 @@ def resample(t: Times, omega: Rotors, channels: Columns, dt: float) -> tuple[Res
             f"; {counted(int(gap.sum()), 'gap')} of up to {1e3 * step.max():.4g} ms: the "
             f"{int((ends[1] - ends[0]).sum())} samples in gaps hold the rotor speeds and count as not measured"
         )
-    return (grid, root_mean_square(Series(t, omega), grid), at_rows(grid, Series(t, channels), step=dt)), note
+    return (grid, root_mean_square(Series(t, omega))(grid), at_rows(grid, Series(t, channels), step=dt)), note
 
 
 def unwrap(angle: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:
@@ -277,7 +293,8 @@ def _means(rows: np.ndarray, width: float, series: Series) -> np.ndarray:
     gaps = np.append(0, np.cumsum(steps > _REACH * np.median(steps)))
     first, last = (np.clip(np.searchsorted(t, edge, side="right") - 1, 0, t.size - 2) for edge in (begin, end))
     whole = (begin >= t[0]) & (end <= t[-1]) & (gaps[last + 1] == gaps[first])
-    mean = (integral(series, end, linear=True) - integral(series, begin, linear=True)) / width
+    total = integral(series, linear=True)
+    mean = (total(end) - total(begin)) / width
     return np.where(whole[:, None], mean, np.nan)
 
 

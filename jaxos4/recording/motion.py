@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ..airframe import Airframe
 from ..excitation import AXES
 from ..flight import STATE_NAMES, Flight
-from ..logs.sampling import average
+from ..logs.sampling import averages
 from .pieces import Recording, as_recording
 
 RATE_COLUMNS = tuple(STATE_NAMES.index(name) for name in ("p", "q", "r"))
@@ -231,7 +231,7 @@ def _pair(found: np.ndarray) -> int | None:
 
 def _response(piece: Recording, mixer: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Torques and angular accelerations [rad/s^2], one sample every `step` [s], between about 2 and 20 Hz."""
-    _, omega, rates = average(piece.time, piece.omega, piece.states[:, RATE_COLUMNS], step)
+    _, omega, rates = averages(piece.time, piece.omega, piece.states[:, RATE_COLUMNS])(step)
     acceleration = np.diff(rates, axis=0) / step
     for i, axis in enumerate(excitation(piece).values()):
         if axis.verdict not in ("good", "weak"):

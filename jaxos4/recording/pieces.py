@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import InputError
 from ..flight import CHANNEL_NAMES, STATE_NAMES, Flight
 from ..logs import FORMATS, Recording as Recording, Table, log_format
-from ..logs.sampling import average
+from ..logs.sampling import averages
 
 # Sample times that differ by less than this share are equal.
 _EQUAL_STEPS = 1e-6
@@ -88,21 +88,26 @@ def cut(flight: Recording, stretch: Stretch) -> Recording:
     return flight.rows(slice(int(inside[0]), int(inside[-1]) + 1))
 
 
-def averaged(flight: Recording, dt: float) -> Recording:
-    """A flight averaged to samples of `dt` [s], see `average`; unchanged if its samples are not shorter."""
-    if dt <= flight.dt * (1 + _EQUAL_STEPS):
-        return flight
+def averaged(flight: Recording, steps: Sequence[float]) -> list[Recording]:
+    """A flight averaged to samples of each length [s], see `averages`; unchanged where its own are not shorter."""
     columns = [flight.channels] if flight.voltage is None else [flight.channels, flight.voltage[:, None]]
-    time, omega, means = average(flight.time, flight.omega, np.hstack(columns), dt)
-    return flight._replace(
-        time=time,
-        omega=omega,
-        states=means[:, :12],
-        specific_force=None if flight.specific_force is None else means[:, 12:15],
-        voltage=None if flight.voltage is None else means[:, 15],
-        body_velocity=None,
-        stretch=None,
-    )
+    average = averages(flight.time, flight.omega, np.hstack(columns))
+
+    def at(dt: float) -> Recording:
+        if dt <= flight.dt * (1 + _EQUAL_STEPS):
+            return flight
+        time, omega, means = average(dt)
+        return flight._replace(
+            time=time,
+            omega=omega,
+            states=means[:, :12],
+            specific_force=None if flight.specific_force is None else means[:, 12:15],
+            voltage=None if flight.voltage is None else means[:, 15],
+            body_velocity=None,
+            stretch=None,
+        )
+
+    return [at(dt) for dt in steps]
 
 
 def join(flights: Sequence[Flight], *, length: int) -> Flight:

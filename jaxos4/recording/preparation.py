@@ -133,7 +133,12 @@ def prepare(
     doublings = math.floor(math.log2(LONGEST_SAMPLE_TIME * _NEARLY_EQUAL / shortest)) if sample_time is None else 0
     steps = [shortest * 2**k for k in range(max(doublings, 0) + 1)]
     about = tuple(notes), tuple(doubts), slowest
-    return tuple(_sampled(recordings, parts, airframe, step, holdout, about) for step in steps)
+    coarse = [averaged(piece, steps) for _, piece in parts]
+    numbers = [number for number, _ in parts]
+    return tuple(
+        _sampled(recordings, [*zip(numbers, pieces, strict=True)], airframe, step, holdout, about)
+        for step, *pieces in zip(steps, *coarse, strict=True)
+    )
 
 
 def at_limit(recording: Recording, airframe: Airframe) -> tuple[str, str] | None:
@@ -153,12 +158,12 @@ def _sampled(
     holdout: float,
     about: tuple,
 ) -> Prepared:
-    """One flight of the usable parts with samples of `step` [s]. `about`: the last fields of the result."""
+    """One flight of the usable parts, averaged to samples of `step` [s]. `about`: the last fields of the result."""
     length = round(WINDOW / step)
     if length < _FEWEST_SAMPLES:
         least = WINDOW / _FEWEST_SAMPLES
         raise InputError(f"`sample_time` {step:g}: too long for a vehicle; give at most {least:g}, or log faster.")
-    coarse = [(number, whole_windows(averaged(piece, step), length)) for number, piece in parts]
+    coarse = [(number, whole_windows(piece, length)) for number, piece in parts]
     numbers = tuple(number for number, piece in coarse if piece.time.size)
     pieces = [piece for _, piece in coarse if piece.time.size]
     if unused := [recording for i, recording in enumerate(recordings) if i not in numbers]:

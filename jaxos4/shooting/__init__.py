@@ -1,7 +1,7 @@
 """The mismatch between a flight and a simulation of it: cost, residuals, gradient and information."""
 
 from .abstract import AbstractProblem as AbstractProblem, Stages as Stages, Unknowns as Unknowns
-from .batching import cores as cores, in_blocks as in_blocks, on_all_cores as on_all_cores
+from .batching import cores as cores, for_threads as for_threads, in_blocks as in_blocks, on_all_cores as on_all_cores
 from .innovations import InnovationsProblem as InnovationsProblem
 from .padding import capacity_of as capacity_of, pad_flight as pad_flight, padded as padded, with_room as with_room
 from .problem import ShootingProblem as ShootingProblem

@@ -8,13 +8,16 @@ one flight instead of one unknown of several flights.
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # The most lanes of a block: two to four of the processor's vectors. In 64 lanes a flight takes up to twice as long.
 _BLOCK = 16
@@ -100,6 +103,17 @@ def cores() -> int:
     return int(os.environ.get("JAX_NUM_CPU_DEVICES") or usable)
 
 
+def for_threads(function: Callable[P, R]) -> Callable[P, R]:
+    """`function` for other threads, with the precision of this one, which JAX sets for each thread."""
+    double = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        with jax.enable_x64(double):
+            return function(*args, **kwargs)
+
+    return call
+
+
 def on_all_cores(function: Callable) -> Callable:
     """A batch on all cores of a CPU: threads run one compiled program. Results are the same on any number of cores.
 
@@ -118,16 +132,16 @@ def on_all_cores(function: Callable) -> Callable:
 
     def batch(many: Any, *shared: Any) -> Any:
         leaves, structure = jax.tree.flatten(eqx.filter((many, shared), eqx.is_array))
-        lanes, double = leaves[0].shape[0], bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+        lanes = leaves[0].shape[0]
         size = min(lanes, _CHUNK) if jax.default_backend() == "cpu" else lanes
 
+        @for_threads
         def run(first: int) -> Any:
-            with jax.enable_x64(double):  # a setting of each thread
-                return jax.block_until_ready(chunk(many, jnp.asarray(first), size, shared))
+            return jax.block_until_ready(chunk(many, jnp.asarray(first), size, shared))
 
         # All chunks are full: the last begins with flights of the one before it.
         firsts, found = [min(first, lanes - size) for first in range(0, lanes, size)], []
-        key = structure, size, double, *(jnp.shape(leaf) for leaf in leaves)
+        key = structure, size, *((leaf.shape, leaf.dtype) for leaf in map(jnp.asarray, leaves))
         if key not in compiled:
             found.append(run(firsts.pop(0)))
             compiled.add(key)
