@@ -4,20 +4,21 @@ JAX keeps compiled programs, and finds one by its traced program. To trace takes
 So the traced program is exported to the same folder. The name of its file is a digest of the function, the shapes and
 static values of its arguments, the sources of `jaxos4`, the installed packages and JAX's settings. This is enough for a
 command, which runs no other code. It is not enough for a program of the user, who may add a term to a table, or switch
-a setting in a part of the program: so only the command line keeps programs, see `keep_programs`.
+a setting in a part of the program: so only the command line keeps programs, see `keep_programs`. To read a file runs
+its code: a folder or a file that another user owns, or can write to, is not used.
 """
 
 import contextlib
 import hashlib
 import io
 import os
-import pickle  # noqa: TID251 - what it reads lies beside machine code, which JAX reads
+import pickle  # noqa: TID251 - nobody else can write what it reads
 import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ._files import write_file
+from ._files import write_atomically
 
 # Packages whose code the digest knows. A program that depends on a class or function of another package is not kept.
 _KNOWN = {"jaxos4", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "optax", "numpy", "builtins"}
@@ -48,10 +49,10 @@ def kept_program(
     import jax
 
     folder = jax.config.values["jax_compilation_cache_dir"]
-    if not folder or jax.device_count() > 1 or not _is_known(function):
+    if not folder or not _is_private(folder) or jax.device_count() > 1 or not _is_known(function):
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
-    shapes = [_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
+    shapes = [(x.shape, str(x.dtype), getattr(x, "weak_type", False)) if eqx.is_array(x) else x for x in leaves]
     try:
         description = _described((function.__module__, function.__qualname__, options, shapes, tree))
     except (pickle.PicklingError, AttributeError, TypeError, ValueError):
@@ -77,10 +78,6 @@ def _compiled(traced: Any, results: Any, options: dict[str, Any], arrays: list[A
         return jax.block_until_ready(jax.tree.unflatten(tree, of_arrays(*leaves)))
 
     return call
-
-
-def _shape(leaf: Any) -> tuple[Any, ...]:
-    return leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False)
 
 
 def _is_known(code: Any) -> bool:
@@ -109,20 +106,27 @@ def _describe_surroundings() -> bytes:
     """Sources, packages and settings. A source is known by size and time, as in Python's own cache."""
     import jax
 
-    sources = [(str(path), path.stat()) for path in sorted(Path(__file__).parent.rglob("*.py"))]
-    sizes = [(path, status.st_size, status.st_mtime_ns) for path, status in sources]
+    sources = sorted(Path(__file__).parent.rglob("*.py"))
+    sizes = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sources]
     packages = sorted(os.listdir(Path(jax.__file__).parents[1]))  # with their versions
     return repr((sizes, packages, sorted(jax.config.values.items()))).encode()
 
 
+def _is_private(path: str | Path) -> bool:
+    """Whether a file or folder is this user's, and nobody else can write to it. Without users of POSIX: always."""
+    with contextlib.suppress(OSError):
+        status = os.stat(path)
+        return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
+    return False
+
+
 def _read(path: Path) -> tuple[Any, Any] | None:
-    """The traced program of a file, and its results; `None` if there is no such file, or if it is damaged."""
+    """The traced program of a file, and its results; `None` if there is none, or if it is damaged or not private."""
     import jax.export
 
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
+    content = b""
+    with contextlib.suppress(OSError):
+        content = path.read_bytes() if _is_private(path) else b""
     if hashlib.sha256(content[32:]).digest() != content[:32]:
         return None
     results, traced = pickle.loads(content[32:])  # noqa: S301
@@ -154,5 +158,8 @@ def _write(path: Path, function: Callable[..., Any], args: Any, kwargs: Any) -> 
     except (NotImplementedError, ValueError, TypeError, pickle.PicklingError, AttributeError):
         return None
     with contextlib.suppress(OSError):
-        write_file(path, hashlib.sha256(content).digest() + content)
+        path.unlink(missing_ok=True)  # damaged, or not private: its mode would be kept
+        with write_atomically(path) as beside:
+            beside.touch(0o600)
+            beside.write_bytes(hashlib.sha256(content).digest() + content)
     return traced, results[0]

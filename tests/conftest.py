@@ -4,6 +4,7 @@ import atexit
 import gc
 import os
 import pathlib
+import re
 import sys
 from collections.abc import Iterator
 
@@ -170,6 +171,40 @@ def run(monkeypatch, capsys, tmp_path):
         return stop.value.code or 0, out, err
 
     return call
+
+
+@pytest.fixture
+def run_three_ways(run, tmp_path, monkeypatch):
+    """Runs a command that writes `out.json`: without kept programs, with those that it keeps, and with those of files.
+
+    Returns code, output and content of each, without the time that it took.
+    """
+    from jaxos4 import _programs
+    from jaxos4.cli._jax import NO_CACHE
+
+    folder, names = tmp_path / "programs", ("jax_enable_compilation_cache", "jax_compilation_cache_dir")
+    before = {name: jax.config.values[name] for name in names}
+    folder.mkdir(mode=0o700)
+
+    def call(*arguments: str) -> list[tuple[int, str, str]]:
+        answers = []
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        monkeypatch.delenv(_xla.NO_OPTIONS, raising=False)  # with it, no program is kept
+        for switched_off, write in (("1", _programs._write), ("", _programs._write), ("", None)):
+            jax.config.update("jax_enable_compilation_cache", True)
+            monkeypatch.setenv(NO_CACHE, switched_off)
+            monkeypatch.setattr(_programs, "_programs", {})  # as in another process
+            monkeypatch.setattr(_programs, "_surroundings", [])
+            monkeypatch.setattr(_programs, "_write", write)  # tracing would call it
+            code, out, _ = run(*arguments)
+            written = re.sub('"seconds": .*', "", (tmp_path / "out.json").read_text())
+            answers.append((code, re.sub(r"[\d.]+ s\b", "", out), written))
+            assert any(folder.glob("jaxos4-*")) == (not switched_off)
+        return answers
+
+    yield call
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 @pytest.fixture

@@ -16,7 +16,6 @@ from jax._src import compiler
 
 import jaxos4
 from jaxos4 import _programs
-from jaxos4._programs import _shape
 from jaxos4._xla import LOOP_FLAGS, NO_OPTIONS, make_loops_fast, quick_jit
 from jaxos4.bracket import _default
 from jaxos4.cli import _jax, _options, estimate
@@ -176,8 +175,10 @@ def test_the_second_command_finds_the_programs_of_the_first_unless_told_otherwis
     first = start(*SIMULATE, code=console, cwd=tmp_path, **home)
     assert (first.returncode, first.stderr, "flight.csv: 11 samples" in first.stdout) == (0, "", True)
     assert len((tmp_path / "flight.csv").read_text().splitlines()) == 12
-    refused = start("estimate", "nowhere.csv", code=console, cwd=tmp_path, **home)
+    chosen = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "chosen"), "XDG_CACHE_HOME": str(tmp_path / "default")}
+    refused = start("estimate", "nowhere.csv", code=console, cwd=tmp_path, **home | chosen)
     assert (refused.returncode, "nowhere.csv: there is no such file" in refused.stderr) == (2, True)
+    assert not (tmp_path / "default").exists()
     compiled = (tmp_path / "cache" / "jaxos4" / "programs").glob("*")
     cut, *others = (path for path in compiled if not path.name.startswith("jaxos4-"))
     cut.write_bytes(cut.read_bytes()[:100])  # compiled again, in silence
@@ -198,26 +199,35 @@ def test_the_cache_is_limited_and_keeps_what_was_used_last_and_a_folder_may_be_u
     assert _jax._usable_folder() is None
 
 
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """Looks for the program of a function as the command line does, in a folder of files, as another process does."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    monkeypatch.setattr(_programs, "_surroundings", [b"this process"])
+
+    def find(*args, function=_default.__wrapped__):
+        monkeypatch.setattr(_programs, "_programs", {})
+        return _programs.kept_program(function, {}, args, {})
+
+    yield find
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_a_folder_that_the_user_chose_is_kept(kept, tmp_path, monkeypatch):
+    monkeypatch.setattr(_jax, "_usable_folder", None)  # the default folder would call it
+    _jax.prepare()
+    assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path)
+    assert kept(jaxos4.PublishedOS4(jaxos4.OS4)) is not None
+    assert len(list(tmp_path.glob("jaxos4-*"))) == 1
+
+
 class OwnModel(jaxos4.CorrectedOS4):
     """A model whose source the package does not know."""
 
 
-@pytest.fixture
-def programs_are_kept(tmp_path):
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    yield
-    jax.config.update("jax_compilation_cache_dir", before)
-
-
-@pytest.mark.usefixtures("programs_are_kept")
-def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known(tmp_path, monkeypatch):
-    monkeypatch.setattr(_programs, "_surroundings", [b"this process"])
+def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known(kept, tmp_path, monkeypatch):
     function, one, other = _default.__wrapped__, jaxos4.PublishedOS4(jaxos4.OS4), jaxos4.PublishedOS4(jaxos4.VOOS)
-
-    def kept(*args, function=function):
-        monkeypatch.setattr(_programs, "_programs", {})  # as in another process
-        return _programs.kept_program(function, {}, args, {})
 
     def files():
         return {path.name: path.read_bytes() for path in tmp_path.glob("jaxos4-*")}
@@ -243,13 +253,48 @@ def test_a_program_is_traced_once_for_all_processes_unless_its_code_is_not_known
     assert all(_programs._read(tmp_path / name) for name in written)
     assert kept(OwnModel(jaxos4.OS4)) is None
     assert kept(1.0, function=lambda x: x) is None
-    assert kept(np.ones(1), function=_shape) is None  # its results are no arrays
+    assert kept(np.ones(1), function=np.shape) is None  # its results are no arrays
     assert len(files()) == 3
     with monkeypatch.context() as patch:
         patch.setattr(_programs, "_surroundings", [])  # not the command line
         assert kept(one) is None
     jax.config.update("jax_compilation_cache_dir", None)
     assert kept(one) is None
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="this system has no users of POSIX")
+def test_a_program_that_another_user_owns_or_can_write_to_is_not_read(kept, tmp_path, monkeypatch):
+    """To read it would run that user's code. The folder is not used at all; a file is written again."""
+    model, us = jaxos4.PublishedOS4(jaxos4.OS4), os.getuid()
+    assert kept(model) is not None
+    (path,) = tmp_path.glob("jaxos4-*")
+    assert path.stat().st_mode & 0o777 == 0o600
+
+    def read():
+        """Whether the file is read, if there is a program."""
+        found, loads = [], _programs.pickle.loads
+        with monkeypatch.context() as patch:
+            patch.setattr(_programs.pickle, "loads", lambda content: found.append(content) or loads(content))
+            return None if kept(model) is None else bool(found)
+
+    assert read() is True
+    for mode in (0o620, 0o602):
+        path.chmod(mode)
+        assert read() is False
+        assert (read(), path.stat().st_mode & 0o777) == (True, 0o600)
+    for mode in (0o720, 0o702):
+        tmp_path.chmod(mode)
+        assert read() is None
+    with monkeypatch.context() as patch:
+        patch.delattr(os, "getuid")  # as on Windows
+        assert read() is True
+    tmp_path.chmod(0o700)
+    monkeypatch.setattr(os, "getuid", lambda: us + 1)
+    assert read() is None
+    assert _programs._read(path) is None
+    path.unlink()
+    assert read() is None
+    assert not list(tmp_path.glob("jaxos4-*"))
 
 
 NATIVE, WIDE = LOOP_FLAGS.values()
