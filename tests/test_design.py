@@ -10,7 +10,7 @@ from helpers import CRAZYFLIE, CRAZYFLIE_TOML, DT, euler_trajectory, published_d
 
 import jaxos4
 from jaxos4 import design
-from jaxos4.cli.flying import Criterion
+from jaxos4.cli.new_flights import Criterion
 from jaxos4.design import Envelope
 from jaxos4.design.fleet import LANES as BATCH, Fleet, batch_of, fly_batch
 from jaxos4.design.rotor_speeds import VEHICLES, drawn, fly_finely

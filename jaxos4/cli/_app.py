@@ -11,13 +11,13 @@ import typer
 from ..errors import InputError, TrainingError
 from ._jax import NO_CACHE, prepare
 from .estimate import estimate, train
-from .flying import design, simulate
 from .identified import export, predict
 from .information import identifiability, inspect
+from .new_flights import design, simulate
 from .studies import compare, report, study
 
 _INTERRUPTED = 130
-_EPILOG = f"Compiled programs are kept in your cache folder, at most 1 GB. {NO_CACHE}=1 switches this off."
+_EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1 switches this off."
 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:

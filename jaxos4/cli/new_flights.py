@@ -1,7 +1,4 @@
-"""`jaxos4 simulate` and `jaxos4 design`: a simulated flight as CSV, and the most informative one to fly.
-
-Both are of an OS4 in open loop, or of a real vehicle under its controller.
-"""
+"""`jaxos4 simulate` and `jaxos4 design`: a flight as CSV, and the best to fly; in open loop, or with a controller."""
 
 import time
 from collections.abc import Callable, Mapping
