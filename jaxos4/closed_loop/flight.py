@@ -165,24 +165,41 @@ class _Vehicle(NamedTuple):
         return x, y, thrust + z
 
 
-def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> tuple[Array | None, ...]:
-    """The random numbers of a flight, in rows for each run of the controller with `steps` of length `h`.
+class _Drawn(NamedTuple):
+    """The random numbers of a flight, in rows for each run of the controller.
 
-    Gusts with the constant torque (4), and winds (3), at the begin and the end of each step; the noise of gyro,
-    attitude and accelerometer (9), and of the controller's own gyro (3).
+    - `gusts` with the constant torque, and `winds`: at the begin and the end of each step.
+    - `noise`: of gyro, attitude and accelerometer. `own`: of the controller's own gyro.
     """
+
+    gusts: Float[Array, "*runs ends 4"]
+    winds: Float[Array, "*runs ends 3"] | None
+    noise: Float[Array, "*runs 9"]
+    own: Float[Array, "*runs 3"] | None
+
+
+class _State(NamedTuple):
+    """What a run of the controller leaves to the next. Row k + 1 of `commands` is that of run k."""
+
+    motion: Motion
+    speeds: Float[Array, "4"]
+    integral: PerAxis
+    commands: Float[Array, "rows 4"]
+    signals: Signals | None
+
+
+def _draw(loop: ClosedLoop, key: Key, runs: int, steps: int, h: Scalar) -> _Drawn:
+    """The random numbers of so many runs of the controller, each with `steps` of length `h`."""
     (gust_key, noise_key), (wind_key, own_key) = jax.random.split(key), jax.random.split(jax.random.fold_in(key, 0))
     shape, rows = (runs * steps + 1, 4), steps * np.arange(runs)[:, None] + np.arange(steps + 1)
     gusts = jnp.append(loop.gust, loop.thrust_gust) * coloured(jax.random.normal(gust_key, shape), h / loop.gust_time)
     noise = jnp.repeat(jnp.stack([loop.gyro_noise, loop.attitude_noise, loop.force_noise]), 3)
-    winds = own = None
+    gusts, winds, own = (jnp.append(loop.offset, 0.0) + gusts)[rows], None, None
     if loop.air is not None:
-        processes = coloured(jax.random.normal(wind_key, shape), h / loop.air.wind_time)
-        winds = loop.air.wind * processes[rows][..., :3]
+        winds = loop.air.wind * coloured(jax.random.normal(wind_key, shape), h / loop.air.wind_time)[rows][..., :3]
     if loop.sensors is not None:
         own = jnp.nan_to_num(loop.sensors.controller_gyro_noise) * jax.random.normal(own_key, (runs, 3))
-    noise = noise * jax.random.normal(noise_key, (runs, 9))
-    return (jnp.append(loop.offset, 0.0) + gusts)[rows], winds, noise, own
+    return _Drawn(gusts, winds, noise * jax.random.normal(noise_key, (runs, 9)), own)
 
 
 @quick_jit
@@ -191,9 +208,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     runs, period = samples * loop.log_every, dt / loop.log_every
     h, vehicle, airframe = period / steps, _Vehicle.of(loop), loop.airframe
     sense_key, log_key = jax.random.split(jax.random.fold_in(key, 1))
-    sense = (
-        None if loop.sensors is None else Sense.of(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
-    )
+    sense = loop.sensors and Sense.of(loop.sensors, jnp.asarray(airframe.hover_speed), period, sense_key)
     mixer, spins, motor = jnp.asarray(airframe.mixer), jnp.asarray(airframe.rotor_spins), loop.motor
     # A command acts `late` runs after its own, and in the first `part` of a run the one before it still acts.
     late = jnp.floor(loop.rotor_delay / period).astype(int)
@@ -204,17 +219,16 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         rotors = Forcing(roll, pitch, yaw, thrust / airframe.mass, residual)
         return _Acting(rotors, spin_up, tuple(gust), None if wind is None else tuple(wind))
 
-    def run(carry, row):
-        motion, speeds, integral, commands, signals = carry  # in row k + 1: the command of run k
-        k, reference, (*blown, error, own_error) = row
+    def run(state: _State, row):
+        (motion, speeds, integral, commands, signals), (k, reference, drawn) = state, row
+        blown, error = (drawn.gusts, drawn.winds), drawn.noise
         weak, nothing = 1 - loop.sag * k / (runs - 1), jnp.zeros(())
-        at_once = jax.tree.map(lambda ends: ends[0], blown)
-        now = acting(weak, jnp.square(speeds), nothing, nothing, *at_once)
+        now = acting(weak, jnp.square(speeds), nothing, nothing, *jax.tree.map(lambda ends: ends[0], blown))
         specific = jnp.stack(vehicle.specific_force(motion.velocity, now)) + error[6:]
         rates, attitude = jnp.stack(motion.rates), jnp.stack(motion.attitude) + error[3:6]
         seen = gyro = rates + error[:3]
         if sense is not None and signals is not None:
-            signals, seen = sense(signals, speeds, gyro, rates + own_error, specific)
+            signals, seen = sense(signals, speeds, gyro, rates + drawn.own, specific)
             gyro, specific = signals.filtered[:3], signals.filtered[6:]
         command, integral = _control(loop, mixer, reference, seen, attitude, integral, period)
         commands = commands.at[k + 1].set(command)
@@ -236,7 +250,7 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
         mean = means.mean(axis=0)
         signals = None if signals is None else signals._replace(angles=signals.angles + period * mean)
         omega = command if loop.logged == "commands" else mean
-        return (later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
+        return _State(later, speeds, integral, commands, signals), (omega, motion, gyro, attitude, specific)
 
     weight, zero = as_float(airframe.mass * airframe.gravity), jnp.zeros(())
     hover, _ = _speeds(mixer, jnp.zeros(3), weight, airframe.max_rotor_speed)
@@ -245,20 +259,13 @@ def _fly(loop: ClosedLoop, references: References, dt: Scalar, key: Key, substep
     still = jnp.zeros(9).at[8].set(vehicle.gravity)
     signals = None if sense is None else Signals(still, still, jnp.zeros(4))
     commands = jnp.broadcast_to(motor.command(hover), (runs + 1, 4))
-    first = motion, hover, jnp.zeros(3), commands, signals
-    draws = _draw(loop, key, runs, steps, h)
-    inputs = (jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), draws)
+    first = _State(motion, hover, jnp.zeros(3), commands, signals)
+    inputs = jnp.arange(runs), jnp.repeat(references, loop.log_every, axis=0), _draw(loop, key, runs, steps, h)
     return log(loop, dt, jax.lax.scan(run, first, inputs)[1], log_key)
 
 
 def _control(
-    loop: ClosedLoop,
-    mixer: Array,
-    reference: Array,
-    seen: PerAxis,
-    attitude: PerAxis,
-    integral: PerAxis,
-    period: Scalar,
+    loop: ClosedLoop, mixer: Array, reference: Array, seen: PerAxis, attitude: PerAxis, integral: PerAxis, dt: Scalar
 ) -> tuple[Float[Array, "4"], PerAxis]:
     """The commands [rad/s] of one run, and the integrators after it. `seen`: the body rates that it answers."""
     airframe = loop.airframe
@@ -268,7 +275,7 @@ def _control(
     thrust = as_float(airframe.mass * (reference[3] + airframe.gravity) / upright)
     inertia = as_float(airframe.inertia) if loop.controller_inertia is None else loop.controller_inertia
     speeds, saturated = _speeds(mixer, inertia * demand, thrust, airframe.max_rotor_speed)
-    return loop.motor.command(speeds), jnp.where(saturated, integral, integral + period * loop.integral_gain * error)
+    return loop.motor.command(speeds), jnp.where(saturated, integral, integral + dt * loop.integral_gain * error)
 
 
 def _speeds(mixer: Array, torque: PerAxis, thrust: Scalar, fastest: Numeric) -> tuple[Float[Array, "4"], Array]:

@@ -44,11 +44,18 @@ class Motion(NamedTuple):
     rates: Rates
 
 
-# The state at each sample as measured, as in `PARTS`; the rates and the disturbance that the filters know [rad/s],
-# [rad/s^2; m/s^2]; the standard deviation of the offsets.
-Known = tuple[
-    Float[Numeric, "... 13"], Float[Numeric, "... 3"], Float[Numeric, "... channels"], Float[Numeric, "... 6"]
-]
+class Known(NamedTuple):
+    """What is known at each sample, or at one.
+
+    - `state`: as measured, as in `PARTS`.
+    - `rates`, `disturbance`: of the filters [rad/s], [rad/s^2; m/s^2].
+    - `unsure`: the standard deviation of each offset, see `Lanes`.
+    """
+
+    state: Float[Numeric, "... 13"]
+    rates: Float[Numeric, "... 3"]
+    disturbance: Float[Numeric, "... channels"]
+    unsure: Float[Numeric, "... 6"]
 
 
 class Lanes(NamedTuple):
@@ -142,15 +149,14 @@ def _fly(
     """The states of one future of one start, from one step after it. A motion that diverges stays where it was."""
     kept, reach = transition(jnp.exp(noise.time_constant), dt)
     scalars, axes = tuple(lane.parameters), model.force_axes
-    state, rates, disturbance, unsure = start
-    p, v, q, w = (state[places] for places in PARTS.values())
+    p, v, q, w = (start.state[places] for places in PARTS.values())
     # A gyro bias is part of the measurement, not of the state.
     steps = lane.gusts.shape[0]
     rows = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, steps), lane.forcing)
     still = jax.tree.map(lambda leaf: leaf[0], rows)._replace(velocity=(0.0, 0.0, 0.0))
     biased = jnp.stack(model.observe(State(Rates(*w)), still, scalars)[:3])
-    w = jnp.where(lane.filtered, rates, w) - (biased - w) + lane.begin
-    error, absorbed = unsure * lane.off
+    w = jnp.where(lane.filtered, start.rates, w) - (biased - w) + lane.begin
+    error, absorbed = start.unsure * lane.off
     offset = lane.offset[first] + error
     begin = Motion(tuple(p), tuple(v), _unit(tuple(q)), Rates(*w))
 
@@ -166,7 +172,7 @@ def _fly(
         motion = jax.tree.map(lambda new, old: jnp.where(sound, new, old), moved, motion)
         return (motion, kept * disturbance + gust[:, 1], sound), jnp.stack(jax.tree.leaves(motion))
 
-    pushed = jnp.where(lane.filtered, disturbance, 0.0) + lane.pushed
+    pushed = jnp.where(lane.filtered, start.disturbance, 0.0) + lane.pushed
     pushed = pushed.at[:3].add(absorbed[:3])
     return jax.lax.scan(step, (begin, pushed, jnp.array(True)), (rows, lane.gusts))[1]
 
@@ -246,7 +252,7 @@ def known_at_samples(
     modelled = jnp.concatenate([turning[0] + offset[0, :, :3], jnp.zeros(force.shape)], axis=1)
     stretch = jnp.zeros(len(rates), dtype=int) if flight.stretch is None else flight.stretch
     found = filtered(noise, jnp.concatenate([rates, force], axis=1), modelled, stretch, flight.dt)
-    return (state, found.rate[:, :3], found.disturbance, unsure), forcing, offset
+    return Known(state, found.rate[:, :3], found.disturbance, unsure), forcing, offset
 
 
 def _offset_weights(
