@@ -4,6 +4,7 @@ import json
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers import refused
 from hypothesis import given, settings, strategies as st
@@ -72,6 +73,12 @@ _VALUES = st.recursive(
 )
 
 
+# One key with numbers, often with an extreme one: half of these tables are a study, of the others hardly any.
+_EXTREME = st.one_of(st.floats(), st.sampled_from([0.01, 5.0, 1e-320, 1e308, np.inf, np.nan]))
+_LISTS = dict.fromkeys(("durations", "scales", "widths"), st.lists(_EXTREME, min_size=1, max_size=2))
+_LIKELY = st.one_of(*(st.fixed_dictionaries({key: values}) for key, values in ({"dt": _EXTREME} | _LISTS).items()))
+
+
 def toml(value) -> str:
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(key)} = {toml(item)}" for key, item in value.items()) + "}"
@@ -83,8 +90,9 @@ def toml(value) -> str:
 
 
 @settings(max_examples=400)
-@given(st.dictionaries(_KEYS, _VALUES, max_size=5))
+@given(st.one_of(st.dictionaries(_KEYS, _VALUES, max_size=5), _LIKELY))
 def test_any_specification_is_a_study_or_an_input_error_of_one_line(table):
+    """The numbers of a study are finite, and its flights can be flown."""
     with tempfile.TemporaryDirectory() as folder:
         text = "".join(f"{json.dumps(key, ensure_ascii=False)} = {toml(value)}\n" for key, value in table.items())
         path = specification(Path(folder), text)
@@ -94,5 +102,7 @@ def test_any_specification_is_a_study_or_an_input_error_of_one_line(table):
             line = str(error)
         else:
             line = f"{path}: {study.cell(study.count - 1)}"
+            assert np.isfinite([study.dt, *study.durations, *study.scales, *study.widths]).all()
+            assert all(2 <= duration / study.dt <= 1e6 for duration in study.durations)
         assert line.startswith(f"{path}: ")
         assert "\n" not in line

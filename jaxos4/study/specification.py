@@ -148,8 +148,6 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     raise InputError(f"`{axis}` must be finite numbers, got {value}; correct it.")
                 if value not in choices:
                     raise InputError(f"`{axis}`: unknown {value!r}; choose from {', '.join(choices)}.")
-        if not math.isfinite(self.dt):
-            raise InputError(f"`dt` must be finite, got {self.dt}; give the sample time in seconds.")
         for key, text in (("title", self.title), *(("airframe", name) for name in self.airframe)):
             if not text.isprintable():
                 raise InputError(f"`{key}` has a line break or another control character; remove it.")
