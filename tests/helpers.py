@@ -3,6 +3,8 @@
 import contextlib
 import functools
 import itertools
+import pathlib
+import re
 
 import equinox as eqx
 import jax
@@ -257,6 +259,13 @@ def refused(result: tuple[int, str, str], *fragments: str) -> None:
     assert err.count("\n") == 1, err
     for fragment in fragments:
         assert fragment in err
+
+
+def documented_class(page: str) -> str:
+    """The class that a page of `docs/extend` shows, as a file of its own has it."""
+    text = (pathlib.Path(__file__).parents[1] / "docs" / "extend" / page).read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?class .*?)```", text, flags=re.DOTALL)
+    return code.replace("from ..", "from jaxos4.")
 
 
 def how_we_compile():

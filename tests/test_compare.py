@@ -1,20 +1,17 @@
 """`jaxos4 compare` from simulation to report, and an estimator in one file and one line of the registry."""
 
 import json
-import pathlib
-import re
 
 import msgspec
 import pytest
 import xarray as xr
-from helpers import compiled_programs, refused
+from helpers import compiled_programs, documented_class, refused
 from small_study import finish, start
 
 from jaxos4.cli import studies
 from jaxos4.report import write_report
 from jaxos4.study import OUTCOMES, Training
 
-PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "extend" / "estimator.md"
 SMALL = {"durations": (0.5,), "flights": 16, "batch": 16, "channels": ("rates",)}
 SMALL |= {"estimators": ("ibss", "network", "hybrid"), "network": Training(steps=20, held_out=1000)}
 
@@ -58,12 +55,6 @@ def test_one_command_makes_table_dataset_figures_and_report(run, tmp_path, monke
     refused(run("compare", "--out", "here"), "here", "another study", "`title`")
 
 
-def documented_estimator():
-    """The class of the page that says how to add an estimator, as a file of its own has it."""
-    (code,) = re.findall(r"```python\n(.*?class .*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
-    return code.replace("from ..", "from jaxos4.")
-
-
 REGISTERED = """
 import sys
 from jaxos4.estimators import ESTIMATORS
@@ -103,7 +94,7 @@ def test_a_new_estimator_is_offered_everywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "study.toml").write_text(STUDY)
     (tmp_path / "commands").write_text(COMMANDS)
-    said = finish(start("commands", code=documented_estimator() + REGISTERED))
+    said = finish(start("commands", code=documented_class("estimator.md") + REGISTERED))
     assert said.count("gauss-newton") >= 3  # in both plans and in the table of the study
     assert "2 estimates: 2 successful" in said
     assert ["gauss-newton", "0", "0"] in [line.split() for line in said.splitlines()]  # nothing remains

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import noisy_states, same, standard_flight, standard_problem
+from helpers import documented_class, noisy_states, same, standard_flight, standard_problem
 from lanes import FEW, HALF, LANES, bound, identify, lanes, names, noisy
 
 import jaxos4
@@ -21,6 +21,20 @@ def test_where_a_start_is_nan_the_search_begins_at_the_center():
     assert set(names(found[0])) == {"successful"}
     elsewhere = identify(jaxos4.IBSS(), *arguments, center.at[7, 2].add(0.5 * HALF[2]))
     assert not np.array_equal(elsewhere.parameters[7], found[0].parameters[7])
+
+
+@pytest.mark.parametrize("kind", ["shooting", "innovations"])
+def test_the_search_of_the_documentation_ends_at_the_minimum_or_says_that_it_did_not(kind):
+    exec(documented_class("likelihood.md"), defined := {"__name__": "descent"})  # noqa: S102
+    problem = standard_problem(channels="rates", states=noisy_states(3)[2], free=True).hold({"alpha2": 0.0})
+    best = (jaxos4.OutputError if kind == "shooting" else jaxos4.FilterError)()(problem)
+    problem = problem if kind == "shooting" else jaxos4.InnovationsProblem(problem)
+    found = defined["Descent"]()(problem)
+    assert names(found) == "successful"
+    off = np.abs(found.parameters[:8] - best.parameters)
+    assert (off <= 0.05 * best.std).all()
+    if kind == "shooting":
+        assert names(defined["Descent"](steps=1)(problem)) == "max_sweeps"
 
 
 def test_too_few_sweeps_are_reported():
