@@ -145,6 +145,7 @@ class IBSS(AbstractEstimator):
         """
         initial = problem.first_state()[0] if initial_state is None else initial_state
         stages = problem.stages(cascade=self.directions == "whitened")
+        stages = stages._replace(evaluate=jax.jit(stages.evaluate, inline=True))  # traced once, although called twice
 
         def from_one(start: Parameters) -> Estimate:
             first = self.init(problem, stages, problem.join(start, initial), spread, skip)
@@ -157,7 +158,8 @@ class IBSS(AbstractEstimator):
                 return jax.lax.while_loop(lambda state: ~self.terminate(stage, state), sweep, begin)
 
             # One loop, so that the search is compiled once for all stages.
-            end = jax.lax.fori_loop(jnp.where(cascade, 0, stages.number - 1), stages.number, fit, first)
+            begin = jnp.where(cascade, 0, stages.number - 1).astype(int)
+            end = jax.lax.fori_loop(begin, stages.number, fit, first)
             more = {"reach": self.reach, "brackets": end.record if self.record else None}
             return estimate_at(problem, end.unknowns, end.curvature, end.rollouts, end.sweeps, done=end.done, **more)
 

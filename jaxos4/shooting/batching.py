@@ -36,7 +36,9 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *ar
 
     @custom_vmap
     def one(arrays: Any) -> Any:
-        return function(*eqx.combine(arrays, settings))
+        # The context in which a batch is traced, so that JAX finds again what `jax.jit` has traced here.
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+            return function(*eqx.combine(arrays, settings))
 
     @one.def_vmap
     def batch(lanes: int, is_batched: list, arrays: Any) -> tuple[Any, Any]:
