@@ -5,6 +5,7 @@ take as long as the slowest flight, its arrays do not fit the cache, and the pro
 one flight instead of one unknown of several flights.
 """
 
+import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -40,10 +41,14 @@ def with_batch(function: Callable, of_batch: Callable[[int, Any, Any], Any], *ar
         with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
             return function(*eqx.combine(arrays, settings))
 
+    # Traced once, although JAX asks several times for the batch of what stands in a loop.
+    @functools.partial(jax.jit, static_argnums=0, inline=True)
+    def together(lanes: int, many: Any, shared: Any) -> Any:
+        return of_batch(lanes, many, eqx.combine(shared, settings))
+
     @one.def_vmap
     def batch(lanes: int, is_batched: list, arrays: Any) -> tuple[Any, Any]:
-        many, shared = eqx.partition(arrays, is_batched[0])
-        out = of_batch(lanes, many, eqx.combine(shared, settings))
+        out = together(lanes, *eqx.partition(arrays, is_batched[0]))
         return out, jax.tree.map(lambda _: True, out)
 
     return one(arrays)
