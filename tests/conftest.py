@@ -55,9 +55,9 @@ TOGETHER = (
 )
 # The slowest modules start first, so that the workers end together.
 LONGEST = (
-    *("experiments", "estimators", "design", "vehicle", "network", "experiments_vehicle", "study_resume", "startup"),
-    *("filter_error", "report_browser", "study", "cli", "predict", "compare"),
-    *("flight_model_fits", "closed_loop", "flight_model", "identify", "study_cluster", "simulate", "shooting"),
+    *("experiments", "estimators", "vehicle", "experiments_vehicle", "network", "design", "study_resume"),
+    *("study_cluster", "startup", "cli", "predict", "closed_loop", "study", "report_browser", "closed_loop_effects"),
+    *("programs", "compare", "shooting", "unknowns", "filter_error", "flight_model_fits", "identify", "simulate"),
 )
 
 

@@ -53,13 +53,15 @@ def fall_and_turn(motion, speeds, change, v):
     yaw = -float(airframe.drag_coefficient) * spin @ speeds**2 - rotor * spin @ change
     rate, (phi, theta, psi) = motion[:3], motion[3:6]
     momentum = inertia * rate + [0, 0, rotor * spin @ speeds]
-    turning = (np.array([y @ force, -x @ force, yaw]) - np.cross(rate, momentum)) / inertia
+    (p, q, r), (a, b, c) = rate, momentum  # `numpy.cross` takes long
+    gyroscopic = [q * c - r * b, r * a - p * c, p * b - q * a]
+    turning = (np.array([y @ force, -x @ force, yaw]) - gyroscopic) / inertia
     turning += np.asarray(v.offset) - np.asarray(v.damping) * rate
-    to_earth = Rotation.from_euler("ZYX", [psi, theta, phi])
-    along = to_earth.inv().apply(motion[6:])
+    to_earth = Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
+    along = to_earth.T @ motion[6:]
     turning += np.array([*np.asarray(v.air.flapping) * along[[1, 0]], 0])
     specific = [0, 0, force.sum() / float(airframe.mass)] - np.array([*v.air.drag, v.air.inflow]) * along
-    moving = to_earth.apply(specific) - [0, 0, float(airframe.gravity)]
+    moving = to_earth @ specific - [0, 0, float(airframe.gravity)]
     across = rate[1] * np.sin(phi) + rate[2] * np.cos(phi)
     forward = rate[1] * np.cos(phi) - rate[2] * np.sin(phi)
     return np.array([*turning, rate[0] + np.tan(theta) * across, forward, across / np.cos(theta), *moving])
