@@ -84,6 +84,7 @@ batch = 2
 """
 COMMANDS = """study study.toml --out study --dry-run
 study study.toml --out study
+report study
 simulate --duration 1 --out flight.csv
 study study.toml --out study --dry-run
 estimate flight.csv --estimator gauss-newton --channels rates --initial-state known --out found.json
@@ -100,3 +101,4 @@ def test_a_new_estimator_is_offered_everywhere(tmp_path, monkeypatch):
     assert ["gauss-newton", "0", "0"] in [line.split() for line in said.splitlines()]  # nothing remains
     found = json.loads((tmp_path / "found.json").read_text())
     assert (found["estimator"], found["result"]) == ("gauss-newton", "successful")
+    assert "gauss-newton" in (tmp_path / "study" / "report.html").read_text(encoding="utf-8")

@@ -132,9 +132,10 @@ def residual_noise(flights, correlation_time):
 def test_robust_intervals_hold_under_coloured_noise_but_those_of_the_bound_do_not():
     naive, robust = residual_noise(2 * LANES, 0.05)
     covered = [(np.abs(x) < 1.96).mean() for x in (naive, robust)]
+    # 128 flights: 47 and 89 %, with Monte-Carlo errors of 1.6 and 1.1 %.
     assert covered[0] < 0.6
     # The fit explains some slow noise as motion, so it is missing in the residuals.
-    assert 0.85 < covered[1] < 0.98
+    assert 0.85 < covered[1] < 0.93
 
 
 def test_robust_is_the_bound_under_white_noise():

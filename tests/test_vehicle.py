@@ -135,8 +135,12 @@ def test_a_network_that_was_trained_aside_of_the_truth_costs_time_and_no_more():
     hybrid = jaxos4.Hybrid(settings.fit(seen, bracket, key=jax.random.key(0)), seen=seen)
     found, newton = hybrid(InnovationsProblem(shooting_problem(flight, airframe))), lane(found_by("filter error"), 0)
     assert names(found) == "successful"
-    off = np.abs(found.parameters - newton.parameters)[: unknowns.count] / np.asarray(newton.std)[: unknowns.count]
-    assert off.max() < 0.05
+    std, best = (np.asarray(each)[: unknowns.count] for each in (newton.std, newton.parameters))
+    # The seed is 41 standard deviations off after 20 steps of training, and 39 after 100: 20 are enough.
+    assert (np.abs(found.seed.center - best) / std).max() > 10
+    assert (np.abs(found.parameters[: unknowns.count] - best) / std).max() < 0.05
+    # IBSS searches the whole bracket after the search near the seed.
+    assert found.rollouts > 1.5 * lane(found_by("ibss"), 0).rollouts
 
 
 def test_an_identification_by_the_hybrid_trains_its_network(monkeypatch):
