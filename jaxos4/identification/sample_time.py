@@ -47,9 +47,9 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
             case = case if found is None else starting_from(case, found)
-            found = jax.block_until_ready(case.estimator(case.problem))
             if not fits:
                 beside.submit(for_threads(compile_ahead), case)
+            found = jax.block_until_ready(case.estimator(case.problem))
             fits.insert(0, beside.submit(for_threads(fit_case), case, first=found))
     fits = [fit.result() for fit in fits]
     finest = cases[0].shooting.flight
