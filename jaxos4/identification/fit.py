@@ -10,7 +10,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from .._custom_types import as_float
 from ..analysis.diagnostics import Diagnostics, residual_diagnostics
@@ -19,8 +19,9 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
 from ..models.abstract import Parameter
 from ..results import RESULTS
-from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
+from ..shooting import InnovationsProblem, ShootingProblem, padded
 from ..shooting.gains import LogNoise
+from .intervals import Errors, bracket_cost, errors_of, parts_found
 from .prepare import Case, Progress
 from .results import COLOURED, Disturbance, HeldParameter, has_answer
 
@@ -36,10 +37,6 @@ _NEGATIVE = 2.0
 # deviations is never tried.
 _CLEARLY, _SURELY = 5.0, 12.0
 _PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
-# The most parts of a flight that are compared, and the fewest that can show a disagreement.
-_MOST, _FEWEST = 20, 4
-# The chance that parts of a flight that the model explains are taken to disagree.
-_CHANCE = 0.05
 _NEGATIVE_NOTE = "came out negative, which is impossible"
 _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 
@@ -56,6 +53,7 @@ class Fit(NamedTuple):
     - `held`: parameters of a vehicle that are not estimated. `negative`: value and standard deviation of those that are
       held at 0 because they came out negative.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
+    - `intervals`: the 95 % intervals of parameters that are not as far to both sides.
     - `disturbances`: by channel. `noise`: the same as logarithms. Only for innovations.
     """
 
@@ -68,6 +66,7 @@ class Fit(NamedTuple):
     held: dict[str, HeldParameter] = {}
     negative: dict[str, tuple[float, float]] = {}
     widened: dict[str, float] = {}
+    intervals: dict[str, tuple[float, float]] = {}
     disturbances: dict[str, Disturbance] = {}
     noise: LogNoise | None = None
 
@@ -159,17 +158,18 @@ def fit_innovations(
     progress("computing errors")
     values, std = np.asarray(found.parameters), _std(found)[: own.count]
     noise = problem.noise(values)
-    free, factor = np.flatnonzero(~np.isin(names, list(notes))), np.ones(values.size)
+    free = np.flatnonzero(~np.isin(names, list(notes)))
+    errors = Errors(np.ones(values.size), np.ones(values.size), {}, 0)
     if has_answer(found):
-        factor[free] = _widening(problem, found, free, recording)
-        known = np.asarray(is_identifiable(factor[: own.count] * std, np.asarray(own.half_width), GAUSSIAN_PRIOR))
-        notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~known)} | notes
+        errors = errors_of(estimator, problem, found, free, recording)
+        known = is_identifiable(errors.scale[: own.count] * std, np.asarray(own.half_width), GAUSSIAN_PRIOR)
+        notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~np.asarray(known))} | notes
     held = {
         name: HeldParameter(float(values[i]), own.units[i], notes[name])
         for i, name in enumerate(names)
         if name in notes
     }
-    spread = as_float(np.asarray(found.covariance) * np.outer(factor, factor))
+    spread = as_float(np.asarray(found.covariance) * np.outer(errors.scale, errors.scale))
     shooting = problem.problem if shooting is None else shooting
     sigma = np.array(shooting.sigma)
     sigma[shooting.columns] = np.exp(noise.sensor)
@@ -178,10 +178,11 @@ def fit_innovations(
         problem=eqx.tree_at(lambda p: p.sigma, shooting, sigma),
         estimate=eqx.tree_at(lambda e: e.covariance, found, spread),
         bound=std,
-        rollouts=rollouts,
+        rollouts=rollouts + errors.rollouts,
         held=held,
         negative=negative,
-        widened={names[i]: float(factor[i]) for i in range(own.count) if factor[i] > 1 and names[i] not in held},
+        widened={name: float(x) for name, x in zip(names, errors.widened, strict=False) if x > 1 and name not in held},
+        intervals={names[i]: ends for i, ends in errors.intervals.items()},
         disturbances=_disturbances(problem, found, noise),
         noise=noise,
     )
@@ -225,12 +226,9 @@ def _searched(
     if has_answer(found) and plain:
         progress("fitting again without what the flights hardly show")
         simpler = holding(plain)
-        other, own = search(simpler), problem.problem.unknowns
-        # The cost that the brackets add at these values, as Gaussian priors. Held parameters have none.
-        places = [own.names.index(name) for name in plain]
-        off = (np.array(list(plain.values())) - np.asarray(own.center)[places]) / np.asarray(own.half_width)[places]
-        against = float(np.square(off).sum()) / 2
-        if has_answer(other) and float(other.cost) + against < float(found.cost) + _CLEARLY:
+        other = search(simpler)
+        rise = float(other.cost) + bracket_cost(problem.problem.unknowns, plain) - float(found.cost)
+        if has_answer(other) and rise < _CLEARLY:
             problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
     return problem, found, rollouts, fixed, negative
 
@@ -240,36 +238,13 @@ def _with_values(table: tuple[Parameter, ...], found: Estimate) -> Iterator[tupl
     return zip(table, np.asarray(found.parameters).tolist(), _std(found).tolist(), strict=False)
 
 
-def _parts(found: Estimate) -> Parts:
-    if found.parts is None:
-        raise ValueError("`estimator` must return the `parts` of the likelihood.")
-    return found.parts
-
-
 def _std(found: Estimate) -> np.ndarray:
     return np.sqrt(np.maximum(np.diagonal(np.asarray(found.covariance)), 0.0))
 
 
-def _widening(
-    problem: InnovationsProblem, found: Estimate, fitted: np.ndarray, recording: np.ndarray
-) -> Float[np.ndarray, " fitted"]:
-    """The factor by which the intervals of the parameters in the places `fitted` widen. `recording`: of each sample."""
-    index, owned, _ = map(np.asarray, problem.cut)
-    middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
-    parts = _parts(found)
-    # In a segment of padding nothing was measured.
-    used = np.asarray(parts.information).any(axis=(1, 2))
-    number = recording[np.minimum(middle, recording.size - 1)][used]
-    gradient = np.asarray(parts.gradient)[used][:, fitted]
-    information = np.asarray(parts.information)[used][:, fitted[:, None], fitted]
-    prior = np.diag(1 / np.square(np.asarray(problem.problem.unknowns.half_width)[fitted]))
-    ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
-    return np.max([np.ones(fitted.size), *ways], axis=0)
-
-
 def _disturbances(problem: InnovationsProblem, found: Estimate, noise: LogNoise) -> dict[str, Disturbance]:
     strength, time_constant, sensor = (np.exp(leaf) for leaf in noise)
-    products = np.asarray(_parts(found).products).sum(axis=0)
+    products = np.asarray(parts_found(found).products).sum(axis=0)
     correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)
     largest = np.take_along_axis(correlation, np.abs(correlation).argmax(axis=1)[:, None], axis=1)[:, 0]
     return {
@@ -282,51 +257,3 @@ def _disturbances(problem: InnovationsProblem, found: Estimate, noise: LogNoise)
         )
         for i, name in enumerate(problem.channels)
     }
-
-
-def parts_of(lanes: int, recording: Int[np.ndarray, " lanes"]) -> list[Int[np.ndarray, " lanes"]]:
-    """The ways to divide lanes into parts: into blocks of neighbours, and into recordings if there are enough."""
-    ways = [np.arange(lanes) * min(lanes, _MOST) // lanes]
-    if np.unique(recording).size >= _FEWEST:
-        ways.append(recording)
-    return [way for way in ways if np.unique(way).size >= _FEWEST]
-
-
-def disagreement(
-    gradient: Float[np.ndarray, "lanes unknowns"],
-    information: Float[np.ndarray, "lanes unknowns unknowns"],
-    prior: Float[np.ndarray, "unknowns unknowns"],
-    part: Int[np.ndarray, " lanes"],
-) -> Float[np.ndarray, " unknowns"]:
-    """By how much parts disagree: the jackknife's standard error over the likelihood's; at least 1.
-
-    The standard errors of a likelihood assume that the model is right. If it is not, parts of a flight give different
-    answers. The jackknife leaves out one part at a time; each answer follows from one Gauss-Newton step, because the
-    search has computed the gradient and the information of each part. 1 if the disagreement could be chance: it happens
-    by chance to one parameter in twenty.
-
-    **Arguments:**
-
-    - `gradient`, `information`: of the negative log-likelihood of each lane, at the estimate from all lanes.
-    - `prior`: the information of the prior.
-    - `part`: the number of the part of each lane.
-
-    Reference: Efron and Tibshirani 1993, An Introduction to the Bootstrap, ch. 11.
-    """
-    from scipy.special import chdtri  # slow to import
-
-    numbers = np.unique(part)
-    whole = information.sum(axis=0) + prior
-    scale = np.sqrt(np.diagonal(whole))
-    moved = []
-    for number in numbers:
-        left_out = part == number
-        rest = (whole - information[left_out].sum(axis=0)) / np.outer(scale, scale)
-        slope = gradient[left_out].sum(axis=0) / scale
-        moved.append(np.linalg.lstsq(rest, slope, rcond=1e-12)[0] / scale)
-    moved = np.stack(moved)
-    variance = (numbers.size - 1) / numbers.size * np.square(moved - moved.mean(axis=0)).sum(axis=0)
-    likelihood = np.diagonal(np.linalg.inv(whole / np.outer(scale, scale))) / scale**2
-    ratio = variance / likelihood
-    freedom = numbers.size - 1
-    return np.sqrt(np.where(ratio > chdtri(freedom, _CHANCE) / freedom, np.maximum(ratio, 1.0), 1.0))
