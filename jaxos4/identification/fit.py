@@ -196,7 +196,7 @@ def _searched(
     **Returns:** also the rollouts of all searches, why each of these parameters is held, and the value and standard
     deviation of those that came out negative.
     """
-    table, rollouts = problem.model.parameters, 0
+    table, rollouts = problem.model.parameters, 0 if first is None else int(first.rollouts)
 
     def search(other: InnovationsProblem) -> Estimate:
         nonlocal rollouts
