@@ -5,7 +5,7 @@ So the traced program is exported to the same folder. The name of its file is a 
 static values of its arguments, the sources of `jaxos4`, the installed packages and JAX's settings. This is enough for a
 command, which runs no other code. It is not enough for a program of the user, who may add a term to a table, or switch
 a setting in a part of the program: so only the command line keeps programs, see `keep_programs`. To read a file runs
-its code: a folder or a file that another user owns, or can write to, is not used.
+its code: none is read from or written to a folder or a file that another user owns, or can write to.
 """
 
 import contextlib
@@ -112,10 +112,10 @@ def _describe_surroundings() -> bytes:
     return repr((sizes, packages, sorted(jax.config.values.items()))).encode()
 
 
-def _is_private(path: str | Path) -> bool:
-    """Whether a file or folder is this user's, and nobody else can write to it. Without users of POSIX: always."""
+def _is_private(place: str | Path | int) -> bool:
+    """Whether a file or folder is this user's, and nobody else can write to it. Without POSIX: if it exists."""
     with contextlib.suppress(OSError):
-        status = os.stat(path)
+        status = os.stat(place)
         return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
     return False
 
@@ -125,8 +125,8 @@ def _read(path: Path) -> tuple[Any, Any] | None:
     import jax.export
 
     content = b""
-    with contextlib.suppress(OSError):
-        content = path.read_bytes() if _is_private(path) else b""
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        content = file.read() if _is_private(file.fileno()) else b""
     if hashlib.sha256(content[32:]).digest() != content[:32]:
         return None
     results, traced = pickle.loads(content[32:])  # noqa: S301

@@ -198,7 +198,7 @@ def run_three_ways(run, tmp_path, monkeypatch):
             monkeypatch.setattr(_programs, "_write", write)  # tracing would call it
             code, out, _ = run(*arguments)
             written = re.sub('"seconds": .*', "", (tmp_path / "out.json").read_text())
-            answers.append((code, re.sub(r"[\d.]+ s\b", "", out), written))
+            answers.append((code, re.sub(r"rollouts, [\d.]+ s\b", "", out), written))
             assert any(folder.glob("jaxos4-*")) == (not switched_off)
         return answers
 

@@ -129,6 +129,9 @@ def test_a_fit_without_a_thrust_is_no_answer_and_its_inertias_are_as_uncertain()
     """The gain of the thrust scales all torques. If it is hardly known, so are the moments of inertia."""
     case = case_of(flown(), 2 * DT)
     _, fit, (answer,) = fit_at_sample_times([case], progress=lambda stage: None)
+    alone = fit_case(case)  # in one thread, from the first search on
+    assert (alone.held, alone.rollouts) == (fit.held, fit.rollouts)
+    np.testing.assert_array_equal(alone.estimate.covariance, fit.estimate.covariance)
     assert set(answer.constants) == {"Ix", "Iy", "Iz"}
     place = fit.problem.model.parameter_names.index("thrust_gain")
     unknown = np.asarray(fit.estimate.covariance).copy()

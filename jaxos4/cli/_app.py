@@ -17,7 +17,7 @@ from .new_flights import design, simulate
 from .studies import compare, report, study
 
 _INTERRUPTED = 130
-_EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1 switches this off."
+_EPILOG = f"Compiled programs are kept. Those in your cache folder take at most 1 GB. {NO_CACHE}=1: nothing is kept."
 
 
 def _prepared(command: Callable[..., None]) -> Callable[..., None]:

@@ -29,7 +29,7 @@ from ..shooting.abstract import WindowUnknowns
 _DAMPING_FACTOR = 10.0  # how much more, or less, is damped after a step that failed, or succeeded
 # A search ends here too: steps with less than this damping failed, although they promised some of the gain.
 _STALLED, _FLAT = 1.0, 0.05
-# The information misjudges the curvature of an unknown with a stride, so every step adds this, per squared stride.
+# The information of an unknown with a stride misjudges the curvature, so this much is added to it, per squared stride.
 _LEAST = 0.3
 _COARSE = 1e-3  # the tolerance of output error on the problems before the last
 

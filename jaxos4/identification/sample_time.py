@@ -1,7 +1,7 @@
 """The sample time of a vehicle's fit: the shortest at which the answer does not depend on it.
 
 Short samples contain the vibration of the sensors and the noise of measured rotor speeds. Long samples hide motion. The
-flight is fitted at several sample times, from the longest on, each starting at the answer before.
+flight is fitted at several sample times, from the longest on.
 
 The rule: the shortest sample time at which innovations are nearly white, measured rotor speeds have little noise, and
 the moments of inertia are those of samples twice as long, within two standard deviations. If there is none: the
@@ -42,24 +42,26 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
 
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
-    found, fits = None, []
-    with ThreadPoolExecutor(1) as beside:
+    found, fits, beside = None, [], ThreadPoolExecutor(1)
+    try:
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            case = case if found is None else starting_from(case, found)
+            case = case if found is None else _starting_from(case, found)
             if not fits:
-                beside.submit(for_threads(compile_ahead), case)
+                beside.submit(for_threads(compile_ahead), case)  # what fails here fails again when it is needed
             found = jax.block_until_ready(case.estimator(case.problem))
-            fits.insert(0, beside.submit(for_threads(fit_case), case, first=found))
-    fits = [fit.result() for fit in fits]
+            fits.append(beside.submit(for_threads(fit_case), case, first=found))
+        fits = [fit.result() for fit in fits][::-1]
+    finally:  # after an error, what has not begun is not computed
+        beside.shutdown(cancel_futures=True)
     finest = cases[0].shooting.flight
     answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
     return place, fits[place], answers
 
 
-def starting_from(case: Case, found: Estimate) -> Case:
-    """The case, whose search starts at the answer for another sample time, if there is one."""
+def _starting_from(case: Case, found: Estimate) -> Case:
+    """The case, whose search starts at the estimate of all parameters for another sample time, if there is one."""
     if not has_answer(found) or not isinstance(case.problem, InnovationsProblem):
         return case
     own, start = case.problem.problem.unknowns, np.asarray(found.parameters)

@@ -129,7 +129,7 @@ def _plain_numbers(lines: list[str], width: int, missing: Collection[str]) -> np
         text = text.replace(", ", ",")
     for cell in missing:
         text = re.sub(rf"(^|(?<=,)){re.escape(cell)}(?=,|$)", "", text, flags=re.MULTILINE)
-    if text.isspace() or len(max(lines, key=len)) >= _LONGEST_LINE - 1 or text.translate(_IN_NUMBERS):
+    if not text or text.isspace() or len(max(lines, key=len)) >= _LONGEST_LINE - 1 or text.translate(_IN_NUMBERS):
         return None
     try:
         numbers = _array(text)

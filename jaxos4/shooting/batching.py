@@ -111,11 +111,12 @@ def cores() -> int:
 
 
 def for_threads(function: Callable[P, R]) -> Callable[P, R]:
-    """`function` for other threads, with the precision of this one, which JAX sets for each thread."""
-    double = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+    """`function` for other threads, with the precision and the device of this one: JAX has them for each thread."""
+    settings = jax.config.values
+    double, device = settings["jax_enable_x64"], settings["jax_default_device"]
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        with jax.enable_x64(double):
+        with jax.enable_x64(double), jax.default_device(device):
             return function(*args, **kwargs)
 
     return call
@@ -148,7 +149,7 @@ def on_all_cores(function: Callable) -> Callable:
 
         # All chunks are full: the last begins with flights of the one before it.
         firsts, found = [min(first, lanes - size) for first in range(0, lanes, size)], []
-        key = structure, size, *((leaf.shape, leaf.dtype) for leaf in map(jnp.asarray, leaves))
+        key = structure, size, jax.config.values["jax_enable_x64"], *map(jnp.shape, leaves)
         if key not in compiled:
             found.append(run(firsts.pop(0)))
             compiled.add(key)
