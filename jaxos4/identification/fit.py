@@ -5,7 +5,7 @@ it. A likelihood of innovations has its noise among its unknowns, and is fitted 
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -81,12 +81,13 @@ class Fit(NamedTuple):
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.held]
 
 
-def fit_case(case: Case, *, first: Estimate | None = None, progress: Progress = lambda stage: None) -> Fit:
-    """The fit of a prepared case, by its likelihood. `first`: see `fit_innovations`."""
+def fit_case(
+    case: Case, *, first: Estimate | None = None, profile: bool = True, progress: Progress = lambda stage: None
+) -> Fit:
+    """The fit of a prepared case, by its likelihood. `first`, `profile`: see `fit_innovations`."""
     if isinstance(case.problem, InnovationsProblem):
-        return fit_innovations(
-            case.estimator, case.problem, case.recording, shooting=case.shooting, first=first, progress=progress
-        )
+        settings: dict[str, Any] = {"shooting": case.shooting, "first": first, "profile": profile}
+        return fit_innovations(case.estimator, case.problem, case.recording, **settings, progress=progress)
     return fit_flight(case.estimator, case.problem, progress=progress)
 
 
@@ -139,6 +140,7 @@ def fit_innovations(
     *,
     shooting: ShootingProblem | None = None,
     first: Estimate | None = None,
+    profile: bool = True,
     progress: Progress = lambda stage: None,
 ) -> Fit:
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
@@ -152,6 +154,7 @@ def fit_innovations(
     - `recording`: the number of the recording of each sample.
     - `shooting`: the flight and its model, if that of the problem is padded.
     - `first`: the estimate of all parameters, if it was computed before.
+    - `profile`: whether intervals of poorly known inertias follow from the profile of the likelihood, by more searches.
     """
     own, names = problem.problem.unknowns, problem.model.parameter_names
     problem, found, rollouts, notes, negative = _searched(estimator, problem, first, progress)
@@ -161,7 +164,7 @@ def fit_innovations(
     free = np.flatnonzero(~np.isin(names, list(notes)))
     errors = Errors(np.ones(values.size), np.ones(values.size), {}, 0)
     if has_answer(found):
-        errors = errors_of(estimator, problem, found, free, recording)
+        errors = errors_of(estimator, problem, found, free, recording, profile=profile)
         known = is_identifiable(errors.scale[: own.count] * std, np.asarray(own.half_width), GAUSSIAN_PRIOR)
         notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~np.asarray(known))} | notes
     held = {

@@ -51,6 +51,8 @@ def errors_of(
     found: Estimate,
     fitted: Int[np.ndarray, " fitted"],
     recording: np.ndarray,
+    *,
+    profile: bool,
 ) -> Errors:
     """The errors of an answer. `fitted`: the places of its parameters. `recording`: the number of each sample's."""
     values, own = np.asarray(found.parameters), problem.problem.unknowns
@@ -65,14 +67,19 @@ def errors_of(
         return estimate
 
     known = np.asarray(is_identifiable((widened * std)[: own.count], np.asarray(own.half_width), GAUSSIAN_PRIOR))
-    poorly = [i for i in INVERSE.values() if i in fitted and known[i] and std[i] > _WELL_KNOWN * abs(values[i])]
+    poorly = [i for i in poorly_known(values, std) if i in fitted and known[i]] if profile else []
     scale, intervals = widened.copy(), profiled(search, problem, found, poorly)
     for i, (low, high) in intervals.items():
-        profile, value = (high - low) / (2 * NINETY_FIVE), float(values[i])
-        stretch = max(widened[i] * std[i] / profile, 1.0) if widened[i] > 1 else 1.0
-        scale[i] = max(stretch * profile / std[i], 1.0)
+        half, value = (high - low) / (2 * NINETY_FIVE), float(values[i])
+        stretch = max(widened[i] * std[i] / half, 1.0) if widened[i] > 1 else 1.0
+        scale[i] = max(stretch * half / std[i], 1.0)
         intervals[i] = value + stretch * (low - value), value + stretch * (high - value)
     return Errors(scale, widened, intervals, rollouts)
+
+
+def poorly_known(values: Float[np.ndarray, " unknowns"], std: Float[np.ndarray, " some"]) -> list[int]:
+    """The places of the alphas of inertias about which the cost is not nearly quadratic within their intervals."""
+    return [i for i in INVERSE.values() if std[i] > _WELL_KNOWN * abs(values[i])]
 
 
 def bracket_cost(unknowns: Unknowns, values: Mapping[str, float]) -> float:

@@ -22,6 +22,7 @@ from ..shooting import InnovationsProblem, for_threads
 from .answers import AXES, NOISY, overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
 from .held_out import compile_ahead
+from .intervals import poorly_known
 from .prepare import Case, Progress
 from .results import Constant, SampleTime, has_answer
 
@@ -42,22 +43,27 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
 
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
-    found, fits, beside = None, [], ThreadPoolExecutor(1)
+    found, fits, beside = [], [], ThreadPoolExecutor(1)
     try:
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            case = case if found is None else _starting_from(case, found)
+            case = _starting_from(case, found[-1]) if found else case
             if not fits:
                 beside.submit(for_threads(compile_ahead), case)  # what fails here fails again when it is needed
-            found = jax.block_until_ready(case.estimator(case.problem))
-            fits.append(beside.submit(for_threads(fit_case), case, first=found))
+            found.append(jax.block_until_ready(case.estimator(case.problem)))
+            fits.append(beside.submit(for_threads(fit_case), case, first=found[-1], profile=False))
         fits = [fit.result() for fit in fits][::-1]
     finally:  # after an error, what has not begun is not computed
         beside.shutdown(cancel_futures=True)
     finest = cases[0].shooting.flight
-    answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
+    answers = [answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True)]
     place = shortest(answers)
-    return place, fits[place], answers
+    case, fit = cases[place], fits[place]
+    if fit.answered and {*fit.free} & {*poorly_known(np.asarray(fit.estimate.parameters), fit.bound)}:
+        progress("computing intervals")
+        fit = fit_case(case, first=found[::-1][place])
+        answers[place] = answer_of(case, fit, finest)
+    return place, fit, tuple(answers)
 
 
 def _starting_from(case: Case, found: Estimate) -> Case:
