@@ -22,7 +22,7 @@ from ..shooting import InnovationsProblem, for_threads
 from .answers import AXES, NOISY, overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
 from .held_out import compile_ahead
-from .intervals import poorly_known
+from .intervals import INVERSE, poorly_known
 from .prepare import Case, Progress
 from .results import Constant, SampleTime, has_answer
 
@@ -59,11 +59,20 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
     answers = [answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True)]
     place = shortest(answers)
     case, fit = cases[place], fits[place]
-    if fit.answered and {*fit.free} & {*poorly_known(np.asarray(fit.estimate.parameters), fit.bound)}:
+    if _needs_profile(fit):
         progress("computing intervals")
         fit = fit_case(case, first=found[::-1][place])
         answers[place] = answer_of(case, fit, finest)
     return place, fit, tuple(answers)
+
+
+def _needs_profile(fit: Fit) -> bool:
+    """Whether an inertia is poorly known, but not lost in a larger disturbance."""
+    if not fit.answered:
+        return False
+    poorly, weak = poorly_known(np.asarray(fit.estimate.parameters), fit.bound), overwhelmed(fit)
+    axes = zip(AXES.values(), INVERSE.values(), strict=True)
+    return any(place in poorly and place in fit.free and axis not in weak for axis, place in axes)
 
 
 def _starting_from(case: Case, found: Estimate) -> Case:
