@@ -11,8 +11,7 @@ from scipy.special import chdtri
 import jaxos4
 from jaxos4.airframe import OS4
 from jaxos4.identification.answers import overwhelmed
-from jaxos4.identification.fit import Fit
-from jaxos4.identification.intervals import disagreement, parts_of
+from jaxos4.identification.fit import Fit, disagreement, parts_of
 from jaxos4.identification.judge import doubts_of, vibration
 from jaxos4.identification.results import (
     Constant,

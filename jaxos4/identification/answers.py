@@ -16,11 +16,12 @@ from ..models.os4 import CorrectedOS4
 from ..models.state import CASCADE_ORDER
 from ..shooting import ShootingProblem
 from .fit import Fit
-from .intervals import INVERSE
 from .prepare import Case
 from .results import ChannelFit, Constant, ParameterEstimate, RigidBody, finite_or_none
 
 UNIT = "kg m^2"
+# The place of the alpha that is torque over this moment of inertia.
+INVERSE = {"Ix": 2, "Iy": 5, "Iz": 7}
 AXES = {"p": "roll", "q": "pitch", "r": "yaw"}
 # The scale of an accelerometer, with what forward flight adds to the lift of rotors, is known to 1 %.
 _SCALE = 0.01
@@ -55,9 +56,7 @@ def parameter_table(case: Case, fit: Fit) -> dict[str, ParameterEstimate]:
             estimate=float(values[i]) if identifiable[i] else None,
             std=finite_or_none(std[i]),
             bound=finite_or_none(fit.bound[i]),
-            ci95=fit.intervals.get(name, (float(values[i] - width[i]), float(values[i] + width[i])))
-            if identifiable[i]
-            else None,
+            ci95=(float(values[i] - width[i]), float(values[i] + width[i])) if identifiable[i] else None,
             unit=unknowns.units[i],
             note=_note(fit, i, float(width[i])) if identifiable[i] else reasons[name],
             noise_limit=limits[name],

@@ -5,12 +5,12 @@ it. A likelihood of innovations has its noise among its unknowns, and is fitted 
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._custom_types import as_float
 from ..analysis.diagnostics import Diagnostics, residual_diagnostics
@@ -19,9 +19,8 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
 from ..models.abstract import Parameter
 from ..results import RESULTS
-from ..shooting import InnovationsProblem, ShootingProblem, padded
+from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
 from ..shooting.gains import LogNoise
-from .intervals import Errors, bracket_cost, errors_of, parts_found
 from .prepare import Case, Progress
 from .results import COLOURED, Disturbance, HeldParameter, has_answer
 
@@ -37,6 +36,10 @@ _NEGATIVE = 2.0
 # deviations is never tried.
 _CLEARLY, _SURELY = 5.0, 12.0
 _PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
+# The most parts of a flight that are compared, and the fewest that can show a disagreement.
+_MOST, _FEWEST = 20, 4
+# The chance that parts of a flight that the model explains are taken to disagree.
+_CHANCE = 0.05
 _NEGATIVE_NOTE = "came out negative, which is impossible"
 _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 
@@ -53,7 +56,6 @@ class Fit(NamedTuple):
     - `held`: parameters of a vehicle that are not estimated. `negative`: value and standard deviation of those that are
       held at 0 because they came out negative.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
-    - `intervals`: the 95 % intervals of parameters that are not as far to both sides.
     - `disturbances`: by channel. `noise`: the same as logarithms. Only for innovations.
     """
 
@@ -66,7 +68,6 @@ class Fit(NamedTuple):
     held: dict[str, HeldParameter] = {}
     negative: dict[str, tuple[float, float]] = {}
     widened: dict[str, float] = {}
-    intervals: dict[str, tuple[float, float]] = {}
     disturbances: dict[str, Disturbance] = {}
     noise: LogNoise | None = None
 
@@ -81,13 +82,12 @@ class Fit(NamedTuple):
         return [i for i, name in enumerate(self.problem.model.parameter_names) if name not in self.held]
 
 
-def fit_case(
-    case: Case, *, first: Estimate | None = None, profile: bool = True, progress: Progress = lambda stage: None
-) -> Fit:
-    """The fit of a prepared case, by its likelihood. `first`, `profile`: see `fit_innovations`."""
+def fit_case(case: Case, *, first: Estimate | None = None, progress: Progress = lambda stage: None) -> Fit:
+    """The fit of a prepared case, by its likelihood. `first`: see `fit_innovations`."""
     if isinstance(case.problem, InnovationsProblem):
-        settings: dict[str, Any] = {"shooting": case.shooting, "first": first, "profile": profile}
-        return fit_innovations(case.estimator, case.problem, case.recording, **settings, progress=progress)
+        return fit_innovations(
+            case.estimator, case.problem, case.recording, shooting=case.shooting, first=first, progress=progress
+        )
     return fit_flight(case.estimator, case.problem, progress=progress)
 
 
@@ -140,7 +140,6 @@ def fit_innovations(
     *,
     shooting: ShootingProblem | None = None,
     first: Estimate | None = None,
-    profile: bool = True,
     progress: Progress = lambda stage: None,
 ) -> Fit:
     """Estimate the parameters of a vehicle, and the disturbances that its model lacks.
@@ -154,25 +153,23 @@ def fit_innovations(
     - `recording`: the number of the recording of each sample.
     - `shooting`: the flight and its model, if that of the problem is padded.
     - `first`: the estimate of all parameters, if it was computed before.
-    - `profile`: whether intervals of poorly known inertias follow from the profile of the likelihood, by more searches.
     """
     own, names = problem.problem.unknowns, problem.model.parameter_names
     problem, found, rollouts, notes, negative = _searched(estimator, problem, first, progress)
     progress("computing errors")
     values, std = np.asarray(found.parameters), _std(found)[: own.count]
     noise = problem.noise(values)
-    free = np.flatnonzero(~np.isin(names, list(notes)))
-    errors = Errors(np.ones(values.size), np.ones(values.size), {}, 0)
+    free, factor = np.flatnonzero(~np.isin(names, list(notes))), np.ones(values.size)
     if has_answer(found):
-        errors = errors_of(estimator, problem, found, free, recording, profile=profile)
-        known = is_identifiable(errors.scale[: own.count] * std, np.asarray(own.half_width), GAUSSIAN_PRIOR)
-        notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~np.asarray(known))} | notes
+        factor[free] = _widening(problem, found, free, recording)
+        known = np.asarray(is_identifiable(factor[: own.count] * std, np.asarray(own.half_width), GAUSSIAN_PRIOR))
+        notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~known)} | notes
     held = {
         name: HeldParameter(float(values[i]), own.units[i], notes[name])
         for i, name in enumerate(names)
         if name in notes
     }
-    spread = as_float(np.asarray(found.covariance) * np.outer(errors.scale, errors.scale))
+    spread = as_float(np.asarray(found.covariance) * np.outer(factor, factor))
     shooting = problem.problem if shooting is None else shooting
     sigma = np.array(shooting.sigma)
     sigma[shooting.columns] = np.exp(noise.sensor)
@@ -181,11 +178,10 @@ def fit_innovations(
         problem=eqx.tree_at(lambda p: p.sigma, shooting, sigma),
         estimate=eqx.tree_at(lambda e: e.covariance, found, spread),
         bound=std,
-        rollouts=rollouts + errors.rollouts,
+        rollouts=rollouts,
         held=held,
         negative=negative,
-        widened={name: float(x) for name, x in zip(names, errors.widened, strict=False) if x > 1 and name not in held},
-        intervals={names[i]: ends for i, ends in errors.intervals.items()},
+        widened={names[i]: float(factor[i]) for i in range(own.count) if factor[i] > 1 and names[i] not in held},
         disturbances=_disturbances(problem, found, noise),
         noise=noise,
     )
@@ -229,9 +225,12 @@ def _searched(
     if has_answer(found) and plain:
         progress("fitting again without what the flights hardly show")
         simpler = holding(plain)
-        other = search(simpler)
-        rise = float(other.cost) + bracket_cost(problem.problem.unknowns, plain) - float(found.cost)
-        if has_answer(other) and rise < _CLEARLY:
+        other, own = search(simpler), problem.problem.unknowns
+        # The cost that the brackets add at these values, as Gaussian priors. Held parameters have none.
+        places = [own.names.index(name) for name in plain]
+        off = (np.array(list(plain.values())) - np.asarray(own.center)[places]) / np.asarray(own.half_width)[places]
+        against = float(np.square(off).sum()) / 2
+        if has_answer(other) and float(other.cost) + against < float(found.cost) + _CLEARLY:
             problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
     return problem, found, rollouts, fixed, negative
 
@@ -241,13 +240,36 @@ def _with_values(table: tuple[Parameter, ...], found: Estimate) -> Iterator[tupl
     return zip(table, np.asarray(found.parameters).tolist(), _std(found).tolist(), strict=False)
 
 
+def _parts(found: Estimate) -> Parts:
+    if found.parts is None:
+        raise ValueError("`estimator` must return the `parts` of the likelihood.")
+    return found.parts
+
+
 def _std(found: Estimate) -> np.ndarray:
     return np.sqrt(np.maximum(np.diagonal(np.asarray(found.covariance)), 0.0))
 
 
+def _widening(
+    problem: InnovationsProblem, found: Estimate, fitted: np.ndarray, recording: np.ndarray
+) -> Float[np.ndarray, " fitted"]:
+    """The factor by which the intervals of the parameters in the places `fitted` widen. `recording`: of each sample."""
+    index, owned, _ = map(np.asarray, problem.cut)
+    middle = np.array([int(np.median(row[own])) if own.any() else 0 for row, own in zip(index, owned, strict=True)])
+    parts = _parts(found)
+    # In a segment of padding nothing was measured.
+    used = np.asarray(parts.information).any(axis=(1, 2))
+    number = recording[np.minimum(middle, recording.size - 1)][used]
+    gradient = np.asarray(parts.gradient)[used][:, fitted]
+    information = np.asarray(parts.information)[used][:, fitted[:, None], fitted]
+    prior = np.diag(1 / np.square(np.asarray(problem.problem.unknowns.half_width)[fitted]))
+    ways = [disagreement(gradient, information, prior, part) for part in parts_of(number.size, number)]
+    return np.max([np.ones(fitted.size), *ways], axis=0)
+
+
 def _disturbances(problem: InnovationsProblem, found: Estimate, noise: LogNoise) -> dict[str, Disturbance]:
     strength, time_constant, sensor = (np.exp(leaf) for leaf in noise)
-    products = np.asarray(parts_found(found).products).sum(axis=0)
+    products = np.asarray(_parts(found).products).sum(axis=0)
     correlation = products[:, 1:] / np.maximum(products[:, :1], 1.0)
     largest = np.take_along_axis(correlation, np.abs(correlation).argmax(axis=1)[:, None], axis=1)[:, 0]
     return {
@@ -260,3 +282,51 @@ def _disturbances(problem: InnovationsProblem, found: Estimate, noise: LogNoise)
         )
         for i, name in enumerate(problem.channels)
     }
+
+
+def parts_of(lanes: int, recording: Int[np.ndarray, " lanes"]) -> list[Int[np.ndarray, " lanes"]]:
+    """The ways to divide lanes into parts: into blocks of neighbours, and into recordings if there are enough."""
+    ways = [np.arange(lanes) * min(lanes, _MOST) // lanes]
+    if np.unique(recording).size >= _FEWEST:
+        ways.append(recording)
+    return [way for way in ways if np.unique(way).size >= _FEWEST]
+
+
+def disagreement(
+    gradient: Float[np.ndarray, "lanes unknowns"],
+    information: Float[np.ndarray, "lanes unknowns unknowns"],
+    prior: Float[np.ndarray, "unknowns unknowns"],
+    part: Int[np.ndarray, " lanes"],
+) -> Float[np.ndarray, " unknowns"]:
+    """By how much parts disagree: the jackknife's standard error over the likelihood's; at least 1.
+
+    The standard errors of a likelihood assume that the model is right. If it is not, parts of a flight give different
+    answers. The jackknife leaves out one part at a time; each answer follows from one Gauss-Newton step, because the
+    search has computed the gradient and the information of each part. 1 if the disagreement could be chance: it happens
+    by chance to one parameter in twenty.
+
+    **Arguments:**
+
+    - `gradient`, `information`: of the negative log-likelihood of each lane, at the estimate from all lanes.
+    - `prior`: the information of the prior.
+    - `part`: the number of the part of each lane.
+
+    Reference: Efron and Tibshirani 1993, An Introduction to the Bootstrap, ch. 11.
+    """
+    from scipy.special import chdtri  # slow to import
+
+    numbers = np.unique(part)
+    whole = information.sum(axis=0) + prior
+    scale = np.sqrt(np.diagonal(whole))
+    moved = []
+    for number in numbers:
+        left_out = part == number
+        rest = (whole - information[left_out].sum(axis=0)) / np.outer(scale, scale)
+        slope = gradient[left_out].sum(axis=0) / scale
+        moved.append(np.linalg.lstsq(rest, slope, rcond=1e-12)[0] / scale)
+    moved = np.stack(moved)
+    variance = (numbers.size - 1) / numbers.size * np.square(moved - moved.mean(axis=0)).sum(axis=0)
+    likelihood = np.diagonal(np.linalg.inv(whole / np.outer(scale, scale))) / scale**2
+    ratio = variance / likelihood
+    freedom = numbers.size - 1
+    return np.sqrt(np.where(ratio > chdtri(freedom, _CHANCE) / freedom, np.maximum(ratio, 1.0), 1.0))

@@ -22,7 +22,6 @@ from ..shooting import InnovationsProblem, for_threads
 from .answers import AXES, NOISY, overwhelmed, vehicle_constants
 from .fit import Fit, fit_case
 from .held_out import compile_ahead
-from .intervals import INVERSE, poorly_known
 from .prepare import Case, Progress
 from .results import Constant, SampleTime, has_answer
 
@@ -43,36 +42,22 @@ def fit_at_sample_times(cases: Sequence[Case], *, progress: Progress) -> tuple[i
 
     **Arguments:** `cases`: of one flight at several sample times, each twice the one before.
     """
-    found, fits, beside = [], [], ThreadPoolExecutor(1)
+    found, fits, beside = None, [], ThreadPoolExecutor(1)
     try:
         for case in reversed(cases):
             progress(f"fitting samples of {1e3 * float(case.shooting.flight.dt):.3g} ms")
-            case = _starting_from(case, found[-1]) if found else case
+            case = case if found is None else _starting_from(case, found)
             if not fits:
                 beside.submit(for_threads(compile_ahead), case)  # what fails here fails again when it is needed
-            found.append(jax.block_until_ready(case.estimator(case.problem)))
-            fits.append(beside.submit(for_threads(fit_case), case, first=found[-1], profile=False))
+            found = jax.block_until_ready(case.estimator(case.problem))
+            fits.append(beside.submit(for_threads(fit_case), case, first=found))
         fits = [fit.result() for fit in fits][::-1]
     finally:  # after an error, what has not begun is not computed
         beside.shutdown(cancel_futures=True)
     finest = cases[0].shooting.flight
-    answers = [answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True)]
+    answers = tuple(answer_of(case, fit, finest) for case, fit in zip(cases, fits, strict=True))
     place = shortest(answers)
-    case, fit = cases[place], fits[place]
-    if _needs_profile(fit):
-        progress("computing intervals")
-        fit = fit_case(case, first=found[::-1][place])
-        answers[place] = answer_of(case, fit, finest)
-    return place, fit, tuple(answers)
-
-
-def _needs_profile(fit: Fit) -> bool:
-    """Whether an inertia is poorly known, but not lost in a larger disturbance."""
-    if not fit.answered:
-        return False
-    poorly, weak = poorly_known(np.asarray(fit.estimate.parameters), fit.bound), overwhelmed(fit)
-    axes = zip(AXES.values(), INVERSE.values(), strict=True)
-    return any(place in poorly and place in fit.free and axis not in weak for axis, place in axes)
+    return place, fits[place], answers
 
 
 def _starting_from(case: Case, found: Estimate) -> Case:
