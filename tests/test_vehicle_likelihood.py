@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxos4
 from jaxos4.flight import STATE_NAMES
 from jaxos4.identification.answers import vehicle_constants
+from jaxos4.identification.fit import fit_case
 from jaxos4.identification.results import Constant, HeldParameter, SampleTime
 from jaxos4.identification.sample_time import answer_of, fit_at_sample_times, moved, noise_of_speeds, shortest
 from jaxos4.identification.vehicle import prepare_vehicle
