@@ -19,7 +19,7 @@ from scipy.spatial.distance import pdist
 from synthetic_study import ESTIMATORS, LEVELS, SCENARIO, UNITS, synthetic_study
 
 from jaxos4.estimators import ESTIMATORS as REGISTRY
-from jaxos4.report import error_table, study_figures, study_page, write_report
+from jaxos4.report import error_table, study_page, write_report
 from jaxos4.report.study_tables import scenarios
 from jaxos4.report.style import drawing, log_axis, styles
 from jaxos4.report.text import percent, plain
@@ -222,7 +222,7 @@ def test_what_is_not_a_study_is_refused_and_nothing_is_written(write, tmp_path, 
 
 def test_user_settings_of_matplotlib_are_neither_used_nor_changed(study):
     (scenario,) = scenarios(study)
-    figures = {"coverage": study_figures.coverage}
+    figures = {"coverage": study_page.coverage}
     before = study_page.draw(figures, scenario.data)
     assert list(before) == ["coverage"]
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 20}):

@@ -7,6 +7,7 @@ import os
 import pathlib
 import subprocess
 import sys
+from typing import get_args
 
 import jax
 import numpy as np
@@ -20,8 +21,10 @@ from jaxos4._xla import LOOP_FLAGS, NO_OPTIONS, make_loops_fast, quick_jit
 from jaxos4.bracket import _default
 from jaxos4.cli import _jax, _options, estimate
 from jaxos4.closed_loop import LOGGED
+from jaxos4.design.task import CRITERIA
 from jaxos4.estimators import ESTIMATORS
 from jaxos4.excitation import EXCITATIONS
+from jaxos4.export import TARGETS
 from jaxos4.models import MODELS
 from jaxos4.models.state import CHANNELS
 from jaxos4.networks import FEATURES, NetworkEstimator
@@ -149,9 +152,10 @@ import diffrax
 
 def test_the_choices_of_the_command_line_are_the_names_in_the_tables_and_a_command_keeps_settings(run):
     tables = {"Estimator": ESTIMATORS, "Model": MODELS, "Excitation": EXCITATIONS, "Method": METHODS, "Sensors": LOGGED}
-    tables |= {"Channels": CHANNELS, "Features": FEATURES}
+    tables |= {"Channels": CHANNELS, "Features": FEATURES, "Simulator": TARGETS, "Criterion": CRITERIA}
     for name, table in tables.items():
-        assert list(getattr(_options, name)) == list(table)
+        kind = getattr(_options, name)
+        assert list(map(str, get_args(kind) or kind)) == list(table)
     defaults = {name: argument.default for name, argument in inspect.signature(estimate.train).parameters.items()}
     for name in ("noise", "steps", "features"):
         assert defaults[name] == getattr(NetworkEstimator, name)

@@ -8,7 +8,7 @@ import typer
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxos4.report.study_figures import dodged
+from jaxos4.report.study_page import dodged
 from jaxos4.report.style import INK, grid, log_axis, styles
 from jaxos4.study import metrics, read_results
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from jaxos4.report.study_figures import efficiency, errors
+from jaxos4.report.study_page import efficiency, errors
 from jaxos4.study import metrics, read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

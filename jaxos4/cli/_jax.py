@@ -12,12 +12,11 @@ NO_CACHE = "JAXOS4_NO_CACHE"
 """The environment variable that switches off the cache of compiled programs."""
 
 _MOST_BYTES = 1 << 30
-_JAX_SHORTEST = 1.0  # by default, JAX does not keep programs that compile in less than this [s]
 
 
 def prepare() -> None:
     """Prepares this process for JAX. A cache folder that was chosen before is kept, unless the cache is off."""
-    rarely_collect_garbage()
+    gc.set_threshold(100_000, 20, 100)  # tracing makes millions of small objects that stay
 
     import jax
 
@@ -30,16 +29,11 @@ def prepare() -> None:
         if folder is None:
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
-    if jax.config.values["jax_persistent_cache_min_compile_time_secs"] == _JAX_SHORTEST:
+    if jax.config.values["jax_persistent_cache_min_compile_time_secs"] == 1.0:  # JAX's default [s]
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # many small programs take long together
     # Another process may be writing the same program, or remove it: it is then compiled again.
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
     keep_programs()
-
-
-def rarely_collect_garbage() -> None:
-    """Makes Python look for garbage rarely, because tracing makes millions of small objects that stay."""
-    gc.set_threshold(100_000, 20, 100)
 
 
 def _usable_folder() -> Path | None:

@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
@@ -11,18 +11,25 @@ from ..errors import InputError
 from ..estimators import ESTIMATORS
 
 # The names in the library's tables, written out because an import of these tables takes seconds; a test compares them.
-# `list(...)`: pyright takes the values of a written list for numbers.
-Model = StrEnum("Model", list(("published", "corrected")))
-Excitation = StrEnum("Excitation", list(("multisine", "doublet", "3211", "chirp")))
-Method = StrEnum("Method", list(("euler", "rk4", "diffrax")))
-Sensors = StrEnum("Sensors", list(("commands", "speeds")))
-Channels = StrEnum("Channels", list(("rates", "attitude", "all")))
-InitialState = StrEnum("InitialState", ["free", "known"])
+Model = Literal["published", "corrected"]
+VehicleModel = Literal["published", "corrected", "flight"]
+Excitation = Literal["multisine", "doublet", "3211", "chirp"]
+Method = Literal["euler", "rk4", "diffrax"]
+Sensors = Literal["commands", "speeds"]
+Channels = Literal["rates", "attitude", "all"]
+InitialState = Literal["free", "known"]
+Simulator = Literal["mujoco", "rotorpy", "sdf"]
+Features = Literal["score", "raw"]
+Criterion = Literal["D", "A", "worst"]
 Estimator = StrEnum("Estimator", list(ESTIMATORS))
-Simulator = StrEnum("Simulator", list(("mujoco", "rotorpy", "sdf")))
-Features = StrEnum("Features", list(("score", "raw")))
 
-VehicleModel = StrEnum("VehicleModel", list((*Model, "flight")))
+
+def check_seed(seed: int) -> int:
+    """Refuses a random seed that JAX cannot use."""
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
+    return seed
+
 
 FlightFile = Annotated[Path, Argument(metavar="FLIGHT.csv", help="The recorded flight.")]
 ModelOption = Annotated[Model, Option(help="Equations of motion: as published, or corrected.")]
@@ -33,18 +40,8 @@ InitialStateOption = Annotated[InitialState, Option(help="free: estimated too; k
 WindowOption = Annotated[
     float | None, Option(help="Multiple shooting: windows of this length [s], each with its own initial state.")
 ]
+SeedOption = Annotated[int, Option(help="Random seed.", callback=check_seed)]
 OutOption = Annotated[Path | None, Option(help="JSON file to write.")]
-
-
-def check_seed(seed: int) -> None:
-    """Refuses a random seed that JAX cannot use."""
-    if not 0 <= seed < 2**63:
-        raise InputError(f"--seed: must lie in 0 to 2^63 - 1, got {seed}.")
-
-
-def chosen(choice: StrEnum | None) -> str | None:
-    """The value of an option, as the library takes it."""
-    return None if choice is None else str(choice.value)
 
 
 def given(**settings: Any) -> dict[str, Any]:

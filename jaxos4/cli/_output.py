@@ -4,23 +4,18 @@ Files are checked before the work that fills them, are never one of the inputs, 
 """
 
 import contextlib
-import importlib
 import json
 import re
 import secrets
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from .._files import check_writable, load_netcdf, write_file
+from .._files import check_writable, write_file
 from ..errors import InputError
-
-DRAWING = ("matplotlib.backends.backend_svg", "matplotlib.figure")
-"""The modules that draw a figure: slow to import."""
 
 _PHRASES = {
     "an `Airframe` as `subject`": "--model flight",
@@ -56,18 +51,6 @@ def option_names(**files: Path | None) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(in_options(str(error), **files)) from None
-
-
-def import_beside(*names: str, netcdf: bool = False) -> None:
-    """Import what will be needed to write files, while programs run."""
-
-    def load() -> None:
-        for name in names:
-            importlib.import_module(name)
-        if netcdf:
-            load_netcdf()
-
-    threading.Thread(target=load, daemon=True).start()
 
 
 @contextlib.contextmanager

@@ -2,7 +2,9 @@
 
 import shlex
 import sys
+import threading
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +13,7 @@ from typer import Argument, Option
 
 from ..errors import InputError, named
 from . import _options as options
-from ._output import DRAWING, check_outputs, end, import_beside, in_options, option_names, stages, write_json
+from ._output import check_outputs, end, in_options, option_names, stages, write_json
 
 if TYPE_CHECKING:
     from ..airframe import Airframe
@@ -39,7 +41,7 @@ def estimate(
     ] = None,
     bracket: options.BracketOption = None,
     channels: options.ChannelsOption = None,
-    initial_state: options.InitialStateOption = options.InitialState["free"],
+    initial_state: options.InitialStateOption = "free",
     window: options.WindowOption = None,
     network: Annotated[
         Path | None, Option(help="A network file from `jaxos4 train`; without it, a network is trained now.")
@@ -56,7 +58,7 @@ def estimate(
     """Estimate alpha_1..8 of a flight, or a real vehicle's parameters from its logs, with 95 % intervals."""
     check_outputs(*flights, airframe, bracket, network, validate, out=out, report=report)
     listed = None if terms is None else [name.strip() for name in terms.split(",") if name.strip()]
-    asked = {"channels": options.chosen(channels), "initial_state": initial_state.value, "window": window}
+    asked = {"channels": channels, "initial_state": initial_state, "window": window}
     asked |= {"terms": listed, "begin": begin, "end": end, "sample_time": sample_time, "holdout": holdout}
     with stages("loading the library") as progress, option_names(bracket=bracket, network=network):
         from ..airframe import Airframe, load_airframe
@@ -72,13 +74,13 @@ def estimate(
         if report is not None and not isinstance(subject, Airframe):
             sign = f"and {flights[0]} has no sign of one" if model is None else f"not for --model {model}"
             raise InputError(f"--report: is for real vehicles, {sign}; leave it out.")
-        if report is not None:  # while the first program runs
-            import_beside("jinja2", *DRAWING)
+        if report is not None:  # slow to import: while the first program runs
+            threading.Thread(target=import_module, args=["jaxos4.report.identification_page"], daemon=True).start()
         found = identify(
             recordings,
             subject,
             settings=settings_for(subject, asked),
-            estimator=options.chosen(estimator),
+            estimator=None if estimator is None else str(estimator),
             bracket=options.read_bracket(bracket),
             network=network,
             validate=None if validate is None else read_recording(validate, vehicle),
@@ -145,11 +147,11 @@ def _publish(found: "Identification", out: Path | None, report: Path | None, *, 
 def train(
     flight: Annotated[Path, Argument(metavar="FLIGHT.csv", help="A flight with the inputs to train for.")],
     out: Annotated[Path, Option(help="The network file to write.")],
-    model: options.ModelOption = options.Model["published"],
+    model: options.ModelOption = "published",
     airframe: options.AirframeOption = "os4",
     bracket: options.BracketOption = None,
-    initial_state: options.InitialStateOption = options.InitialState["free"],
-    features: Annotated[options.Features, Option(help="What the network sees.")] = options.Features["score"],
+    initial_state: options.InitialStateOption = "free",
+    features: Annotated[options.Features, Option(help="What the network sees.")] = "score",
     noise: Annotated[
         tuple[float, float],
         Option(help="Lowest and highest noise to train for, in multiples of the standard sensors' noise."),
@@ -161,10 +163,9 @@ def train(
         ),
     ] = None,
     steps: Annotated[int, Option(help="Number of training steps.")] = STEPS,
-    seed: Annotated[int, Option(help="Random seed for training.")] = 0,
+    seed: options.SeedOption = 0,
 ) -> None:
     """Train a network that identifies any flight with the inputs of this one."""
-    options.check_seed(seed)
     with stages("loading the library") as progress:
         from ..airframe import load_airframe
         from ..identification.problem import train_network
@@ -173,7 +174,7 @@ def train(
         from ..recording import read_recording
 
         with named("options"):
-            settings = NetworkEstimator(features=features.value, noise=noise, steps=steps)
+            settings = NetworkEstimator(features=features, noise=noise, steps=steps)
         check_outputs(flight, airframe, bracket, out=out)
         progress("reading")
         subject = MODELS[model](load_airframe(airframe))
@@ -187,14 +188,14 @@ def train(
             subject,
             settings,
             bracket=options.read_bracket(bracket),
-            channels=options.chosen(channels),
-            initial_state=str(initial_state.value),
+            channels=channels,
+            initial_state=initial_state,
             seed=seed,
         )
     save_network(network, out)
     low, high = noise
     typer.echo(
-        f"{out}: {features.value} features of the {network.channels}, noise {low:g} to {high:g} times the standard "
-        f"one, {model.value} model, {recording.flight.time.shape[0]} samples, loss "
+        f"{out}: {features} features of the {network.channels}, noise {low:g} to {high:g} times the standard "
+        f"one, {model} model, {recording.flight.time.shape[0]} samples, loss "
         f"{network.history[:, 1].min():.4g}, {time.perf_counter() - begin:.0f} s"
     )

@@ -1,25 +1,16 @@
 """`jaxos4 export` and `jaxos4 predict`: an identified vehicle as a model for a simulator, and on another flight."""
 
+import threading
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
-from .._files import check_writable, write_file
+from .._files import check_writable, load_netcdf, write_file
 from ..errors import InputError
 from . import _options as options
-from ._output import (
-    DRAWING,
-    check_outputs,
-    end,
-    import_beside,
-    in_options,
-    option_names,
-    stages,
-    write_folder,
-    write_json,
-)
+from ._output import check_outputs, end, in_options, option_names, stages, write_folder, write_json
 
 MOST_SAMPLES = 100_000
 
@@ -31,7 +22,7 @@ def export(
     samples: Annotated[
         int, Option(help="Also draw N vehicles from the covariance, into the folder OUT-samples.", metavar="N")
     ] = 0,
-    seed: Annotated[int, Option(help="Random seed of the samples.")] = 0,
+    seed: options.SeedOption = 0,
 ) -> None:
     """Write an identified vehicle as a model for a simulator, and vehicles drawn from its uncertainty."""
     if samples > MOST_SAMPLES:
@@ -48,9 +39,9 @@ def export(
         from ..export import TARGETS, export_vehicle, read_result
 
         progress("reading")
-        found, target = read_result(result), TARGETS[to.value]
+        found, target = read_result(result), TARGETS[to]
         progress("drawing and writing")
-        written = export_vehicle(found, to.value, samples=samples, seed=seed)
+        written = export_vehicle(found, to, samples=samples, seed=seed)
     if folder is not None:
         files = {f"{number:06}{target.suffix}": text for number, text in enumerate(written.samples, start=1)}
         write_folder(files, folder)
@@ -76,14 +67,12 @@ def predict(
         float | None, Option(help="The sample time to average to [s]. Default: that of the estimate.")
     ] = None,
     spacing: Annotated[float, Option(help="Time between two starts [s]; 0: from each sample.")] = 0.1,
-    seed: Annotated[int, Option(help="Random seed of the 95 % band.")] = 0,
+    seed: options.SeedOption = 0,
     out: Annotated[Path | None, Option(help="The predictions, as netCDF (.nc) or CSV (.csv).")] = None,
     json: Annotated[Path | None, Option(help="The errors, as JSON.")] = None,
-    figure: Annotated[Path | None, Option(help="A figure of the predictions (.svg).")] = None,
 ) -> None:
     """Predict a flight with an identified vehicle, and compare with constant rates and a regression."""
-    options.check_seed(seed)
-    check_outputs(result, flight, out=out, json=json, figure=figure)
+    check_outputs(result, flight, out=out, json=json)
     with stages("loading the library") as progress, option_names():
         from ..forecast import check_suffix, predict as predict_flight, vehicle_of
         from ..recording import read_recording
@@ -94,23 +83,20 @@ def predict(
         vehicle = vehicle_of(result)
         recording = read_recording(flight, vehicle.model.airframe)
         progress("predicting")
-        import_beside(*DRAWING * (figure is not None), netcdf=out is not None and out.suffix == ".nc")
+        if out is not None and out.suffix == ".nc":  # slow to import: while the program runs
+            threading.Thread(target=load_netcdf, daemon=True).start()
         found = predict_flight(vehicle, recording, horizon=horizon, sample_time=sample_time, spacing=spacing, seed=seed)
         progress("writing")
         if out is not None:
             found.write(out)
         if json is not None:
             write_json(found.to_dict(), json)
-        if figure is not None:
-            from ..report import write_prediction_figure
-
-            write_prediction_figure(figure, found)
     from rich.console import Console
 
     from ..report import print_prediction
 
     console = Console()
     print_prediction(console, found._replace(notes=tuple(in_options(note) for note in found.notes)))
-    for path in filter(None, (out, json, figure)):
+    for path in filter(None, (out, json)):
         console.print(f"written: {path}", markup=False, highlight=False)
     end(vehicle.result)

@@ -104,11 +104,11 @@ def _print_parts(console: "Console", found: "Inspection") -> None:
 
 def identifiability(
     flight: options.FlightFile,
-    model: options.ModelOption = options.Model["published"],
+    model: options.ModelOption = "published",
     airframe: options.AirframeOption = "os4",
     bracket: options.BracketOption = None,
     channels: options.ChannelsOption = None,
-    initial_state: options.InitialStateOption = options.InitialState["free"],
+    initial_state: options.InitialStateOption = "free",
     window: options.WindowOption = None,
     out: options.OutOption = None,
 ) -> None:
@@ -130,8 +130,8 @@ def identifiability(
             recording,
             subject,
             bracket=options.read_bracket(bracket),
-            channels=options.chosen(channels),
-            initial_state=str(initial_state.value),
+            channels=channels,
+            initial_state=initial_state,
             window=window,
             progress=progress,
         )

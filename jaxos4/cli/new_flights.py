@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Mapping
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from ..flight import Flight
 
 MOST_SAMPLES = 5_000_000  # more do not fit into the memory of an ordinary machine
-# A list would make the names lower-case.
-Criterion = StrEnum("Criterion", {"D": "D", "A": "A", "worst": "worst"})
 
 OpenLoopModelOption = Annotated[options.Model | None, Option(help="Equations of motion. Default: published.")]
 DurationOption = Annotated[float | None, Option(help="Duration [s]. Default: 5; with --closed-loop: 20.")]
@@ -36,10 +33,8 @@ SensorsOption = Annotated[
 ]
 
 # The options of flights in open loop, and those of flights in closed loop, with their defaults. `None`: the library's.
-_OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": None, "noise": 0.0}
-_OPEN |= {"model": options.Model["published"], "excitation": options.Excitation["multisine"]}
-_OPEN |= {"method": options.Method["euler"], "channels": options.Channels["all"]}
-_OPEN |= {"initial_state": options.InitialState["free"]}
+_OPEN = {"duration": 5.0, "dt": 0.01, "accuracy": 1.0, "slew": None, "speeds": None, "noise": 0.0, "method": "euler"}
+_OPEN |= {"model": "published", "excitation": "multisine", "channels": "all", "initial_state": "free"}
 _CLOSED = {"duration": 20.0, "dt": 0.004, "accuracy": 5.0, "gust": 5.0, "lag": None, "delay": None}
 _CLOSED |= {"sensors": None, "references": None}
 _MOST = {"gust": 1e6, "lag": 1.0, "delay": 1.0, "noise": 1e6}
@@ -50,7 +45,7 @@ def simulate(
     airframe: options.AirframeOption = "os4",
     duration: DurationOption = None,
     dt: SampleTimeOption = None,
-    seed: Annotated[int, Option(help="Random seed.")] = 0,
+    seed: options.SeedOption = 0,
     model: OpenLoopModelOption = None,
     excitation: Annotated[options.Excitation | None, Option(help="Shape of the inputs. Default: multisine.")] = None,
     speeds: Annotated[
@@ -126,7 +121,7 @@ def _open_loop(asked: dict[str, Any]) -> tuple["Flight", str]:
             omega = EXCITATIONS[shape](model.airframe, duration=asked["duration"], dt=dt)
         else:
             omega = as_float(read_input(asked["speeds"], dt))
-        flight = fly(model, model.alpha, omega, dt=dt, method=asked["method"].value)
+        flight = fly(model, model.alpha, omega, dt=dt, method=asked["method"])
     flight = measure(flight, WhiteNoise(asked["noise"] * SENSOR_SIGMA), seed=asked["seed"])
     return flight, f"{dt:g} s, {asked['model']} model, {asked['method']}, noise {asked['noise']:g}"
 
@@ -158,8 +153,9 @@ def design(
         options.InitialState | None, Option(help="free: estimated too; known: as the first sample. Default: free.")
     ] = None,
     criterion: Annotated[
-        Criterion, Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound.")
-    ] = Criterion["D"],
+        options.Criterion,
+        Option(help="D: all parameters together; A: the mean squared bound; worst: the largest bound."),
+    ] = "D",
     accuracy: Annotated[
         float | None,
         Option(
@@ -171,7 +167,7 @@ def design(
     delay: DelayOption = None,
     sensors: SensorsOption = None,
     figure: Annotated[Path | None, Option(help="SVG file: what to fly, and the bounds over time.")] = None,
-    seed: Annotated[int, Option(help="Random seed.")] = 0,
+    seed: options.SeedOption = 0,
 ) -> None:
     """Design the most informative flight within limits: rotor speeds, or the references of a controller."""
     asked = of_kind(closed_loop, locals())
@@ -206,7 +202,7 @@ def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "Design":
     settings = options.given(
         duration=asked["duration"], dt=asked["dt"], bandwidth=asked["bandwidth"], key=asked["seed"]
     )
-    settings |= {"criterion": asked["criterion"].value, "compare": True, "progress": progress}
+    settings |= {"criterion": asked["criterion"], "compare": True, "progress": progress}
     intervals = options.read_bracket(asked["bracket"])
     if asked["closed_loop"]:
         loop = make_loop(asked)
@@ -214,7 +210,7 @@ def _find(asked: dict[str, Any], progress: Callable[[str], None]) -> "Design":
         bracket = bracket_of(intervals, model_of(loop))
         return design_references(loop, bracket=bracket, limits=options.given(**limits), **settings)
     subject, known = MODELS[asked["model"]](load_airframe(asked["airframe"])), asked["initial_state"] == "known"
-    settings |= {"limits": options.given(**limits), "channels": asked["channels"].value, "start_is_known": known}
+    settings |= {"limits": options.given(**limits), "channels": asked["channels"], "start_is_known": known}
     return design_input(subject, bracket=bracket_of(intervals, subject), **settings)
 
 
@@ -230,7 +226,6 @@ def of_kind(closed_loop: bool, asked: Mapping[str, Any]) -> dict[str, Any]:
             raise InputError(f"--{name.replace('_', '-')}: is for flights {how}.")
         if name in _MOST and not 0 <= value <= _MOST[name]:
             raise InputError(f"--{name}: must lie in 0 to {_MOST[name]:g}, got {value}.")
-    options.check_seed(asked["seed"])
     return dict(asked) | {name: default for name, default in own.items() if asked.get(name) is None}
 
 
@@ -240,7 +235,7 @@ def make_loop(asked: Mapping[str, Any]) -> "ClosedLoop":
     from ..closed_loop import ClosedLoop
 
     vehicle = load_airframe(asked["airframe"])
-    logged, scaled = options.chosen(asked["sensors"]), vehicle.has_full_scale
+    logged, scaled = asked["sensors"], vehicle.has_full_scale
     if logged == "commands" and not scaled:
         raise InputError(
             f"--sensors commands: {asked['airframe']} has no max_rotor_speed [rad/s]; set it, or log speeds."

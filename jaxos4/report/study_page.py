@@ -1,31 +1,30 @@
-"""The report of a study: its figures with their captions, and one HTML page that needs no other file."""
+"""The report of a study: the figures of its scenarios, and one HTML page that needs no other file."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
 
 from .._files import check_writable, write_file
-from . import study_figures, study_tables
+from ..study import metrics
+from . import study_tables
 from .html import Drawing, draw as draw_panels, render, swatch
-from .study_tables import Scenario, best_estimators, bounds, names, scenarios
-from .style import BOUND_DASHES, drawing, styles
+from .study_tables import best_estimators, bounds, error_unit, names, positive_scales, scenarios
+from .style import BOUND_DASHES, INK, Style, drawing, estimator_gid, grid, label, legend, log_axis, scale_axis, styles
+from .text import plain
 
 MOST_DRAWN = 12
 """At most so many scenarios have figures. All scenarios have tables."""
 
 # Attributes of the Dataset, and their labels on the page.
 _PROVENANCE = {"version": "jaxos4", "jax": "jax", "precision": "precision", "device": "device", "seed": "seed"}
-
-
-# The figures of each scenario. Each draws nothing if its data are absent. `study.html.j2` has titles and captions.
-SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
-    "overview": study_figures.overview,
-    "error": study_figures.errors,
-    "efficiency": study_figures.efficiency,
-    "coverage": study_figures.coverage,
-}
+_COLUMNS = 4
+_DODGE = 0.3  # the markers of all estimators are spread over this share of the gap between two noise scales
+_NO_ROLLOUTS = 0.5  # the place on a logarithmic axis for an estimator without rollouts
 
 
 def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
@@ -35,16 +34,38 @@ def write_report(dataset: xr.Dataset, directory: Path) -> list[Path]:
     """
     target, folder = directory / "report.html", directory / "figures"
     check_writable(target)
-    every, sections = list(scenarios(dataset)), []
-    for scenario in every:
-        shown = SCENARIO_FIGURES if scenario.number <= MOST_DRAWN else {}
-        sections.append((scenario, draw(shown, scenario.data, f"-{scenario.number}" if len(every) > 1 else "")))
-    files = {target: _page(dataset, sections).encode()}
-    files |= {folder / f"{drawn.stem}.svg": drawn.svg for _, figures in sections for drawn in figures.values()}
+    every, drawings, sections = list(scenarios(dataset)), [], []
+    for number, title, data in every:
+        shown = SCENARIO_FIGURES if number <= MOST_DRAWN else {}
+        drawings.append(draw(shown, data, f"-{number}" if len(every) > 1 else ""))
+        found = {"number": number, "label": title, "figures": drawings[-1], "best": best_estimators(data)}
+        found |= {"tables": study_tables.scenario_tables(data), "trouble": study_tables.troubled_flights(data)}
+        sections.append(found)
+    estimators, attributes = names(dataset, "estimator"), {name: str(x) for name, x in dataset.attrs.items()}
+    missing, cells = study_tables.cells_not_run(dataset)
+    page = render(
+        "study.html.j2",
+        title=attributes.get("title", "") or "A study",
+        command=attributes.get("command", ""),
+        specification=attributes.get("specification", ""),
+        provenance=[(shown, attributes[name]) for name, shown in _PROVENANCE.items() if name in attributes],
+        estimators=estimators,
+        bounds=list(bounds(dataset))[: len(BOUND_DASHES)],
+        swatches=[swatch(look) for look in styles(estimators).values()],
+        sections=sections,
+        level=f"{100 * study_tables.shown_level(dataset):g} %",
+        failed=study_tables.failed_cells(dataset),
+        missing=missing,
+        cells=cells,
+        drawn=sum(map(bool, drawings)),
+        zero_scale=bool((dataset["scale"] == 0).any()),
+    )
+    files = {folder / f"{each.stem}.svg": each.svg for figures in drawings for each in figures.values()}
     folder.mkdir(exist_ok=True)
-    for path, content in reversed(files.items()):  # the page last
+    for path, content in files.items():
         write_file(path, content)
-    return list(files)
+    write_file(target, page)
+    return [target, *files]
 
 
 def draw(figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, suffix: str = "") -> dict[str, Drawing]:
@@ -57,30 +78,164 @@ def draw(figures: Mapping[str, Callable[..., Figure | None]], data: xr.Dataset, 
     return made
 
 
-def _page(dataset: xr.Dataset, sections: list[tuple[Scenario, dict[str, Drawing]]]) -> str:
-    """The page. `sections`: each scenario with its figures."""
-    attributes = {name: str(value) for name, value in dataset.attrs.items()}
-    estimators = names(dataset, "estimator")
-    missing, cells = study_tables.cells_not_run(dataset)
-    return render(
-        "study.html.j2",
-        title=attributes.get("title", "") or "A study",
-        command=attributes.get("command", ""),
-        specification=attributes.get("specification", ""),
-        provenance=[(label, attributes[name]) for name, label in _PROVENANCE.items() if name in attributes],
-        estimators=estimators,
-        bounds=list(bounds(dataset))[: len(BOUND_DASHES)],
-        swatches=[swatch(look) for look in styles(estimators).values()],
-        sections=[
-            scenario._asdict()
-            | {"figures": drawn, "tables": study_tables.scenario_tables(scenario.data)}
-            | {"trouble": study_tables.troubled_flights(scenario.data), "best": best_estimators(scenario.data)}
-            for scenario, drawn in sections
-        ],
-        level=f"{100 * study_tables.shown_level(dataset):g} %",
-        failed=study_tables.failed_cells(dataset),
-        missing=missing,
-        cells=cells,
-        drawn=sum(bool(drawn) for _, drawn in sections),
-        zero_scale=bool((dataset["scale"] == 0).any()),
-    )
+def errors(data: xr.Dataset) -> Figure | None:
+    """RMS error of each parameter and estimator against the noise scale, with the Cramer-Rao bounds."""
+    data = positive_scales(data)
+    found, best, seen = metrics.estimator_error(data), metrics.bound_error(data), bounds(data)
+    units = [error_unit(data, place) for place in range(data.sizes["parameter"])]
+    values = [found[kind].isel(parameter=place) for place, (kind, _, _) in enumerate(units)]
+    figure, x = _against_noise(data, values, "RMS error", bounds=list(seen)), data["scale"].values
+    if figure is None:
+        return None
+    for place, (panel, (kind, unit, why)) in enumerate(zip(figure.axes, units, strict=True)):
+        for dash, estimator in zip(BOUND_DASHES, seen.values(), strict=False):
+            y = best[kind].isel(parameter=place, estimator=estimator).values
+            marker = "_" if len(x) == 1 else None
+            panel.plot(x, y, color=INK, linestyle=dash, linewidth=1.1, marker=marker, zorder=1.9)
+        log_axis(panel, "y")
+        panel.set_title(f"{names(data, 'parameter')[place]} [{unit}]")
+        if why:
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high * (high / low) ** 0.22)
+            panel.text(0.03, 0.98, f"absolute: {why}", transform=panel.transAxes, va="top", fontsize=7)
+    return figure
+
+
+def efficiency(data: xr.Dataset) -> Figure | None:
+    """RMSE / bound of each parameter and estimator against the noise scale, with Monte-Carlo intervals."""
+    data = positive_scales(data)
+    found = metrics.efficiency(data)
+    values = [found["efficiency"].isel(parameter=place) for place in range(data.sizes["parameter"])]
+    figure = _against_noise(data, values, "RMSE / bound", interval=found)
+    if figure is None:
+        return None
+    for panel in figure.axes:
+        panel.axhline(1, color=INK, linewidth=1.1, zorder=1.9)
+    lows, highs = zip(*(panel.get_ylim() for panel in figure.axes), strict=True)
+    for panel in figure.axes:
+        panel.set_ylim(min(lows), max(highs))
+        log_axis(panel, "y")
+    return figure
+
+
+def _against_noise(
+    data: xr.Dataset,
+    values: list[xr.DataArray],
+    quantity: str,
+    *,
+    interval: xr.Dataset | None = None,
+    bounds: Sequence[str] = (),
+) -> Figure | None:
+    """A panel for each parameter: its `values` for each estimator against the noise scale, with intervals if any."""
+    if not any(one.notnull().any() for one in values):
+        return None
+    figure, axes = grid(len(values), columns=_COLUMNS, height=2.2)
+    scales = data["scale"].values
+    for parameter, (panel, name) in enumerate(zip(axes, names(data, "parameter"), strict=True)):
+        for place, look in _looks(data):
+            x = scales if interval is None else dodged(scales, place, data.sizes["estimator"])
+            panel.plot(x, values[parameter].isel(estimator=place).values, gid=estimator_gid(place), **look.line)
+            if interval is not None:
+                one = interval.isel(parameter=parameter, estimator=place)
+                ends = one["low"].values, one["high"].values
+                panel.vlines(x, *ends, color=look.color, linewidth=1.0, gid=estimator_gid(place))
+        if not np.isfinite(values[parameter].values).any():
+            panel.text(0.5, 0.5, "no estimates", transform=panel.transAxes, ha="center")
+        scale_axis(panel, scales)
+        panel.set_yscale("log")
+        panel.set_title(name)
+    label(figure, x="noise scale", y=quantity)
+    legend(figure, names(data, "estimator"), bounds=bounds)
+    return figure
+
+
+def coverage(data: xr.Dataset) -> Figure | None:
+    """Share of intervals that hold the truth against the level that they claim, at each noise scale."""
+    found = metrics.mean_coverage(data)
+    if not found["coverage"].notnull().any():
+        return None
+    estimators, levels, count = names(data, "estimator"), data["level"].values, data.sizes["scale"]
+    figure, axes = grid(count, columns=_COLUMNS, width=2.25 * min(count, _COLUMNS) + 1.2, height=2.8)
+    lowest = min(float(found["low"].min()), float(levels.min())) - 0.04
+    for place, panel in enumerate(axes):
+        one = found.isel(scale=place)
+        for x, level in enumerate(levels):
+            panel.hlines(level, x - 0.45, x + 0.45, color=INK, linewidth=1.4)
+        for row, look in _looks(data):
+            shift = 0.7 * (row / max(len(estimators) - 1, 1) - 0.5)
+            at, part, gid = np.arange(len(levels)) + shift, one.isel(estimator=row), estimator_gid(row)
+            panel.vlines(at, part["low"].values, part["high"].values, color=look.color, linewidth=1.0, gid=gid)
+            shares = part["coverage"].values
+            panel.plot(at, shares, color=look.color, marker=look.marker, linestyle="none", markersize=4, gid=gid)
+        panel.set_title(f"noise scale {data['scale'].values[place]:g}")
+        panel.set_xticks(range(len(levels)), [f"{100 * level:g} %" for level in levels])
+        panel.set_ylim(lowest, 1.02)
+        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g} %"))
+        panel.grid(axis="x", visible=False)
+    label(figure, x="level claimed", y="intervals that hold the truth")
+    legend(figure, estimators)
+    return figure
+
+
+def overview(data: xr.Dataset) -> Figure | None:
+    """RMSE / least bound, the mean of all parameters: left against the noise scale, right against the rollouts."""
+    data = positive_scales(data)
+    found = metrics.accuracy_interval(data)
+    rollouts = metrics.mean_rollouts(data).transpose("scale", "estimator").values
+    values, low, high = (found[name].values for name in ("accuracy", "low", "high"))
+    known = np.isfinite(values) & np.isfinite(rollouts)
+    if not known.any():
+        return None
+    figure, (by_noise, by_rollouts) = grid(2, columns=2, height=3.6)
+    spent = np.maximum(rollouts, _NO_ROLLOUTS)
+    for row, look in _looks(data):
+        at, line = known[:, row], {"color": look.color, "linestyle": look.dash, "gid": estimator_gid(row)}
+        x, y, across = dodged(data["scale"].values, row, data.sizes["estimator"])[at], values[at, row], spent[at, row]
+        by_noise.plot(x, y, **line)
+        by_noise.vlines(x, low[at, row], high[at, row], color=look.color, linewidth=1.0, gid=estimator_gid(row))
+        by_rollouts.plot(across, y, linewidth=1.0, **{**line, "zorder": 1.5})
+        for size, (place, a, b, c) in enumerate(zip(np.flatnonzero(at), x, across, y, strict=True)):
+            tip = f"noise x {data['scale'].values[place]:g}: {plain(c)} ({plain(low[place, row])} to "
+            tip += f"{plain(high[place, row])}), {plain(rollouts[place, row])} rollouts"
+            marks: dict[str, Any] = {"color": look.color, "marker": look.marker, "linewidths": 0}
+            marks["gid"] = estimator_gid(row, f"{names(data, 'estimator')[row]}, {tip}")
+            by_noise.scatter(a, c, s=30, **marks)
+            by_rollouts.scatter(b, c, s=26 + 30 * size, alpha=0.8, **marks)
+    for panel in (by_noise, by_rollouts):
+        panel.axhline(1, color=INK, linewidth=1.1, zorder=1.4)
+        panel.set_ylim(min(0.9, 0.9 * np.nanmin(low[known])), 1.15 * np.nanmax(high[known]))
+        log_axis(panel, "y")
+    by_noise.set_title("RMSE / least bound, by noise")
+    scale_axis(by_noise, data["scale"].values)
+    by_noise.set_xlabel("noise scale")
+    by_rollouts.set_title("RMSE / least bound, by rollouts")
+    by_rollouts.set_xscale("log")
+    powers = 10.0 ** np.arange(np.ceil(np.log10(max(spent[known].max(), 10.0))) + 1)
+    ticks = {_NO_ROLLOUTS: "none"} if (rollouts[known] <= 0).any() else {}
+    ticks |= {power: f"{power:,.0f}" for power in powers}
+    by_rollouts.set_xticks(list(ticks), list(ticks.values()))
+    by_rollouts.xaxis.set_minor_locator(NullLocator())
+    by_rollouts.set_xlim(min(ticks) / 1.5, max(ticks) * 1.2)
+    by_rollouts.set_xlabel("rollouts for one flight; larger marks: more noise")
+    legend(figure, names(data, "estimator"))
+    return figure
+
+
+def dodged(scales: np.ndarray, place: int, count: int) -> np.ndarray:
+    """The noise scales, shifted for the estimator `place` of `count`, so that markers do not cover each other."""
+    gap = np.diff(np.log(np.sort(scales))).min() if len(scales) > 1 else np.log(3.0)
+    return scales * np.exp(_DODGE * gap * (place / max(count - 1, 1) - 0.5))
+
+
+def _looks(data: xr.Dataset) -> Iterator[tuple[int, Style]]:
+    """The index and the style of each estimator."""
+    return enumerate(styles(names(data, "estimator")).values())
+
+
+SCENARIO_FIGURES: dict[str, Callable[..., Figure | None]] = {
+    "overview": overview,
+    "error": errors,
+    "efficiency": efficiency,
+    "coverage": coverage,
+}
+"""The figures of each scenario. Each is `None` if its data are absent. `study.html.j2` has titles and captions."""
