@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from jaxos4._custom_types import Key, States
-from jaxos4._files import write_atomically
+from jaxos4._files import write_atomically, write_netcdf
 from jaxos4.bracket import Bracket
 from jaxos4.cli.studies import run_with_bar
 from jaxos4.estimate import AbstractEstimator, Estimate
@@ -26,7 +26,7 @@ from jaxos4.noise import AbstractNoise
 from jaxos4.report.style import Style, drawing, svg
 from jaxos4.shooting import ShootingProblem
 from jaxos4.study import Study, device_name
-from jaxos4.study.dataset import RESULTS_FILE, provenance, save_dataset
+from jaxos4.study.dataset import RESULTS_FILE, provenance
 
 PARAMETERS = tuple(f"a{i}" for i in range(1, 9))
 """Column headings of the eight alphas."""
@@ -52,7 +52,7 @@ def run_studies(studies: dict[str, Study], out: Path) -> None:
 def save_results(dataset: xr.Dataset, study: Study, out: Path) -> None:
     """Writes a Dataset that was not computed by the cells of `study`, with the provenance of `study`, into a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    save_dataset(dataset.assign_attrs(provenance(study, device_name())), out)
+    write_netcdf(out / RESULTS_FILE, dataset.assign_attrs(provenance(study, device_name())), 4)
 
 
 def load_results(directory: Path) -> xr.Dataset:

@@ -79,7 +79,7 @@ def test_cells_enumerate_every_scenario_and_block_once(lengths, flights, batch):
     }
     some = {name: values[:n] for (name, values), n in zip(all_values.items(), lengths, strict=True)}
     study = Study(flights=flights, batch=batch, models=("published", "corrected"), **some)
-    cells = list(study.cells())
+    cells = [study.cell(number) for number in range(study.count)]
     assert [cell.number for cell in cells] == list(range(study.count))
     axes = [getattr(study, axis) for axis in AXES]
     wanted = set(itertools.product(itertools.product(*axes), range(0, flights, batch)))
@@ -93,7 +93,7 @@ def test_flights_of_a_number_are_the_same_draws_in_all_scenarios():
     sizes = {"durations": (1.0,), "widths": (1.0, 0.5), "flights": 8, "batch": 4, "truth": "drawn", "seed": 7}
     study = Study(scales=(0.0, 1.0, 10.0), channels=("rates", "all"), estimators=("ibss", "kalman"), **sizes)
     truths, noises, draws = {}, {}, {}
-    for cell in study.cells():
+    for cell in map(study.cell, range(study.count)):
         fleet = cell_module.fleet_of(study, cell.scenario)
         truth, true, measured = (np.asarray(x) for x in cell_module.fly(study, fleet, cell))
         width, scale, first = cell.scenario.width, cell.scenario.scale, cell.first

@@ -13,8 +13,9 @@ from distributed.utils import get_mp_context
 from helpers import refused
 from small_study import NETWORKED, cells, environment, results, run_study, specification
 
+from jaxos4._files import write_netcdf
 from jaxos4.study import load_study, run_on_cluster
-from jaxos4.study.dataset import assemble, open_store, save_dataset
+from jaxos4.study.dataset import RESULTS_FILE, assemble, open_store
 
 # The sockets of a killed worker are closed by the garbage collector.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -69,7 +70,7 @@ def test_a_study_is_the_same_on_a_cluster_that_loses_workers(whole, client, tmp_
             done.append(number)
             if number in (finished + 2, finished + 9):
                 kill_a_worker(client)
-        save_dataset(assemble(store), out)
+        write_netcdf(out / RESULTS_FILE, assemble(store), 4)
     assert done[-1] == study.count
     assert cells(out) == cells(whole)
     assert (out / "networks" / "0000.net").read_bytes() == (whole / "networks" / "0000.net").read_bytes()

@@ -20,7 +20,7 @@ import numpy as np
 import tomlkit
 import xarray as xr
 
-from .._files import BROKEN, write_file, write_netcdf
+from .._files import BROKEN, write_file
 from .._version import __version__
 from ..errors import InputError
 from ..models import MODELS
@@ -57,11 +57,8 @@ _AXES = {
     "level": "share of intervals that should hold the truth",
 }
 RESULTS_FILE = "results.nc"
-# What a report needs of the Dataset.
-_NEEDED = {"truth", "center", "estimate", "half_width", "bound", "result", "rollouts", "hit", "seen", "unit"}
 _SPECIFICATION, _LOCK = "study.json", "lock"
-# Names of files that were being written when a run was killed.
-_UNFINISHED = ".*.part*"
+_UNFINISHED = ".*.part*"  # files that were being written when a run was killed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,11 +97,11 @@ class Store:
     def read_network(self, number: int) -> TrainedNetwork | None:
         """A network, or `None` if it is not trained. Raises `InputError` if its file is damaged."""
         path = self.network_file(number)
-        if not path.exists():
-            return None
         try:
             with jax.enable_x64(True):
                 return load_network(path)
+        except FileNotFoundError:
+            return None
         except InputError:
             raise InputError(f"{path}: not a whole network; delete it, and run the study again.") from None
 
@@ -181,19 +178,14 @@ def assemble(store: Store) -> xr.Dataset:
 
     **Raises:** `InputError` if a cell's file is damaged.
     """
-    study = store.study
-    coordinates = _coordinates(study)
-    sizes = {name: len(values) for name, (_, values, _) in coordinates.items()}
+    study, coordinates, failures = store.study, _coordinates(store.study), []
+    blank = {"result": OUTCOMES.index("not_run"), "rollouts": 0, "hit": -1}
     arrays = {
-        name: np.full([sizes[dim] for dim in _dims(name)], np.nan if kind == "f8" else -1, kind)
+        name: np.full([len(coordinates[dim][1]) for dim in _dims(name)], blank.get(name, np.nan), kind)
         for name, (_, kind, _, _) in _VARIABLES.items()
     }
-    arrays["result"][...] = OUTCOMES.index("not_run")
-    arrays["rollouts"][...] = 0
-    failures = []
-    for cell in study.cells():
-        results = store.read(cell.number)
-        if results is None:
+    for cell in map(study.cell, range(study.count)):
+        if (results := store.read(cell.number)) is None:
             continue
         flights = slice(cell.first, min(cell.first + study.batch, study.flights))
         lanes, shared = (*cell.place, flights), (*cell.place[:-1], flights)
@@ -212,22 +204,17 @@ def assemble(store: Store) -> xr.Dataset:
         except (KeyError, ValueError):
             path = store.cell_file(cell.number)
             raise InputError(f"{path}: not a cell of this study; delete it, and run the study again.") from None
-    named = {name: _named(long_name, unit) for name, (_, _, unit, long_name) in _VARIABLES.items()}
-    named["result"] |= {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
-    variables = {name: (_dims(name), arrays[name], attributes) for name, attributes in named.items()}
+    variables = {name: (_dims(name), arrays[name], _named(*about[2:])) for name, about in _VARIABLES.items()}
     command = {"command": "jaxos4 study study.toml --out DIR", "failures": json.dumps(failures)}
-    variables |= _brackets(study)
-    return xr.Dataset(variables, coords=coordinates, attrs=provenance(study, store.device) | command)
+    dataset = xr.Dataset(variables | _brackets(study), coordinates, provenance(study, store.device) | command)
+    flags = {"flag_values": np.arange(len(OUTCOMES), dtype=np.int8), "flag_meanings": " ".join(OUTCOMES)}
+    dataset["result"].attrs |= flags
+    return dataset
 
 
 def _dims(name: str) -> tuple[str, ...]:
     """The dimensions of a variable; the truth is the same for all estimators."""
     return (*(SCENARIO[:-1] if name == "truth" else SCENARIO), "flight", *_VARIABLES[name][0])
-
-
-def save_dataset(dataset: xr.Dataset, directory: Path) -> None:
-    """Writes a study's Dataset into its folder, completely or not at all."""
-    write_netcdf(directory / RESULTS_FILE, dataset, 4)
 
 
 def read_results(directory: Path) -> xr.Dataset:
@@ -246,18 +233,19 @@ def read_results(directory: Path) -> xr.Dataset:
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         what = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a netCDF file that can be read ({what}); run the study again.") from None
-    if missing := ", ".join(sorted(_NEEDED - dataset.variables.keys() | _AXES.keys() - set(dataset.dims))):
+    needed = {*_VARIABLES, "center", "seen", "unit"}
+    if missing := ", ".join(sorted(needed - dataset.variables.keys() | _AXES.keys() - set(dataset.dims))):
         raise InputError(f"{path}: not the results of a study: no {missing}; give a folder that `jaxos4 study` wrote.")
     return dataset
 
 
 def _coordinates(study: Study) -> dict[str, tuple]:
     model = MODELS[study.models[0]](study.vehicle(study.airframes[0]))
-    values = {dim: list(getattr(study, axis)) for dim, axis in zip(SCENARIO, AXES, strict=True)}
-    values |= {"flight": np.arange(study.flights), "parameter": list(model.parameter_names), "level": list(LEVELS)}
-    units = {"duration": "s"}
-    coordinates = {dim: (dim, values[dim], _named(name, units.get(dim, "1"))) for dim, name in _AXES.items()}
-    return coordinates | {"unit": ("parameter", list(model.parameter_units), _named("unit of the parameter", "1"))}
+    values = [list(getattr(study, axis)) for axis in AXES]
+    values += [np.arange(study.flights), list(model.parameter_names), list(LEVELS)]
+    described = zip(_AXES.items(), values, strict=True)
+    coordinates = {dim: (dim, some, _named("s" if dim == "duration" else "1", name)) for (dim, name), some in described}
+    return coordinates | {"unit": ("parameter", list(model.parameter_units), _named("1", "unit of the parameter"))}
 
 
 def provenance(study: Study, device: str) -> dict[str, str | int]:
@@ -281,14 +269,14 @@ def _brackets(study: Study) -> dict[str, tuple]:
         for model, airframe, width in itertools.product(study.models, study.airframes, study.widths)
     ]
     shape = [len(study.models), len(study.airframes), len(study.widths), -1]
-    lower, upper = (np.stack([getattr(b, end) for b in brackets]).reshape(shape) for end in ("lower", "upper"))
+    center, half = (np.stack([getattr(b, name) for b in brackets]).reshape(shape) for name in ("center", "half_width"))
     seen = [[first._replace(channels=c, estimator=e).seen for e in study.estimators] for c in study.channels]
     return {
-        "center": (dims, (lower + upper) / 2, _named("middle of the bracket", "unit")),
-        "bracket_half_width": (dims, (upper - lower) / 2, _named("half the width of the bracket", "unit")),
-        "seen": (("channels", "estimator"), seen, _named("channels that the estimator looks at", "1")),
+        "center": (dims, center, _named("unit", "middle of the bracket")),
+        "bracket_half_width": (dims, half, _named("unit", "half the width of the bracket")),
+        "seen": (("channels", "estimator"), seen, _named("1", "channels that the estimator looks at")),
     }
 
 
-def _named(long_name: str, units: str) -> dict[str, Any]:
+def _named(units: str, long_name: str) -> dict[str, Any]:
     return {"long_name": long_name, "units": units}

@@ -20,12 +20,12 @@ import jax
 import numpy as np
 import xarray as xr
 
-from .._files import write_file
+from .._files import write_file, write_netcdf
 from ..errors import InputError, TrainingError
 from ..networks import NetworkEstimator, TrainedNetwork, encode_network, load_network
 from ..shooting import cores
 from .cell import blank_problem, fleet_of, key_of, program_of, run_cell
-from .dataset import Store, assemble, check_store, open_store, save_dataset
+from .dataset import RESULTS_FILE, Store, assemble, check_store, open_store
 from .specification import Cell, Scenario, Study
 
 if TYPE_CHECKING:
@@ -219,5 +219,5 @@ def carry_out(
             progress(label, done)
         progress("writing the Dataset", study.count)
         dataset = assemble(store)
-        save_dataset(dataset, out)
+        write_netcdf(out / RESULTS_FILE, dataset, 4)
     return dataset

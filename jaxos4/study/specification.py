@@ -6,7 +6,7 @@ every scenario, so that differences between estimators, or between scales of noi
 
 import itertools
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_type_hints
 
@@ -31,17 +31,9 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 Speeds = tuple[NotNegative, NotNegative, NotNegative, NotNegative]
 Seed = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
-_CHOICES: dict[str, Collection[str]] = {
-    "models": MODELS,
-    "excitations": EXCITATIONS,
-    "methods": METHODS,
-    "noises": NOISES,
-    "channels": CHANNELS,
-    "estimators": ESTIMATORS,
-}
-# A larger study is a mistake in its specification: each cell is a file.
-_MOST_CELLS = 1_000_000
-_MOST_SAMPLES = 1_000_000
+_CHOICES: dict[str, Collection[str]] = {"models": MODELS, "excitations": EXCITATIONS, "methods": METHODS}
+_CHOICES |= {"noises": NOISES, "channels": CHANNELS, "estimators": ESTIMATORS}
+_MOST = 1_000_000  # cells, each of which is a file; and samples of a flight
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -137,12 +129,11 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     def __post_init__(self):
         for axis in AXES:
             values = getattr(self, axis)
-            more = self.input if axis == "excitations" else ()
-            choices = [*(_CHOICES[axis] if axis in _CHOICES else values), *more]
             if not values:
                 raise InputError(f"`{axis}` is empty; give at least one value.")
             if len(set(values)) < len(values):
                 raise InputError(f"`{axis}` names a value twice: {', '.join(map(str, values))}; remove one.")
+            choices = [*(_CHOICES.get(axis) or values), *(self.input if axis == "excitations" else ())]
             for value in values:
                 if isinstance(value, float) and not math.isfinite(value):
                     raise InputError(f"`{axis}` must be finite numbers, got {value}; correct it.")
@@ -159,11 +150,11 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         for name in self.airframes:
             self.vehicle(name)
         for duration in self.durations:
-            if not 2 <= duration / self.dt <= _MOST_SAMPLES:
+            if not 2 <= duration / self.dt <= _MOST:
                 got = f"{duration:g} s at `dt` {self.dt:g} s"
-                raise InputError(f"`durations`: {got} is not 2 to {_MOST_SAMPLES} samples; change one.")
-        if self.count > _MOST_CELLS:
-            raise InputError(f"{self.count} cells, more than {_MOST_CELLS}; shorten an axis, or increase `batch`.")
+                raise InputError(f"`durations`: {got} is not 2 to {_MOST} samples; change one.")
+        if self.count > _MOST:
+            raise InputError(f"{self.count} cells, more than {_MOST}; shorten an axis, or increase `batch`.")
 
     def vehicle(self, name: str) -> Airframe:
         """The airframe of that name. Raises `InputError` if there is none, or if its table is not usable."""
@@ -227,10 +218,6 @@ class Study(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         place = tuple(int(i) for i in (*others, estimator))
         values = [getattr(self, axis)[i] for axis, i in zip(AXES, place, strict=True)]
         return Cell(index, Scenario(*values), place, int(block) * self.batch)
-
-    def cells(self) -> Iterator[Cell]:
-        """All cells in their order."""
-        return map(self.cell, range(self.count))
 
 
 def load_study(path: Path) -> Study:
