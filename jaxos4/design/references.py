@@ -132,7 +132,6 @@ class References(task.AbstractTask):
     size: int = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
-    criterion: str = eqx.field(static=True)
 
     write = staticmethod(task.write_references)
 
@@ -140,7 +139,7 @@ class References(task.AbstractTask):
         """See `AbstractTask`."""
         cosines, sines = jnp.moveaxis(coefficients.reshape(4, 2, -1), 1, 0)
         added = jnp.einsum("rk,rkuv->uv", jnp.square(cosines) + jnp.square(sines), self.added)
-        return task.criterion_of(jnp.asarray(self.base) + added, jnp.ones(len(INERTIAS), dtype=float), self.criterion)
+        return task.criterion_of(jnp.asarray(self.base) + added, jnp.ones(len(INERTIAS), dtype=float))
 
     def uses(self, coefficients: Coefficients) -> Uses:
         """See `AbstractTask`."""
@@ -193,7 +192,6 @@ def design_references(
     bracket: Bracket | None = None,
     duration: float = 20.0,
     dt: float = 0.004,
-    criterion: str = "D",
     bandwidth: float = 6.0,
     compare: bool = False,
     key: Key | int,
@@ -213,15 +211,14 @@ def design_references(
     - `limits`: some limits of an `Envelope`, by name, but not `slew`. The others are those that 3-2-1-1 references with
       the same largest values need; those of rotor speeds are the airframe's.
     - `bracket`: the knowledge of the parameters of a `FlightModel` before the flight; by default the model's.
-    - `criterion`: as of `design_input`, for the logarithms of Ix, Iy and Iz.
-    - The others: as of `design_input`.
+    - The others: as of `design_input`. The criterion is of the logarithms of Ix, Iy and Iz.
 
     **Raises:** `InputError` if an argument is out of range, or the vehicle cannot fly within the limits.
     """
     for name, value, most in (("angle", angle, _LARGEST_ANGLE), ("acceleration", acceleration, _LARGEST_ACCELERATION)):
         if not 0 < value <= most:
             raise InputError(f"`{name}` must be positive and at most {most:g}, got {value:g}.")
-    task.check_ranges(duration, dt, bandwidth, criterion, samples=(250, 20_000), cycles=2, fastest=0.1)
+    task.check_ranges(duration, dt, bandwidth, samples=(250, 20_000), cycles=2, fastest=0.1)
     progress("limits")
     key = jax.random.key(key) if isinstance(key, int) else key
     bracket = Bracket.default(model_of(loop)) if bracket is None else bracket
@@ -242,7 +239,6 @@ def design_references(
         size=8 * tones.number,
         names=fleet.inertias_first(INERTIAS, fleet.model.parameter_names),
         units=fleet.inertias_first(("kg m^2",) * 3, fleet.model.parameter_units),
-        criterion=criterion,
         **_response(fleet, envelope, largest, tones, samples, jax.random.fold_in(key, 3)),
     )
     return task.solve(references, (8, 0.85, 80), compare=compare, key=key, progress=progress)

@@ -1,7 +1,8 @@
 """A design: the search for the most informative inputs within an envelope, a comparison with standard inputs, files.
 
-The search minimises criterion + penalty by BFGS. The penalty grows from stage to stage, so that the limits hold better
-and better. They hold exactly only after the task has flown the inputs and has reduced their amplitude.
+The criterion is D-optimality: the volume of the confidence ellipsoid. The search minimises criterion + penalty by BFGS.
+The penalty grows from stage to stage, so that the limits hold better and better. They hold exactly only after the task
+has flown the inputs and has reduced their amplitude.
 
 Reference: Nocedal and Wright, Numerical Optimization, ch. 6 (BFGS) and 17 (penalty).
 """
@@ -23,7 +24,7 @@ from .._files import write_atomically
 from .._xla import quick_jit
 from ..errors import InputError
 from ..flight import STATE_NAMES, Flight
-from ..linalg import gram, joint_factor
+from ..linalg import joint_factor
 from ..logs import write_flight
 from ..logs.assemble import SPEED_NAMES
 from ..logs.csv import read_table
@@ -36,9 +37,6 @@ Inputs = Float[np.ndarray, "samples 4"]
 Flown = tuple[Inputs, dict[str, float]]
 Progress = Callable[[str], None]
 
-CRITERIA = ("D", "A", "worst")
-# In the criterion `worst`, the largest bound is replaced by this norm of the bounds, which has derivatives.
-_NORM = 16
 # The penalty of each stage.
 _PENALTIES = (10.0, 50.0, 250.0, 1250.0, 6000.0)
 # BFGS starts with a unit matrix as second derivative, so its unknowns are coefficients over their usual size.
@@ -52,11 +50,10 @@ _PRECISION = 1e-3
 class Designed(NamedTuple):
     """Inputs of a flight, and the accuracy of an estimate from it.
 
-    - `inputs`: rotor speeds [rad/s], held from sample to sample; or references of roll, pitch and yaw angle [rad] and
-      vertical acceleration [m/s^2], as `fly_closed_loop` takes them. `dt`: their sample time [s].
+    - `inputs`: rotor speeds [rad/s], held from sample to sample; or references as `fly_closed_loop` takes them.
+      `dt`: their sample time [s].
     - `bounds`: the smallest standard deviation that each parameter can have after the flight.
-    - `uses`: the largest share of each limit that any vehicle of the bracket uses, by the name of the limit; at most 1.
-      Empty if no vehicle was flown to find out.
+    - `uses`: the largest share of each limit that any vehicle of the bracket uses; empty if none was flown.
     - `period`: the time after which the inputs repeat [s]; the whole flight if they do not.
     - `history`: the bounds after each sample, infinite until a parameter is excited. `None`: the bounds fall with the
       square root of the duration.
@@ -77,8 +74,8 @@ class Designed(NamedTuple):
     def shortest(self, wanted: Float[Numeric, " targets"]) -> Float[np.ndarray, " targets"]:
         """The shortest flights [s] after which the first parameters can have the standard deviations `wanted`.
 
-        Longer flights repeat the inputs. Each repetition adds the same information, so the bounds fall with the square
-        root of the duration. For references, shorter flights cut a period, which is not exact.
+        Longer flights repeat the inputs: the bounds fall with the square root of the duration. This is not exact for a
+        flight of references that cuts a period.
         """
         wanted = np.asarray(wanted)
         repeated = self.duration * np.square(self.bounds[: wanted.size] / wanted)
@@ -92,13 +89,14 @@ class AbstractTask(eqx.Module):
     """A kind of input: how coefficients become a flight, its limits, its information, and its file.
 
     - `kind`: the name of the inputs. `vehicles`: the number of vehicles that stay within the envelope.
-    - `size`: the number of coefficients.
+    - `write`: writes the inputs as CSV. `size`: the number of coefficients.
     - `names`, `units`: those of the parameters, the targets first. `scale`: for each target, a size of which accuracies
       are shares. `unexcited`: a parameter whose bound is not below this counts as not excited.
     """
 
     kind: ClassVar[str]
     vehicles: ClassVar[int]
+    write: ClassVar[Callable[[Designed, Path], None]]
     size: eqx.AbstractVar[int]
     envelope: eqx.AbstractVar[Envelope]
     names: eqx.AbstractVar[tuple[str, ...]]
@@ -125,11 +123,6 @@ class AbstractTask(eqx.Module):
     @abc.abstractmethod
     def judged(self, flown: Mapping[str, Flown]) -> dict[str, Designed]:
         """The bounds of several inputs."""
-
-    @staticmethod
-    @abc.abstractmethod
-    def write(designed: Designed, path: Path) -> None:
-        """Write the inputs as CSV."""
 
 
 class Design(NamedTuple):
@@ -194,41 +187,18 @@ def _minimise(
     return jax.vmap(one)(starts)
 
 
-def bounds_of(information: Float[Array, "unknowns unknowns"], count: int) -> tuple[Float[Array, "count count"], Scalar]:
-    """The smallest covariance of the first `count` unknowns, and the logarithm of its determinant."""
-    factor, basis = joint_factor(information[None], count)
-    determinant = -2 * jnp.log(jnp.diagonal(factor[0, :count, -count:])).sum()
-    return gram(basis[0, :count, -count:]), determinant
+def criterion_of(information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"]) -> Scalar:
+    """The logarithm of the geometric mean of the first unknowns' bounds, as shares of `half_width`. Smaller is better.
 
-
-def criterion_of(
-    information: Float[Array, "unknowns unknowns"], half_width: Float[Array, " count"], criterion: str
-) -> Scalar:
-    """The logarithm of a mean bound of the first unknowns, see `design_input`. Smaller is better.
-
-    A bound is a standard deviation as a share of the `half_width` of its parameter's bracket. The volume of `"D"` is
-    given as the edge of a cube.
+    It is the edge of a cube with the volume of their confidence ellipsoid.
     """
     count = half_width.shape[0]
-    covariance, determinant = bounds_of(information, count)
-    if criterion == "D":
-        return (determinant / 2 - jnp.log(half_width).sum()) / count
-    squares = jnp.diagonal(covariance) / jnp.square(half_width)
-    if criterion == "A":
-        return jnp.log(squares.mean()) / 2
-    largest = squares.max()
-    return jnp.log(largest) / 2 + jnp.log(((squares / largest) ** (_NORM / 2)).sum()) / _NORM
+    volume = -jnp.log(jnp.diagonal(joint_factor(information[None], count).factor[0, :count, -count:])).sum()
+    return (volume - jnp.log(half_width).sum()) / count
 
 
 def check_ranges(
-    duration: float,
-    dt: float,
-    bandwidth: float,
-    criterion: str,
-    *,
-    samples: tuple[int, int],
-    cycles: int,
-    fastest: float,
+    duration: float, dt: float, bandwidth: float, *, samples: tuple[int, int], cycles: int, fastest: float
 ) -> None:
     """Raise `InputError` for settings that cannot be designed for.
 
@@ -238,8 +208,6 @@ def check_ranges(
     if not (dt > 0 and samples[0] <= duration / dt <= samples[1]):
         allowed = f"{samples[0]} to {samples[1]} samples of a positive `dt`"
         raise InputError(f"`duration` must be {allowed}, got {duration:g} s and {dt:g} s.")
-    if criterion not in CRITERIA:
-        raise InputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}.")
     low, high = cycles / duration, fastest / dt
     if not low <= bandwidth <= high:
         limits = f"{cycles} / `duration` and {fastest:g} / `dt`, {low:.3g} to {high:.3g} Hz"
