@@ -141,32 +141,47 @@ def load_airframe(source: str | PathLike[str]) -> Airframe:
         return airframe_from_table(table)
 
 
+_VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
+_SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
+_REQUIRED = tuple(name for name in _SHAPES if name not in ("gravity", "max_rotor_speed"))
+_REPLACES = {"arm": "rotor_positions", "hover_speed": "thrust_coefficient"}
+_GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
+# The least and the largest value, if they are not those of the other constants.
+_SIZES = {"rotor_positions": (-1e3, 1e3), "rotor_spins": (-1e3, 1e3), "rotor_inertia": (0.0, 1e3)}
+_SIZES |= {"max_rotor_speed": (1e-15, math.inf), "hover_speed": (1e-3, 1e6)}
+
+
 def airframe_from_table(table: dict[str, Any]) -> Airframe:
     """The airframe of a table with the keys of `load_airframe`. Raises `InputError` that names the wrong key."""
     table = {"rotor_spins": ALTERNATING_SPINS} | table
     for short, whole in _REPLACES.items():
         if {short, whole} <= table.keys():
             raise InputError(f"`{short}` and `{whole}` exclude each other; keep one of them.")
-    given = table.keys() | {whole for short, whole in _REPLACES.items() if short in table}
-    required = [name for name in _SHAPES if name not in _OPTIONAL]
-    missing = [name for name in required if name not in given]
-    if missing:
-        raise InputError(f"`{missing[0]}` is missing; an airframe needs {', '.join(required)}.")
-    unknown = [name for name in table if name not in _SHAPES and name not in _REPLACES]
-    if unknown:
-        keys = ", ".join((*_REPLACES, *_SHAPES))
-        raise InputError(f"`{unknown[0]}` is not a known key; the keys are {keys}.")
+    given = table.keys() | {_REPLACES.get(name) for name in table}
+    if missing := [name for name in _REQUIRED if name not in given]:
+        raise InputError(f"`{missing[0]}` is missing; an airframe needs {', '.join(_REQUIRED)}.")
+    keys = (*_REPLACES, *_SHAPES)
+    if unknown := [name for name in table if name not in keys]:
+        raise InputError(f"`{unknown[0]}` is not a known key; the keys are {', '.join(keys)}.")
     guessed = [name for name in _GUESSABLE if isinstance(table[name], str) and table[name] == GUESS]
     constants = {name: _numbers(name, value) for name, value in table.items() if name not in guessed}
-    _check_sizes(constants, table)
     if "arm" in constants:
         constants["rotor_positions"] = np.asarray(plus_layout(constants.pop("arm").item()))
     if "hover_speed" in constants:
         weight = constants["mass"] * constants.get("gravity", GRAVITY)
         constants["thrust_coefficient"] = np.asarray(weight / (4 * constants.pop("hover_speed").item() ** 2))
-    constants |= {name: value for name, value in _guesses(constants).items() if name in guessed}
-    airframe = Airframe(**constants)
-    mixer = np.asarray(airframe.mixer)
+    square = (constants["rotor_positions"] ** 2).sum(axis=1).mean()
+    guesses = {
+        "inertia": constants["mass"] * square * np.asarray(_GUESSED_INERTIA),
+        "drag_coefficient": constants["thrust_coefficient"] * np.sqrt(square) * _GUESSED_DRAG,
+        "rotor_inertia": constants["mass"] * square * _GUESSED_ROTOR_INERTIA,
+    }
+    airframe = Airframe(**constants | {name: guesses[name] for name in guessed})
+    inertia, mixer = np.asarray(airframe.inertia), np.asarray(airframe.mixer)
+    if 2 * inertia.max() > inertia.sum():
+        raise InputError(
+            f"`inertia` {inertia.tolist()} breaks the triangle inequality: no moment may exceed the sum of the others."
+        )
     scale = np.abs(mixer).max(axis=1, keepdims=True)
     if np.linalg.matrix_rank(mixer / np.where(scale > 0, scale, 1)) < 4:
         raise InputError(
@@ -181,55 +196,20 @@ def airframe_table(airframe: Airframe) -> dict[str, Any]:
     return {name: value.tolist() for name, value in table.items() if np.isfinite(value).all()}
 
 
-def _guesses(constants: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The values for `GUESS`, see `load_airframe`."""
-    square = (constants["rotor_positions"] ** 2).sum(axis=1).mean()
-    guesses = {
-        "inertia": constants["mass"] * square * np.asarray(_GUESSED_INERTIA),
-        "drag_coefficient": constants["thrust_coefficient"] * np.sqrt(square) * _GUESSED_DRAG,
-        "rotor_inertia": constants["mass"] * square * _GUESSED_ROTOR_INERTIA,
-    }
-    return {name: np.asarray(value) for name, value in guesses.items()}
-
-
-def _check_sizes(constants: dict[str, np.ndarray], table: dict[str, Any]) -> None:
-    for name, values in constants.items():
-        least, most = _SIZES.get(name, (1e-15, 1e6))
-        if not ((values >= least) & (values <= most)).all():
-            sign = "" if least < 0 else "not negative and " if least == 0 else "positive and "
-            raise InputError(f"`{name}` must be {sign}of a quadrotor's size in SI units, got {_short(table[name])}.")
-    if np.any(np.abs(constants["rotor_spins"]) != 1):
-        raise InputError(f"`rotor_spins` must be 1 (counter-clockwise) or -1, got {_short(table['rotor_spins'])}.")
-    inertia = constants.get("inertia")
-    if inertia is not None and 2 * inertia.max() > inertia.sum():
-        raise InputError(
-            f"`inertia` {inertia.tolist()} breaks the triangle inequality: no moment may exceed the sum of the others."
-        )
-
-
-_VECTORS = {"inertia": (3,), "rotor_positions": (4, 2), "rotor_spins": (4,)}
-_SHAPES: dict[str, tuple[int, ...]] = {field.name: _VECTORS.get(field.name, ()) for field in fields(Airframe)}
-_OPTIONAL = {"gravity", "max_rotor_speed"}
-_REPLACES = {"arm": "rotor_positions", "hover_speed": "thrust_coefficient"}
-_GUESSABLE = ("inertia", "drag_coefficient", "rotor_inertia")
-# The least and the largest value, if they are not those of the other constants.
-_SIZES = {"rotor_positions": (-1e3, 1e3), "rotor_spins": (-1e3, 1e3), "rotor_inertia": (0.0, 1e3)}
-_SIZES |= {"max_rotor_speed": (1e-15, math.inf), "hover_speed": (1e-3, 1e6)}
-
-
 def _numbers(name: str, value: Any) -> np.ndarray:
-    shape = _SHAPES.get(name, ())
+    """A constant of a table as an array. Raises `InputError` if no quadrotor has it."""
     try:
         array = np.asarray(value)
-    except (ValueError, OverflowError):
+    except (ValueError, OverflowError):  # rows of several lengths, or an integer of more than 64 bits
         array = np.asarray(None)
-    usable = array.dtype.kind in "iuf" and array.shape == shape
-    if not usable or np.isnan(array).any() or (name != "max_rotor_speed" and np.isinf(array).any()):
-        wanted = "one finite number" if shape == () else f"finite numbers of shape {list(shape)}"
-        raise InputError(f"`{name}` must be {wanted}, got {_short(value)}.")
-    return array.astype(float)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    shape, (least, most) = _SHAPES.get(name, ()), _SIZES.get(name, (1e-15, 1e6))
+    if array.dtype.kind not in "iuf" or array.shape != shape:
+        wanted = f"numbers of shape {list(shape)}" if shape else "one number"
+    elif not ((array >= least) & (array <= most)).all():
+        sign = "" if least < 0 else "not negative and " if least == 0 else "positive and "
+        wanted = f"{sign}of a quadrotor's size in SI units"
+    elif name == "rotor_spins" and (np.abs(array) != 1).any():
+        wanted = "1 (counter-clockwise) or -1"
+    else:
+        return array.astype(float)
+    raise InputError(f"`{name}` must be {wanted}, got {repr(value)[:80]}.")
