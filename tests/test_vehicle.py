@@ -11,7 +11,7 @@ from helpers import CRAZYFLIE
 from lanes import names
 
 import jaxos4
-from jaxos4.identification import problem as problems
+from jaxos4.identification import problem as problems, profile
 from jaxos4.identification.fit import fit_innovations
 from jaxos4.identification.problem import liveliest
 from jaxos4.shooting import InnovationsProblem
@@ -187,6 +187,37 @@ def test_what_is_not_estimated_is_named(kind, damping, share):
     assert {"alpha3", "alpha6", "rotor_lag"}.isdisjoint(fit.held) == (kind != "hover")
     assert (std >= fit.bound * (1 - 1e-9)).all()
     assert set(fit.disturbances) == {"p", "q", "r"}
+
+
+@pytest.mark.usefixtures("optimised")
+def test_at_the_upper_end_of_a_wide_interval_the_least_cost_is_higher_by_two(monkeypatch):
+    """By 1.96^2 / 2. It is higher by 1.7 where 1.96 standard deviations of the covariance end."""
+    flight, airframe = (lane(part, 0) for part in flown(1.0, 1.0))
+    problem = InnovationsProblem(shooting_problem(flight, airframe, TERMS[:-1]))
+    fit = fit_innovations(jaxos4.FilterError(), problem, np.zeros(flight.time.shape[0], int))
+    place, own, stages = problem.problem.unknowns.names.index("alpha8"), problem.problem.unknowns, []
+    wider = profile.with_profile(fit, progress=stages.append)
+    assert stages == ["computing intervals"]  # the other inertias are known well
+    assert wider.rollouts > fit.rollouts
+    assert wider.held == fit.held
+    value, before, after = float(fit.estimate.parameters[place]), fit.bound[place], float(wider.estimate.std[place])
+    others = np.arange(fit.estimate.std.size) != place
+    np.testing.assert_array_equal(wider.estimate.std[others], fit.estimate.std[others])
+
+    def rise(end):
+        other = jaxos4.FilterError(tolerance=1e-6)(problem.hold({"alpha8": np.asarray(end)}))
+        prior = ((end - float(own.center[place])) / float(own.half_width[place])) ** 2 / 2
+        return float(other.cost) + prior - float(fit.estimate.cost)
+
+    assert rise(value + 1.96 * after) == pytest.approx(1.92, rel=0.02)
+    assert rise(value + 1.96 * before) < 1.75
+    # The cost falls, so the estimate was no minimum: the interval grows until the inertia is not identifiable.
+    raised = eqx.tree_at(lambda e: e.cost, fit.searched[1], fit.searched[1].cost + 100)
+    assert "alpha8" in profile.with_profile(fit._replace(searched=(problem, raised)), progress=stages.append).held
+    # A fit that did not converge tells nothing.
+    failed = eqx.tree_at(lambda e: e.result, fit.estimate, jaxos4.RESULTS.max_sweeps)
+    monkeypatch.setattr(profile, "_SEARCH", lambda problem: failed)
+    np.testing.assert_array_equal(profile.with_profile(fit, progress=stages.append).estimate.std, fit.estimate.std)
 
 
 @pytest.mark.usefixtures("optimised")

@@ -4,7 +4,7 @@ The noise of a simulated likelihood is that of the sensors; it follows from the 
 it. A likelihood of innovations has its noise among its unknowns, and is fitted once.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from ..bracket import GAUSSIAN_PRIOR, is_identifiable
 from ..estimate import AbstractEstimator, Estimate
 from ..models.abstract import Parameter
 from ..results import RESULTS
-from ..shooting import InnovationsProblem, Parts, ShootingProblem, padded
+from ..shooting import InnovationsProblem, Parts, ShootingProblem, Unknowns, padded
 from ..shooting.gains import LogNoise
 from .prepare import Case, Progress
 from .results import COLOURED, Disturbance, HeldParameter, has_answer
@@ -35,11 +35,11 @@ _NEGATIVE = 2.0
 # kinks is not quadratic, and standard deviations are too small. A value further off than the second number of standard
 # deviations is never tried.
 _CLEARLY, _SURELY = 5.0, 12.0
-_PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
 # The most parts of a flight that are compared, and the fewest that can show a disagreement.
 _MOST, _FEWEST = 20, 4
 # The chance that parts of a flight that the model explains are taken to disagree.
 _CHANCE = 0.05
+PRIOR_NOTE = "not identifiable from these flights; the other intervals allow for its bracket, as a standard deviation"
 _NEGATIVE_NOTE = "came out negative, which is impossible"
 _PLAIN_NOTE = "at the usual value, which these flights do not contradict"
 
@@ -57,6 +57,7 @@ class Fit(NamedTuple):
       held at 0 because they came out negative.
     - `widened`: by which factor an interval was widened because parts of the flights disagree, by parameter.
     - `disturbances`: by channel. `noise`: the same as logarithms. Only for innovations.
+    - `searched`: the problem of innovations with what is held, and its estimate with the covariance of the search.
     """
 
     problem: ShootingProblem
@@ -70,6 +71,7 @@ class Fit(NamedTuple):
     widened: dict[str, float] = {}
     disturbances: dict[str, Disturbance] = {}
     noise: LogNoise | None = None
+    searched: tuple[InnovationsProblem, Estimate] | None = None
 
     @property
     def answered(self) -> bool:
@@ -162,8 +164,7 @@ def fit_innovations(
     free, factor = np.flatnonzero(~np.isin(names, list(notes))), np.ones(values.size)
     if has_answer(found):
         factor[free] = _widening(problem, found, free, recording)
-        known = np.asarray(is_identifiable(factor[: own.count] * std, np.asarray(own.half_width), GAUSSIAN_PRIOR))
-        notes = {names[i]: _PRIOR_NOTE for i in np.flatnonzero(~known)} | notes
+        notes = dict.fromkeys(not_identifiable(problem, factor[: own.count] * std), PRIOR_NOTE) | notes
     held = {
         name: HeldParameter(float(values[i]), own.units[i], notes[name])
         for i, name in enumerate(names)
@@ -184,7 +185,15 @@ def fit_innovations(
         widened={names[i]: float(factor[i]) for i in range(own.count) if factor[i] > 1 and names[i] not in held},
         disturbances=_disturbances(problem, found, noise),
         noise=noise,
+        searched=(problem, found),
     )
+
+
+def not_identifiable(problem: InnovationsProblem, std: Float[np.ndarray, " parameters"]) -> list[str]:
+    """The parameters about which the flights say less than the bracket."""
+    own = problem.problem.unknowns
+    known = np.asarray(is_identifiable(std, np.asarray(own.half_width), GAUSSIAN_PRIOR))
+    return [own.names[i] for i in np.flatnonzero(~known)]
 
 
 def _searched(
@@ -225,14 +234,18 @@ def _searched(
     if has_answer(found) and plain:
         progress("fitting again without what the flights hardly show")
         simpler = holding(plain)
-        other, own = search(simpler), problem.problem.unknowns
-        # The cost that the brackets add at these values, as Gaussian priors. Held parameters have none.
-        places = [own.names.index(name) for name in plain]
-        off = (np.array(list(plain.values())) - np.asarray(own.center)[places]) / np.asarray(own.half_width)[places]
-        against = float(np.square(off).sum()) / 2
-        if has_answer(other) and float(other.cost) + against < float(found.cost) + _CLEARLY:
+        other = search(simpler)
+        rise = float(other.cost) + bracket_cost(problem.problem.unknowns, plain) - float(found.cost)
+        if has_answer(other) and rise < _CLEARLY:
             problem, found, fixed = simpler, other, fixed | dict.fromkeys(plain, _PLAIN_NOTE)
     return problem, found, rollouts, fixed, negative
+
+
+def bracket_cost(unknowns: Unknowns, values: Mapping[str, float]) -> float:
+    """The cost that brackets, as Gaussian priors, add at these values. An unknown that is held there has none."""
+    places = [unknowns.names.index(name) for name in values]
+    off = np.array(list(values.values())) - np.asarray(unknowns.center)[places]
+    return float(np.square(off / np.asarray(unknowns.half_width)[places]).sum()) / 2
 
 
 def _with_values(table: tuple[Parameter, ...], found: Estimate) -> Iterator[tuple[Parameter, float, float]]:

@@ -21,6 +21,7 @@ from .fit import Fit, fit_case
 from .judge import judge
 from .prepare import Case, FlightSettings, VehicleSettings, own_settings, prepare_flight
 from .problem import Intervals
+from .profile import with_profile
 from .results import Identification, SampleTime, finite_or_none
 from .sample_time import fit_at_sample_times
 from .vehicle import DEFAULT, prepare_vehicle, with_estimator
@@ -77,6 +78,7 @@ def identify(
     if isinstance(subject, Airframe):
         cases = prepare_vehicle(recordings, subject, own_settings(VehicleSettings, settings), **common)
         case, fit, sample_times = _fit_vehicle(cases, estimator or DEFAULT, seed=seed, progress=progress)
+        fit = with_profile(fit, progress=progress)
     else:
         own = own_settings(FlightSettings, settings)
         case = prepare_flight(recordings, subject, own, seed=seed, progress=progress, **common)
