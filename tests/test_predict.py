@@ -248,7 +248,7 @@ def test_a_parameter_that_is_not_identified_is_noted(write):
 def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     write(result())
     jaxos4.write_flight(flown(2), tmp_path / "log.csv", CRAZYFLIE)
-    files = ("--out", "out.nc", "--json", "out.json")
+    files = ("--out", "out.nc", "--json", "out.json", "--figure", "out.svg")
     code, out, err = run("predict", "found.json", "log.csv", "--horizon", "0.25", "--seed", "3", *files)
     assert (code, err) == (0, "")
     assert all(
@@ -259,6 +259,7 @@ def test_the_command_prints_a_table_and_writes_files(run, tmp_path, write):
     assert written["starts"] == dataset.sizes["start"]
     error = np.abs(dataset.rates - dataset.rates_measured).sel(rate="p").mean("start")
     np.testing.assert_allclose(error, written["quantities"]["p"]["error"])
+    assert "<svg" in (tmp_path / "out.svg").read_text(encoding="utf-8")
     assert run("predict", "found.json", "log.csv", "--horizon", "0.25", "--out", "out.csv", "--seed", "3")[0] == 0
     table = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
     np.testing.assert_allclose(table["qw"], dataset.attitude.sel(component="w").values.ravel(), rtol=1e-8)
@@ -301,6 +302,7 @@ def test_a_result_that_is_not_to_be_trusted_predicts_with_exit_code_1(run, tmp_p
         (result(), ("--spacing", "-1"), ("--spacing", "at least 0")),
         (result(), ("--seed", "-1"), ("--seed",)),
         (result(), ("--out", "out.xlsx"), ("out.xlsx", ".nc or .csv")),
+        (result(), ("--figure", "out.gif"), ("out.gif", ".svg")),
         (result(), ("--out", "log.csv"), ("log.csv", "overwrite an input")),
     ],
 )

@@ -70,9 +70,10 @@ def predict(
     seed: options.SeedOption = 0,
     out: Annotated[Path | None, Option(help="The predictions, as netCDF (.nc) or CSV (.csv).")] = None,
     json: Annotated[Path | None, Option(help="The errors, as JSON.")] = None,
+    figure: Annotated[Path | None, Option(help="A figure of the predictions (.svg).")] = None,
 ) -> None:
     """Predict a flight with an identified vehicle, and compare with constant rates and a regression."""
-    check_outputs(result, flight, out=out, json=json)
+    check_outputs(result, flight, out=out, json=json, figure=figure)
     with stages("loading the library") as progress, option_names():
         from ..forecast import check_suffix, predict as predict_flight, vehicle_of
         from ..recording import read_recording
@@ -91,12 +92,16 @@ def predict(
             found.write(out)
         if json is not None:
             write_json(found.to_dict(), json)
+        if figure is not None:
+            from ..report import write_prediction_figure
+
+            write_prediction_figure(figure, found)
     from rich.console import Console
 
     from ..report import print_prediction
 
     console = Console()
     print_prediction(console, found._replace(notes=tuple(in_options(note) for note in found.notes)))
-    for path in filter(None, (out, json)):
+    for path in filter(None, (out, json, figure)):
         console.print(f"written: {path}", markup=False, highlight=False)
     end(vehicle.result)
