@@ -92,7 +92,7 @@ def mujoco_acceleration(found, states, omega):
 
     model = mujoco_model(found)
     data, accelerations = mujoco.MjData(model), []
-    thrusts = found.vehicle.thrust_coefficient * omega**2
+    thrusts = found.vehicle.airframe.thrust_coefficient * omega**2
     for state, quaternion, thrust in zip(states, quaternions(states), thrusts, strict=True):
         data.qpos[:] = np.append(state[[0, 2, 4]], np.roll(quaternion, 1))
         data.qvel[:] = state[[1, 3, 5, 7, 9, 11]]
@@ -155,7 +155,7 @@ def test_the_drag_of_rotorpy_alone_is_right_at_the_hover_speed(tmp_path):
     found = read(tmp_path, vehicle_result(values))
     states, _ = random_states(0, 1)
     states[:, [7, 9, 11]] = 0.0
-    hover = np.full((STATES, 4), found.vehicle.hover_speed)
+    hover = np.full((STATES, 4), found.vehicle.airframe.hover_speed)
     simulated = rotorpy_acceleration(found, states, hover, "Multirotor")[:, :3]
     assert agree(simulated, vehicle_acceleration(values, states, hover)[:, :3])
 
@@ -191,7 +191,7 @@ def flown_by_mujoco(found, omega, begin):
     data, states = mujoco.MjData(model), []
     data.qpos[:], data.qvel[:] = begin[[0, 1, 2, 6, 7, 8, 9]], begin[[3, 4, 5, 10, 11, 12]]
     for speeds in omega:
-        data.ctrl[:4] = found.vehicle.thrust_coefficient * speeds**2
+        data.ctrl[:4] = found.vehicle.airframe.thrust_coefficient * speeds**2
         mujoco.mj_step(model, data, 20)
         states.append(np.concatenate([data.qpos[:3], data.qvel[:3], data.qpos[3:], data.qvel[3:]]))
     return np.array(states)
