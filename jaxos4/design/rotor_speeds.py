@@ -45,55 +45,20 @@ _PLAN = (4, 0.17, 40)
 _LEAST = 1e-6
 
 
-class Multisine(eqx.Module):
-    """Rotor speeds as a function of coefficients: angular and vertical accelerations are sums of cosines.
+class RotorSpeeds(task.AbstractTask):
+    """Rotor speeds for which angular and vertical accelerations are sums of cosines.
 
     The frequencies are the multiples of 1 / (2 duration) up to a bandwidth. Such cosines can make every input of this
     bandwidth, so only amplitudes are searched: a phase follows from neighbouring tones.
 
+    - `scale`: the half-widths of the bracket. `unexcited`: those of the model's default bracket.
     - `tones`: each tone at each sample.
-    - `scale`: the amplitude of each tone for a coefficient of 1, about as large as the envelope allows: for roll,
-      pitch, yaw [rad/s^2] and vertical acceleration [m/s^2].
+    - `amplitudes`: of each tone for a coefficient of 1, about as large as the envelope allows: for roll, pitch, yaw
+      [rad/s^2] and vertical acceleration [m/s^2].
     - `hover`: squared rotor speeds that carry the weight [rad^2/s^2]. `action`: their change by a unit of each
       acceleration.
-    """
-
-    tones: Float[Array, "samples tones"] = eqx.field(converter=as_float)
-    scale: Float[Array, "4 tones"] = eqx.field(converter=as_float)
-    hover: Float[Array, "4"] = eqx.field(converter=as_float)
-    action: Float[Array, "4 4"] = eqx.field(converter=as_float)
-
-    @classmethod
-    def within(cls, airframe: Airframe, envelope: Envelope, samples: int, dt: float, bandwidth: float) -> "Multisine":
-        """Tones up to `bandwidth` [Hz] in so many samples, scaled to the envelope."""
-        duration = (samples - 1) * dt
-        frequency = np.arange(math.floor(2 * duration * bandwidth + 1e-9) + 1) / (2 * duration)
-        hover = hover_squares(airframe, envelope)
-        action = np.linalg.solve(np.asarray(airframe.mixer), np.diag(np.append(airframe.inertia, airframe.mass)))
-        speed, limits = np.sqrt(hover), np.asarray([envelope.slowest, envelope.fastest])
-        change = (np.abs(action) / (2 * speed)[:, None]).max(axis=0)[:, None]  # of rotor speed, by one unit
-        angular = 2 * math.pi * np.maximum(frequency, _SLOWEST)
-        uses = (
-            change / np.abs(speed[:, None] - limits).min(),
-            change * angular / np.asarray(envelope.slew),
-            1 / (angular * np.append(envelope.rate, envelope.velocity)[:, None]),
-            1 / (angular**2 * np.append(envelope.angle, envelope.distance)[:, None]),
-        )
-        tones = np.cos(2 * math.pi * frequency * dt * np.arange(samples)[:, None])
-        return cls(tones, 1 / np.linalg.norm(np.broadcast_arrays(*uses), axis=0), hover, action)
-
-    def __call__(self, coefficients: Coefficients) -> Speeds:
-        """The rotor speeds [rad/s]."""
-        acceleration = self.tones @ (self.scale * coefficients.reshape(self.scale.shape)).T
-        return jnp.sqrt(jnp.maximum(self.hover + acceleration @ self.action.T, _LEAST))
-
-
-class RotorSpeeds(task.AbstractTask):
-    """Rotor speeds, as a multisine. The objective is the mean of the criterion over `draws`.
-
-    - `scale`: the half-widths of the bracket. `unexcited`: those of the model's default bracket.
-    - `make`: the rotor speeds for coefficients.
-    - `fleet`: the parameters of the vehicles that must stay within the envelope.
+    - `fleet`: the parameters of the vehicles that must stay within the envelope. `draws`: of those over which the
+      criterion is averaged.
     - `weights`: 1 / sigma of each channel, in cascade order.
     - `start_is_known`: whether the flight starts exactly at rest.
     """
@@ -105,7 +70,10 @@ class RotorSpeeds(task.AbstractTask):
     scale: Float[Numeric, " parameters"]
     unexcited: Float[Numeric, " parameters"]
     model: AbstractModel
-    make: Multisine
+    tones: Float[Array, "samples tones"] = eqx.field(converter=as_float)
+    amplitudes: Float[Array, "4 tones"] = eqx.field(converter=as_float)
+    hover: Float[Array, "4"] = eqx.field(converter=as_float)
+    action: Float[Array, "4 4"] = eqx.field(converter=as_float)
     fleet: Float[Array, "vehicles parameters"]
     draws: Float[Array, "draws parameters"]
     weights: Float[Array, " sensors"]
@@ -117,9 +85,14 @@ class RotorSpeeds(task.AbstractTask):
 
     write = staticmethod(task.write_input)
 
+    def _omega(self, coefficients: Coefficients) -> Speeds:
+        """The rotor speeds [rad/s]."""
+        acceleration = self.tones @ (self.amplitudes * coefficients.reshape(self.amplitudes.shape)).T
+        return jnp.sqrt(jnp.maximum(self.hover + acceleration @ self.action.T, _LEAST))
+
     def objective(self, coefficients: Coefficients) -> Scalar:
         """See `AbstractTask`."""
-        omega = self.make(coefficients)
+        omega = self._omega(coefficients)
 
         def one(parameters: Parameters) -> Scalar:
             slopes = self._sense(omega, parameters)
@@ -130,17 +103,17 @@ class RotorSpeeds(task.AbstractTask):
 
     def uses(self, coefficients: Coefficients) -> Uses:
         """See `AbstractTask`."""
-        omega = self.make(coefficients)
+        omega = self._omega(coefficients)
         fly = jax.vmap(lambda a: simulate(self.model, a, omega, dt=self.dt).states)
         return self.envelope.uses(omega, fly(self.fleet[:_LIMITED]), self.dt)
 
     def flown(self, coefficients: Float[np.ndarray, " coefficients"]) -> Flown:
         """See `AbstractTask`."""
-        return self._within_limits(np.asarray(self.make(as_float(coefficients))))
+        return self._within_limits(np.asarray(self._omega(as_float(coefficients))))
 
     def _within_limits(self, inputs: Inputs) -> Flown:
         """The input with the largest amplitude that all vehicles can fly, also at a tenth of the sample time."""
-        hover = hover_squares(self.model.airframe, self.envelope)
+        hover = np.asarray(self.hover)
 
         def amplified(factor: float) -> Inputs:
             """The input with all accelerations multiplied."""
@@ -175,7 +148,7 @@ class RotorSpeeds(task.AbstractTask):
         found, dt = {}, float(self.dt)
         for name, make in EXCITATIONS.items():
             try:
-                omega = make(self.model.airframe, duration=(self.make.tones.shape[0] - 1) * dt, dt=dt)
+                omega = make(self.model.airframe, duration=(self.tones.shape[0] - 1) * dt, dt=dt)
             except ValueError:  # too short
                 continue
             found[name] = self._within_limits(np.asarray(omega))
@@ -242,6 +215,26 @@ def fly_finely(
     return jax.vmap(lambda a: simulate(model, a, held, dt=dt / finer).states)(vehicles)
 
 
+def _tones(airframe: Airframe, envelope: Envelope, samples: int, dt: float, bandwidth: float) -> dict[str, np.ndarray]:
+    """The fields `tones`, `amplitudes`, `hover` and `action` of `RotorSpeeds`, with tones up to `bandwidth` [Hz]."""
+    duration = (samples - 1) * dt
+    frequency = np.arange(math.floor(2 * duration * bandwidth + 1e-9) + 1) / (2 * duration)
+    hover = hover_squares(airframe, envelope)
+    action = np.linalg.solve(np.asarray(airframe.mixer), np.diag(np.append(airframe.inertia, airframe.mass)))
+    speed, limits = np.sqrt(hover), np.asarray([envelope.slowest, envelope.fastest])
+    change = (np.abs(action) / (2 * speed)[:, None]).max(axis=0)[:, None]  # of rotor speed, by one unit
+    angular = 2 * math.pi * np.maximum(frequency, _SLOWEST)
+    uses = (
+        change / np.abs(speed[:, None] - limits).min(),
+        change * angular / np.asarray(envelope.slew),
+        1 / (angular * np.append(envelope.rate, envelope.velocity)[:, None]),
+        1 / (angular**2 * np.append(envelope.angle, envelope.distance)[:, None]),
+    )
+    tones = np.cos(2 * math.pi * frequency * dt * np.arange(samples)[:, None])
+    amplitudes = 1 / np.linalg.norm(np.broadcast_arrays(*uses), axis=0)
+    return {"tones": tones, "amplitudes": amplitudes, "hover": hover, "action": action}
+
+
 def _standard_envelope(model: AbstractModel, vehicles: Array, duration: float, dt: float) -> Envelope:
     with named("the standard multisine, which sets the envelope"):
         omega = multisine(model.airframe, duration=duration, dt=dt)
@@ -296,21 +289,21 @@ def design_input(
     vehicles = drawn(bracket, key, VEHICLES)
     envelope = _standard_envelope(model, vehicles, duration, dt).limited(limits or {})
     center, others = np.asarray(bracket.center)[None], drawn(bracket, jax.random.fold_in(key, 1), _DRAWS - 1)
-    make = Multisine.within(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
+    tones = _tones(model.airframe, envelope, round(duration / dt) + 1, dt, bandwidth)
     rotor_speeds = RotorSpeeds(
         envelope=envelope,
         scale=np.asarray(bracket.half_width),
         unexcited=np.asarray(model.half_width),
         model=model,
-        make=make,
         fleet=vehicles,
         draws=jnp.concatenate([center, others]),
         weights=as_float(1 / SENSOR_SIGMA[CASCADE_ORDER[: CHANNELS[channels]]]),
         dt=as_float(dt),
-        size=make.scale.size,
+        size=tones["amplitudes"].size,
         names=model.parameter_names,
         units=model.parameter_units,
         start_is_known=start_is_known,
+        **tones,
     )
     found = task.solve(rotor_speeds, _PLAN, compare=compare, key=key, progress=progress)
     if not (found.designed.bounds < rotor_speeds.unexcited).any():
