@@ -3,9 +3,9 @@
 JAX keeps compiled programs, and finds one by its traced program. To trace takes longer than to read what is compiled.
 So the traced program is exported to the same folder. The name of its file is a digest of the function, the shapes and
 static values of its arguments, the sources of `jaxos4`, the installed packages and JAX's settings. This is enough for a
-command, which runs no other code. It is not enough for a program of the user, who may add a term to a table, or switch
-a setting in a part of the program: so only the command line keeps programs, see `keep_programs`. To read a file runs
-its code: none is read from or written to a folder or a file that another user owns, or can write to.
+command, which runs no other code. A program of the user may add a term to a table, or switch a setting in a part of the
+program: so only the command line keeps programs. To read a file runs its code: none is read from or written to a folder
+or a file that another user owns, or can write to.
 """
 
 import contextlib
@@ -13,15 +13,11 @@ import hashlib
 import io
 import os
 import pickle  # noqa: TID251 - nobody else can write what it reads
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from ._files import write_atomically
-
-# Packages whose code the digest knows. A program that depends on a class or function of another package is not kept.
-_KNOWN = {"jaxos4", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "optax", "numpy", "builtins"}
 
 _programs: dict[str, Callable[..., Any] | None] = {}
 _surroundings: list[bytes] = []  # what every program of this process depends on; empty: nothing is kept
@@ -36,7 +32,11 @@ def keep_programs() -> None:
 
     settings = jax.config.values
     if settings["jax_enable_compilation_cache"] and not (settings["jax_disable_jit"] or settings["jax_debug_nans"]):
-        _surroundings[:] = [_describe_surroundings()]
+        # A source is known by size and time, as in Python's own cache; a package by the name of its folder.
+        sources = [(str(path), path.stat()) for path in sorted(Path(__file__).parent.rglob("*.py"))]
+        sizes = [(path, status.st_size, status.st_mtime_ns) for path, status in sources]
+        packages = sorted(os.listdir(Path(jax.__file__).parents[1]))
+        _surroundings[:] = [repr((sizes, packages, sorted(settings.items()))).encode()]
 
 
 def kept_program(
@@ -49,15 +49,18 @@ def kept_program(
     import jax
 
     folder = jax.config.values["jax_compilation_cache_dir"]
-    if not folder or not _is_private(folder) or jax.device_count() > 1 or not _is_known(function):
+    if not folder or not _is_private(folder) or jax.device_count() > 1 or "<" in function.__qualname__:
         return None
     leaves, tree = jax.tree.flatten((args, kwargs))
     shapes = [(x.shape, str(x.dtype), getattr(x, "weak_type", False)) if eqx.is_array(x) else x for x in leaves]
+    described = io.BytesIO()
+    pickler = pickle.Pickler(described)
+    pickler.fast = True  # equal values have equal bytes, whether or not their parts are one object
     try:
-        description = _described((function.__module__, function.__qualname__, options, shapes, tree))
+        pickler.dump((function.__module__, function.__qualname__, options, shapes, tree))
     except (pickle.PicklingError, AttributeError, TypeError, ValueError):
         return None
-    name = hashlib.sha256(_surroundings[0] + description).hexdigest()
+    name = hashlib.sha256(_surroundings[0] + described.getvalue()).hexdigest()
     if name not in _programs:
         path, arrays = Path(folder) / f"jaxos4-{name}", [leaf for leaf in leaves if eqx.is_array(leaf)]
         content = _read(path) or _write(path, function, args, kwargs)
@@ -78,38 +81,6 @@ def _compiled(traced: Any, results: Any, options: dict[str, Any], arrays: list[A
         return jax.block_until_ready(jax.tree.unflatten(tree, of_arrays(*leaves)))
 
     return call
-
-
-def _is_known(code: Any) -> bool:
-    """Whether a class or function has a name in a package that the digest knows."""
-    return "<" not in code.__qualname__ and code.__module__.partition(".")[0] in _KNOWN
-
-
-class _Pickler(pickle.Pickler):
-    """Writes classes and functions by name, and refuses those whose code is not known."""
-
-    def reducer_override(self, obj: Any) -> Any:
-        if isinstance(obj, type | types.FunctionType) and not _is_known(obj):
-            raise pickle.PicklingError(f"the code of {obj} is not known")
-        return NotImplemented
-
-
-def _described(value: Any) -> bytes:
-    with io.BytesIO() as file:
-        pickler = _Pickler(file)
-        pickler.fast = True  # equal values have equal bytes, whether or not their parts are one object
-        pickler.dump(value)
-        return file.getvalue()
-
-
-def _describe_surroundings() -> bytes:
-    """Sources, packages and settings. A source is known by size and time, as in Python's own cache."""
-    import jax
-
-    sources = sorted(Path(__file__).parent.rglob("*.py"))
-    sizes = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sources]
-    packages = sorted(os.listdir(Path(jax.__file__).parents[1]))  # with their versions
-    return repr((sizes, packages, sorted(jax.config.values.items()))).encode()
 
 
 def _is_private(place: str | Path | int) -> bool:
@@ -136,7 +107,6 @@ def _read(path: Path) -> tuple[Any, Any] | None:
 def _write(path: Path, function: Callable[..., Any], args: Any, kwargs: Any) -> tuple[Any, Any] | None:
     """Traces a program and writes its file; `None` if it cannot be exported, or if a result is no array."""
     import equinox as eqx
-    import jax
     import jax.export
 
     arrays, static = eqx.partition((args, kwargs), eqx.is_array)
