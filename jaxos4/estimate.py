@@ -25,11 +25,10 @@ _START_STEPS = 4
 
 
 class Calibration(eqx.Module):
-    """How wide an interval must be to contain the truth in the share of flights that its level gives.
+    """Half-widths, in standard deviations, of intervals that contain the truth in the share of flights of their level.
 
     - `levels`: between 0 and 1, rising.
-    - `factors`: half-width of the interval in standard deviations, for each level and parameter.
-    - `simultaneous`: the same, for intervals that hold all parameters at once.
+    - `factors`: for each level and parameter. `simultaneous`: of intervals that hold all parameters at once.
     """
 
     levels: Float[Array, " levels"]
@@ -43,23 +42,21 @@ _count = functools.partial(jnp.asarray, dtype=int)
 class Estimate(eqx.Module):
     """Parameters with their uncertainty, and how they were found.
 
-    - `parameters`: the estimate of all unknowns that the problem's windows share; a held one has its value, and a
-      variance of 0. If `result` says that there is no estimate: the bracket's center, or 0 if the bracket
-      is invalid.
-    - `covariance`: of `parameters`; infinite without an estimate. An estimator that shoots takes it from the Fisher
-      information at the estimate and the problem's `sigma`, a network from its errors on simulated flights.
+    - `parameters`: all unknowns that the problem's windows share; a held one has its value, and a variance of 0. If
+      `result` says that there is no estimate: the bracket's center, or 0 if the bracket is invalid.
+    - `covariance`: of `parameters`; infinite without an estimate. It follows from the Fisher information at the
+      estimate and the problem's `sigma`; that of a network from its errors on simulated flights.
     - `initial_state`: the estimated, or known, state at the first sample of each window, in cascade order.
     - `cost`: 1/2 |W (y - x)|^2 at the estimate, for the problem's channels (a network: for its own); infinite without
       an estimate.
-    - `rollouts`: the work in simulated flights, on any channels: one for a shot, and one for each of its derivatives.
-      IBSS, and the fit of an initial state alone, count the derivatives only.
-    - `sweeps`: number of iterations, summed over the stages.
+    - `rollouts`: the work in simulated flights: one for a shot, and one for each of its derivatives. IBSS, and the fit
+      of an initial state alone, count the derivatives only. `sweeps`: number of iterations, summed over the stages.
     - `result`: how the search ended.
     - `calibration`: of the intervals, if they were calibrated on simulated flights; `None` means Gaussian.
     - `seed`: the bracket that the search began from, if another estimator gave one.
     - `history`: the parameters after each sample, from a recursive estimator.
-    - `brackets`: the lowest and highest value of each parameter inside the brackets that each sweep opens, from an
-      estimator that records them; NaN after the last sweep.
+    - `brackets`: the lowest and highest value of each parameter inside the brackets that each sweep opens, if recorded;
+      NaN after the last sweep.
     - `parts`: the likelihood of each part of the flight, from a problem whose parts are compared.
     """
 
@@ -84,12 +81,8 @@ class Estimate(eqx.Module):
     def half_width(self, level: float, *, simultaneous: bool = False) -> Float[Array, "*batch parameters"]:
         """Half-width of an interval around each parameter that holds the truth in a share `level` of all flights.
 
-        **Arguments:**
-
-        - `level`: between 0 and 1. Calibrated intervals cover 50 to 99.9 %; they do not change outside this range.
-        - `simultaneous`: whether the intervals hold all parameters at once; by default each holds its own.
-
-        **Raises:** `ValueError` for a level that is not between 0 and 1.
+        `level`: between 0 and 1, else `ValueError`. Calibrated intervals do not change outside of 0.5 to 0.999.
+        `simultaneous`: whether the intervals hold all parameters at once; by default each holds its own.
         """
         if not 0 < level < 1:
             raise ValueError(f"`level` must lie between 0 and 1, got {level}.")
@@ -125,8 +118,7 @@ def as_estimate(
 
     **Arguments:**
 
-    - `sound`: whether the trajectory is sound to its end.
-    - `done`: whether the search ended by itself.
+    - `sound`: whether the trajectory is sound to its end. `done`: whether the search ended by itself.
     - `reach`: how many half-widths an answer may lie away from the bracket's center.
     - `prior`: how the estimator uses the bracket, see `jaxos4.bracket`; by default as the problem does.
     - The others are fields of an `Estimate`.
@@ -218,21 +210,12 @@ def fit_start(
 ) -> tuple[Float[Array, " starts"], Scalar, Bool[Array, ""], int]:
     """The initial state that explains the flight best with these parameters, for algorithms that do not search for it.
 
+    A free one takes a few Gauss-Newton steps from the first measurements, whose errors are the prior.
+
     **Returns:** initial state, cost, whether the trajectory is sound, and number of rollouts.
     """
-    start, rollouts = best_start(problem, parameters)
-    cost, sound = problem.shots(parameters, start)
-    return start, cost, sound, rollouts + 1
-
-
-def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[Array, " starts"], int]:
-    """`fit_start` without the cost: a free initial state takes a few Gauss-Newton steps from the first measurements."""
-    first, off = problem.first_state()
+    start, off = problem.first_state()
     count, free = parameters.shape[0], problem.free_size
-    if not free:
-        return first, 0
-    # The errors of the first measurements are the prior.
-    known = 1 / jnp.square(problem.split(off))
 
     def improve(start: Float[Array, " starts"], _) -> tuple[Float[Array, " starts"], None]:
         _, gradient, information, _ = problem.curvatures(parameters, start)
@@ -240,7 +223,11 @@ def best_start(problem: ShootingProblem, parameters: Parameters) -> tuple[Float[
         slope = gradient[:, count:] + known * problem.split(start - first)
         return start - (covariance * slope[:, None, :]).sum(axis=-1).ravel(), None
 
-    return jax.lax.scan(improve, first, length=_START_STEPS)[0], _START_STEPS * (count + free)
+    if free:
+        first, known = start, 1 / jnp.square(problem.split(off))
+        start, _ = jax.lax.scan(improve, first, length=_START_STEPS)
+    cost, sound = problem.shots(parameters, start)
+    return start, cost, sound, 1 + (_START_STEPS * (count + free) if free else 0)
 
 
 class AbstractEstimator(eqx.Module):

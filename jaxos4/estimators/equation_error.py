@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from .._custom_types import Count, Parameters, Scalar, integer, setting
 from .._xla import quick_jit
 from ..bracket import Bracket
-from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, best_start, in_one_program
+from ..estimate import AbstractEstimator, AbstractRecursion, Estimate, as_estimate, fit_start, in_one_program
 from ..flight import RATES
 from ..linalg import gram, invert
 from ..models.state import Rates
@@ -185,7 +185,7 @@ class Regression(NamedTuple):
         parameters = center + half_width * steps if history is None else history[-1]
         covariance = half_width[:, None] * covariance * half_width[None, :]
         identifiable = problem.unknowns.usable.identifiable(jnp.sqrt(jnp.diagonal(covariance))).all()
-        initial_state, rollouts = best_start(problem, parameters)
+        initial_state, _, _, rollouts = fit_start(problem, parameters)
         choices = (parameters, initial_state), (center, problem.first_state()[0])
         choices = jax.tree.map(lambda *each: jnp.stack(each), *choices)
         # One after the other, so that the simulation is compiled once.
@@ -200,7 +200,7 @@ class Regression(NamedTuple):
             covariance=covariance,
             initial_state=initial_state,
             cost=shot.cost,
-            rollouts=rollouts + 2,
+            rollouts=rollouts + 1,
             sweeps=1,
             sound=shot.sound,
             done=jnp.ones((), dtype=bool),
