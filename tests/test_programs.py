@@ -186,27 +186,26 @@ def test_simulates_another_flight_without_another_trace(counted, method):
     assert count[0] == 2
 
 
-@pytest.mark.parametrize("what", ["cost", "residuals", "predict"])
-def test_shoots_at_another_problem_without_another_trace(counted, what):
+def shot(what):
+    def shoot(problem, trial):
+        return getattr(jaxos4.ShootingProblem, what)(problem, 1.1 * problem.model.alpha, problem.first_state()[0])
+
+    return shoot
+
+
+def search(problem, trial):
+    bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
+    return jaxos4.IBSS(tolerance=0.01 * (1 + trial), reach=4 - trial)(problem, bracket)
+
+
+@pytest.mark.parametrize("compute", [shot("cost"), shot("residuals"), shot("predict"), search])
+def test_another_problem_needs_no_other_trace(counted, compute):
     model_class, count = counted
     counts = []
     for trial in range(3):
-        problem = problem_of(model_class, trial)
-        shoot = getattr(jaxos4.ShootingProblem, what)
-        eqx.filter_eval_shape(shoot, problem, 1.1 * problem.model.alpha, problem.first_state()[0])
-        counts.append(count[0])
-    assert counts[0] == counts[-1]
-
-
-def test_the_estimator_itself_traces_once(counted):
-    model_class, count = counted
-    counts = []
-    for trial in range(3):
-        problem = problem_of(model_class, trial)
-        bracket = jaxos4.Bracket.around(problem.model.alpha, (1 + trial) * jaxos4.DEFAULT_HALF_WIDTH)
-        eqx.filter_eval_shape(jaxos4.IBSS(tolerance=0.01 * (1 + trial), reach=4 - trial), problem, bracket)
+        eqx.filter_eval_shape(lambda problem, trial=trial: compute(problem, trial), problem_of(model_class, trial))
         counts.append(count[0])
     assert counts[0] == counts[-1]
     # Another kind of problem is seen.
-    eqx.filter_eval_shape(jaxos4.IBSS(), problem.restrict("attitude"), bracket)
+    eqx.filter_eval_shape(lambda problem: compute(problem, 0), problem_of(model_class, 0).restrict("attitude"))
     assert count[0] > counts[0]
